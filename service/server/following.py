@@ -147,8 +147,8 @@ def _step(session: Session, node: ServerNode) -> list[Session]:
             info,
             begin_t_ns,
             scene_content=scene_content,
-            calibration=node.calibration,
-            calibration_source=node.calibration_source,
+            calibration=node.estimates.calibration,
+            calibration_source=node.estimates.calibration_source,
         )
     ]
 
@@ -238,7 +238,7 @@ def sources_now(session: Session, node: ServerNode, *, exact: bool = False) -> S
     return sources_of(
         session,
         streams,
-        tares=lambda: node.tares,
+        tares=lambda: node.estimates.tares,
         emulated=node.hello.emulated,
         no_array=node.info,
         exact=exact,

@@ -10,7 +10,6 @@ import logging
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
 
 from devices.errors import (
     DamagedFileError,
@@ -20,18 +19,13 @@ from devices.errors import (
     StateError,
     StorageError,
 )
-from devices.frames import ArrayInfo, FrameBatch
-from service.estimation.calibration import Calibration
+from devices.frames import ArrayInfo
 from service.link import BOOT_ID, Hello, StreamNumbers
-from service.server.assignment import Assignment
-from service.server.live_estimates import LiveEstimates
+from service.server.estimates.of_node import Estimated, NodeEstimates
 from service.server.pace import Pace
 from service.server.streams import ServerStream
-from service.server.tare_keeper import TareKeeper
 from service.server_clock import utc_ns
-from service.sessions.pipeline import Columns
 from service.sessions.tare_file import RecordedTare
-from service.sessions.tares import TareHistory
 from storage.checked_json import write_checked
 from storage.clock.log import ClockOffset
 from storage.durable import make_folder, storage_errors
@@ -42,8 +36,6 @@ log = logging.getLogger("foottile.nodes")
 
 IS_BOOT_ID = re.compile(BOOT_ID)
 HELLO_FILE = "hello.json"
-
-Estimated = tuple[FrameBatch, Columns]
 
 
 class ServerNode:
@@ -59,8 +51,7 @@ class ServerNode:
         self.name = hello.array_info.node
         self.hello = hello
         self.connected = False
-        self.tares = TareHistory(folder / "tares.json")
-        self.assignment = Assignment(folder / "assigned.json")
+        self.estimates = NodeEstimates(folder, hello)
         self.streams: dict[str, ServerStream] = {}
         """By boot_id: those that are kept here, and those that it said it has."""
         self.unread: set[str] = set()
@@ -95,68 +86,16 @@ class ServerNode:
                 except FootTileError as error:  # a disk that is full, or another version wrote it
                     self.unread.add(path.name)
                     self._found.append(f"a journal is left out until it can be read: {error}")
-        for problem in (self.tares.problem, self.assignment.problem):
-            if problem is not None:
-                self._found.append(problem)
+        self._found += self.estimates.damages
         for text in self._found:
             log.warning("node %s: %s", self.name, text)
         self.present = self._stream_of(self.info)
         """The stream that it takes now."""
-        self.live = LiveEstimates(self.info, None, None)
-        self.tare_keeper: TareKeeper
-        self._has_failed = False
-        self._estimate_anew()
 
     @property
     def problems(self) -> list[str]:
         """What was found damaged of what is kept of it, and what became of it, in words."""
         return [f"node {self.name}: {text}" for text in self._found]
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """What its tiles are to be estimated with: the server's choice, else what it says itself.
-
-        It may not fit them; what is in use is `live.calibration`.
-        """
-        if self.assignment.problem is not None:
-            return None
-        assigned = self.assignment.present
-        return self.hello.calibration if assigned is None else assigned.calibration
-
-    @property
-    def calibration_source(self) -> Literal["node", "server"]:
-        """Who says which that is."""
-        chosen = self.assignment.present is not None or self.assignment.problem is not None
-        return "server" if chosen else "node"
-
-    @property
-    def calibration_problem(self) -> str | None:
-        """Why none is in use."""
-        own = self.hello.calibration_problem if self.calibration_source == "node" else None
-        return self.assignment.problem or self.live.calibration_problem or own
-
-    def use_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
-        """Estimate with a calibration of the server's choice from the next frame on.
-
-        What is being recorded keeps the one that it began with.
-
-        Args:
-            calibration: which; None: the node's own again.
-            t_ns: the server's UTC.
-
-        Raises:
-            StorageError: that cannot be kept; nothing has changed then.
-        """
-        if calibration is None:
-            self.assignment.take_back(t_ns)
-        else:
-            self.assignment.put(calibration, t_ns)
-        before = self.live
-        self._estimate_anew()
-        try:
-            self.live.go_on_from(before)
-        except Exception as error:
-            self._go_without_estimates(error)
 
     @property
     def info(self) -> ArrayInfo:
@@ -228,7 +167,6 @@ class ServerNode:
             self.last_seq = self.last_t_ns = None
             self.troubles, self.fault_counts = (), {}
             self._pace.clear()
-        known = (self.hello.array_info, self.hello.calibration)
         self.hello = hello
         self.has_spoken, self.greeted_t_ns = True, now_t_ns
         for stream in list(self.streams.values()):
@@ -245,8 +183,7 @@ class ServerNode:
         for name in self.order:
             stream = self.streams[name]
             stream.owed = stream.held & stream.may_come
-        if known != (hello.array_info, hello.calibration) or self._has_failed:
-            self._estimate_anew()
+        self.estimates.greet(hello)
         self.has_words = True
 
     def lacks(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
@@ -306,7 +243,9 @@ class ServerNode:
             frames = frames.rows(self.last_seq + 1 - first, len(frames))
         self.last_seq, self.last_t_ns = last, int(frames.t_ns[-1])
         self._pace.note(int(frames.t_mono_ns[-1]), last)
-        return first, last, self._estimated(frames)
+        due = self.estimates.feed(frames)
+        self._look_for_tare()
+        return first, last, due
 
     def take_tare(self, reason: str = "") -> RecordedTare:
         """Tare from an unloaded interval of the last seconds, and put it in force.
@@ -320,7 +259,7 @@ class ServerNode:
             raise StateError(
                 f"node {self.name!r} is away", remedy="Tare when it is connected again"
             )
-        return self.tare_keeper.by_hand(reason)
+        return self.estimates.tare_keeper.by_hand(reason)
 
     def read_again(self) -> None:
         """Try the journals again that could not be read."""
@@ -391,43 +330,13 @@ class ServerNode:
             self.streams[info.boot_id] = ServerStream(self._journals_folder / info.boot_id, info)
         return self.streams[info.boot_id]
 
-    def _estimated(self, frames: FrameBatch) -> list[Estimated]:
-        """Frames whose estimates are due; a bug there costs this node its estimates, no more."""
-        try:
-            due = list(self.live.feed(frames))
-        except Exception as error:
-            self._go_without_estimates(error)
-            return [(frames, {})]
-        self._look_for_tare()
-        return due
-
-    def _go_without_estimates(self, error: Exception) -> None:
-        log.exception("node %s: this is a bug; it goes on without estimates", self.name)
-        self._has_failed = True
-        self.live = LiveEstimates(self.info, None, None, self.live)
-        self.live.calibration_problem = f"the estimator failed, until it connects again: {error!r}"
-        self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=False)
-
     def _look_for_tare(self) -> None:
         if self.storage_problem is not None:  # it could not be kept
             return
         try:
-            self.tare_keeper.look(self.journal, lambda: self.present.may_come)
-        except StorageError as error:  # not in force then; tried again once it can be kept
+            self.estimates.look_for_tare(self.journal, lambda: self.present.may_come)
+        except StorageError as error:
             self.storage_problem = str(error)
-        except Exception as error:
-            self._go_without_estimates(error)
-
-    def _estimate_anew(self) -> None:
-        self._has_failed = False
-        try:
-            tare = self.tares.to_use(self.info)
-            self.live = LiveEstimates(self.info, self.calibration, tare, self.live)
-        except Exception as error:
-            self._go_without_estimates(error)
-            return
-        automatic = self.hello.scene.get("auto_tare", True) is not False
-        self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=automatic)
 
 
 def _joined(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:

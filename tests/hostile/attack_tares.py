@@ -73,7 +73,7 @@ def _estimated(data: Path, hello: Hello) -> tuple[dict[str, Numbers], bool]:
 def _live(node: ServerNode) -> Numbers:
     journal = node.journal
     assert journal is not None
-    due = [c for batch in journal.read(0, 2**61) for _, c in node.live.feed(batch)]
+    due = [c for batch in journal.read(0, 2**61) for _, c in node.estimates.live.feed(batch)]
     return _joined(due)
 
 

@@ -13,7 +13,7 @@ from devices.frames import ArrayInfo, ServoInfo
 from service.api.routes.access import ServerState, problems
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
-from service.server.ranges import Ranges
+from service.server.estimates.ranges import Ranges
 from service.server.screens.views import CalibrationView, TileView, View, scale_of, tiles_of
 from service.server.server import Server
 

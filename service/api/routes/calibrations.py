@@ -144,7 +144,8 @@ class NodeCalibrationView(View):
     @classmethod
     def of(cls, node: ServerNode) -> NodeCalibrationView:
         """As it is now."""
-        live, own, assigned = node.live, node.hello.calibration, node.assignment.present
+        estimates, own = node.estimates, node.hello.calibration
+        live, assigned = estimates.live, estimates.assignment.present
         used = None
         if live.calibration is not None and live.calibration_id and live.ranges is not None:
             used = CalibrationView(
@@ -154,10 +155,10 @@ class NodeCalibrationView(View):
             )
         return cls(
             node=node.name,
-            source=node.calibration_source,
+            source=estimates.calibration_source,
             assigned_t_ns=None if assigned is None else assigned.t_ns,
             calibration=used,
-            problem=node.calibration_problem,
+            problem=estimates.calibration_problem,
             own_id=None if own is None else own.id,
         )
 
@@ -327,7 +328,7 @@ async def assign(
     calibration = await run_in_threadpool(server.calibrations.get, body.id)
     _expect_in_use(the_node, if_match)
     _check_fits(the_node, calibration)
-    the_node.use_calibration(calibration, utc_ns())
+    the_node.estimates.use_calibration(calibration, utc_ns())
     server.tell_node(the_node)
     return NodeCalibrationView.of(the_node)
 
@@ -346,8 +347,8 @@ async def take_back(node: str, server: ServerState, if_match: InUse = None) -> N
     """The node's own calibration is in use again, if it has one."""
     the_node = server.nodes.get(node)
     _expect_in_use(the_node, if_match)
-    if the_node.calibration_source == "server":
-        the_node.use_calibration(None, utc_ns())
+    if the_node.estimates.calibration_source == "server":
+        the_node.estimates.use_calibration(None, utc_ns())
         server.tell_node(the_node)
     return NodeCalibrationView.of(the_node)
 
@@ -367,7 +368,8 @@ def _file(calibration: Calibration, request: Request) -> Response:
 
 
 def _expect_in_use(node: ServerNode, if_match: str | None) -> None:
-    expect(tag_of(if_match), node.live.calibration_id or _NONE, f"the calibration of {node.name!r}")
+    present = node.estimates.live.calibration_id or _NONE
+    expect(tag_of(if_match), present, f"the calibration of {node.name!r}")
 
 
 def _check_fits(node: ServerNode, calibration: Calibration) -> None:

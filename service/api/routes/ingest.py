@@ -158,14 +158,14 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
         await asyncio.sleep(0)
         message = await _receive(socket)
         if isinstance(message, bytes):
-            tare_before = node.live.tare
+            tare_before = node.estimates.live.tare
             try:
                 *_, due = node.take(link.stream, _frames(message), utc_ns())
             except LinkError as error:
                 raise HangUp(Close.REFUSED, str(error)) from error
             server.hub.publish(node, due)
             server.frames.publish(node, due)
-            if node.live.tare is not tare_before:
+            if node.estimates.live.tare is not tare_before:
                 server.tell_node(node)
             continue
         said = _parse(message)

@@ -91,7 +91,7 @@ InForce = Annotated[
 
 
 def _expect_in_force(node: ServerNode, if_match: str | None) -> None:
-    recorded = node.tares.in_force(node.info)
+    recorded = node.estimates.tares.in_force(node.info)
     in_force = "none" if recorded is None else recorded.id
     expect(tag_of(if_match), in_force, f"the tare of {node.name!r}")
 
@@ -195,7 +195,7 @@ async def tare(
 async def list_tares(node: str, server: ServerState) -> TaresPage:
     """Newest first; the first one of the present tiles that is not undone is in force."""
     the_node = server.nodes.get(node)
-    items = [TareView.of(t) for t in reversed(the_node.tares.all)]
+    items = [TareView.of(t) for t in reversed(the_node.estimates.tares.all)]
     return TaresPage(items=items, drift=DriftView.of(the_node))
 
 
@@ -217,5 +217,5 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
     """
     the_node = server.nodes.get(node)
     _expect_in_force(the_node, if_match)
-    the_node.tare_keeper.undo(tare_id)
+    the_node.estimates.tare_keeper.undo(tare_id)
     server.tell_node(the_node)

@@ -13,7 +13,8 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from devices.frames import FrameBatch
-from service.server.node import Estimated, ServerNode
+from service.server.estimates.of_node import Estimated
+from service.server.node import ServerNode
 from service.sessions.pipeline import Columns
 
 BYTES_MAX = 8 << 20

@@ -20,9 +20,10 @@ from typing import Literal, get_args
 from devices.errors import DamagedFramesError
 from service.estimation.warm import is_warming
 from service.link import Close, HangUp
+from service.server.estimates.of_node import Estimated
 from service.server.full_rate.memory import NodeMemory, Piece, wait_for
 from service.server.full_rate.recomputed import Position, Recomputed
-from service.server.node import Estimated, ServerNode
+from service.server.node import ServerNode
 from service.server.streams import ServerStream
 from storage.intervals import CORRUPT, NO_END, Intervals
 

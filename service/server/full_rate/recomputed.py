@@ -19,7 +19,8 @@ from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.ladder.plan import make_plan, warm_up_s
 from service.estimation.tare.tare import Tare
-from service.server.node import Estimated, ServerNode
+from service.server.estimates.of_node import Estimated
+from service.server.node import ServerNode
 from service.server.streams import ServerStream
 from service.sessions.pipeline import Columns, EstimateRun
 from storage.journal.journal import Journal
@@ -128,7 +129,7 @@ class Recomputed:
         self._journal: Journal = stream.journal
         self.position = position
         """The frame that is wanted next."""
-        calibration = node.live.calibration
+        calibration = node.estimates.live.calibration
         if calibration is not None and not stream.info.has_same_tiles_as(node.info):
             calibration = None
         last = self._journal.held.last or 0
@@ -146,7 +147,7 @@ class Recomputed:
     ) -> int:
         """Number of the frame with which models begin."""
         t_ns = self._journal.t_ns_near(seq, newest=False)
-        tare = node.tares.to_use(stream.info)
+        tare = node.estimates.tares.to_use(stream.info)
         if calibration is None or tare is None or t_ns is None:
             return seq
         plan = make_plan(
@@ -196,7 +197,7 @@ def _changes(
     """Where the estimates of these frames began anew, in order."""
     own = [
         Change(each.calibration, each.tare, seq=each.seq)
-        for each in (node.live.begun if stream is node.present else ())
+        for each in (node.estimates.live.begun if stream is node.present else ())
     ]
     before = [change for change in own if change.seq is not None and change.seq <= begin]
     if before:  # all of it is this server's own
@@ -209,5 +210,5 @@ def _changes(
     until_ns = journal.t_ns_near(until, newest=True)
     if t_ns is None or until_ns is None:
         return own
-    tares = node.tares.during(stream.info, t_ns, until_ns)
+    tares = node.estimates.tares.during(stream.info, t_ns, until_ns)
     return [*(Change(calibration, tare, t_ns=tare.t_ns) for tare in tares), *own]

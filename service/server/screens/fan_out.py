@@ -14,7 +14,8 @@ from typing import Any, Protocol
 from websockets.frames import Frame, Opcode
 
 from service.link import Close, HangUp
-from service.server.node import Estimated, ServerNode
+from service.server.estimates.of_node import Estimated
+from service.server.node import ServerNode
 from service.server.screens.picture import Summary, dumps, sum_up
 from service.server.screens.recent import Recent
 from service.server.screens.recent_tiles import RecentTiles

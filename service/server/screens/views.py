@@ -13,10 +13,10 @@ from devices.frames import ArrayInfo, ServoInfo
 from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
 from service.estimation.warm import WARMING, is_warming
 from service.server.book import mark_of, said_of
+from service.server.estimates.ranges import Ranges
+from service.server.estimates.tare_keeper import AutoTare
 from service.server.node import ServerNode
-from service.server.ranges import Ranges
 from service.server.recorder import Recorder
-from service.server.tare_keeper import AutoTare
 from service.sessions.tare_file import RecordedTare
 from storage.sessions.folder import Event, Part, Session
 
@@ -119,8 +119,8 @@ class DriftView(View):
     @classmethod
     def of(cls, node: ServerNode) -> DriftView:
         """Of a node as it is now."""
-        live, tiles = node.live, len(node.info.tiles)
-        line = trend(node.tares.valid(node.info), tiles=tiles)
+        live, tiles = node.estimates.live, len(node.info.tiles)
+        line = trend(node.estimates.tares.valid(node.info), tiles=tiles)
         none = np.full(tiles, np.nan)
         slope = none if live.ranges is None else live.ranges.slope_n_per_kpa
         warmer_by_k = none if live.tare is None else warmer_k(live.tare, live.recent_tadc())
@@ -206,9 +206,10 @@ class NodeView(View):
     @classmethod
     def of(cls, node: ServerNode, recorder: Recorder) -> NodeView:
         """Of a node as it is now."""
-        info, live = node.info, node.live
+        info, estimates = node.info, node.estimates
+        live, keeper = estimates.live, estimates.tare_keeper
         calibration = live.calibration
-        tare, lost = node.tares.in_force(info), node.lost
+        tare, lost = estimates.tares.in_force(info), node.lost
         return cls(
             node=node.name,
             connected=node.connected,
@@ -224,12 +225,12 @@ class NodeView(View):
             else CalibrationView(
                 id=live.calibration_id, name=calibration.name, absolute_scale=scale_of(live.ranges)
             ),
-            calibration_source=node.calibration_source,
-            calibration_problem=node.calibration_problem,
+            calibration_source=estimates.calibration_source,
+            calibration_problem=estimates.calibration_problem,
             tare=TareView.of(tare) if tare is not None else None,
-            tare_problem=node.tare_keeper.problem,
-            tare_warnings=node.tare_keeper.warnings(),
-            auto_tare=node.tare_keeper.auto_tare,
+            tare_problem=keeper.problem,
+            tare_warnings=keeper.warnings(),
+            auto_tare=keeper.auto_tare,
             drift=DriftView.of(node),
             storage_problem=node.storage_problem,
             clock=None

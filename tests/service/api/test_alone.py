@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from devices.frames import FrameBatch
-from service.server.live_estimates import LiveEstimates
+from service.server.estimates.live import LiveEstimates
 from service.server.node import ServerNode
 from service.server.screens.views import NodeView
 from storage.verify.journal import verify_stream

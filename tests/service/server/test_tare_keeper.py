@@ -108,15 +108,15 @@ class Foot:
 
     @property
     def auto_tare(self) -> str:
-        return self.node.tare_keeper.auto_tare
+        return self.node.estimates.tare_keeper.auto_tare
 
     @property
     def history(self) -> list[tuple[str, bool]]:
-        return [(t.tare.source, t.undone) for t in self.node.tares.all]
+        return [(t.tare.source, t.undone) for t in self.node.estimates.tares.all]
 
     @property
     def offset_counts(self) -> list[float]:
-        tare = self.node.live.tare
+        tare = self.node.estimates.live.tare
         assert tare is not None
         return list((tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA)
 
@@ -152,14 +152,17 @@ def test_a_lead_that_comes_after_what_followed_it_is_tared_all_the_same(foot_of:
     lead = foot.frames(1.0, 1.0, lead=True)
     foot.live(2.0, 20.0)
     assert foot.history == []
-    assert foot.node.tare_keeper.problem == "not tared: lift the foot, hold it still, and tare"
+    assert (
+        foot.node.estimates.tare_keeper.problem
+        == "not tared: lift the foot, hold it still, and tare"
+    )
     foot.send(lead.rows(0, 50))
     assert foot.history == []
     foot.send(lead.rows(50, 100))
     assert foot.history == [("lead", False)]
-    assert foot.node.live.tare.frames == 100
+    assert foot.node.estimates.live.tare.frames == 100
     assert foot.offset_counts == pytest.approx([1.0, 1.0], abs=0.4)
-    assert foot.node.tare_keeper.problem is None
+    assert foot.node.estimates.tare_keeper.problem is None
 
 
 def test_a_lead_of_which_a_part_never_comes_is_tared_from_the_rest(foot_of: Any) -> None:
@@ -171,7 +174,7 @@ def test_a_lead_of_which_a_part_never_comes_is_tared_from_the_rest(foot_of: Any)
     assert foot.history == []
     foot.live(2.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.live.tare.frames == 75
+    assert foot.node.estimates.live.tare.frames == 75
 
 
 def test_a_server_that_is_restarted_in_the_lead_tares_from_all_of_it_and_not_twice(
@@ -183,11 +186,11 @@ def test_a_server_that_is_restarted_in_the_lead_tares_from_all_of_it_and_not_twi
     foot.live(0.5, lead=True)
     foot.live(1.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.live.tare.frames == 100
+    assert foot.node.estimates.live.tare.frames == 100
     foot.restart()
     foot.live(1.0, 20.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.live.tare is not None
+    assert foot.node.estimates.live.tare is not None
 
 
 def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
@@ -195,7 +198,7 @@ def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
     foot.live(1.0, lead=True, silent=1)
     foot.live(1.0, 20.0)
     assert foot.history == []
-    problem = foot.node.tare_keeper.problem
+    problem = foot.node.estimates.tare_keeper.problem
     assert "the lead gave no tare (tile T02 has 0 readable frames" in problem
     assert "lift the foot" in problem
 
@@ -203,7 +206,7 @@ def test_a_lead_that_is_no_tare_is_said_with_its_reason(foot_of: Any) -> None:
 def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_said(
     foot: Foot,
 ) -> None:
-    before = foot.node.live.tare
+    before = foot.node.estimates.live.tare
     again = {"boot_id": "1" * 32}
     info = foot.hello.array_info.model_copy(update=again)
     foot.hello = foot.hello.model_copy(update={"array_info": info})
@@ -211,10 +214,10 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
     foot.seq = 0
     foot.live(1.0, lead=True, silent=0)
     foot.live(1.0)
-    assert foot.node.live.tare is not None
+    assert foot.node.estimates.live.tare is not None
     assert before is not None
-    assert foot.node.live.tare.t_ns == before.t_ns
-    assert "tile T01 has 0 readable frames" in str(foot.node.tare_keeper.problem)
+    assert foot.node.estimates.live.tare.t_ns == before.t_ns
+    assert "tile T01 has 0 readable frames" in str(foot.node.estimates.tare_keeper.problem)
 
 
 def test_a_lead_whose_tare_cannot_be_kept_is_a_storage_problem_and_tried_again(
@@ -227,12 +230,12 @@ def test_a_lead_whose_tare_cannot_be_kept_is_a_storage_problem_and_tried_again(
         foot.live(1.0)
         assert "No space left" in foot.node.storage_problem
         assert foot.history == []
-        assert foot.node.live.tare is None
+        assert foot.node.estimates.live.tare is None
         foot.live(1.0)
     foot.node.storage_problem = None  # as the server does once it can write again
     foot.live(1.0)
     assert foot.history == [("lead", False)]
-    assert foot.node.live.tare is not None
+    assert foot.node.estimates.live.tare is not None
 
 
 # --- in flight ------------------------------------------------------------------------------------
@@ -244,8 +247,8 @@ def test_a_foot_whose_lead_failed_is_tared_as_soon_as_it_steps(foot_of: Any) -> 
     foot.step(4, rest=2.0)
     assert foot.history == [("flight", False)]
     assert foot.offset_counts == pytest.approx([2.0, 2.0], abs=0.6)
-    assert foot.node.tare_keeper.problem is None
-    assert "between two steps" in foot.node.tares.all[0].reason
+    assert foot.node.estimates.tare_keeper.problem is None
+    assert "between two steps" in foot.node.estimates.tares.all[0].reason
 
 
 def test_a_foot_that_stands_from_the_beginning_is_never_tared_unasked(foot_of: Any) -> None:
@@ -253,7 +256,7 @@ def test_a_foot_that_stands_from_the_beginning_is_never_tared_unasked(foot_of: A
     foot.live(1.0, lead=True, silent=1)
     foot.live(60.0, 8.0)
     assert foot.history == []
-    assert foot.node.tare_keeper.problem is not None
+    assert foot.node.estimates.tare_keeper.problem is not None
 
 
 def test_a_dome_that_warms_is_followed_between_steps_and_each_time_is_in_the_history(
@@ -264,9 +267,9 @@ def test_a_dome_that_warms_is_followed_between_steps_and_each_time_is_in_the_his
         for _ in range(20):
             foot.live(2.0, COUNTS_PER_K * warmer_k, warmer_k=warmer_k)
             foot.live(1.0, COUNTS_PER_K * warmer_k + 40.0, warmer_k=warmer_k)
-    flights = [t for t in foot.node.tares.all if t.tare.source == "flight"]
+    flights = [t for t in foot.node.estimates.tares.all if t.tare.source == "flight"]
     assert 3 <= len(flights) <= 5
-    t_s = np.array([t.tare.t_ns for t in foot.node.tares.all]) * 1e-9
+    t_s = np.array([t.tare.t_ns for t in foot.node.estimates.tares.all]) * 1e-9
     assert (np.diff(t_s) >= 60.0 - 1e-6).all()
     assert all("in flight" in t.reason for t in flights)
     assert foot.offset_counts == pytest.approx([COUNTS_PER_K * 2.0] * 2, abs=COUNTS_PER_K * 0.6)
@@ -284,7 +287,7 @@ def test_after_a_gap_nobody_knows_where_the_foot_was(foot: Foot) -> None:
     foot.live(50.0, 0.9)
     foot.seq += 2000
     foot.live(0.3, 0.9)
-    assert foot.node.live.free_since_t_ns == UTC_NS + (foot.seq - 30) * PERIOD_NS
+    assert foot.node.estimates.live.free_since_t_ns == UTC_NS + (foot.seq - 30) * PERIOD_NS
     assert foot.history == [("lead", False)]
     foot.live(60.0, 0.9)
     assert foot.history == [("lead", False), ("flight", False)]
@@ -298,10 +301,10 @@ def test_a_foot_in_contact_is_left_alone_however_long(foot: Foot) -> None:
 def test_a_light_load_that_stays_is_said_and_not_tared_away(foot: Foot) -> None:
     foot.live(90.0, 2.0)  # below contact: two newtons on each of two tiles
     assert foot.history == [("lead", False)]
-    (warning,) = foot.node.tare_keeper.warnings()
+    (warning,) = foot.node.estimates.tare_keeper.warnings()
     assert "a light load, or a baseline that has moved" in warning
     foot.live(20.0)
-    assert foot.node.tare_keeper.warnings() == []
+    assert foot.node.estimates.tare_keeper.warnings() == []
 
 
 def test_a_scene_can_turn_it_off(foot_of: Any) -> None:
@@ -321,7 +324,7 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False), ("flight", False)]
     assert foot.auto_tare == "on"
-    foot.node.tare_keeper.undo(foot.node.tares.all[-1].id)
+    foot.node.estimates.tare_keeper.undo(foot.node.estimates.tares.all[-1].id)
     assert foot.offset_counts == pytest.approx([0.0, 0.0], abs=0.4)
     assert foot.auto_tare == "paused"
     foot.live(200.0, 0.9)
@@ -338,11 +341,11 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
 def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
     foot: Foot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = foot.node.live.tare
+    before = foot.node.estimates.live.tare
     monkeypatch.setattr("service.sessions.tares.write_tares", refusing(StorageError, "full"))
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False)]
-    assert foot.node.live.tare is before
+    assert foot.node.estimates.live.tare is before
     assert foot.node.storage_problem == "full"
 
 
@@ -350,14 +353,14 @@ def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
 
 
 def test_a_foot_that_has_warmed_up_since_its_tare_is_told_of_in_newtons(foot: Foot) -> None:
-    assert foot.node.tare_keeper.warnings() == []
+    assert foot.node.estimates.tare_keeper.warnings() == []
     foot.live(2.0, 20.0, warmer_k=5.0)
-    (warning,) = foot.node.tare_keeper.warnings()
+    (warning,) = foot.node.estimates.tare_keeper.warnings()
     # 5 K of 0.336 kPa/K are 13.2 N on each of two tiles of a newton a count
     assert warning.startswith("the tiles are 5.0 K warmer than when tared")
     assert "about +26." in warning
     foot.live(2.0, 20.0, warmer_k=-2.0)
-    (warning,) = foot.node.tare_keeper.warnings()
+    (warning,) = foot.node.estimates.tare_keeper.warnings()
     assert "2.1 K colder" in warning
 
 
@@ -367,14 +370,14 @@ def test_an_old_tare_is_told_of(foot_of: Any) -> None:
     foot.live(1.0)
     foot.seq += 31 * 60 * 100
     foot.live(1.0)
-    assert foot.node.tare_keeper.warnings() == [
+    assert foot.node.estimates.tare_keeper.warnings() == [
         "tared 31 min ago: lift the foot, hold it still, and tare"
     ]
 
 
 def test_a_tile_whose_temperature_is_not_known_warns_of_nothing(foot: Foot) -> None:
     foot.live(2.0, warmer_k=0.0, silent=0)
-    assert foot.node.tare_keeper.warnings() == []
+    assert foot.node.estimates.tare_keeper.warnings() == []
 
 
 def test_a_node_without_calibration_is_not_tared_and_frames_pass(foot_of: Any) -> None:

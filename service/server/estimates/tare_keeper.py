@@ -16,7 +16,7 @@ from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.estimation.ladder.plan import TARE_OLD_NS
 from service.estimation.tare.automatic import APART_NS, SETTLE_NS, WINDOW_NS, Look
 from service.estimation.tare.tare import Tare, expected_shift_kpa, has_warmed, warmer_k
-from service.server.live_estimates import LiveEstimates
+from service.server.estimates.live import LiveEstimates
 from service.sessions.tare_file import RecordedTare
 from service.sessions.tares import TareHistory
 from storage.intervals import Intervals

@@ -28,7 +28,7 @@ from service.estimation.tare.automatic import (
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import TareFrames, take_tare
 from service.estimation.warm import is_warming
-from service.server.ranges import Ranges
+from service.server.estimates.ranges import Ranges
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
 
 _TADC_OVER_NS = 1_000_000_000

@@ -1,0 +1,1 @@
+"""What makes forces of the frames of a node as they come: calibration, tares, estimator."""

@@ -1,0 +1,146 @@
+"""The estimates of one node over all its streams: with which calibration, from which tare."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from devices.errors import StorageError
+from devices.frames import ArrayInfo, FrameBatch
+from service.estimation.calibration import Calibration
+from service.link import Hello
+from service.server.estimates.assignment import Assignment
+from service.server.estimates.live import LiveEstimates
+from service.server.estimates.tare_keeper import TareKeeper
+from service.sessions.pipeline import Columns
+from service.sessions.tares import TareHistory
+from storage.intervals import Intervals
+from storage.journal.journal import Journal
+
+log = logging.getLogger("foottile.nodes")
+
+Estimated = tuple[FrameBatch, Columns]
+
+
+class NodeEstimates:
+    """What estimates a node's present stream; a bug there costs its estimates, no more.
+
+    Args:
+        folder: what is kept of the node: its tares, and the calibration chosen here.
+        hello: what it said last.
+    """
+
+    def __init__(self, folder: Path, hello: Hello) -> None:
+        self.tares = TareHistory(folder / "tares.json")
+        self.assignment = Assignment(folder / "assigned.json")
+        self.live = LiveEstimates(hello.array_info, None, None)
+        self.tare_keeper: TareKeeper
+        self._hello = hello
+        self._has_failed = False
+        self._begin()
+
+    @property
+    def info(self) -> ArrayInfo:
+        """The present stream's array."""
+        return self._hello.array_info
+
+    @property
+    def damages(self) -> list[str]:
+        """What was found damaged of what is kept, and what became of it, in words."""
+        said = (self.tares.problem, self.assignment.problem)
+        return [problem for problem in said if problem is not None]
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """What its tiles are to be estimated with: the server's choice, else what it says itself.
+
+        It may not fit them; what is in use is `live.calibration`.
+        """
+        if self.assignment.problem is not None:
+            return None
+        assigned = self.assignment.present
+        return self._hello.calibration if assigned is None else assigned.calibration
+
+    @property
+    def calibration_source(self) -> Literal["node", "server"]:
+        """Who says which that is."""
+        chosen = self.assignment.present is not None or self.assignment.problem is not None
+        return "server" if chosen else "node"
+
+    @property
+    def calibration_problem(self) -> str | None:
+        """Why none is in use."""
+        own = self._hello.calibration_problem if self.calibration_source == "node" else None
+        return self.assignment.problem or self.live.calibration_problem or own
+
+    def use_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
+        """Estimate with a calibration of the server's choice from the next frame on.
+
+        What is being recorded keeps the one that it began with.
+
+        Args:
+            calibration: which; None: the node's own again.
+            t_ns: the server's UTC.
+
+        Raises:
+            StorageError: that cannot be kept; nothing has changed then.
+        """
+        if calibration is None:
+            self.assignment.take_back(t_ns)
+        else:
+            self.assignment.put(calibration, t_ns)
+        before = self.live
+        self._begin()
+        try:
+            self.live.go_on_from(before)
+        except Exception as error:
+            self._go_without(error)
+
+    def greet(self, hello: Hello) -> None:
+        """The node has connected; estimates begin anew with another stream or calibration."""
+        known, self._hello = self._hello, hello
+        is_same = (known.array_info, known.calibration) == (hello.array_info, hello.calibration)
+        if not is_same or self._has_failed:
+            self._begin()
+
+    def feed(self, frames: FrameBatch) -> list[Estimated]:
+        """Take the next frames of the present stream; return those whose estimates are due."""
+        try:
+            return list(self.live.feed(frames))
+        except Exception as error:
+            self._go_without(error)
+            return [(frames, {})]
+
+    def look_for_tare(self, journal: Journal | None, may_come: Callable[[], Intervals]) -> None:
+        """Tare, if there is reason to, as `TareKeeper.look` says.
+
+        Raises:
+            StorageError: the tare cannot be kept; it is not in force then, and tried again.
+        """
+        try:
+            self.tare_keeper.look(journal, may_come)
+        except StorageError:
+            raise
+        except Exception as error:
+            self._go_without(error)
+
+    def _begin(self) -> None:
+        self._has_failed = False
+        try:
+            tare = self.tares.to_use(self.info)
+            self.live = LiveEstimates(self.info, self.calibration, tare, self.live)
+        except Exception as error:
+            self._go_without(error)
+            return
+        automatic = self._hello.scene.get("auto_tare", True) is not False
+        self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=automatic)
+
+    def _go_without(self, error: Exception) -> None:
+        node = self.info.node
+        log.exception("node %s: this is a bug; it goes on without estimates", node)
+        self._has_failed = True
+        self.live = LiveEstimates(self.info, None, None, self.live)
+        self.live.calibration_problem = f"the estimator failed, until it connects again: {error!r}"
+        self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=False)
