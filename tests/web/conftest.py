@@ -129,9 +129,9 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     complaints: list[str] = []
     contexts = []
 
-    def open_(url: str, width: int = 1366, height: int = 768) -> Page:
+    def open_(url: str, width: int = 1366, height: int = 768, **options: Any) -> Page:
         context = browser.new_context(
-            viewport={"width": width, "height": height}, accept_downloads=True
+            viewport={"width": width, "height": height}, accept_downloads=True, **options
         )
         contexts.append(context)
         page = context.new_page()

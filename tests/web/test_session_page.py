@@ -223,33 +223,6 @@ def test_keys_zoom_move_the_cursor_and_show_all(walk: Recording, open_page: Open
     assert seen(page) == all_s
 
 
-def test_a_stance_is_gone_to_from_its_row_and_by_keys(walk: Recording, open_page: OpenPage) -> None:
-    stances = walk.running.http.get(f"{walk.url}/stances").json()
-    begin_ns = int(walk.column("t_ns")[0])
-    page = open_page(url_of(walk))
-    rows = page.locator("#stances-rows tr")
-    expect(rows).to_have_count(len(stances))
-    expect(rows.nth(5)).to_contain_text("90.0 N")
-
-    def shows(number: int) -> None:
-        expect(page.locator("#stances-rows [aria-current]")).to_have_attribute(
-            "data-stance", str(number)
-        )
-        begin_s, end_s = seen(page)
-        stance = stances[number - 1]
-        assert begin_s < (stance["begin_t_ns"] - begin_ns) * 1e-9
-        assert end_s > (stance["end_t_ns"] - begin_ns) * 1e-9
-        assert end_s - begin_s < 2 * stance["duration_s"]
-
-    rows.nth(1).click()
-    shows(2)
-    page.keyboard.press("]")
-    shows(3)
-    page.keyboard.press("[")
-    page.keyboard.press("[")
-    shows(1)
-
-
 def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
     walk: Recording, open_page: OpenPage
 ) -> None:

@@ -60,7 +60,7 @@ export class Foot {
     this.ground = svg("line", { class: "ground", x1: 0, x2: widthPx });
     const hint = this.plan
       ? [svg("text", { class: "hint", x: widthPx - 4, y: 18, "text-anchor": "end" }, "↑"), svg("text", { class: "hint", x: widthPx - 4, y: 34, "text-anchor": "end" }, "toes")]
-      : [svg("text", { class: "hint", x: widthPx - 8, y: 18, "text-anchor": "end" }, "forward →"), this.ground];
+      : [svg("text", { class: "hint", x: widthPx - 8, y: heightPx - 6, "text-anchor": "end" }, "forward →"), this.ground];
     this.root.replaceChildren(...hint, this.legend(heightPx), this.turning);
   }
 

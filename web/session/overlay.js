@@ -46,6 +46,35 @@ export function drawStances(plots, context, view, x, bottom, current) {
   });
 }
 
+/**
+ * A mark on the greatest force of each stance, with its number where the stance has room for it.
+ * @param {Plots} plots @param {{left: number, right: number, top: number}} box @param {(value: number) => number} y
+ */
+export function drawPeaks(plots, context, view, x, box, y) {
+  const { colours } = plots;
+  context.textAlign = "center";
+  context.textBaseline = "bottom";
+  context.lineJoin = "round";
+  for (const { from, to, peakS, peak_grf_n: peak } of plots.stances) {
+    if (peakS === null || peakS < view.from || peakS > view.to) continue;
+    const [at, tip] = [x(peakS), y(peak) - 2];
+    context.fillStyle = colours.text;
+    context.beginPath();
+    context.moveTo(at, tip);
+    context.lineTo(at - 4, tip - 6);
+    context.lineTo(at + 4, tip - 6);
+    context.fill();
+    const text = number(peak);
+    const width = context.measureText(text).width;
+    if (x(to) - x(from) < width + 4) continue;
+    const middle = Math.min(box.right - width / 2, Math.max(box.left + width / 2, at));
+    context.lineWidth = 3;
+    context.strokeStyle = colours.page;
+    context.strokeText(text, middle, tip - 6);
+    context.fillText(text, middle, tip - 6);
+  }
+}
+
 /** @param {Plots} plots */
 export function drawTime(plots, context, view, x, bottom) {
   const { colours } = plots;

@@ -3,9 +3,10 @@
 import { coloursOf, crisp, decimalsOf, fit, hatching, ticks, whenColoursChange } from "../common/axes.js";
 import { byId, number, setData } from "../common/text.js";
 import { KINDS, stretchesOf } from "./flags.js";
-import { HEAD_PX, drawMarks, drawStances, drawTime } from "./overlay.js";
+import { HEAD_PX, drawMarks, drawPeaks, drawStances, drawTime } from "./overlay.js";
 import { drawTiles } from "./heat.js";
 import { panelsOf } from "./panels.js";
+import { scalesOf } from "./scales.js";
 import { drawBand, drawBound, drawSeries } from "./series.js";
 
 const AXIS_PX = 26;
@@ -99,7 +100,7 @@ export class Plots {
     const bottom = this.height - AXIS_PX;
     const right = this.left + this.plotWidth;
     drawStances(this, context, view, x, bottom, current);
-    const scales = this.scales(view);
+    const scales = scalesOf(this, view);
     let top = HEAD_PX;
     this.drawn = this.panels.map((panel) => {
       const box = { left: this.left, right, top: top + panel.head, bottom: top + panel.head + this.scaled(panel) };
@@ -107,39 +108,12 @@ export class Plots {
       return { panel, box, y: this.drawPanel(context, panel, box, view, x, scales.get(panel.group ?? panel.key)) };
     });
     this.drawFlags(context, view, x);
+    const force = this.drawn.find(({ panel }) => panel.key === "grf");
+    if (force) drawPeaks(this, context, view, x, force.box, force.y);
     drawTime(this, context, view, x, bottom);
     drawMarks(this, context, view, x, bottom);
     setData(this.box, "framesInBin", String(this.best(view).framesInBin));
     setData(this.box, "kinds", this.shownKinds.map(({ key }) => key).join(" "));
-  }
-
-  /** Least and greatest of what is in view; panels of a group share theirs. */
-  scales(view) {
-    const bins = this.best(view);
-    const [begin, end] = bins.within(view);
-    const scales = new Map();
-    for (const panel of this.panels) {
-      if (panel.kind !== "series") continue;
-      const factor = panel.factor ?? 1;
-      const key = panel.group ?? panel.key;
-      const scale = scales.get(key) ?? { low: panel.zero ? 0 : Infinity, high: panel.zero ? 0 : -Infinity };
-      const own = panel.besideOnly ? [] : [panel.columns, panel.band].filter(Boolean);
-      const all = own.map(([low, high]) => bins.extremes(low, high, begin, end));
-      for (const found of [...all, this.beside?.extremes(panel.key, view)]) {
-        if (!found) continue;
-        scale.low = Math.min(scale.low, found.low * factor);
-        scale.high = Math.max(scale.high, found.high * factor);
-      }
-      if (panel.bound) scale.high = Math.max(scale.high, bins.extremes(panel.bound, panel.bound, begin, end)?.high ?? 0);
-      scales.set(key, scale);
-    }
-    for (const scale of scales.values()) {
-      if (!(scale.high >= scale.low)) Object.assign(scale, { low: 0, high: 1, empty: true });
-      const room = Math.max(0.06 * (scale.high - scale.low), 1e-3, scale.high === scale.low ? 0.5 : 0);
-      scale.high += room;
-      scale.low -= scale.low === 0 ? 0 : room;
-    }
-    return scales;
   }
 
   drawPanel(context, panel, box, view, x, scale) {

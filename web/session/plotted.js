@@ -31,7 +31,7 @@ export class Plotted {
     this.plots.changed = () => this.draw();
     this.readout = new Readout();
     this.numbers = new Numbers(session.id);
-    this.stances = new Stances((index) => this.goTo(index));
+    this.stances = new Stances((index) => { this.goTo(index); this.stances.bringIntoView(); });
     this.marks = new Marks(session.id, {
       go: (timeS) => this.goToMark(timeS), cursor: () => this.cursorS,
       changed: () => { this.plots.marks = this.marks.placed; this.draw(); },
@@ -203,13 +203,12 @@ export class Plotted {
     else this.draw();
   }
 
-  step(by) { this.stances.step(by, this.cursorS ?? this.middle); }
+  step(by) { this.stances.step(by, this.cursorS, this.view); }
 
   goTo(index) {
     const stance = this.plots.stances[index];
-    this.stances.choose(index);
     this.overlay?.choose(index);
-    this.cursorS = stance.peak_t_ns === null ? stance.from : stance.from + (stance.peak_t_ns - stance.begin_t_ns) * 1e-9;
+    this.cursorS = stance.peakS ?? stance.from;
     this.show(views.around(stance.from, stance.to, this.durationS));
   }
 
@@ -271,6 +270,7 @@ export class Plotted {
     box.dataset.whole = String(views.isWhole(view, this.durationS));
     box.dataset.from = view.from.toFixed(4);
     box.dataset.to = view.to.toFixed(4);
+    this.stances.follow(this.cursorS, this.replay.playing.going);
     const drawnKey = [view.from, view.to, plots.width, plots.whole, plots.detail, this.marks.version, plots.stances.length, plots.asHeat,
       this.stances.current, plots.colours, devicePixelRatio];
     if (drawnKey.some((one, i) => one !== this.drawnKey?.[i])) {

@@ -1,16 +1,19 @@
-// The table of stances: when the foot stood, and how hard. A click goes there.
+// Stances: a table of when the foot stood, and how hard, and the one that the cursor is in, in words above the plots.
 
-import { byId, el, number } from "../common/text.js";
+import { byId, el, number, setData, setText } from "../common/text.js";
 import { estimateWords } from "./flags.js";
 import { timeWords } from "./overlay.js";
 
+const FORCE_SEEN_PX = 280; // head, the plot of the force, and the buttons that stay below it on a phone
 const AT_ONCE = 200; // an hour of walking has thousands
+const EDGE_S = 1e-9; // of times that were added up
 const ORDINARY = ~(4 | 8 | 16 | 64); // outliers, gaps (said by number), COP at the edges, scale of the session
 
 /** In seconds after the session's first frame. */
 export function placed(stances, beginNs) {
   return stances.map((stance) => ({
     ...stance, from: (stance.begin_t_ns - beginNs) * 1e-9, to: (stance.end_t_ns - beginNs) * 1e-9,
+    peakS: stance.peak_t_ns === null ? null : (stance.peak_t_ns - beginNs) * 1e-9,
   }));
 }
 
@@ -23,6 +26,28 @@ function flagsOf(stance) {
   return words.join(", ");
 }
 
+/** The one that an instant is in; -1: none. Stances rise in time. */
+export function stanceAt(stances, timeS) {
+  return timeS === null ? -1 : stances.findIndex(({ from, to }) => timeS >= from - EDGE_S && timeS <= to + EDGE_S);
+}
+
+/** The next or previous one of the cursor's; without a cursor the first or last in view. */
+export function neighbour(stances, by, cursorS, view) {
+  const here = stanceAt(stances, cursorS);
+  if (here >= 0) return here + by;
+  if (by > 0) return stances.findIndex((stance) => (cursorS === null ? stance.to >= view.from : stance.from > cursorS));
+  return stances.findLastIndex((stance) => (cursorS === null ? stance.from <= view.to : stance.to < cursorS));
+}
+
+const known = (value, decimals, unit, factor = 1) => (value === null ? "–" : `${number(value * factor, decimals)} ${unit}`);
+
+/** What a stance is told by, in the table and above the plots. */
+export const figuresOf = (stance) => ({
+  duration: known(stance.duration_s, 0, "ms", 1e3),
+  peak: known(stance.peak_grf_n, 1, "N") + (stance.peak_sigma_n === null ? "" : ` ± ${number(1.96 * stance.peak_sigma_n)}`),
+  impulse: known(stance.impulse_n_s, 2, "N\u00a0s"), // in one line
+});
+
 export class Stances {
   /** @param {(index: number) => void} onGo */
   constructor(onGo) {
@@ -30,13 +55,15 @@ export class Stances {
     this.body = byId("stances-rows");
     this.stances = [];
     this.current = -1;
+    this.says = byId("stance-says");
     byId("stances-more").addEventListener("click", () => this.add());
   }
 
   show(stances) {
     this.stances = stances;
     this.body.replaceChildren();
-    byId("stances-card").hidden = !stances.length;
+    this.current = -1;
+    for (const id of ["stances-card", "stance-line"]) byId(id).hidden = !stances.length;
     byId("stances-legend").textContent = `${stances.length} in all`;
     this.add();
   }
@@ -48,35 +75,30 @@ export class Stances {
   }
 
   row(stance, index) {
-    const known = (value, decimals, unit, factor = 1) => (value === null ? "–" : `${number(value * factor, decimals)} ${unit}`);
+    const { duration, peak, impulse } = figuresOf(stance);
     const go = el("button", { type: "button", cls: "small", text: String(stance.number), "aria-label": `${stance.number}: show this stance` });
-    const peak = known(stance.peak_grf_n, 1, "N");
-    const sure = stance.peak_sigma_n === null ? "" : ` ± ${number(1.96 * stance.peak_sigma_n)}`;
     const row = el("tr", { "data-stance": String(stance.number) },
       el("td", {}, go),
       el("td", { text: timeWords(stance.from, 0.01) }),
-      el("td", { text: known(stance.duration_s, 0, "ms", 1e3) }),
-      el("td", { text: peak + sure }),
-      el("td", { text: known(stance.impulse_n_s, 2, "N s") }),
+      el("td", { text: duration }),
+      el("td", { text: peak }),
+      el("td", { text: impulse }),
       el("td", { text: known(stance.cop_x_range_m, 1, "mm", 1e3) }),
       el("td", { cls: "why", text: flagsOf(stance) }));
     row.addEventListener("click", () => this.onGo(index));
     return row;
   }
 
-  /** The next or previous one: of the one that was gone to, else of an instant. */
-  step(by, timeS) {
-    const { stances, current } = this;
-    if (!stances.length) return;
-    let next = current + by;
-    if (current < 0) {
-      const after = stances.findIndex((stance) => stance.from > timeS);
-      next = by > 0 ? (after < 0 ? stances.length - 1 : after) : (after < 0 ? stances.length : after) - 1;
-    }
-    this.onGo(Math.min(stances.length - 1, Math.max(0, next)));
+  step(by, cursorS, view) {
+    const next = neighbour(this.stances, by, cursorS, view);
+    if (next in this.stances) this.onGo(next);
   }
 
-  choose(index) {
+  /** The one that the cursor is in is said, and marked in the table. */
+  follow(timeS, isPlaying) {
+    const index = stanceAt(this.stances, timeS);
+    this.say(this.stances[index], isPlaying);
+    if (index === this.current) return;
     this.current = index;
     while (index >= this.body.children.length) this.add();
     for (const row of this.body.querySelectorAll("[aria-current]")) row.removeAttribute("aria-current");
@@ -88,5 +110,21 @@ export class Stances {
     const [top, bottom] = [row.offsetTop, row.offsetTop + row.offsetHeight];
     if (top - 40 < box.scrollTop) box.scrollTop = top - 40;
     else if (bottom > box.scrollTop + box.clientHeight) box.scrollTop = bottom - box.clientHeight;
+  }
+
+  say(stance, isPlaying) {
+    this.says.ariaLive = isPlaying ? "off" : "polite"; // at four times the speed nobody can listen
+    const many = this.stances.length.toLocaleString("en-GB");
+    const { duration, peak, impulse } = stance ? figuresOf(stance) : {};
+    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : many === "1" ? "1 stance" : `${many} stances`);
+    setText(byId("stance-figures"), stance ? `peak ${peak}, ${duration}, ${impulse}` : "");
+    setData(this.says, "stance", stance ? String(stance.number) : "");
+  }
+
+  /** Seen from a row, too, what is gone to has to come into view: its words, and the force below them. */
+  bringIntoView() {
+    const line = byId("stance-line");
+    const seenToPx = byId("plots").getBoundingClientRect().top + FORCE_SEEN_PX;
+    if (line.getBoundingClientRect().top < 0 || seenToPx > innerHeight) line.scrollIntoView();
   }
 }

@@ -1,0 +1,189 @@
+"""Stances of a session's page: found, gone to, and read, on a phone as on a desk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.service.fake_node import FakeNode
+from tests.service.recording import Recording
+from tests.service.running import Running
+from tests.web.test_accessible import complaints
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+
+STANCES = 12
+PHONE: dict[str, Any] = {"width": 390, "height": 844, "has_touch": True, "is_mobile": True}
+_IN_SIGHT = """([selector, downTo]) => {
+  const box = document.querySelector(selector).getBoundingClientRect();
+  return box.top >= 0 && box.top + downTo <= innerHeight;
+}"""
+_KEYS_SHOWN = "[...document.querySelectorAll('kbd')].filter((key) => key.checkVisibility()).length"
+FORCE_PX = 200  # from the upper edge of the plots to the foot of the first
+
+
+@pytest.fixture(scope="module")
+def hops(server: Running) -> Recording:
+    """Twelve stances, each harder than the one before."""
+    node = FakeNode(server, "hopper")
+    node.connect()
+    node.tared()
+    session = node.record(name="hops")
+    for i in range(STANCES):
+        node.send(100, [0.0, 0.0], alive=True)
+        node.send(100, [10.0 + i, 30.0 + 2 * i], alive=True)
+    node.deliver(100, [0.0, 0.0], alive=True)
+    node.finish(session)
+    node.close()
+    return session
+
+
+@pytest.fixture(scope="module")
+def stances(hops: Recording) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = hops.running.http.get(f"{hops.url}/stances").json()
+    assert len(found) == STANCES
+    return found
+
+
+def opened(open_page: OpenPage, session: Recording, **options: Any) -> Page:
+    page = open_page(f"{session.running.url}/sessions/{session.id}", **options)
+    expect(page.locator("#stance-line")).to_be_visible()
+    settled(page)
+    return page
+
+
+def settled(page: Page) -> Any:
+    plots = page.locator("#plots[data-settled=true]")
+    expect(plots).to_have_count(1)
+    return plots
+
+
+def says(page: Page, stance: dict[str, Any]) -> None:
+    """The line above the plots tells of this one, and so does the table."""
+    line = page.locator("#stance-says")
+    expect(line).to_contain_text(f"Stance {stance['number']} of {STANCES}")
+    expect(line).to_contain_text(f"peak {stance['peak_grf_n']:.1f} N ±")
+    expect(line).to_contain_text(f"{1e3 * stance['duration_s']:.0f} ms")
+    expect(line).to_contain_text(f"{stance['impulse_n_s']:.2f} N s")
+    row = page.locator("#stances-rows [aria-current]")
+    expect(row).to_have_attribute("data-stance", str(stance["number"]))
+
+
+def in_view(page: Page, stance: dict[str, Any], begin_ns: int) -> None:
+    """It, and little else, is plotted."""
+    plots = settled(page)
+    begin_s, end_s = (
+        float(plots.get_attribute(f"data-{name}") or "nan") for name in ("from", "to")
+    )
+    assert begin_s < (stance["begin_t_ns"] - begin_ns) * 1e-9
+    assert end_s > (stance["end_t_ns"] - begin_ns) * 1e-9
+    assert end_s - begin_s < 2 * stance["duration_s"]
+
+
+def test_a_stance_is_gone_to_from_its_row_and_by_keys(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops)
+    begin_ns = int(hops.column("t_ns")[0])
+    rows = page.locator("#stances-rows tr")
+    expect(rows).to_have_count(STANCES)
+    expect(rows.nth(11)).to_contain_text(f"{stances[11]['peak_grf_n']:.1f} N")
+
+    def shows(number: int) -> None:
+        says(page, stances[number - 1])
+        in_view(page, stances[number - 1], begin_ns)
+
+    rows.nth(1).click()
+    shows(2)
+    page.keyboard.press("]")
+    shows(3)
+    page.keyboard.press("[")
+    page.keyboard.press("[")
+    shows(1)
+    page.keyboard.press("[")  # there is none before it
+    shows(1)
+
+
+def test_on_a_phone_the_peak_of_the_third_stance_is_three_taps_away(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops, **PHONE)
+    expect(page.locator("#stance-says")).to_have_text(f"{STANCES} stances")
+    assert page.evaluate(_IN_SIGHT, ["#stance-line", 44])  # without scrolling
+    for stance in stances[:3]:
+        page.tap("#stance-next")
+        says(page, stance)
+    assert page.evaluate(_IN_SIGHT, ["#plots", FORCE_PX])
+    assert page.evaluate("scrollY") == 0
+    for button in ("#stance-before", "#stance-next"):
+        box = page.locator(button).bounding_box()
+        assert box is not None
+        assert min(box["width"], box["height"]) >= 44
+    assert complaints(page) == []
+
+
+def test_a_row_that_is_tapped_brings_its_plot_into_view(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops, **PHONE)
+    page.locator("#stances-rows tr").nth(2).tap()
+    says(page, stances[2])
+    in_view(page, stances[2], int(hops.column("t_ns")[0]))
+    assert page.evaluate(_IN_SIGHT, ["#stance-line", 44])
+    assert page.evaluate(_IN_SIGHT, ["#plots", FORCE_PX])
+
+
+def test_where_the_plots_are_touched_the_stance_is_said_and_the_next_one_follows_from_there(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops, **PHONE)
+    page.tap("#stance-next")
+    says(page, stances[0])
+    page.tap("#zoom-all")
+    box = settled(page).bounding_box()
+    duration_s = float(page.locator("#plots").get_attribute("data-to") or "nan")
+    left, right = 40, 12  # of the plots on a narrow screen: axis, and air
+    begin_ns = int(hops.column("t_ns")[0])
+    middle_s = (0.5 * (stances[6]["begin_t_ns"] + stances[6]["end_t_ns"]) - begin_ns) * 1e-9
+    at = left + (box["width"] - left - right) * middle_s / duration_s
+    page.touchscreen.tap(box["x"] + at, box["y"] + 100)
+    says(page, stances[6])
+    page.tap("#stance-next")
+    says(page, stances[7])
+
+
+def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> None:
+    page = opened(open_page, hops, **PHONE)
+    hint = page.locator("#readout-hint")
+    assert "Touch the plots" in hint.inner_text()
+    assert "press" not in hint.inner_text()
+    for path in (f"/sessions/{hops.id}", "/nodes", "/"):
+        page.goto(f"{hops.running.url}{path}")
+        page.tap("#help")
+        expect(page.locator("#help-dialog")).to_be_visible()
+        assert page.evaluate(_KEYS_SHOWN) == 0, path
+        assert complaints(page) == []
+    desk = opened(open_page, hops)
+    assert "press" in desk.locator("#readout-hint").inner_text()
+    desk.keyboard.press("?")
+    assert desk.evaluate(_KEYS_SHOWN) > 6
+
+
+@pytest.mark.parametrize(
+    ("by", "cursor_s", "found"),
+    [(1, None, 1), (-1, None, 2), (1, 1.5, 1), (-1, 1.5, 0), (1, 2.5, 2), (-1, 2.5, 0), (1, 9, -1)],
+)
+def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(
+    server: Running, open_page: OpenPage, by: int, cursor_s: float | None, found: int
+) -> None:
+    page = open_page(f"{server.url}/docs")
+    asked = "import('/static/session/stances.js').then((m) => m.neighbour(%s, %d, %s, %s))"
+    all_ = "[{from: 0, to: 1}, {from: 2, to: 3}, {from: 4, to: 5}]"
+    cursor = "null" if cursor_s is None else str(cursor_s)
+    view = "{from: 1.2, to: 4.5}"
+    assert page.evaluate(asked % (all_, by, cursor, view)) == found
