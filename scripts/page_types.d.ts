@@ -46,6 +46,11 @@ interface Overview {
 
 type OverviewQuery = { points: number; start_s?: number; end_s?: number; columns?: string };
 
+/** Of GET /sessions/ID/verification. */
+interface Verified {
+  complete: boolean; lossy: boolean; parts: { recorded: number }[]; sha256: string | null; problems: string[]; unproven: string[];
+}
+
 interface Clock { streams: { stretches: { begin_t_ns: number; end_t_ns: number; offset_ns: number; drift_ppm: number }[] }[] }
 
 interface Certain { value: number; interval_95: [number, number] }

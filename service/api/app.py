@@ -35,6 +35,7 @@ from service.api.routes import (
     stances,
     takes,
     trash,
+    verification,
     zips,
 )
 from service.api.routes.ingest import ingest
@@ -129,6 +130,7 @@ def make_app(
         stances,
         overview,
         comparisons,
+        verification,
     ):
         api.include_router(module.router)
     app.include_router(api)

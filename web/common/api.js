@@ -18,7 +18,7 @@ const JSON_TYPE = "application/json";
  * Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. `stop` takes it back;
  * with `said` it is refused (412) if what is changed is not that any more.
  */
-export async function call(method, path, body, stop = null, type = JSON_TYPE, said = null) {
+export async function call(method, path, body, stop = null, type = JSON_TYPE, said = null, patienceS = 10) {
   const headers = { Accept: type };
   if (said !== null) headers["If-Match"] = `"${said}"`;
   if (body !== undefined) headers["Content-Type"] = JSON_TYPE;
@@ -27,17 +27,17 @@ export async function call(method, path, body, stop = null, type = JSON_TYPE, sa
     response = await fetch(PREFIX + path, {
       method, headers, cache: "no-store",
       body: body === undefined ? undefined : JSON.stringify(body),
-      signal: stop ? AbortSignal.any([stop, AbortSignal.timeout(10_000)]) : AbortSignal.timeout(10_000),
+      signal: AbortSignal.any([...(stop ? [stop] : []), AbortSignal.timeout(patienceS * 1e3)]),
     });
   } catch (error) {
     const slow = error instanceof DOMException && error.name === "TimeoutError";
-    throw new Refusal(slow ? "The server did not answer within 10 s." : "The server cannot be reached.", 0);
+    throw new Refusal(slow ? `The server did not answer within ${patienceS} s.` : "The server cannot be reached.", 0);
   }
   const read = () => (response.ok && type !== JSON_TYPE ? response.text() : response.json());
   const answer = response.status === 204 ? null : await read().catch(() => null);
   if (response.ok) return answer;
   const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
-  if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop, type, said);
+  if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop, type, said, patienceS);
   throw new Refusal(String(detail), response.status);
 }
 
@@ -75,6 +75,8 @@ export const newestSessions = (limit) => call("GET", `/sessions?limit=${limit}`)
 /** @type {(session: string) => Promise<Dressed>} */
 export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`);
 export const ledgerOf = (session) => call("GET", `/sessions/${id(session)}/ledger`);
+/** Every file of it is read: of a long one that takes its time. @type {(session: string) => Promise<Verified>} */
+export const verified = (session) => call("GET", `/sessions/${id(session)}/verification`, undefined, null, JSON_TYPE, null, 300);
 /** @type {(session: string) => Promise<Clock>} */
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
 /** @type {(session: string, query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} */

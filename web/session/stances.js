@@ -48,6 +48,11 @@ export const figuresOf = (stance) => ({
   impulse: known(stance.impulse_n_s, 2, "N\u00a0s"), // in one line
 });
 
+function figuresInWords(stance) {
+  const { duration, peak, impulse } = figuresOf(stance);
+  return stance.peak_grf_n === null ? `force not known, ${duration}` : `peak ${peak}, ${duration}, ${impulse}`;
+}
+
 export class Stances {
   /** @param {(index: number) => void} onGo */
   constructor(onGo) {
@@ -115,9 +120,8 @@ export class Stances {
   say(stance, isPlaying) {
     this.says.ariaLive = isPlaying ? "off" : "polite"; // at four times the speed nobody can listen
     const many = this.stances.length.toLocaleString("en-GB");
-    const { duration, peak, impulse } = stance ? figuresOf(stance) : {};
     setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : many === "1" ? "1 stance" : `${many} stances`);
-    setText(byId("stance-figures"), stance ? `peak ${peak}, ${duration}, ${impulse}` : "");
+    setText(byId("stance-figures"), stance ? figuresInWords(stance) : "");
     setData(this.says, "stance", stance ? String(stance.number) : "");
   }
 

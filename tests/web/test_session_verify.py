@@ -1,0 +1,47 @@
+"""A session's files are checked from its page, and what is found is said in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.web.scripted import Scripted
+from tests.web.test_accessible import complaints
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+
+
+def test_what_a_check_of_the_files_finds_is_said_in_plain_words(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = scripted.recorded("walk")
+    page = open_page(f"{scripted.url}/sessions/{session.id}")
+    page.click("#ledger-card summary")
+    expect(page.locator("#ledger")).to_contain_text("none is lost")
+    page.click("#verify")
+    found = page.locator("#verified")
+    expect(found.locator("[data-whole=true]")).to_contain_text("it is what was sealed")
+    expect(found).to_contain_text(f"all {session.now()['frames']:,} frames were read again")
+    assert complaints(page) == []
+    path = session.folder / "clock.parquet"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    page.click("#verify")
+    expect(found.locator("[data-whole=false]")).to_contain_text("something is wrong")
+    expect(found.locator("li")).to_contain_text("clock.parquet")
+    assert complaints(page) == []
+
+
+def test_a_session_that_is_recorded_is_not_offered_to_be_checked(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = scripted.node.record(name="now")
+    page = open_page(f"{scripted.url}/sessions/{session.id}")
+    page.click("#ledger-card summary")
+    expect(page.locator("#ledger")).to_contain_text("not sealed yet")
+    expect(page.locator("#verify")).to_be_hidden()
