@@ -250,12 +250,18 @@ class WebSocket(WebSocketsSansIOProtocol):
     def hang_up(self, code: int, reason: str) -> None:
         """Say why it ends, to one who does not read as well: behind all that was written before.
 
-        Once its application has returned, the transport closes when that has gone.
+        As uvicorn's own close, but without waiting for room. Until the other end has answered, or
+        for `close_timeout`, the connection stays open and what comes is left unheard: to close it
+        before that would be a reset, which takes back what was said.
         """
         if not (self.close_sent or self.disconnected or self.transport.is_closing()):
             self.conn.send_close(code, reason)
             self.transport.write(b"".join(self.conn.data_to_send()))
             self.close_sent = True
+            if self.read_paused:
+                self.read_paused = False
+                self.transport.resume_reading()
+            self.close_timer = self.loop.call_later(self.close_timeout, self.transport.close)
 
     async def receive(self) -> ASGIReceiveEvent:
         """A message, or the end; the first word of a node gets it its place, if there is one."""

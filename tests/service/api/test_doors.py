@@ -264,6 +264,21 @@ def test_one_that_was_let_go_and_goes_on_sending_takes_no_nodes_place(
         node_of(running).connect()
 
 
+def test_one_that_goes_on_talking_is_not_cut_off_before_it_has_heard_why(running: Running) -> None:
+    word = b"\x81\x81" + bytes(4) + b"x"
+    with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as connection:
+        connection.sendall(upgrade(LIVE_PATH))
+        said = connection.recv(65536)
+        connection.sendall(word)
+        while b"only {" not in said:  # of the close frame
+            said += connection.recv(65536)
+        for _ in range(100):  # into a closed connection: the first brings a reset, the next breaks
+            connection.sendall(word)
+        connection.sendall(b"\x88\x82" + bytes(4) + int(Close.POLICY).to_bytes(2))
+        while connection.recv(65536):  # to the end, which is not a reset
+            pass
+
+
 def upgrade(path: str) -> bytes:
     """A request for a websocket."""
     return (
