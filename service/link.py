@@ -93,6 +93,8 @@ class Close(IntEnum):
     SUPERSEDED = 4010
     NO_STREAM = 4011
     """A stream that was asked for is not here, or not any more."""
+    UNREADABLE = 4012
+    """Frames that are kept cannot be read, and that will not mend by itself."""
 
 
 class HangUp(Exception):  # noqa: N818  # no error: how a connection ends

@@ -148,16 +148,25 @@ class Settling:
                 self._book.keep(each)
         return session if followed[0] is session else self._book.keep(followed[0])
 
-    def _disown(self, session: Session, error: DamagedFramesError) -> None:
-        """Drop frames damaged on disk: get them from the node again, or count them as lost."""
-        node, folder = self._nodes.get(session.node), Path(error.where).parent
+    def drop_damaged(self, node: ServerNode, error: DamagedFramesError, whose: str) -> None:
+        """Drop frames damaged on disk: get them from the node again, or count them as lost.
+
+        Args:
+            node: whose journal has them.
+            error: which they are.
+            whose: who wanted to read them, for the log.
+        """
+        folder = Path(error.where).parent
         for stream in node.streams.values():
             if stream.folder == folder:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
                 stream.disown(damaged, corrupt=True)
-                log.warning("session %s: %s", session.id, error)
+                log.warning("%s: %s", whose, error)
                 if stream.may_come & damaged:
                     self._ask_again(node)
+
+    def _disown(self, session: Session, error: DamagedFramesError) -> None:
+        self.drop_damaged(self._nodes.get(session.node), error, f"session {session.id}")
 
     async def _seal(self, session_id: str) -> None:
         book = self._book

@@ -12,17 +12,8 @@ from devices.errors import UsageError
 from service.api.protocols import send
 from service.link import Close, HangUp
 from service.server.full_rate.arrow import Encoder, check_columns
-from service.server.full_rate.reading import (
-    POLICIES,
-    Begins,
-    Item,
-    Missing,
-    Policy,
-    Reader,
-    first_position,
-    resume_text,
-)
-from service.server.full_rate.recomputed import Position
+from service.server.full_rate.items import Begins, Item, Missing, Position
+from service.server.full_rate.reading import POLICIES, Policy, Reader, first_position
 from service.server.node import ServerNode
 from service.server.screens.fan_out import TOO_SLOW_S
 from service.server.screens.picture import dumps
@@ -66,8 +57,15 @@ class LiveFrames:
             _matching(given.get("boot_id"), _BOOT_ID, "boot_id", "32 hex digits"),
             _number(given.get("from_seq")),
         )
-        name, memory = self._node.name, server.frames.of(self._node.name)
-        self._reader = Reader(self._node, memory, lambda: server.recorder.needed(name), position)
+        node, self._memory = self._node, server.frames.of(self._node.name)
+        self._reader = Reader(
+            node,
+            self._memory,
+            self._policy,
+            position,
+            needed=lambda: server.recorder.needed(node.name),
+            drop_damaged=lambda error: server.settling.drop_damaged(node, error, "a live client"),
+        )
         self._encoder: Encoder | None = None
         self._at = position
         """The first frame that was not sent."""
@@ -88,19 +86,20 @@ class LiveFrames:
             "policy": self._policy,
         }
         await self._send(dumps(hello))
-        async with aclosing(self._reader.items(self._policy)) as items:
+        async with aclosing(self._reader.items()) as items:
             async for item in items:
                 await self._tell(item)
 
     async def _tell(self, item: Item) -> None:
         match item:
-            case Begins(boot_id=boot_id, seq=seq):
+            case Begins(boot_id=boot_id, from_seq=seq):
                 stream = self._node.streams.get(boot_id)
                 info = self._node.info if stream is None else stream.info
                 try:
                     self._encoder = Encoder(info, self._columns)
                 except UsageError as error:  # it came back with other tiles
                     raise HangUp(Close.POLICY, error.what) from error
+                self._at = Position(boot_id, seq)
                 await self._send(dumps({"type": "stream", "boot_id": boot_id, "from_seq": seq}))
                 await self._send(self._encoder.header())
             case Missing(boot_id=boot_id, from_seq=first, to_seq=last, reason=reason):
@@ -110,7 +109,7 @@ class LiveFrames:
                 self._at = Position(boot_id, last + 1)
             case _:
                 assert self._encoder is not None  # noqa: S101  # a stream has begun before
-                for message, following in self._encoder.messages(item):
+                for message, following in self._encoder.messages(item, self._memory.shared):
                     await self._send(message)
                     self._at = Position(item.boot_id, following)
 
@@ -124,7 +123,7 @@ class LiveFrames:
             async with asyncio.timeout(TOO_SLOW_S):
                 await send(self._socket, message)
         except TimeoutError as error:
-            where = "" if self._at is None else f"; {resume_text(self._at)}"
+            where = "" if self._at is None else f"; {self._at}"
             raise HangUp(Close.TOO_SLOW, f"this client does not read{where}") from error
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -12,7 +13,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.link import Hello
 from service.server.estimates.assignment import Assignment
-from service.server.estimates.live import LiveEstimates
+from service.server.estimates.live import Begun, LiveEstimates
 from service.server.estimates.tare_keeper import TareKeeper
 from service.sessions.pipeline import Columns
 from service.sessions.tares import TareHistory
@@ -22,6 +23,8 @@ from storage.journal.journal import Journal
 log = logging.getLogger("foottile.nodes")
 
 Estimated = tuple[FrameBatch, Columns]
+_ENDED_MAX = 16
+"""Streams that have ended of which is known where their estimates began anew."""
 
 
 class NodeEstimates:
@@ -39,6 +42,8 @@ class NodeEstimates:
         self.tare_keeper: TareKeeper
         self._hello = hello
         self._has_failed = False
+        self._begun: OrderedDict[str, tuple[Begun, ...]] = OrderedDict()
+        """Of streams before the present one."""
         self._begin()
 
     @property
@@ -75,6 +80,12 @@ class NodeEstimates:
         own = self._hello.calibration_problem if self.calibration_source == "node" else None
         return self.assignment.problem or self.live.calibration_problem or own
 
+    def begun(self, boot_id: str) -> tuple[Begun, ...]:
+        """Where estimates of a stream were begun anew since the server was started, in order."""
+        if boot_id == self.live.info.boot_id:
+            return tuple(self.live.begun)
+        return self._begun.get(boot_id, ())
+
     def use_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
         """Estimate with a calibration of the server's choice from the next frame on.
 
@@ -101,6 +112,10 @@ class NodeEstimates:
     def greet(self, hello: Hello) -> None:
         """The node has connected; estimates begin anew with another stream or calibration."""
         known, self._hello = self._hello, hello
+        if known.array_info.boot_id != hello.array_info.boot_id:
+            self._begun[known.array_info.boot_id] = tuple(self.live.begun)
+            if len(self._begun) > _ENDED_MAX:
+                self._begun.popitem(last=False)
         is_same = (known.array_info, known.calibration) == (hello.array_info, hello.calibration)
         if not is_same or self._has_failed:
             self._begin()

@@ -1,7 +1,7 @@
 """Frames with their estimates as Arrow messages: columns of a sealed file, all or those asked for.
 
-Schema and batches, one behind the other, are an Arrow IPC stream. A batch is encoded once for all
-who ask for the same columns.
+Schema and batches, one behind the other, are an Arrow IPC stream. A piece of memory is encoded once
+for all who ask for the same columns.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import pyarrow as pa
 
 from devices.errors import UsageError
 from devices.frames import ArrayInfo
-from service.server.full_rate.reading import Rows
+from service.server.full_rate.items import Rows
+from service.server.full_rate.shared import Shared
 from storage.schema import ARRAY_INFO_KEY, ESTIMATES, FRAMES, Column, flat_column
 
 ROWS_MAX = 256
@@ -56,18 +57,22 @@ class Encoder:
         """The schema's message."""
         return self.schema.serialize().to_pybytes()
 
-    def messages(self, rows: Rows) -> Iterator[tuple[bytes, int]]:
-        """Frames as messages, `ROWS_MAX` at most in each, and the number after each."""
-        seq, piece = rows.estimated[0].seq, rows.piece
+    def messages(self, rows: Rows, shared: Shared) -> Iterator[tuple[bytes, int]]:
+        """Frames as messages, `ROWS_MAX` at most in each, and the number after each.
+
+        Args:
+            rows: the frames.
+            shared: what was encoded of pieces of the same memory, for this reader and others.
+        """
+        seq = rows.estimated[0].seq
         for begin in range(0, len(seq), ROWS_MAX):
             end = min(begin + ROWS_MAX, len(seq))
-            message = None
-            if piece is not None:  # others ask for it, too
-                message = piece.shared.get((self._key, begin))
+            key = None if rows.number is None else (rows.number, self._key, begin)
+            message = None if key is None else shared.get(key)
             if message is None:
                 message = self._encoded(rows, begin, end)
-                if piece is not None:
-                    piece.shared[self._key, begin] = message
+                if key is not None:
+                    shared.put(key, message)
             yield message, int(seq[end - 1]) + 1
 
     def _encoded(self, rows: Rows, begin: int, end: int) -> bytes:

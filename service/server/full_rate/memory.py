@@ -10,10 +10,11 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from devices.frames import FrameBatch
 from service.server.estimates.of_node import Estimated
+from service.server.full_rate.shared import Shared
 from service.server.node import ServerNode
 from service.sessions.pipeline import Columns
 
@@ -21,12 +22,10 @@ BYTES_MAX = 8 << 20
 """Of one node: some 20 s of 8 tiles at 544 Hz, more of fewer."""
 _PIECE_BYTES = 3000
 """What a piece takes beside its numbers: objects of numpy, some forty."""
-_SHARED_LAST = 16
-"""So many of the newest pieces keep what was encoded of them: those who keep up share it."""
 _LOOK_AGAIN_S = 1.0
 
 
-@dataclass
+@dataclass(frozen=True)
 class Piece:
     """Consecutive frames of one stream, as the live estimates gave them."""
 
@@ -35,8 +34,6 @@ class Piece:
     boot_id: str
     frames: FrameBatch
     columns: Columns
-    shared: dict[object, bytes] = field(default_factory=dict)
-    """What was encoded of it, for others who ask for the same."""
 
     @property
     def first(self) -> int:
@@ -59,6 +56,8 @@ class NodeMemory:
 
     def __init__(self, turn: asyncio.Semaphore, bytes_max: int = BYTES_MAX) -> None:
         self.turn = turn
+        self.shared = Shared()
+        """What was encoded of the pieces, for others who ask for the same."""
         self._pieces: deque[Piece] = deque()
         self._bytes_max = bytes_max
         self._bytes = 0
@@ -88,8 +87,6 @@ class NodeMemory:
             self._pieces.append(Piece(self._next_number, boot_id, frames, columns))
             self._next_number += 1
             self._bytes += _bytes_of(frames, columns)
-            if len(self._pieces) > _SHARED_LAST:
-                self._pieces[-1 - _SHARED_LAST].shared.clear()
         while self._bytes > self._bytes_max and len(self._pieces) > 1:
             gone = self._pieces.popleft()
             self._bytes -= _bytes_of(gone.frames, gone.columns)
@@ -117,9 +114,10 @@ class NodeMemory:
             found = piece
         return found
 
-    def has(self, boot_id: str) -> bool:
-        """Is any frame of this stream kept?"""
-        return next(self._of(boot_id), None) is not None
+    def last(self, boot_id: str) -> int | None:
+        """Number of the newest frame of this stream that is kept; None if none is."""
+        piece = next(self._of(boot_id), None)
+        return None if piece is None else piece.last
 
     def _of(self, boot_id: str) -> Iterator[Piece]:
         """Pieces of a stream, the newest first: who asks is mostly near the end."""

@@ -14,26 +14,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.ladder.plan import make_plan, warm_up_s
 from service.estimation.tare.tare import Tare
 from service.server.estimates.of_node import Estimated
+from service.server.full_rate.items import Position, cut
 from service.server.node import ServerNode
 from service.server.streams import ServerStream
-from service.sessions.pipeline import Columns, EstimateRun
+from service.sessions.pipeline import EstimateOptions, EstimateRun, EstimateStream
 from storage.journal.journal import Journal
 
 ROWS_AT_ONCE = 1024
-
-
-@dataclass(frozen=True)
-class Position:
-    """The frame of a stream that is wanted next."""
-
-    boot_id: str
-    seq: int
 
 
 @dataclass(frozen=True)
@@ -118,7 +112,6 @@ class Recomputed:
         ends: will no more frames of this stream come?
 
     Raises:
-        FootTileError: the calibration does not fit the stream's tiles.
         StorageError: the journal cannot be read.
     """
 
@@ -130,7 +123,7 @@ class Recomputed:
         self.position = position
         """The frame that is wanted next."""
         calibration = node.estimates.live.calibration
-        if calibration is not None and not stream.info.has_same_tiles_as(node.info):
+        if calibration is not None and not _fits(calibration, stream.info, node.info):
             calibration = None
         last = self._journal.held.last or 0
         begin = self._begin(node, stream, calibration, position.seq)
@@ -160,7 +153,8 @@ class Recomputed:
         """The next frames that are due, `ROWS_AT_ONCE` at most; None: no more are for now.
 
         Raises:
-            FileFormatError: the journal is damaged.
+            DamagedFramesError: frames are damaged; which, it says.
+            FileFormatError: what it holds are no frames of this stream.
             StorageError: it cannot be read.
         """
         while True:
@@ -175,16 +169,21 @@ class Recomputed:
             if len(steps):
                 end = begin + int(steps[0]) + 1
             if end < len(frames):
-                self._rest = _rows(frames, columns, end, len(frames))
+                self._rest = cut((frames, columns), end, len(frames))
             if begin < end:
                 self.position = Position(self.position.boot_id, int(frames.seq[end - 1]) + 1)
-                return _rows(frames, columns, begin, end)
+                return cut((frames, columns), begin, end)
 
 
-def _rows(frames: FrameBatch, columns: Columns, begin: int, end: int) -> Estimated:
-    if begin == 0 and end == len(frames):
-        return frames, columns
-    return frames.rows(begin, end), {name: v[begin:end] for name, v in columns.items()}
+def _fits(calibration: Calibration, info: ArrayInfo, present: ArrayInfo) -> bool:
+    """Can a stream be estimated with the calibration of the node's present one?"""
+    if not info.has_same_tiles_as(present):
+        return False
+    try:  # its scene may have asked for other models
+        EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
+    except FootTileError:
+        return False
+    return True
 
 
 def _changes(
@@ -197,7 +196,7 @@ def _changes(
     """Where the estimates of these frames began anew, in order."""
     own = [
         Change(each.calibration, each.tare, seq=each.seq)
-        for each in (node.estimates.live.begun if stream is node.present else ())
+        for each in node.estimates.begun(stream.boot_id)
     ]
     before = [change for change in own if change.seq is not None and change.seq <= begin]
     if before:  # all of it is this server's own

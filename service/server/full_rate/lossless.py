@@ -1,0 +1,142 @@
+"""What comes next for one who is to have every frame once, in order: a rule without any I/O.
+
+What is still to come is waited for; what will not come is said. Who has fallen out of memory by his
+own slowness is told the position to resume from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from service.link import Close, HangUp
+from service.server.full_rate.items import Begins, Item, Missing, Position, Rows, cut
+from service.server.full_rate.known import Known
+from service.server.full_rate.memory import NodeMemory, Piece
+from storage.intervals import NO_END, Intervals
+
+NOT_KEPT = "not_kept"
+"""Why a frame is lost that this server has had, or could have had, and nobody has reserved."""
+
+
+@dataclass(frozen=True)
+class Again:
+    """Frames to be estimated again from the journal, whose next one is held.
+
+    Attributes:
+        at: the first of them.
+        last: the greatest number that is held.
+        ends: will no more frames of this stream come?
+        until: from this number on memory has them; None: it has none.
+    """
+
+    at: Position
+    last: int
+    ends: bool
+    until: int | None
+
+
+class Lossless:
+    """A reader's position.
+
+    Args:
+        memory: of the node.
+        look: what is known of a stream; None: nothing, or not any more.
+        position: the frame that is wanted first; None: the next that comes.
+    """
+
+    def __init__(
+        self,
+        memory: NodeMemory,
+        look: Callable[[str], Known | None],
+        position: Position | None,
+    ) -> None:
+        self.position = position
+        self._memory = memory
+        self._look = look
+        self._number: int | None = memory.next_number if position is None else None
+        """Of the piece that comes next, for one who reads from memory."""
+
+    def next(self) -> Item | Again | None:
+        """What comes next; None: nothing yet.
+
+        Raises:
+            HangUp: it cannot go on; the reason says from where to resume.
+        """
+        memory = self._memory
+        if (at := self.position) is None:
+            if self._number is None or self._number >= memory.next_number:
+                return None
+            self._number = max(self._number, memory.oldest)
+            piece = memory[self._number]
+            at = self.position = Position(piece.boot_id, piece.first)
+        if (found := self._piece(at)) is not None:
+            self._number = found.number + 1
+            self.position = Position(at.boot_id, found.last + 1)
+            begin = at.seq - found.first
+            rows = cut((found.frames, found.columns), begin, len(found.frames))
+            return Rows(at.boot_id, rows, found.number if begin == 0 else None)
+        stream = self._look(at.boot_id)
+        if stream is None:
+            raise HangUp(Close.NO_STREAM, f"not kept any more: stream {at.boot_id}")
+        ahead = memory.after(at.boot_id, at.seq)
+        held = stream.held
+        if held.within(at.seq, at.seq):
+            # Frames that wait for their look-ahead come from the live estimates, in a moment.
+            if ahead is None and not stream.is_over and memory.last(at.boot_id) is not None:
+                return None
+            until = None if ahead is None else ahead.first
+            return Again(at, held.last or at.seq, stream.is_over, until)
+        return self._gap(at, stream, ahead)
+
+    def had(self, rows: Rows) -> None:
+        """Frames that were estimated again have been given."""
+        self.position = Position(rows.boot_id, rows.to_seq + 1)
+
+    def _piece(self, at: Position) -> Piece | None:
+        """The piece in memory with this frame, if there is one."""
+        memory, number = self._memory, self._number
+        if number is None:
+            return memory.find(at.boot_id, at.seq)
+        if number < memory.oldest:
+            raise HangUp(Close.TOO_SLOW, f"too slow; {at}")
+        if number < memory.next_number:
+            piece = memory[number]
+            if piece.boot_id == at.boot_id and piece.first <= at.seq:
+                return piece
+            self._number = None  # frames are missing between
+        return None
+
+    def _gap(self, at: Position, stream: Known, ahead: Piece | None) -> Item | None:
+        """The frame is not here: is it still to come, lost, or behind the stream's end?"""
+        comes = stream.to_come().within(at.seq, NO_END).first
+        if comes == at.seq:
+            return None
+        held = stream.held.within(at.seq, NO_END).first
+        here = [n for n in (None if ahead is None else ahead.first, held, comes) if n is not None]
+        if not here and stream.is_over:
+            here = [max(at.seq, stream.end)]
+        to_seq = min(here, default=at.seq) - 1
+        if to_seq >= at.seq:
+            reason, last = _reason(stream, at.seq, to_seq)
+            self._go_to(Position(at.boot_id, last + 1))
+            return Missing(at.boot_id, at.seq, last, reason)
+        following = stream.following if stream.is_over else None
+        if following is None:
+            return None
+        self._go_to(Position(following, 0))
+        return Begins(following, 0)
+
+    def _go_to(self, position: Position) -> None:
+        self.position, self._number = position, None
+
+
+def _reason(stream: Known, first: int, last: int) -> tuple[str, int]:
+    """Why frames are lost, and up to which of them that is the reason."""
+    known = stream.lost.within(Intervals([(first, last)]))
+    for reason, numbers in known.items():
+        for begin, end in numbers:
+            if begin == first:
+                return reason, end
+    begins = [begin for numbers in known.values() for begin, _ in numbers]
+    return NOT_KEPT, min([last, *(begin - 1 for begin in begins)])
