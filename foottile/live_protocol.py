@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 from urllib.parse import urlencode
@@ -25,7 +25,7 @@ Policy = Literal["lossless", "drop_oldest", "latest"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 MESSAGE_BYTES_MAX = 1 << 24
-_POLICY, _NO_STREAM = 1008, 4011
+_POLICY, _NO_STREAM, _UNREADABLE = 1008, 4011, 4012
 _LOSSES_MAX = 1000
 _AGAIN_S = (0.1, 5.0)
 _TRY_LATER = 503
@@ -50,6 +50,15 @@ class Asked:
     policy: Policy
     boot_id: str | None = None
     from_seq: int | None = None
+
+    @classmethod
+    def of(
+        cls, url: str, node: str | None, columns: str | Sequence[str], policy: Policy, *begin: Any
+    ) -> Asked:
+        """The same, where a name alone may stand for columns."""
+        return cls(
+            url, node, (columns,) if isinstance(columns, str) else (*columns,), policy, *begin
+        )
 
 
 @dataclass(frozen=True)
@@ -117,7 +126,7 @@ class LiveProtocol:
         Raises:
             DamagedError: it is not one of a foottile server.
         """
-        self._failures, self._has_begun = 0, True
+        self._has_begun = True
         try:
             if isinstance(message, str):
                 self._said(json.loads(message))
@@ -134,14 +143,17 @@ class LiveProtocol:
 
         Raises:
             UsageError: what was asked for is not there.
+            DamagedError: the server cannot read the frame that is wanted next.
         """
         if code == _POLICY:
             raise UsageError(f"{self._asked.url}: {reason}")
+        if code == _UNREADABLE:
+            raise DamagedError(f"{self._asked.url}: {reason}")
         if code == _NO_STREAM:
             if not self._has_begun or self._boot_id is None:
                 raise UsageError(f"{self._asked.url}: {reason}")
             loss = Loss(self._boot_id, self._next_seq or 0, None, "no_stream")
-            self._boot_id = self._next_seq = None
+            self._boot_id, self._next_seq = None, 0  # all that there is of the present one
             self._lose(loss)
 
     def refused(self, status: int, body: bytes | bytearray) -> FootTileError | None:
@@ -185,6 +197,7 @@ class LiveProtocol:
                 self._boot_id, self._next_seq = said["boot_id"], int(said["from_seq"])
             self._schema = None
         elif kind in ("lost", "dropped"):
+            self._check_next(int(said["from_seq"]))
             self._boot_id, self._next_seq = said["boot_id"], int(said["to_seq"]) + 1
             reason = str(said["reason"])
             self._lose(Loss(said["boot_id"], int(said["from_seq"]), int(said["to_seq"]), reason))
@@ -192,14 +205,24 @@ class LiveProtocol:
     def _news(self, batch: pa.RecordBatch) -> pa.RecordBatch | None:
         seq = batch.column("seq")
         first, last = seq[0].as_py(), seq[-1].as_py()
-        if first is None or last is None:
-            raise ValueError("frames without numbers")
+        if first is None or last is None or last - first + 1 != batch.num_rows:
+            raise ValueError("frames whose numbers do not follow one another")
+        self._check_next(first)
+        self._failures = 0
         if self._next_seq is not None and first < self._next_seq:  # it was here already
             batch = batch.slice(self._next_seq - first)
         self._next_seq = max(last + 1, self._next_seq or 0)
         return batch if batch.num_rows else None
 
+    def _check_next(self, seq: int) -> None:
+        """No frame is missing of which nothing was said."""
+        if self._next_seq is not None and seq > self._next_seq:
+            raise ValueError(
+                f"frame {seq} after {self._next_seq - 1}, and no word of those between"
+            )
+
     def _lose(self, loss: Loss) -> None:
+        self._failures = 0
         self.losses.append(loss)
         if self._on_loss is not None:
             self._on_loss(loss)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 from urllib.parse import quote
 
+from foottile.closing import Closing
 from foottile.http import Http
 from foottile.live import Live
 from foottile.live_protocol import Asked, Loss, Policy
@@ -17,7 +17,7 @@ from foottile.sessions import Session
 _PAGE = 500
 
 
-class Server:
+class Server(Closing):
     """One server; made by `foottile.connect`. May be used from several threads.
 
     Every method raises a `FootTileError` if there is no answer, or one that is a problem.
@@ -25,17 +25,6 @@ class Server:
 
     def __init__(self, url: str, token: str | None = None, *, timeout_s: float = 10.0) -> None:
         self._http = Http(url, token, timeout_s)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close its connections."""
@@ -169,8 +158,7 @@ class Server:
             give_up_s: raise `NoAnswerError` if the server does not answer for so long; None: never,
                 once it has answered.
         """
-        names = (columns,) if isinstance(columns, str) else tuple(columns)
-        asked = Asked(self._http.url, node, names, policy, boot_id, from_seq)
+        asked = Asked.of(self._http.url, node, columns, policy, boot_id, from_seq)
         return Live(asked, self.headers, on_loss=on_loss, give_up_s=give_up_s)
 
 

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import pyarrow as pa
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
+from foottile.closing import AsyncClosing
 from foottile.data import Data
 from foottile.errors import FootTileError
-from foottile.live_protocol import MESSAGE_BYTES_MAX, Asked, LiveProtocol, Loss, Policy
+from foottile.live_protocol import Asked, Loss, Policy
+from foottile.live_state import LiveState
 from foottile.server import Server
 from foottile.sessions import Mark, Session
 
@@ -122,21 +124,14 @@ class AsyncSession:
         return await asyncio.to_thread(self.now.download, path, **how)
 
 
-class AsyncServer:
+class AsyncServer(AsyncClosing):
     """One server, as `Server`; made by `foottile.connect_async`."""
 
     def __init__(self, url: str, token: str | None = None, *, timeout_s: float = 10.0) -> None:
         self._server = Server(url, token, timeout_s=timeout_s)
 
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def close(self) -> None:
+        """As `Server.close`."""
         self._server.close()
 
     async def nodes(self) -> list[dict[str, Any]]:
@@ -180,40 +175,17 @@ class AsyncServer:
         give_up_s: float | None = None,
     ) -> AsyncLive:
         """As `Server.live`: `async for batch in server.live("left")`."""
-        names = (columns,) if isinstance(columns, str) else tuple(columns)
-        asked = Asked(self._server.url, node, names, policy, boot_id, from_seq)
+        asked = Asked.of(self._server.url, node, columns, policy, boot_id, from_seq)
         headers = self._server.headers
         return AsyncLive(asked, headers, on_loss=on_loss, give_up_s=give_up_s)
 
 
-class AsyncLive:
+class AsyncLive(LiveState, AsyncClosing):
     """A live stream, as `Live`: an asynchronous iterator of Arrow batches."""
 
-    def __init__(
-        self,
-        asked: Asked,
-        headers: Mapping[str, str],
-        *,
-        on_loss: Callable[[Loss], None] | None = None,
-        give_up_s: float | None = None,
-    ) -> None:
-        self._protocol = LiveProtocol(asked, on_loss)
-        self._headers = dict(headers)
-        self._give_up_s = give_up_s
-        self._heard_s = time.monotonic()
+    def __init__(self, *asked: Any, **how: Any) -> None:
+        super().__init__(*asked, **how)
         self._socket: ClientConnection | None = None
-        self._is_over = False
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        await self.close()
 
     def __aiter__(self) -> Self:
         return self
@@ -225,10 +197,7 @@ class AsyncLive:
                 message = await (await self._connected()).recv()
             except ConnectionClosed as end:
                 self._socket = None
-                code, reason = (1006, "") if end.rcvd is None else (end.rcvd.code, end.rcvd.reason)
-                if not self._is_over:
-                    self._protocol.closed(int(code), reason)
-                    await self._pause(end)
+                await asyncio.sleep(self._closed_s(end))
                 continue
             self._heard_s = time.monotonic()
             try:
@@ -240,16 +209,6 @@ class AsyncLive:
                 return batch
         raise StopAsyncIteration
 
-    @property
-    def position(self) -> tuple[str, int] | None:
-        """As `Live.position`."""
-        return self._protocol.position
-
-    @property
-    def losses(self) -> Sequence[Loss]:
-        """As `Live.losses`."""
-        return tuple(self._protocol.losses)
-
     async def close(self) -> None:
         """End it."""
         self._is_over = True
@@ -260,23 +219,7 @@ class AsyncLive:
     async def _connected(self) -> ClientConnection:
         while self._socket is None:
             try:
-                self._socket = await connect(
-                    self._protocol.address(),
-                    additional_headers=self._headers,
-                    compression=None,
-                    max_size=MESSAGE_BYTES_MAX,
-                    close_timeout=1.0,
-                    proxy=None,
-                )
-            except InvalidStatus as error:
-                answer = error.response
-                if (problem := self._protocol.refused(answer.status_code, answer.body)) is not None:
-                    raise problem from error
-                await self._pause(error)
+                self._socket = await connect(self._protocol.address(), **self._options())
             except (OSError, InvalidHandshake, EOFError) as error:
-                await self._pause(error)
+                await asyncio.sleep(self._failed_s(error))
         return self._socket
-
-    async def _pause(self, error: Exception) -> None:
-        silent_s = time.monotonic() - self._heard_s
-        await asyncio.sleep(self._protocol.again_s(error, silent_s, self._give_up_s))

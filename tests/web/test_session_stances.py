@@ -174,21 +174,6 @@ def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> No
     assert desk.evaluate(_KEYS_SHOWN) > 6
 
 
-@pytest.mark.parametrize("scheme", ["sunlight", "dark"])
-def test_axe_has_nothing_to_complain_of_in_the_sun_or_the_dark_with_a_stance_and_with_help(
-    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage, scheme: str
-) -> None:
-    page = opened(open_page, hops, color_scheme="dark")
-    if scheme == "sunlight":  # whatever the machine prefers
-        page.click("#sun")
-    page.keyboard.press("]")
-    says(page, stances[0])
-    assert complaints(page) == []
-    page.keyboard.press("?")
-    expect(page.locator("#help-dialog")).to_be_visible()
-    assert complaints(page) == []
-
-
 @pytest.mark.parametrize(
     ("by", "cursor_s", "found"),
     [(1, None, 1), (-1, None, 2), (1, 1.5, 1), (-1, 1.5, 0), (1, 2.5, 2), (-1, 2.5, 0), (1, 9, -1)],
