@@ -79,18 +79,26 @@ def session(browser: Browser) -> None:
             time.sleep(0.2)
         begin_ns = http.get(f"/sessions/{id_}/overview", params={"points": 1}).json()["begin_t_ns"]
         stances = http.get(f"/sessions/{id_}/stances").json()
-        middle = max(0, next(i for i, one in enumerate(stances) if one["is_whole"] and i > 3))
+        # Two whole ones with little time between.
+        whole = [
+            i for i in range(3, len(stances) - 1) if all(s["is_whole"] for s in stances[i : i + 2])
+        ]
+        middle = min(whole, key=lambda i: stances[i + 1]["begin_t_ns"] - stances[i]["end_t_ns"])
         begin_s, end_s = (
             (stances[i][at] - begin_ns) * 1e-9
             for i, at in ((middle, "begin_t_ns"), (middle + 1, "end_t_ns"))
         )
+        from_s, to_s = begin_s - 0.4, end_s + 0.6
         page = browser.new_page(viewport={"width": 1280, "height": 800})
-        page.goto(f"{url}sessions/{id_}?from={begin_s - 0.4}&to={end_s + 0.6}")
+        page.goto(f"{url}sessions/{id_}?from={from_s}&to={to_s}")
         page.wait_for_selector("#plots[data-settled=true]")
         page.wait_for_selector("#stances-rows tr")
         box = page.locator("#plots").bounding_box()
         assert box is not None
-        page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 100)
+        # In the first of them: beside the plots are the axis and a margin.
+        share = (begin_s + 0.45 * stances[middle]["duration_s"] - from_s) / (to_s - from_s)
+        page.mouse.move(box["x"] + 56 + share * (box["width"] - 56 - 12), box["y"] + 100)
+        page.wait_for_selector("#stance-says:not([data-stance=''])")
         time.sleep(0.5)
         save(page, "session")
 
