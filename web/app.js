@@ -20,6 +20,7 @@ import { drawGrf } from "./live/grf.js";
 import { History } from "./live/history.js";
 import { Marks } from "./live/marks.js";
 import { Notes } from "./live/notes.js";
+import { Pace, Reading } from "./live/pace.js";
 import { Pause } from "./live/pause.js";
 import { Range } from "./live/range.js";
 import { Status } from "./live/status.js";
@@ -46,18 +47,24 @@ const state = {
 };
 
 inSunlight();
-const again = () => { state.fresh = true; };
+const reading = new Reading();
+const pace = new Pace(draw);
+const again = () => {
+  state.fresh = true;
+  reading.again();
+  pace.ask();
+};
 const range = new Range(byId("range"), again);
 const bars = new Bars(again, range);
 const foot = new Foot(range);
 foot.resized = again;
-const trace = new Trace(() => past.want());
+const trace = new Trace(() => { past.want(); pace.ask(); });
 const tileTraces = new TileTraces(range, () => { again(); trace.recolour(); });
 const past = new History(trace.points, () => state.node?.boot_id);
 const pause = new Pause(() => {
-  state.fresh = true;
   if (pause.held) trace.pause(pause.held.nowMs);
   else trace.goOn();
+  again();
 });
 pause.newest = () => state.frame;
 helpWithKeys();
@@ -88,7 +95,7 @@ const handlers = {
     if (state.node?.node === node.node) {
       if (wasBoot !== node.boot_id) forget(); // it restarted: the old trace is another story
       state.node = node;
-      state.fresh = true;
+      show();
     }
     if (isNew || !state.node) chooseNode();
   },
@@ -120,12 +127,17 @@ function takeFrame(frame) {
   const nowMs = performance.now();
   if (state.fresh && state.frame && !document.hidden) keepSpan(frame, state.frame); // two messages, one drawing: keep both peaks
   state.frame = frame;
-  state.fresh = true;
+  show();
   state.heard.frameMs = nowMs;
   status.see(frame);
   notes.see(state.node, frame, nowMs);
   trace.add(frame, state.node.nominal_rate_hz, nowMs);
   past.see(state.node, frame, trace.windowS, nowMs, tileTraces.wants(bars.unit));
+}
+
+function show() {
+  state.fresh = true;
+  pace.ask();
 }
 
 function keepSpan(frame, earlier) {
@@ -179,7 +191,7 @@ function chooseNode(wanted = state.wanted ?? kept()) {
   if (next?.node !== state.node?.node || next?.boot_id !== state.node?.boot_id) forget();
   state.node = next;
   state.wanted = wanted ?? next?.node ?? null;
-  state.fresh = true;
+  show();
   const select = byId("node-select", HTMLSelectElement);
   const names = all.map((node) => node.node).sort();
   if (names.join("\n") !== [...select.options].map((option) => option.value).join("\n")) {
@@ -217,16 +229,16 @@ function tick() {
 }
 
 function draw() {
-  requestAnimationFrame(draw);
   const { node } = state;
   if (!node) return;
   const nowMs = performance.now();
-  if (state.fresh) {
+  const { frame, nowMs: shownMs } = pause.held ?? { frame: state.frame, nowMs };
+  const isRead = reading.isDue(node, frame, nowMs);
+  if (state.fresh || isRead) {
     state.fresh = false;
-    const { frame, nowMs: shownMs } = pause.held ?? { frame: state.frame, nowMs };
-    if (!tileTraces.shown) bars.draw(node, frame, shownMs);
-    foot.draw(node, frame);
-    drawGrf(node, frame);
+    if (!tileTraces.shown) bars.draw(node, frame, shownMs, isRead);
+    foot.draw(node, frame, isRead);
+    if (isRead) drawGrf(node, frame);
   }
   const drawn = trace.draw(nowMs, status.live);
   if (drawn) tileTraces.draw(node, drawn, nowMs, bars.unit);
@@ -235,4 +247,4 @@ function draw() {
 setText(byId("start-command"), `foottile node --scene FILE --server ${location.origin}`);
 setInterval(tick, 100);
 tick();
-draw();
+pace.ask();

@@ -56,9 +56,8 @@ DRAWN = """() => {
 }"""
 """How much of the trace's older half has its colour."""
 
-PICTURE = (
-    "() => document.querySelector('#trace').toDataURL() + document.querySelector('#bars').outerHTML"
-)
+PICTURE = """() => ["trace", "tracks"].map((id) => document.getElementById(id).toDataURL())
+  + document.querySelector("#bars").outerHTML"""
 
 
 def streamed(scripted: Scripted) -> None:

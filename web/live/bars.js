@@ -3,6 +3,7 @@
 import { byId, el, number, plain, setData, setText } from "../common/text.js";
 import { Range } from "./range.js";
 import { FAULT_STATES, hasFullScale, readTile, unitOf } from "./tile.js";
+import { Tracks } from "./tracks.js";
 
 const BELOW_ZERO = 0.1; // room below the zero line, as a share of full scale
 const PEAK_HOLD_MS = 1000; // a peak of one message would be gone in 33 ms
@@ -15,9 +16,11 @@ export class Bars {
   /** @param {() => void} onUnit @param {Range} [range] up to which value the bars go */
   constructor(onUnit, range = new Range()) {
     this.list = byId("bars");
+    this.tracks = new Tracks();
     this.range = range;
     this.cells = [];
     this.key = "";
+    this.tiles = null;
     this.onUnit = onUnit;
     let kept = null;
     try { kept = localStorage.getItem(UNIT_KEY); } catch { /* private window */ }
@@ -33,6 +36,7 @@ export class Bars {
     this.unit = unit;
     try { localStorage.setItem(UNIT_KEY, unit); } catch { /* private window */ }
     this.key = ""; // full scales change: build anew
+    this.tiles = null;
     this.showUnit();
     this.onUnit();
   }
@@ -44,11 +48,14 @@ export class Bars {
 
   /** Build the cells for the node's tiles; nothing happens while they stay the same. */
   fit(node) {
-    const key = JSON.stringify([this.shown, node?.node, node?.tiles]);
+    if (node.tiles === this.tiles && this.key.startsWith(this.shown)) return;
+    this.tiles = node.tiles;
+    const key = this.shown + JSON.stringify([node.node, node.tiles]);
     if (key === this.key) return;
     this.key = key;
     this.cells = (node?.tiles ?? []).map((tile) => makeCell(tile, this.shown));
     this.list.replaceChildren(...this.cells.map((cell) => cell.root));
+    this.tracks.over(this.cells.map((cell) => cell.track));
     this.arrange();
   }
 
@@ -56,7 +63,7 @@ export class Bars {
     const count = this.cells.length;
     if (!count) return;
     const widthPx = this.list.clientWidth;
-    const compact = count > MOST_UPRIGHT;
+    const compact = this.tracks.lying = count > MOST_UPRIGHT;
     let columns;
     if (compact) columns = widthPx >= 440 ? 8 : 4;
     else {
@@ -69,14 +76,18 @@ export class Bars {
     this.list.style.setProperty("--rows", String(Math.ceil(count / columns)));
   }
 
-  draw(node, frame, nowMs) {
+  /** `isRead`: numbers are written, too. */
+  draw(node, frame, nowMs, isRead = true) {
     this.shown = hasPressuresOnly(frame) ? "kPa" : this.unit;
     this.fit(node);
     this.range.see(node, frame, nowMs);
-    this.cells.forEach((cell, i) => {
+    this.tracks.draw(this.cells.map((cell, i) => {
       setScale(cell, this.range.of(cell.tile, cell.unit), this.range.automatic);
-      drawCell(cell, readTile(node, i, frame, this.shown), nowMs);
-    });
+      const reading = readTile(node, i, frame, this.shown);
+      setData(cell.root, "value", plain(reading.value));
+      if (isRead) writeCell(cell, reading);
+      return barOf(cell, reading, nowMs);
+    }));
   }
 }
 
@@ -85,20 +96,18 @@ const hasPressuresOnly = (frame) => Boolean(frame?.gauge_kpa?.some(Number.isFini
 
 function makeCell(tile, unitChosen) {
   const unit = unitOf(tile, unitChosen);
-  const part = (cls) => el("i", { cls });
   const cell = {
     tile, unit, scale: null, peak: null, peakUntilMs: 0,
-    fill: part("fill"), band: part("band"), line: part("line"), tick: part("peak"), zero: part("zero"),
     says: el("span", { cls: "says" }),
     value: el("span", { cls: "value", text: "–" }),
     sigma: el("span", { cls: "sigma" }),
   };
   cell.says.append(cell.word = el("span"), cell.bound = el("span", { cls: "bound" }));
-  const track = el("div", { cls: "track" }, cell.fill, cell.band, cell.zero, cell.tick, cell.line, cell.says);
+  cell.track = el("div", { cls: "track" }, cell.says);
   cell.root = el("li", { cls: "tile", "data-serial": tile.serial, "data-state": "waiting", "data-value": "", "data-unit": unit },
     el("span", { cls: "serial", text: tile.serial }),
     el("span", { cls: "scale", text: tile.reference ? "reference" : "" }),
-    track,
+    cell.track,
     el("span", { cls: "number" }, cell.value, el("span", { cls: "unit", text: ` ${unit}` })),
     cell.sigma);
   if (tile.reference) cell.root.dataset.reference = "true";
@@ -111,38 +120,33 @@ function setScale(cell, scale, automatic) {
   if (cell.scale === scale && cell.automatic === automatic) return;
   cell.scale = scale;
   cell.automatic = automatic;
-  cell.root.style.setProperty("--zero", String(share(0, scale)));
   if (cell.tile.reference) return;
   const said = automatic || hasFullScale(cell.tile, cell.unit);
   cell.scaleText.replaceChildren(...(said ? [number(scale, scale < 100 && !automatic ? 1 : 0), el("span", { cls: "unit", text: ` ${cell.unit}` })] : []));
 }
 
-function drawCell(cell, reading, nowMs) {
+function writeCell(cell, reading) {
   setData(cell.root, "state", reading.state);
-  setData(cell.root, "value", plain(reading.value));
   setData(cell.root, "fault", String(FAULT_STATES.has(reading.state)));
   setText(cell.word, reading.text);
   setText(cell.bound, reading.bound ? `, ≥ ${reading.bound} ${cell.unit}` : "");
   setText(cell.value, reading.bound ? `≥ ${reading.bound}` : number(reading.value, Math.abs(reading.value) < 99.95 ? 1 : 0));
   setText(cell.sigma, reading.sigma === null ? "" : `± ${number(1.96 * reading.sigma)}`);
+}
+
+/** @returns {import("./tracks.js").Bar | null} */
+function barOf(cell, reading, nowMs) {
+  const at = (value) => share(value, cell.scale);
+  const zero = at(0);
   if (reading.value === null) {
     cell.peak = null;
-    return;
+    return reading.state === "saturated" ? { zero } : null;
   }
-  const set = (element, name, value) => element.style.setProperty(name, value.toFixed(4));
-  const zero = share(0, cell.scale);
-  const value = share(reading.value, cell.scale);
-  set(cell.fill, "--from", Math.min(zero, value));
-  set(cell.fill, "--to", Math.max(zero, value));
-  set(cell.line, "--from", value);
-  const spanned = reading.low !== null && reading.high !== null;
-  cell.band.hidden = cell.tick.hidden = !spanned;
-  if (!spanned) return;
-  set(cell.band, "--from", share(reading.low, cell.scale));
-  set(cell.band, "--to", share(reading.high, cell.scale));
+  const bar = { zero, value: at(reading.value) };
+  if (reading.low === null || reading.high === null) return bar;
   if (cell.peak === null || reading.high >= cell.peak || nowMs > cell.peakUntilMs) {
     cell.peak = reading.high;
     cell.peakUntilMs = nowMs + PEAK_HOLD_MS;
   }
-  set(cell.tick, "--from", share(cell.peak, cell.scale));
+  return { ...bar, low: at(reading.low), high: at(reading.high), peak: at(cell.peak) };
 }

@@ -12,6 +12,7 @@ const TRAIL_S = 2;
 export const LOW_PX = 220;
 const PARTS = 4; // of the trail, each paler than the one after it
 const GAP_S = 0.25; // the trail is not drawn across a longer one
+const TRAIL_EVERY_S = 0.06; // it is long, and what is new in it is next to the mark
 
 export class Cop {
   /** @param {import("../common/foot_layout.js").FootLayout} layout */
@@ -24,27 +25,34 @@ export class Cop {
     this.trail = Array.from({ length: PARTS }, (_, i) => svg("path", { class: "cop-trail", opacity: ((i + 1) / PARTS).toFixed(2) }));
     this.parts = [...this.trail, this.halo, this.area, this.span, this.mark];
     this.past = [];
+    this.trailS = -Infinity; // of the frame that it was drawn with
     /** From the side the past lies below the present. */
     this.fallsPx = layout.heightPx < LOW_PX ? 8 : 22;
   }
 
-  draw(node, frame) {
+  draw(node, frame, isRead) {
     const note = byId("cop");
     const x = frame?.cop_x_m ?? null;
     const shown = x !== null;
-    this.follow(frame);
+    this.follow(frame, isRead);
     for (const part of [this.mark, this.halo, this.span, this.area]) place(part, { visibility: shown ? "visible" : "hidden" });
     const sigma = frame?.cop_sigma_x_m ?? null;
     setData(note, "xM", shown ? x.toFixed(6) : "");
     setData(note, "sigmaM", shown && sigma !== null ? sigma.toFixed(6) : "");
-    if (!shown) return setText(note, `no COP: ${whyNoCop(node, frame)}`);
-    return this.layout.plan ? this.drawPlan(frame, note) : this.drawSide(frame, note);
+    if (isRead) setText(note, shown ? this.words(frame) : `no COP: ${whyNoCop(node, frame)}`);
+    if (!shown) return;
+    if (this.layout.plan) this.drawPlan(frame);
+    else this.drawSide(frame);
   }
 
-  drawPlan(frame, note) {
+  words({ cop_x_m: x, cop_y_m: y, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null }) {
+    const across = this.layout.plan ? `, ${say("y", y ?? 0, sigmaY)}` : "";
+    return `COP ${say("x", x, sigmaX)}${across} (95 %)`;
+  }
+
+  drawPlan(frame) {
     const { cop_x_m: x, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null } = frame;
     const y = frame.cop_y_m ?? 0;
-    setText(note, `COP ${say("x", x, sigmaX)}, ${say("y", y, sigmaY)} (95 %)`);
     const at = this.layout.at(x, y);
     const halfPx = (sigma) => Math.max(3, Z95 * (sigma ?? 0) * this.layout.scale);
     const [across, along] = this.layout.toesUp ? [sigmaY, sigmaX] : [sigmaX, sigmaY];
@@ -56,10 +64,9 @@ export class Cop {
     place(this.mark, { d });
   }
 
-  drawSide(frame, note) {
+  drawSide(frame) {
     const { layout } = this;
     const { cop_x_m: x, cop_sigma_x_m: sigma = null } = frame;
-    setText(note, `COP ${say("x", x, sigma)} (95 %)`);
     const px = layout.at(x, 0).x;
     const halfPx = Z95 * (sigma ?? 0) * layout.scale;
     const [a, b] = [px - halfPx, px + halfPx];
@@ -75,7 +82,7 @@ export class Cop {
   }
 
   /** Where it was, oldest first, by the clock of the frames: a picture that is played back has it, too. */
-  follow(frame) {
+  follow(frame, isRead) {
     const { past, layout } = this;
     const nowS = timeOf(frame);
     if (nowS === null) past.length = 0;
@@ -84,6 +91,9 @@ export class Cop {
       past.push({ timeS: nowS, x: frame.cop_x_m ?? null, y: frame.cop_y_m ?? 0 });
       while (past[0].timeS < nowS - TRAIL_S) past.shift();
     }
+    setData(layout.plan ? this.area : this.span, "trail", String(past.length));
+    if (!isRead && nowS !== null && Math.abs(nowS - this.trailS) < TRAIL_EVERY_S) return;
+    this.trailS = nowS;
     const paths = Array.from({ length: PARTS }, () => []);
     past.forEach((one, i) => {
       const before = past[i - 1];
@@ -92,7 +102,6 @@ export class Cop {
       paths[Math.min(PARTS - 1, Math.floor((1 - age) * PARTS))].push(`M${this.placeOf(before, nowS)}L${this.placeOf(one, nowS)}`);
     });
     this.trail.forEach((part, i) => place(part, { d: paths[i].join("") }));
-    setData(layout.plan ? this.area : this.span, "trail", String(past.length));
   }
 
   placeOf(one, nowS) {

@@ -33,10 +33,11 @@ export class Foot {
   }
 
   fit(node) {
+    if (this.key && node.tiles === this.tiles) return;
     const key = JSON.stringify([node?.node, node?.tiles, Boolean(node?.servo)]);
+    this.tiles = node?.tiles ?? [];
     if (key === this.key) return;
     this.key = key;
-    this.tiles = node?.tiles ?? [];
     this.plan = isPlan(this.tiles);
     this.grid = isGrid(this.tiles);
     setData(this.root, "grid", String(this.grid));
@@ -104,17 +105,19 @@ export class Foot {
     return { group, dome, arrow, says: this.grid && cell >= NUMBERS_FROM_PX ? says : null, name: says };
   }
 
-  draw(node, frame) {
+  /** `isRead`: numbers are written, too. */
+  draw(node, frame, isRead = true) {
     this.fit(node);
     this.range.see(node, frame, performance.now());
     const most = this.range.ofAll;
     setText(this.top, `${number(most, most < 10 && most % 1 ? 1 : 0)} N`);
-    this.drawAngle(node, frame);
-    this.marks.forEach((mark, i) => this.drawTile(mark, i, readTile(node, i, frame, "N"), most));
-    this.cop.draw(node, frame);
+    this.turn(node, frame);
+    if (isRead) this.writeAngle(node, frame);
+    this.marks.forEach((mark, i) => this.drawTile(mark, i, readTile(node, i, frame, "N"), most, isRead));
+    this.cop.draw(node, frame, isRead);
   }
 
-  drawTile({ group, dome, arrow, says, name }, i, reading, most) {
+  drawTile({ group, dome, arrow, says, name }, i, reading, most, isRead) {
     const fault = FAULT_STATES.has(reading.state);
     setData(group, "state", fault ? "fault" : reading.state);
     const known = reading.value !== null && !this.tiles[i].reference;
@@ -122,7 +125,7 @@ export class Foot {
     const { fill, ink } = known ? shadeOf(this.shades, share) : { fill: "none", ink: "" };
     place(dome, { fill });
     place(name, { fill: known ? ink : "currentColor" });
-    if (says) setText(says, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
+    if (says && isRead) setText(says, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
     if (!this.plan) this.drawArrow(arrow, i, Math.min(1, share));
   }
 
@@ -141,7 +144,7 @@ export class Foot {
     return place(path, { d: `M${from.x} ${from.y}L${to.x} ${to.y}M${side(1)}L${to.x} ${to.y}L${side(-1)}` });
   }
 
-  drawAngle(node, frame) {
+  writeAngle(node, frame) {
     const label = byId("angle");
     label.hidden = !node.servo;
     const angle = frame?.angle_rad ?? null;
@@ -149,7 +152,11 @@ export class Foot {
     const degrees = angle === null ? "angle unknown" : `${angle > 0 ? "+" : ""}${number((angle * 180) / Math.PI)}°`;
     setText(label, stale ? `${degrees} servo stale` : degrees);
     setData(label, "stale", String(stale));
+  }
+
+  turn(node, frame) {
     if (this.plan) return;
+    const angle = frame?.angle_rad ?? null;
     // Clockwise on the screen: the tiles in front come down, so contact moves forward.
     const turn = node.servo && angle !== null ? angle : 0;
     const { layout } = this;

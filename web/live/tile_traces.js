@@ -1,8 +1,10 @@
 // Each tile over the last seconds: rows of traces, or of colours where there are too many for that.
 
+import { coloursOf, fit, whenColoursChange } from "../common/axes.js";
 import { shadeOf, shadesOf } from "../common/heat.js";
 import { byId, number } from "../common/text.js";
 import { runs } from "./points.js";
+import { Strip } from "./strip.js";
 import { unitOf } from "./tile.js";
 
 const KEY = "foottile.tiles-as";
@@ -16,6 +18,12 @@ export class TileTraces {
     this.range = range;
     this.canvas = byId("tile-traces", HTMLCanvasElement);
     this.context = this.canvas.getContext("2d");
+    this.strip = new Strip();
+    this.colours = null;
+    this.shades = [];
+    whenColoursChange(() => { this.colours = null; });
+    this.past = null; // what the strip was begun with
+    this.begun = 0;
     this.shown = false;
     this.drawnMs = 0;
     try { this.shown = localStorage.getItem(KEY) === "traces"; } catch { /* private window */ }
@@ -40,7 +48,7 @@ export class TileTraces {
   show() {
     byId("as-bars").setAttribute("aria-pressed", String(!this.shown));
     byId("as-traces").setAttribute("aria-pressed", String(this.shown));
-    byId("bars").hidden = byId("bars-legend").hidden = this.shown;
+    byId("bars-box").hidden = byId("bars-legend").hidden = this.shown;
     this.canvas.hidden = !this.shown;
   }
 
@@ -53,47 +61,50 @@ export class TileTraces {
   draw(node, { points, tilesPast, endS, windowS, live }, nowMs, unitChosen) {
     if (!this.shown || nowMs - this.drawnMs < EVERY_MS) return;
     this.drawnMs = nowMs;
-    const { canvas, context } = this;
-    const ratio = devicePixelRatio || 1;
+    const { canvas } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width || !height) return;
-    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
-      [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
-    }
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, width, height);
+    const context = fit(canvas, width, height);
     this.range.see(node, points.at(-1)?.tiles, nowMs);
-    const style = getComputedStyle(canvas);
-    const colours = Object.fromEntries(["text", "grid", "fill", "band", "stale", "edge"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
-    if (!live) colours.fill = colours.band = colours.stale;
-    const rowPx = height / node.tiles.length;
-    const shades = rowPx < ROW_PX ? shadesOf(canvas) : null;
-    const x = (timeS) => width - RIGHT_PX - ((endS - timeS) / windowS) * (width - RIGHT_PX - LEFT_PX);
+    if (!this.colours) this.readColours();
+    const colours = live ? this.colours : { ...this.colours, fill: this.colours.stale, band: this.colours.stale };
     const heard = points.filter((point) => point.tiles);
     const known = [...tilesPast.filter((point) => point.timeS > endS - windowS), ...heard];
-    context.font = `600 ${Math.min(13, Math.max(8, rowPx - 2))}px system-ui, sans-serif`;
-    node.tiles.forEach((tile, i) => {
+    const box = { width: width - RIGHT_PX - LEFT_PX, height, rowPx: height / node.tiles.length };
+    const rows = node.tiles.map((tile, i) => {
       const unit = unitOf(tile, unitChosen);
-      const top = i * rowPx;
-      const most = this.range.of(tile, unit);
       const of = (point, which) => point.tiles[unit === "N" ? `force_${which}n` : `gauge_${which}kpa`]?.[i] ?? null;
-      context.fillStyle = colours.text;
-      context.textAlign = "right";
-      context.textBaseline = "middle";
-      if (rowPx >= 9 || i % 4 === 0) context.fillText(tile.serial, LEFT_PX - 5, top + rowPx / 2);
+      return { tile, unit, top: i * box.rowPx, most: this.range.of(tile, unit), of };
+    });
+    context.font = `600 ${Math.min(13, Math.max(8, box.rowPx - 2))}px system-ui, sans-serif`;
+    context.fillStyle = colours.text;
+    context.textAlign = "right";
+    context.textBaseline = "middle";
+    rows.forEach(({ tile, top }, i) => { if (box.rowPx >= 9 || i % 4 === 0) context.fillText(tile.serial, LEFT_PX - 5, top + box.rowPx / 2); });
+    if (box.rowPx < ROW_PX) this.drawColours(rows, known, tilesPast, { endS, windowS, ...box });
+    else this.drawTraces(rows, known, { endS, windowS, ...box }, colours);
+  }
+
+  readColours() {
+    this.colours = coloursOf(this.canvas, ["text", "grid", "fill", "band", "stale", "edge"]);
+    this.shades = shadesOf(this.canvas);
+  }
+
+  drawTraces(rows, points, { endS, windowS, width, rowPx }, colours) {
+    const { context } = this;
+    const x = (timeS) => LEFT_PX + width - ((endS - timeS) / windowS) * width;
+    for (const { unit, top, most, of } of rows) {
       context.save();
       context.beginPath();
-      context.rect(LEFT_PX, top, width - RIGHT_PX - LEFT_PX, rowPx);
+      context.rect(LEFT_PX, top, width, rowPx);
       context.clip();
-      if (shades) this.colours(known, of, x, top, rowPx, most, shades);
-      else this.trace(known, of, x, top, rowPx, most, colours);
+      this.trace(points, of, x, top, rowPx, most, colours);
       context.restore();
-      if (shades) return;
       context.fillStyle = colours.text;
       context.textAlign = "left";
       context.textBaseline = "top";
       if (rowPx >= 26) context.fillText(`${number(most, most < 10 && most % 1 ? 1 : 0)} ${unit}`, LEFT_PX + 3, top + 3);
-    });
+    }
   }
 
   trace(points, of, x, top, rowPx, most, colours) {
@@ -128,15 +139,20 @@ export class TileTraces {
   }
 
   /** The greatest value of each span, as the colour of its time. */
-  colours(points, of, x, top, rowPx, most, shades) {
-    const { context } = this;
-    points.forEach((point, k) => {
-      const value = of(point, "max_");
-      if (value === null) return; // not known: nothing is drawn
-      const to = x(point.timeS);
-      const from = point.gap || !points[k - 1] ? to - 2 : x(points[k - 1].timeS);
-      context.fillStyle = shadeOf(shades, value / most).fill;
-      context.fillRect(from, top, to - from + 0.5, rowPx - 0.5);
+  drawColours(rows, points, tilesPast, { endS, windowS, width, height, rowPx }) {
+    const { strip, shades } = this;
+    if (tilesPast !== this.past) [this.past, this.begun] = [tilesPast, this.begun + 1];
+    const key = [this.begun, shades.map(({ fill }) => fill), ...rows.map(({ tile, unit, most }) => `${tile.serial} ${most} ${unit}`)].join();
+    strip.draw(points, { endS, windowS, widthPx: width, heightPx: height, key }, (context, k, x) => {
+      const to = x(points[k].timeS);
+      const from = points[k].gap || !k ? to - 2 : x(points[k - 1].timeS);
+      for (const { of, top, most } of rows) {
+        const value = of(points[k], "max_");
+        if (value === null) continue; // not known: nothing is drawn
+        context.fillStyle = shadeOf(shades, value / most).fill;
+        context.fillRect(from, top, to - from + 0.5, rowPx - 0.5);
+      }
     });
+    strip.show(this.context, LEFT_PX, 0, width, height);
   }
 }

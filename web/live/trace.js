@@ -1,14 +1,14 @@
 // The ground reaction force of the last seconds, on a canvas: drawn anew when it has moved by half a pixel.
 
+import { coloursOf, whenColoursChange } from "../common/axes.js";
 import { byId, setData } from "../common/text.js";
 import { Points, runs } from "./points.js";
+import { TraceAxes } from "./trace_axes.js";
 
 const WINDOWS_S = [5, 10, 30, 60];
-const TICKS_S = { 5: 1, 10: 1, 30: 5, 60: 10 };
 const WINDOW_KEY = "foottile.window";
 const STEPS_N = [1, 2, 3, 4, 5, 10, 15, 20, 30, 50, 100, 200, 500, 1000, 2000, 5000, 10000];
 const [LEFT_PX, RIGHT_PX] = [50, 10]; // of the axes
-const FRAME_MS = 30; // as often as there is something new
 const SHRINK_AFTER_MS = 4000; // a scale that follows every step of the robot cannot be read
 
 export class Trace {
@@ -16,6 +16,7 @@ export class Trace {
   constructor(onWindow) {
     this.canvas = byId("trace", HTMLCanvasElement);
     this.context = this.canvas.getContext("2d");
+    this.axes = new TraceAxes();
     this.still = matchMedia("(prefers-reduced-motion: reduce)");
     this.points = new Points();
     this.held = null; // while paused: the points as they were then, and when that was
@@ -34,8 +35,7 @@ export class Trace {
       onWindow();
     });
     new ResizeObserver(() => this.resize()).observe(this.canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.recolour());
-    document.addEventListener("foottile-colours", () => this.recolour());
+    whenColoursChange(() => this.recolour());
   }
 
   recolour() {
@@ -95,7 +95,7 @@ export class Trace {
     if (devicePixelRatio !== this.ratio) this.resize(); // moved to another screen
     const boxPx = this.canvas.width / this.ratio - LEFT_PX - RIGHT_PX;
     const everyMs = this.held ? Infinity
-      : this.still.matches ? 200 : Math.max(FRAME_MS, (500 * this.windowS) / Math.max(boxPx * this.ratio, 1));
+      : this.still.matches ? 200 : (500 * this.windowS) / Math.max(boxPx * this.ratio, 1);
     if (this.drawnMs && this.coloursLive === live && nowMs - this.drawnMs < everyMs) return null;
     this.drawnMs = nowMs;
     if (!this.colours || this.coloursLive !== live) this.readColours(live);
@@ -115,8 +115,7 @@ export class Trace {
     const box = { left: LEFT_PX, right: width - RIGHT_PX, top: 8, bottom: height - 24 };
     const x = (timeS) => box.right - ((endS - timeS) / windowS) * (box.right - box.left);
     const y = (n) => box.bottom - ((n - bottom) / (top - bottom)) * (box.bottom - box.top);
-    const everyS = TICKS_S[windowS];
-    this.axes(box, x, y, top, endS, width < 500 && windowS === 10 ? 2 : everyS);
+    this.axes.draw({ width, height, ratio }, box, { top, bottom, windowS }, colours);
 
     context.save();
     context.beginPath();
@@ -183,53 +182,9 @@ export class Trace {
     context.stroke();
   }
 
-  axes(box, x, y, top, endS, everyS) {
-    const { context, colours } = this;
-    const crisp = (value) => Math.round(value) + 0.5;
-    context.font = "600 13px system-ui, sans-serif";
-    context.textBaseline = "middle";
-    context.textAlign = "right";
-    const isLow = y(0) - y(top / 5) < 15;
-    for (let i = 0; i <= 5; i++) {
-      const n = (top / 5) * i;
-      const row = crisp(y(n));
-      context.strokeStyle = i ? colours.grid : colours.text;
-      context.lineWidth = 1;
-      context.beginPath();
-      context.moveTo(box.left, row);
-      context.lineTo(box.right, row);
-      context.stroke();
-      if (isLow && i % 5 && i !== 3) continue; // no room for each of them
-      context.fillStyle = colours.text;
-      if (i === 5) context.fillText(`${n} N`, box.left - 5, row + 3);
-      else context.fillText(String(n), box.left - 5, row);
-    }
-    context.textBaseline = "alphabetic";
-    context.strokeStyle = colours.text;
-    context.beginPath();
-    context.moveTo(box.left, crisp(box.bottom));
-    context.lineTo(box.right, crisp(box.bottom));
-    context.stroke();
-    for (let back = 0; back <= this.windowS; back += everyS) {
-      const column = crisp(x(endS - back));
-      context.strokeStyle = colours.text;
-      context.beginPath();
-      context.moveTo(column, box.bottom);
-      context.lineTo(column, box.bottom + 4);
-      context.stroke();
-      context.textAlign = back === 0 ? "right" : "center";
-      const label = back === 0 ? "0 s" : `\u2212${back}`;
-      context.fillText(label, back === 0 ? box.right + 8 : column, box.bottom + 18);
-    }
-  }
-
   readColours(live) {
-    const style = getComputedStyle(this.canvas);
-    const colour = (name) => style.getPropertyValue(name).trim();
     this.coloursLive = live;
-    this.colours = {
-      text: colour("--text"), grid: colour("--grid"), warn: colour("--warn-line"),
-      line: colour(live ? "--fill" : "--stale"), band: colour(live ? "--band" : "--grid"),
-    };
+    const { text, grid, stale, fill, band, "warn-line": warn } = coloursOf(this.canvas, ["text", "grid", "stale", "fill", "band", "warn-line"]);
+    this.colours = { text, grid, warn, line: live ? fill : stale, band: live ? band : grid };
   }
 }
