@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from typing import Annotated
@@ -52,6 +53,9 @@ def main() -> None:
 
     So does Ctrl-C, where it does not end a command well, as it does `serve`, `node` and `demo`.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # started with it closed: whoever does wants to hear nothing
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  # as long as it runs
     # So that what is half-written is cleaned up when the machine is shut down, too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     try:

@@ -7,6 +7,7 @@ import threading
 import warnings
 from collections.abc import Iterator
 
+import pyarrow as pa
 import pytest
 
 import foottile
@@ -174,7 +175,66 @@ def test_a_stream_that_is_gone_is_a_loss_and_the_next_one_is_begun() -> None:
     with pytest.warns(foottile.FramesLostWarning, match="from 5 on"):
         live.closed(4011, "no stream")
     assert "boot_id" not in live.address()
+    assert "from_seq=0" in live.address()  # nothing of the next one is left out
     assert live.losses[0].reason == "no_stream"
+
+
+def begun(seq: int, policy: str = "lossless") -> LiveProtocol:
+    """A live stream whose next frame is this one."""
+    live = protocol(policy=policy)
+    live.take(json.dumps({"type": "stream", "boot_id": "a" * 32, "from_seq": seq}))
+    live.take(SCHEMA.serialize().to_pybytes())
+    return live
+
+
+SCHEMA = pa.schema([("seq", pa.uint64())])
+
+
+def frames(*seqs: int) -> bytes:
+    batch = pa.RecordBatch.from_arrays([pa.array(seqs, pa.uint64())], schema=SCHEMA)
+    return bytes(batch.serialize().to_pybytes())
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        frames(6, 7),
+        frames(5, 7),
+        json.dumps({"type": "lost", "boot_id": "a" * 32, "from_seq": 6, "to_seq": 9, "reason": ""}),
+    ],
+    ids=["frames before it", "a frame among them", "a loss that leaves some out"],
+)
+def test_a_frame_of_which_nothing_was_said_is_missed(message: str | bytes) -> None:
+    with pytest.raises(foottile.DamagedError):
+        begun(5).take(message)
+
+
+def test_frames_that_were_here_already_are_left_out() -> None:
+    live = begun(5)
+    assert live.take(frames(5, 6)) is not None
+    rows = live.take(frames(5, 6, 7))
+    assert rows is not None
+    assert rows["seq"].to_pylist() == [7]
+    assert live.take(frames(6, 7)) is None
+
+
+def test_a_frame_that_the_server_cannot_read_is_an_error_and_is_not_tried_again() -> None:
+    with pytest.raises(foottile.DamagedError, match="from_seq=5"):
+        begun(5).closed(4012, "resume with from_seq=5")
+
+
+def test_one_who_gets_nowhere_waits_longer_each_time_until_frames_come() -> None:
+    live, waits = begun(5), []
+    for _ in range(9):
+        live.closed(1013, "try later")
+        waits.append(live.again_s(OSError(), 0.0, None))
+        live.address()
+        live.take(json.dumps({"type": "hello"}))
+    assert waits == sorted(waits)
+    assert waits[0] < waits[-1] == 5.0
+    live.take(SCHEMA.serialize().to_pybytes())
+    live.take(frames(5))
+    assert live.again_s(OSError(), 0.0, None) == waits[0]
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,8 @@ class Served(Running):
         self._folder = folder
 
     def __enter__(self) -> Served:
-        options = (*self._arguments, "--port", 0, "--data", self.data)
+        # Entered once more, after it was killed, it is where it was.
+        options = (*self._arguments, "--port", self.port, "--data", self.data)
         self.process = Process(*options, folder=self._folder / "cwd", **self._environment)
         if self._files_max is not None:
             # It has asked for as many as it may when it comes to listen.

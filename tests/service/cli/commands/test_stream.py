@@ -86,3 +86,23 @@ def test_what_cannot_be_is_one_line_and_a_code(
     assert process.ended(PATIENCE_S) == code
     assert len(process.err) == 1
     assert said in process.err[0]
+
+
+@pytest.mark.parametrize(
+    ("sink", "code", "said"), [("> /dev/full", 1, "No space left on device"), (">&-", 0, "")]
+)
+def test_where_nothing_can_be_written_it_ends_and_says_why_if_it_was_to_be_written(
+    running: Running, tared: FakeNode, tmp_path: Path, sink: str, code: int, said: str
+) -> None:
+    command = [str(Path(sys.executable).parent / "foottile"), "stream", "--server", running.url]
+    with Play(tared):
+        ended = subprocess.run(
+            ["sh", "-c", f'exec "$@" {sink}', "sh", *command, "--frames", "5"],
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=tmp_path,
+            timeout=PATIENCE_S,
+        )
+    assert ended.returncode == code
+    assert len(ended.stderr.splitlines()) == code
+    assert said in ended.stderr
