@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from foottile.closing import Closing
+from foottile.files import download
 from foottile.http import Http
 from foottile.live import Live
 from foottile.live_protocol import Asked, Loss, Policy
@@ -92,6 +95,32 @@ class Server(Closing):
     def session(self, session_id: str) -> Session:
         """One session."""
         return Session(self._http, self._http.get(f"/sessions/{quote(session_id, safe='')}"))
+
+    def download_take(
+        self,
+        take: str,
+        path: str | os.PathLike[str],
+        *,
+        format: str,  # noqa: A002  # the API's name
+        start_s: float | None = None,
+        end_s: float | None = None,
+    ) -> Path:
+        """All sessions of a take as one file, on the server's axis of time.
+
+        Args:
+            take: `Session.take`.
+            path: of the file, which appears whole or not at all.
+            format: one that holds several: `c3d`, `opensim`, `mcap`, `mat`, `xdf`.
+            start_s: from so many seconds after each session's first frame on; None: all.
+            end_s: before so many seconds; None: to the end.
+
+        Raises:
+            ConflictError: one of them is not sealed.
+            UsageError: the format holds one session only, or one cannot be in it.
+            OSError: the file cannot be written.
+        """
+        query = {"format": format, "start_s": start_s, "end_s": end_s}
+        return download(self._http, f"/takes/{quote(take, safe='')}/data", query, path)
 
     def record(
         self,

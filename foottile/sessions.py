@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 import uuid
@@ -14,11 +13,11 @@ from typing import Any, Self
 from urllib.parse import quote
 
 from foottile.data import Data
-from foottile.errors import ConflictError, DamagedError, FootTileError
+from foottile.errors import ConflictError, FootTileError
+from foottile.files import download
 from foottile.http import Http
 
 _LOOK_EVERY_S = 0.2
-_CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -112,6 +111,12 @@ class Session:
         """What people wrote to find it again."""
         return tuple(self.facts["tags"])
 
+    @property
+    def take(self) -> str | None:
+        """The take that it is of: its id, None of a session that was recorded by itself."""
+        found: str | None = self.facts["take"]
+        return found
+
     def refresh(self) -> Self:
         """Ask what is known of it now.
 
@@ -202,26 +207,12 @@ class Session:
             OSError: the file cannot be written.
             FootTileError: no answer, or it is refused.
         """
-        target = Path(path)
-        partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
-        digest = hashlib.sha256()
-        try:
-            with (
-                self._http.stream(f"{self._path}/data", {"format": format}) as answer,
-                partial.open("xb") as file,
-            ):
-                for chunk in answer.iter_bytes(_CHUNK):
-                    digest.update(chunk)
-                    file.write(chunk)
-                file.flush()
-                os.fsync(file.fileno())
-            expected = self.refresh().facts["sha256"] if format == "parquet" else None
-            if expected is not None and digest.hexdigest() != expected:
-                raise DamagedError(f"session {self.id}: what came has not the hash that it has")
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
-        return target
+
+        def expected() -> str | None:
+            sha256: str | None = self.refresh().facts["sha256"]
+            return sha256 if format == "parquet" else None
+
+        return download(self._http, f"{self._path}/data", {"format": format}, path, expected)
 
     @property
     def _path(self) -> str:

@@ -151,6 +151,10 @@ class AsyncServer(AsyncClosing):
         """As `Server.session`."""
         return AsyncSession(await asyncio.to_thread(self._server.session, session_id))
 
+    async def download_take(self, take: str, path: Any, **how: Any) -> Any:
+        """As `Server.download_take`."""
+        return await asyncio.to_thread(self._server.download_take, take, path, **how)
+
     async def record(self, node: str, name: str, **described: Any) -> AsyncSession:
         """As `Server.record`; `async with` stops it."""
         return AsyncSession(await asyncio.to_thread(self._server.record, node, name, **described))

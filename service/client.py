@@ -239,11 +239,41 @@ class Client:
             StorageError: it cannot be written.
         """
         session = self._session(session_id)
+        path = self._pull_made(f"/sessions/{session_id}/data", session_id, out, part, to, options)
+        return {**session, "path": str(path), "bytes": path.stat().st_size}
+
+    def pull_take(
+        self,
+        take_id: str,
+        out: Path,
+        part: Slice,
+        to: Format,
+        options: FormatOptions = NO_OPTIONS,
+    ) -> dict[str, Any]:
+        """Download all sessions of a take, or some seconds of each, as one file in `out`.
+
+        Returns:
+            Where it is, and what is known of the take.
+
+        Raises:
+            LinkError: the server does not answer or refuses.
+            UsageError: that is a folder in which a server or node keeps its sessions.
+            StorageError: it cannot be written.
+        """
+        url = f"/takes/{quote(take_id, safe='')}"
+        take = self._get(url)
+        complete = "lossy" if any(s["complete"] == "lossy" for s in take["sessions"]) else True
+        path = self._pull_made(f"{url}/data", f"take-{take['id']}", out, part, to, options)
+        return {**take, "complete": complete, "path": str(path), "bytes": path.stat().st_size}
+
+    def _pull_made(
+        self, url: str, stem: str, out: Path, part: Slice, to: Format, options: FormatOptions
+    ) -> Path:
         refuse_data_folder(out)
         with storage_errors(out):
             out.mkdir(parents=True, exist_ok=True)
         end = "end" if part.end_s is None else f"{part.end_s:g}s"
-        path = out / f"{session_id}_{part.start_s or 0.0:g}s-{end}.{to.ending}"
+        path = out / f"{stem}_{part.start_s or 0.0:g}s-{end}.{to.ending}"
         query: dict[str, object] = {"format": to.name, "start_s": part.start_s, "end_s": part.end_s}
         query["columns"] = ",".join(part.columns) or None
         query |= options.model_dump(mode="json")
@@ -251,7 +281,7 @@ class Client:
         # Under a name of its own until it is proven: who is cut off begins anew.
         partial = temporary_of(path)
         try:
-            self._write(f"/sessions/{session_id}/data", asked, partial)
+            self._write(url, asked, partial)
             # Of other formats the connection says whether they came to their end.
             report = verify_export(partial) if to.name in PROVEN else None
             if to.name in PROVEN and (report is None or report.problems):
@@ -266,7 +296,7 @@ class Client:
                 sync_folder(path.parent)
         finally:
             partial.unlink(missing_ok=True)
-        return {**session, "path": str(path), "bytes": path.stat().st_size}
+        return path
 
     def _write(self, url: str, query: dict[str, str], path: Path) -> None:
         """Write an answer to a file, on the disk."""

@@ -14,7 +14,7 @@ from storage.formats.marks import Mark
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.sealed import export_of, marks_of
 from storage.formats.slice import Slice
-from storage.formats.written.registry import format_named
+from storage.formats.written.registry import format_named, together_named
 from storage.sessions.beside import EVENTS_NAME, read_events
 from storage.sessions.reader import SessionReader
 
@@ -68,7 +68,7 @@ def export_together(sources: Sequence[Path], out: Path, options: ExportOptions) 
     """Write several sealed sessions into one file, on the server's axis of time.
 
     Args:
-        sources: their frames, two at least.
+        sources: their frames.
         out: the file.
         options: what of each; of a slice, seconds count from each session's own first frame.
 
@@ -77,9 +77,7 @@ def export_together(sources: Sequence[Path], out: Path, options: ExportOptions) 
         FileFormatError: a file is damaged.
         StorageError: `out` cannot be written.
     """
-    if len(sources) < 2:
-        raise UsageError("a single session with --together", expected="two sessions or more")
-    to = format_named(options.to)
+    to = together_named(options.to)
     with ExitStack() as opened:
         readers = [
             opened.enter_context(SessionReader(source, only_slices=not options.part.is_all))

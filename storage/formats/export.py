@@ -115,6 +115,12 @@ class Export:
     options: FormatOptions = NO_OPTIONS
 
     @property
+    def called(self) -> str:
+        """Which session it is, for people."""
+        named = self.source.get("session")
+        return f"session {named} of {self.info.node}" if named else f"session of {self.info.node}"
+
+    @property
     def about(self) -> dict[str, object]:
         """What the file is of, what was chosen of it, and its facts (`storage.formats.facts`).
 
@@ -129,7 +135,7 @@ class Export:
         chosen["clock"] = "node" if self.clock is None else "server"
         has_server_time = self.clock is not None
         facts = facts_of(self.notes, self.source, has_server_time=has_server_time)
-        return {**self.source, **chosen, **facts}
+        return {**self.source, "node": self.info.node, **chosen, **facts}
 
     @property
     def all_notes(self) -> dict[str, object]:
@@ -204,6 +210,7 @@ class Export:
             raise UsageError(
                 f"the slice starts at {self.part.start_s:g} s, and the session ends at "
                 f"{end_s:.3f} s",
+                where=self.called,
                 expected="a start before the session's end",
             )
         yield header
@@ -245,6 +252,7 @@ class Export:
                 start_s, end_s = self.part.start_s or 0.0, np.floor(fits_ns * 1e-6) * 1e-3
                 raise UsageError(
                     f"there are more than {frames_max} frames, the limit of this format",
+                    where=self.called,
                     expected=f"a slice: here {start_s:g} s to {end_s:.3f} s fits",
                 )
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}

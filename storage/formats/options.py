@@ -25,15 +25,21 @@ class FormatOptions(BaseModel):
         description="Columns `time_s`, seconds after the session's first frame, and `time_utc`, "
         "`t_ns` as a timestamp: in whatever is made, but not in the sealed Parquet file.",
     )
+    about: bool | None = Field(
+        default=None,
+        description="Column `about` of CSV, whose first row says as JSON what the file is of; in "
+        "it unless columns are chosen.",
+    )
     decimal: Literal["point", "comma"] | None = Field(
         default=None,
         description="Decimal sign of CSV; with a comma, columns are parted by semicolons.",
     )
     body: str | None = Field(
         default=None,
-        max_length=100,
-        pattern=r"^[\w.:-]+$",
-        description="OpenSim: the model's body that the ground acts on, as `calcn_r`; else `foot`.",
+        max_length=1000,
+        pattern=r"^[\w.:-]{1,100}(,[\w.:-]{1,100})*$",
+        description="OpenSim: the model's body that the ground acts on, as `calcn_r`; else `foot`. "
+        "Of several sessions one for each, in their order: `calcn_l,calcn_r`.",
     )
 
     messages: Literal["foxglove", "ros2"] | None = Field(

@@ -41,6 +41,8 @@ from storage.sessions.footer import NOTES_KEY
 
 EXPORT_KEY = b"foottile.export"
 """Only in what was made from a session: of which one, and what of it."""
+EXPORT_COLUMN = "about"
+"""The same in CSV, which has no metadata: a column of which the first cell has it."""
 
 ROW_GROUP_NS = 60_000_000_000
 """The shortest row group, and the pieces of which longer ones are made."""

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from storage.file_hash import FORMAT_KEY
 from storage.schema import ARRAY_INFO_KEY, KNOWN
 from storage.sessions.content_hash import CONTENT_KEY
-from storage.sessions.file import EXPORT_KEY
+from storage.sessions.file import EXPORT_COLUMN, EXPORT_KEY
 
 FORMATS = frozenset({"parquet", "arrow", "csv"})
 """Formats whose exports it recognises."""
@@ -105,20 +105,27 @@ def _arrow(path: Path) -> ExportReport | None:
 
 def _csv(path: Path) -> ExportReport | None:
     with path.open("rb") as file:
-        first = file.readline(_HEADER_MAX)
+        lines = [file.readline(_HEADER_MAX) for _ in range(2)]
     try:
-        header = first.decode("utf-8").rstrip("\r\n")
+        header, row = (line.decode("utf-8").rstrip("\r\n") for line in lines)
         between = ";" if _SEMICOLONS.match(header) else ","
-        (names,) = csv.reader([header], delimiter=between)
+        names, *cells = csv.reader([header, row] if row else [header], delimiter=between)
     except (UnicodeDecodeError, ValueError, csv.Error):
         return None
-    is_ours = bool(names) and all(name in KNOWN or _OF_A_TILE.match(name) for name in names)
-    return ExportReport(path, "csv") if is_ours else None
+    known = {*KNOWN, EXPORT_COLUMN}
+    if not names or not all(name in known or _OF_A_TILE.match(name) for name in names):
+        return None
+    first = dict(zip(names, *cells, strict=False)) if cells else {}
+    return ExportReport(path, "csv", _json(first.get(EXPORT_COLUMN, "")))
 
 
 def _source(said: dict[bytes, bytes]) -> dict[str, Any]:
+    return _json(said.get(EXPORT_KEY, b""))
+
+
+def _json(text: str | bytes) -> dict[str, Any]:
     try:
-        source = json.loads(said.get(EXPORT_KEY, b"{}"))
+        source = json.loads(text)
     except ValueError:
         return {}
     return source if isinstance(source, dict) else {}

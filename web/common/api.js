@@ -58,6 +58,8 @@ export const markEvent = (session, event) => call("POST", `/sessions/${id(sessio
 /** @type {(name: string) => Promise<Take>} */
 export const startTake = (name) => call("POST", "/takes", { name });
 /** @type {(take: string) => Promise<Take>} */
+export const getTake = (take) => call("GET", `/takes/${id(take)}`);
+/** @type {(take: string) => Promise<Take>} */
 export const stopTake = (take) => call("POST", `/takes/${id(take)}/stop`);
 /** @type {(take: string, event: object) => Promise<Take>} */
 export const markTake = (take, event) => call("POST", `/takes/${id(take)}/events`, event);
@@ -107,3 +109,5 @@ export const listFormats = () => call("GET", "/formats");
 /** Of a download, with marks if there are any; Parquet without them is the sealed file itself. */
 export const dataAddress = (session, format, part = "") =>
   `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marks ? "&marks=true" : ""}${part}`;
+/** Of a download of all sessions of a take. */
+export const takeDataAddress = (take, format, part = "") => `${PREFIX}/takes/${id(take)}/data?format=${format}${part}`;

@@ -61,7 +61,8 @@ export class Plotted {
     this.takeWhole(whole);
     if (first) {
       this.listen();
-      quietly(async () => { await this.downloads.load(); this.downloads.offer(this.plots.whole); this.drawLinks(); });
+      const offer = () => { this.downloads.offer(this.plots.whole); this.drawLinks(); };
+      quietly(async () => { await this.downloads.load(session, offer); offer(); });
     }
     this.draw();
     if (first || sealed || grown) await this.loadBeside(whole, sealed);

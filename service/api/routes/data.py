@@ -2,38 +2,30 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from base64 import b64encode
-from collections.abc import AsyncIterator, Iterator
 from http import HTTPStatus
 from typing import Annotated
 
-import pyarrow as pa
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import FileResponse, StreamingResponse
-from pydantic import Field
-from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
+from fastapi.responses import FileResponse
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
 
-from devices.errors import StateError, UnknownError, UsageError
+from devices.errors import StateError
 from service.api.problems import problem
-from service.api.routes.access import SecondsQuery, ServerState, has_it, present, problems
+from service.api.routes.access import ServerState, has_it, present, problems
+from service.api.routes.data_query import DataQuery
+from service.api.routes.made import Chunks, known, made, said_of_marks, tag_of_made
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.sessions.frames_so_far import FramesSoFar
 from service.sessions.so_far import SoFar
-from service.version import SOFTWARE
-from storage.clock.file import CLOCK_NAME
-from storage.file_hash import sha256_of
-from storage.formats.export import ClockName, Export
+from storage.formats.export import Export
 from storage.formats.marks import TIMES, Marks, place
-from storage.formats.options import FormatOptions
 from storage.formats.sealed import export_of, marks_of
-from storage.formats.slice import Slice
-from storage.formats.written.format import Format
 from storage.formats.written.parquet import PARQUET
-from storage.formats.written.registry import FORMATS, FormatName, format_named
+from storage.formats.written.registry import FORMATS
 from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
@@ -41,65 +33,7 @@ router = APIRouter(prefix="/sessions", tags=["data"])
 _CHUNK = 256 << 10  # three times the default's throughput (performance.md)
 _SINGLE_RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{0,18})|-(\d{1,18}))")
 _YEAR_S = 31_536_000
-_MEDIA_TYPES = [known.media_type for known in FORMATS.values()]
-
-
-class DataQuery(SecondsQuery, FormatOptions):
-    """Which data, and how."""
-
-    format: FormatName = PARQUET.name
-    columns: str | None = Field(
-        default=None,
-        description="Names with commas between: of all tiles (`force_n`) or one (`force_n_0`).",
-        examples=["t_ns,grf_n,force_n_0"],
-    )
-    clock: ClockName = Field(
-        default="node",
-        description="`server` adds `t_server_ns`, the frame's instant in the server's UTC, and its "
-        "bound `t_server_uncertainty_ns`; null where the clocks were not compared.",
-    )
-
-    marks: bool | None = Field(
-        default=None,
-        description="Adds `event`: what people marked, at the frame nearest in time; null "
-        "elsewhere. Left out: true, but false for Parquet, which is then the sealed file.",
-    )
-
-    @property
-    def to(self) -> Format:
-        """The format."""
-        return format_named(self.format)
-
-    @property
-    def has_marks(self) -> bool:
-        """Are marks wanted?"""
-        return self.to.is_marked if self.marks is None else self.marks
-
-    @property
-    def options(self) -> FormatOptions:
-        """Of the format."""
-        return FormatOptions(**{name: getattr(self, name) for name in FormatOptions.model_fields})
-
-    @property
-    def slice(self) -> Slice:
-        """Rows and columns."""
-        names = [name.strip() for name in (self.columns or "").split(",")]
-        return Slice(self.start_s, self.end_s, tuple(name for name in names if name))
-
-    @property
-    def canonical(self) -> str:
-        """The same for queries that ask for the same."""
-        part = self.slice
-        columns = ",".join(part.columns)
-        rows = f"{part.start_s}|{part.end_s}"
-        options = self.options.model_dump_json(exclude_none=True)
-        return f"{self.format}|{rows}|{columns}|{self.clock}|{self.has_marks}|{options}"
-
-    @property
-    def is_stored(self) -> bool:
-        """Is it the sealed file as it is?"""
-        is_plain = self.clock == "node" and not self.has_marks and not self.options.set_names
-        return self.to is PARQUET and self.slice.is_all and is_plain
+MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
 
 
 @router.head("/{session_id}/data", include_in_schema=False)
@@ -111,7 +45,7 @@ class DataQuery(SecondsQuery, FormatOptions):
     responses={
         200: {
             "description": "The data.",
-            "content": {media_type.split(";")[0]: {} for media_type in _MEDIA_TYPES},
+            "content": {media_type.split(";")[0]: {} for media_type in MEDIA_TYPES},
         },
         206: {"description": "A range of the stored file."},
         304: {"description": "It is what If-None-Match names."},
@@ -136,14 +70,12 @@ async def data(
     while a session is recorded it is what there is so far. `Foottile-Complete` says whether frames
     are missing, `Foottile-Marks` how many marks are in it and how many could not be placed.
     """
-    session = server.sessions.get(session_id)
+    session = known(server.sessions.get(session_id))
     ledger = server.recorder.ledger(session_id)
     complete = "lossy" if ledger.lossy else str(ledger.complete).lower()
     headers = {"Foottile-Complete": complete}
-    if session.state == "sealed" and session.sha256 is None:
-        raise UnknownError(f"session {session_id}: {session.problem}")
     if session.state != "sealed" and query.to.needs_sealed:
-        others = [known.name for known in FORMATS.values() if not known.needs_sealed]
+        others = [each.name for each in FORMATS.values() if not each.needs_sealed]
         raise StateError(
             f"session {session_id} is {session.state}, and {query.to.title} is made when it is "
             "sealed",
@@ -193,51 +125,17 @@ def _stored(
 async def _made(
     session: Session, query: DataQuery, request: Request, server: Server, headers: dict[str, str]
 ) -> Response:
-    beside = ""
-    if query.clock == "server" or query.has_marks:  # marks are placed by the clocks
-        beside = await run_in_threadpool(_clocks_hash, session, server)
-    if query.has_marks:
-        beside += "".join(event.model_dump_json() for event in session.events)
-    if session.sha256 is not None:
-        weak, content = "", f"{session.sha256}|{pa.__version__}"
-    else:
-        recorded = server.recorder.ledger(session.id).recorded
-        weak, content = "W/", f"{session.id}|{session.state}|{recorded}"
-    about = f"{content}|{query.canonical}|{beside}|{SOFTWARE}"
-    tag = hashlib.sha256(about.encode()).hexdigest()
+    tag = await tag_of_made(session, query, server)
+    weak = "" if session.sha256 is not None else "W/"
     headers |= {"ETag": f'{weak}"{tag}"'}
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
     if has_it(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    headers["Content-Disposition"] = f'attachment; filename="{session.id}.{query.to.ending}"'
     marks = None
     if query.has_marks:
         marks = await run_in_threadpool(_marks, session, query, server)
-        left_out = len(marks.left_out)
-        headers["Foottile-Marks"] = f"placed={len(marks.all) - left_out}, left-out={left_out}"
-    chunks = _chunks(session, query, server, marks)
-    # The first chunk now: what is wrong with the query is then an answer, not a broken download.
-    first = await run_in_threadpool(next, chunks, None)
-    if first is None:
-        raise UsageError("the session has no frames")
-    if request.method == "HEAD":
-        answer = Response(headers=headers, media_type=query.to.media_type)
-        del answer.headers["content-length"]  # it is not known before it is made
-        return answer
-
-    async def body() -> AsyncIterator[bytes]:
-        yield first
-        async for chunk in iterate_in_threadpool(chunks):
-            yield chunk
-
-    return StreamingResponse(body(), headers=headers, media_type=query.to.media_type)
-
-
-def _clocks_hash(session: Session, server: Server) -> str:
-    path = server.sessions.folder.path(session.id) / CLOCK_NAME
-    if session.sha256 is not None and path.is_file():
-        return sha256_of(path)
-    return hashlib.sha256(repr(session.clock).encode()).hexdigest()
+        headers |= said_of_marks([marks])
+    return await made(_chunks(session, query, server, marks), query, session.id, request, headers)
 
 
 def _marks(session: Session, query: DataQuery, server: Server) -> Marks:
@@ -254,9 +152,7 @@ def _marks(session: Session, query: DataQuery, server: Server) -> Marks:
     return place(session.events, times, sources.clock_table(), query.slice)
 
 
-def _chunks(
-    session: Session, query: DataQuery, server: Server, marks: Marks | None
-) -> Iterator[bytes]:
+def _chunks(session: Session, query: DataQuery, server: Server, marks: Marks | None) -> Chunks:
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None

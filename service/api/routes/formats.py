@@ -22,6 +22,7 @@ class FormatView(BaseModel):
     takes_columns: bool = Field(description="Can columns be chosen?")
     needs_forces: bool = Field(description="Not of a session without estimates.")
     needs_sealed: bool = Field(description="Not of a session that is not sealed.")
+    holds_several: bool = Field(description="Can all sessions of a take be in one file?")
     frames_max: int | None = Field(description="Ask for a slice of more; null: any number.")
     missing: str | None = Field(description="What this server lacks for it; null: nothing.")
 

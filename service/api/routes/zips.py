@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
-from starlette.concurrency import iterate_in_threadpool
 
 from devices.errors import StateError, UnknownError, UsageError
 from service.api.routes.access import ServerState, present, problems
+from service.api.routes.made import sent
 from storage.formats.zipped import Sealed, zipped
 from storage.sessions.folder import FRAMES_NAME, Session
 
@@ -53,22 +52,12 @@ async def zip_sessions(
     chosen = [
         _sealed(server.sessions.get(name), server.sessions.folder.path(name)) for name in names
     ]
-    pieces = zipped(chosen)
-
-    async def body() -> AsyncIterator[bytes]:
-        try:
-            async for piece in iterate_in_threadpool(pieces):
-                if piece:
-                    yield piece
-        finally:
-            pieces.close()  # who asked may have gone: files are not left open
-
     name = names[0] if len(names) == 1 else f"foottile-{len(names)}-sessions"
     headers = {
         "Content-Disposition": f'attachment; filename="{name}.zip"',
         "Cache-Control": "private, no-store",
     }
-    return StreamingResponse(body(), headers=headers, media_type="application/zip")
+    return StreamingResponse(sent(zipped(chosen)), headers=headers, media_type="application/zip")
 
 
 def _sealed(session: Session, folder: Path) -> Sealed:

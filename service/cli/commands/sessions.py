@@ -31,6 +31,7 @@ from service.cli.options import (
     stdout,
 )
 from storage.formats.options import FormatOptions
+from storage.formats.written.registry import SEVERAL
 from storage.sessions.beside import EVENTS_NAME
 
 if TYPE_CHECKING:
@@ -134,8 +135,15 @@ def sessions_command(
 @with_format_options
 @needs_extra("server", "`foottile pull`")
 def pull_command(
-    session: Annotated[str, typer.Argument(help="Id of the session.")],
     out: Annotated[Path, typer.Option(help="Folder to put it in; made if absent.")],
+    session: Annotated[str | None, typer.Argument(help="Id of the session.")] = None,
+    take: Annotated[
+        str | None,
+        typer.Option(
+            help="All sessions of this take, as one file on the server's axis of time: "
+            f"--format {', '.join(SEVERAL)}."
+        ),
+    ] = None,
     server: ServerOption = None,
     start_s: StartOption = None,
     end_s: EndOption = None,
@@ -147,19 +155,23 @@ def pull_command(
 ) -> None:
     """Download a sealed session: data, description, events. Goes on where it was broken off.
 
-    The data is compared with its hash. Some seconds or columns, or another format, are made by the
-    server for the asking, and are one file in --out. Exit code 3: the session is complete on disk,
-    but lossy.
+    The data is compared with its hash. Some seconds or columns, another format, or all of a take,
+    are made by the server for the asking, and are one file in --out. Exit code 3: the session is
+    complete on disk, but lossy.
     """
     from service.client import Client
     from storage.formats.slice import Slice
     from storage.formats.written.parquet import PARQUET
-    from storage.formats.written.registry import format_named
+    from storage.formats.written.registry import format_named, together_named
 
-    chosen = format_named(to)
+    if (session is None) == (take is None):
+        raise UsageError("what is to be pulled", expected="the id of a session, or --take")
+    chosen = format_named(to) if take is None else together_named(to)
     part = Slice(start_s, end_s, _names(columns))
-    with Client(server or SERVER) as client, progress(f"pulling {session}"):
-        if part.is_all and chosen is PARQUET and not options.set_names:
+    with Client(server or SERVER) as client, progress(f"pulling {session or take}"):
+        if session is None:
+            pulled = client.pull_take(str(take), out, part, chosen, options)
+        elif part.is_all and chosen is PARQUET and not options.set_names:
             pulled = client.pull(session, out)
         else:
             pulled = client.pull_made(session, out, part, chosen, options)
@@ -205,11 +217,14 @@ def export_command(
             "if there are events beside the frames.",
         ),
     ] = None,
+    take: Annotated[
+        str | None, typer.Option(help="Those of this take in --data, --together.")
+    ] = None,
     together: Annotated[
         bool,
         typer.Option(
             "--together",
-            help="Two sessions or more into one file, on the server's axis of time: c3d.",
+            help=f"All of them into one file, on the server's axis of time: {', '.join(SEVERAL)}.",
         ),
     ] = False,
     manifest: ManifestOption = None,
@@ -234,6 +249,10 @@ def export_command(
 
     if clock not in CLOCKS:
         raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
+    if take is not None:
+        if sessions:
+            raise UsageError("--take and sessions are two ways to name them", remedy="Name one")
+        sessions, together = _of_take(take, data), True
     part = Slice(start_s, end_s, _names(columns))
     wanted = ExportOptions(
         format_named(to).name, part, "server" if together else clock, marks, options
@@ -273,6 +292,20 @@ def export_command(
 
 def _names(columns: str | None) -> tuple[str, ...]:
     return tuple(name.strip() for name in (columns or "").split(",") if name.strip())
+
+
+def _of_take(take: str, data: Path | None) -> list[str]:
+    """Ids of a take's sessions, in the order of their nodes.
+
+    Raises:
+        UsageError: there is none.
+    """
+    from storage.sessions.choice import Choice
+
+    found = _in_folder(data_folder(data), Choice(take=take))
+    if not found:
+        raise UsageError(f"no session of take {take!r}", where=str(data_folder(data)))
+    return [each["id"] for each in sorted(found, key=lambda each: (each["node"], each["id"]))]
 
 
 def _in_folder(data: Path, choice: Choice) -> list[dict[str, Any]]:

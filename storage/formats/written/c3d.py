@@ -24,7 +24,7 @@ from devices.arrays import Floats
 from devices.errors import StorageError
 from devices.frames import TileInfo
 from storage.formats.export import Export
-from storage.formats.written.described import ascii_of, described
+from storage.formats.written.described import ascii_of, clock_bound, described
 from storage.formats.written.format import Format
 from storage.formats.written.reaction import FURTHER, Reaction, reactions_of
 from storage.schema import KNOWN
@@ -158,7 +158,6 @@ def c3d_content(
 
 
 def _said(found: Reaction, export: Export, filling: int, events: int) -> dict[str, str]:
-    filled = f"; the last {filling} samples fill the last frame: NaN" if filling else ""
     text = f"{found.marks} marks, {len(found.events) - found.marks} begins and ends of contact"
     if events > EVENTS_MAX:
         text += (
@@ -169,18 +168,17 @@ def _said(found: Reaction, export: Export, filling: int, events: int) -> dict[st
         **described(export, found.steady.begin_ns),
         "AXES": "the foot frame: x forward, y to the left, z up the segment, origin at the ankle; "
         "the platform moves with the foot",
-        "TIME_BASE": found.steady.says() + filled,
-        "UNKNOWN": "NaN: no frame, a saturated or missing tile, or no COP stated while in contact; "
-        "estimate_status says which, grf_at_least_n is a lower bound",
+        "RESAMPLED": found.steady.says(),
+        "FILLED": f"no number; at the end {filling} samples, NaN, fill the last frame"
+        if filling
+        else "nothing",
+        "MASKED": "NaN: no frame, a saturated or missing tile, or no COP stated while in contact; "
+        "estimate_status says which, grf_at_least_n is a lower bound. Without contact Fz, Mx and "
+        "My are 0, and grf_n is what was measured",
         "SHEAR": "not measured: Fx, Fy and Mz are 0",
         "EVENTS": text,
     }
-    if found.uncertainty_s is not None:
-        said["CLOCK_UNCERTAINTY"] = (
-            f"the truth is within {np.nanmax(found.uncertainty_s) * 1e3:.3f} ms of the axis at "
-            f"most: channel {_UNCERTAINTY}; between two platforms, within the sum of both"
-        )
-    return said
+    return said | ({} if found.uncertainty_s is None else clock_bound(found.uncertainty_s))
 
 
 def _further(found: Reaction, export: Export) -> Iterator[Channel]:

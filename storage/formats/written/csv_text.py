@@ -1,7 +1,12 @@
-"""CSV, in which no text is a spreadsheet's formula."""
+"""CSV, in which no text is a spreadsheet's formula.
+
+It has no place for what a file says of itself, so that is the first cell of a column, `about`, that
+is empty elsewhere: every reader of tables takes that.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any, BinaryIO
 
@@ -12,6 +17,7 @@ import pyarrow.csv as pacsv
 from storage.formats.export import Export
 from storage.formats.written.format import TABLE_OPTIONS, Format
 from storage.formats.written.sink import in_pieces
+from storage.sessions.file import EXPORT_COLUMN
 
 _FORMULA = r"^([=+\-@'\t\r\n\x{ff0b}\x{ff0d}\x{ff1d}\x{ff20}])"
 """What a spreadsheet takes for the beginning of a formula, and the sign that says it is none."""
@@ -76,9 +82,22 @@ def _without_formulas(table: pa.Table) -> pa.Table:
     return table
 
 
+def _with_about(tables: Iterator[pa.Table], about: str) -> Iterator[pa.Table]:
+    """Tables with a column more: this text in the first row of all, and nothing in the others."""
+    for table in tables:
+        cells = pa.nulls(len(table), pa.string())
+        if about and len(table):
+            cells = pa.concat_arrays([pa.array([about]), cells[1:]])
+            about = ""
+        yield table.append_column(EXPORT_COLUMN, cells)
+
+
 def _write(export: Export) -> Iterator[bytes]:
     opened = _CommaWriter if export.options.decimal == "comma" else _Writer
-    return in_pieces(export.tables(), opened)
+    tables, has_about = export.tables(), export.options.about
+    if has_about or (has_about is None and not export.part.columns):
+        tables = _with_about(tables, json.dumps(export.about))
+    return in_pieces(tables, opened)
 
 
 CSV = Format(
@@ -87,5 +106,5 @@ CSV = Format(
     "spreadsheets, MATLAB, R",
     "text/csv; charset=utf-8; header=present",
     _write,
-    options=(*TABLE_OPTIONS, "decimal"),
+    options=(*TABLE_OPTIONS, "decimal", "about"),
 )

@@ -6,12 +6,15 @@ import unicodedata
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+import numpy as np
+
+from devices.arrays import Floats
 from storage.formats.export import Export
 from storage.formats.facts import completeness
 
 
 def described(export: Export, begin_ns: int) -> dict[str, str]:
-    """Facts of an export by name, as text in ASCII.
+    """Facts of an export by name, as text in ASCII; who resamples or fills says so in its place.
 
     Args:
         export: what is written.
@@ -25,6 +28,11 @@ def described(export: Export, begin_ns: int) -> dict[str, str]:
         "SESSION": str(about.get("session") or "none: simulated or estimated by itself"),
         "NODE": export.info.node,
         "COMPLETE": _in_words(notes, export.source),
+        "TIME_BASE": str(about["time_base"]),
+        "AXES": str(about["axes"]),
+        "RESAMPLED": str(about["resampled"]),
+        "FILLED": str(about["filled"]),
+        "MASKED": str(about["masked"]),
         "BEGIN_T_NS": str(begin_ns),
         "BEGIN_UTC": f"{begin}.{rest:09d}Z by {clock} clock"
         + ("" if export.info.clock_set or export.clock is not None else ", which was not set"),
@@ -50,6 +58,18 @@ def _in_words(notes: Mapping[str, object], source: Mapping[str, object]) -> str:
     ledger = notes.get("ledger")
     missed = ledger.get("missed_slots") if isinstance(ledger, dict) else None
     return f"{text}; {missed} slots in which no frame was taken" if missed else text
+
+
+def clock_bound(uncertainty_s: Floats) -> dict[str, str]:
+    """How far a session's frames may be from the axis of the server's time.
+
+    Args:
+        uncertainty_s: bound of each sample; NaN where there is no frame.
+    """
+    return {
+        "CLOCK_UNCERTAINTY": f"the truth is within {np.nanmax(uncertainty_s) * 1e3:.3f} ms of the "
+        "axis at most; between two sessions, within the sum of both"
+    }
 
 
 def ascii_of(text: str) -> str:

@@ -82,10 +82,7 @@ class Format:
                 time that the others share.
         """
         if self.write_together is None:
-            raise UsageError(
-                f"{self.name} holds one session only",
-                remedy="Write a file for each: leave --together out",
-            )
+            raise UsageError(f"{self.name} holds one session only")
         for export in exports:
             self._check(export)
             if export.clock is None:
@@ -94,6 +91,11 @@ class Format:
                 )
         with self._needed():
             yield from self.write_together(exports)
+
+    @property
+    def holds_several(self) -> bool:
+        """Can several sessions be in one file?"""
+        return self.write_together is not None
 
     def _needed(self) -> AbstractContextManager[None]:
         if self.extra is None:
@@ -118,6 +120,7 @@ class Format:
             raise UsageError(
                 f"{self.name} holds forces, and this session has none"
                 + (f": {why}" if isinstance(why, str) else ""),
+                where=export.called,
                 remedy="Add them with `foottile estimate`, or ask for its counts as Parquet, "
                 "Arrow or CSV",
             )

@@ -16,6 +16,7 @@ from devices.arrays import Floats, Times
 from devices.errors import UsageError
 from storage.formats.export import Export
 from storage.formats.written.steady import Steady, axis_of, steady
+from storage.formats.written.together import instants_of
 from storage.schema import SERVER_TIME, Array
 
 NEEDED = ("t_ns", "contact", "grf_n", "cop_x_m", "cop_y_m", "estimate_status")
@@ -121,14 +122,17 @@ def _frames(
     names += ["event"] if export.marks is not None else []
     names += ["part"] if "part" in present else []
     columns = export.whole(list(dict.fromkeys(["seq", *names])), frames_max=frames_max)
-    t_ns = columns["t_server_ns" if export.clock is not None else "t_ns"]
+    t_ns = instants_of(export, columns)
     if not len(t_ns):
         raise UsageError(
-            "no frame is in this slice", expected="a slice with frames, as this format needs them"
+            "no frame is in this slice",
+            where=export.called,
+            expected="a slice with frames, as this format needs them",
         )
     if not np.isfinite(columns["grf_n"]).any():
         raise UsageError(
             f"none of its {len(t_ns)} frames has a force (estimate_status {_bits(columns)})",
+            where=export.called,
             remedy="Ask for Parquet, Arrow or CSV: they have counts and bounds",
         )
     return t_ns, columns

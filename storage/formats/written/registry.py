@@ -12,9 +12,9 @@ from storage.formats.written.arrow import ARROW
 from storage.formats.written.c3d import C3D
 from storage.formats.written.csv_text import CSV
 from storage.formats.written.format import Format
-from storage.formats.written.matlab import MATLAB
+from storage.formats.written.matlab.file import MATLAB
 from storage.formats.written.mcap.file import MCAP
-from storage.formats.written.opensim import OPENSIM
+from storage.formats.written.opensim.file import OPENSIM
 from storage.formats.written.parquet import PARQUET
 from storage.formats.written.xdf import XDF
 
@@ -33,6 +33,10 @@ FORMATS: Mapping[str, Format] = {
 }
 
 
+SEVERAL = tuple(known.name for known in FORMATS.values() if known.holds_several)
+"""Those that several sessions can be in."""
+
+
 def format_named(name: str) -> Format:
     """The format that people call so.
 
@@ -42,6 +46,22 @@ def format_named(name: str) -> Format:
     if name not in FORMATS:
         raise UsageError(f"no format {name[:80]!r}", expected="one of " + ", ".join(FORMATS))
     return FORMATS[name]
+
+
+def together_named(name: str) -> Format:
+    """The same, of several sessions in one file.
+
+    Raises:
+        UsageError: there is none, or it holds one session only.
+    """
+    found = format_named(name)
+    if not found.holds_several:
+        raise UsageError(
+            f"{name} holds one session only",
+            expected="one of " + ", ".join(SEVERAL),
+            remedy="Or ask for each session by itself",
+        )
+    return found
 
 
 def _known(name: str) -> str:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from devices.arrays import Floats, Times
 from devices.errors import UsageError
-from storage.schema import NO_INSTANT, Array
+from storage.schema import Array
 
 BRIDGED_PERIODS = 2.5
 """No line is drawn over more: in one slot a frame may be late, or not taken."""
@@ -106,7 +106,7 @@ def axis_of(streams: Sequence[tuple[Times, float]], samples_max: int) -> Axis:
         samples_max: more are refused.
 
     Raises:
-        UsageError: instants run back or are not known, or there were too many samples.
+        UsageError: instants run back, or there were too many samples.
     """
     for t_ns, _ in streams:
         _check_instants(t_ns)
@@ -153,12 +153,6 @@ def steady(axis: Axis, t_ns: Times, seq: Array, part: Array | None) -> Steady:
 
 
 def _check_instants(t_ns: Times) -> None:
-    unknown = int((t_ns == NO_INSTANT).sum())
-    if unknown:
-        raise UsageError(
-            f"of {unknown} frames the server's time is not known",
-            remedy="Ask for the node's clock, or a slice of a part whose clock was compared",
-        )
     steps_ns = np.diff(t_ns)
     if (steps_ns <= 0).any():
         at = int(np.flatnonzero(steps_ns <= 0)[0])

@@ -5,6 +5,8 @@ there is a stream of 32-bit floats, with all estimates and counts, and one of 64
 numbers that need them; of all together a stream of marks. Instants are the node's, in seconds since
 1970, and with the server's clock every few seconds a clock offset leads from them to the server's,
 as LSL's own recorder has it. No rate is stated, so that readers leave every instant as it is.
+Several sessions are one after the other, with streams of their own; readers join them by the
+offsets.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, count
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
@@ -19,7 +22,8 @@ import pyarrow as pa
 
 from storage.formats.export import Export
 from storage.formats.written.format import Format
-from storage.schema import KNOWN, NO_INSTANT, Array
+from storage.formats.written.together import distinct, instants_of
+from storage.schema import KNOWN, NO_INSTANT, SERVER_TIME, Array
 
 _MAGIC = b"XDF:"
 _FILE_HEADER, _STREAM_HEADER, _SAMPLES, _CLOCK_OFFSET, _STREAM_FOOTER = 1, 2, 3, 4, 6
@@ -27,8 +31,10 @@ _OFFSET_EVERY_NS = 5_000_000_000
 """As LSL's recorder does."""
 _COUNTERS = ("seq", "servo_counts", "servo_age_us")
 """Beyond what 32-bit floats count exactly."""
-_TIMES = ("time_s", "time_utc", "t_ns", "t_mono_ns", "t_server_ns", "t_server_uncertainty_ns")
+_TIMES = ("time_s", "time_utc", "t_ns", "t_mono_ns", "t_server_ns")
 """Every sample has its instant."""
+_BOUND = SERVER_TIME[1].name
+"""Of each sample's time by the server's clock: a channel, whatever columns were chosen."""
 
 
 @dataclass
@@ -66,45 +72,75 @@ class _Stream:
 
 
 def _write(export: Export) -> Iterator[bytes]:
-    chosen = {
-        name: of
-        for name, of in export.chosen().items()
-        if of not in _TIMES and not pa.types.is_string(KNOWN[of].type)
-    }
-    asked = [*chosen, "t_ns"]
-    asked += ["part"] if "part" in export.content.names else []
-    asked += ["t_server_ns"] if export.clock is not None else []
-    asked += ["event"] if export.marks is not None else []
-    pieces = export.pieces(asked)
-    first = next(pieces)  # what is wrong is said before anything is given away
-    file = _File(export, chosen)
-    yield file.header()
-    yield file.piece(first)
-    for piece in pieces:
-        yield file.piece(piece)
-    yield file.footers()
+    return _write_together([export])
 
 
-class _File:
-    """The streams of a file, as far as it is written."""
+def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
+    numbers = count(1)
+    names = distinct([export.info.node for export in exports])
+    sessions = [_Session(*each, numbers) for each in zip(exports, names, strict=True)]
+    pieces = [session.pieces(is_alone=len(exports) == 1) for session in sessions]
+    firsts = [next(each) for each in pieces]  # what is wrong is said before anything is given away
+    yield _MAGIC + _header(exports)
+    for session, first, further in zip(sessions, firsts, pieces, strict=True):
+        yield session.begin()
+        for piece in chain((first,), further):
+            yield session.piece(piece)
+        yield session.footers()
 
-    def __init__(self, export: Export, chosen: Mapping[str, str]) -> None:
-        self._export, self._chosen = export, chosen
+
+def _header(exports: Sequence[Export]) -> bytes:
+    """What comes first, with what the file says of itself, or of each session in it."""
+    info = Element("info")
+    _texts(info, {"version": "1.0", "software": exports[0].info.software})
+    several = SubElement(info, "sessions") if len(exports) > 1 else None
+    for export in exports:
+        into = info if several is None else SubElement(several, "session")
+        _texts(into, {k: str(v) for k, v in export.about.items()})
+    return _chunk(_FILE_HEADER, tostring(info, xml_declaration=True))
+
+
+class _Session:
+    """The streams of a session, as far as they are written.
+
+    Args:
+        export: the session.
+        name: with which those of its streams begin.
+        numbers: of streams, in all the file.
+    """
+
+    def __init__(self, export: Export, name: str, numbers: Iterator[int]) -> None:
+        self._export, self._name, self._numbers = export, name, numbers
+        self._chosen = {
+            name: of
+            for name, of in export.chosen().items()
+            if of not in _TIMES and not pa.types.is_string(KNOWN[of].type)
+        }
+        if export.clock is not None:
+            self._chosen[_BOUND] = _BOUND
         self._streams: list[_Stream] = []
         self._parts: dict[int, list[_Stream]] = {}
         self._marks: _Stream | None = None
         self._next_offset_ns: dict[int, int] = {}
 
-    def header(self) -> bytes:
-        """What comes first, with what the file says of itself."""
-        info = Element("info")
-        said = {"version": "1.0", **{k: str(v) for k, v in self._export.about.items()}}
-        _texts(info, {**said, "software": self._export.info.software})
-        begin = _MAGIC + _chunk(_FILE_HEADER, tostring(info, xml_declaration=True))
+    def pieces(self, *, is_alone: bool) -> Iterator[Mapping[str, Array]]:
+        """Its frames. Beside others it has to have the server's time: it is all they share."""
+        export = self._export
+        asked = [*self._chosen, "t_ns"]
+        asked += ["part"] if "part" in export.content.names else []
+        asked += ["t_server_ns"] if export.clock is not None else []
+        asked += ["event"] if export.marks is not None else []
+        for piece in export.pieces(asked):
+            if not is_alone:
+                instants_of(export, piece)
+            yield piece
+
+    def begin(self) -> bytes:
+        """The header of its marks."""
         if self._export.marks is None:
-            return begin
+            return b""
         self._marks, header = self._opened("marks", "Markers", ["label"], "string")
-        return begin + header
+        return header
 
     def piece(self, piece: Mapping[str, Array]) -> bytes:
         """Chunks of some frames."""
@@ -191,11 +227,11 @@ class _File:
     ) -> tuple[_Stream, bytes]:
         """A further stream, and its header."""
         dtype = {"float32": "<f4", "double64": "<f8", "string": ""}[format_]
-        stream = _Stream(len(self._streams) + 1, columns, dtype)
+        stream = _Stream(next(self._numbers), columns, dtype)
         self._streams.append(stream)
         node = self._export.info.node
         info = Element("info")
-        said = {"name": f"{node} {name}", "type": kind, "channel_count": str(len(columns))}
+        said = {"name": f"{self._name} {name}", "type": kind, "channel_count": str(len(columns))}
         said |= {"nominal_srate": "0", "channel_format": format_}
         source = f"{node} {self._export.about.get('session') or ''} {name}"
         _texts(info, {**said, "source_id": source, "version": "1.1", "hostname": node})
@@ -228,4 +264,5 @@ XDF = Format(
     "pyxdf, beside LabStreamingLayer",
     "application/x-xdf",
     _write,
+    write_together=_write_together,
 )

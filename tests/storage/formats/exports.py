@@ -102,11 +102,12 @@ def exported(
 
 
 def read(content: bytes, to: str) -> pa.Table:
+    """The columns of frames; CSV has one more, of what is said of the file."""
     if to == "parquet":
         return pq.read_table(io.BytesIO(content))
     if to == "arrow":
         return pa.ipc.open_stream(content).read_all()
-    return pacsv.read_csv(
+    table = pacsv.read_csv(
         io.BytesIO(content),
         # A row of which the one column asked for is not known is an empty line.
         parse_options=pacsv.ParseOptions(ignore_empty_lines=False),
@@ -115,6 +116,7 @@ def read(content: bytes, to: str) -> pa.Table:
             strings_can_be_null=False,
         ),
     )
+    return table.drop_columns(["about"]) if "about" in table.column_names else table
 
 
 def values(table: pa.Table) -> dict[str, list[object]]:

@@ -19,13 +19,14 @@ from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
 from storage.formats.export import content_of
 from storage.formats.marks import NEAREST_NS, TIMES, Marks, place
+from storage.formats.options import FormatOptions
 from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.folder import Event
 from storage.sessions.footer import NOTES_KEY
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
-from tests.storage.formats.exports import TABLES, export
+from tests.storage.formats.exports import NO_TIMES, TABLES, export
 
 UTC_NS = 10**18
 OFFSET_NS = 7_000_000_000
@@ -151,11 +152,25 @@ def test_any_pieces_give_the_frames_that_a_search_of_all_frames_gives(
 # --- in a file ------------------------------------------------------------------------------------
 
 
-def exported(to: str, marks: Marks | None, columns: tuple[str, ...] = ()) -> bytes:
+def exported(
+    to: str,
+    marks: Marks | None,
+    columns: tuple[str, ...] = (),
+    options: FormatOptions = NO_TIMES,
+) -> bytes:
     frames, part = session()
     pieces = ((frames.rows(a, a + 20), {"part": part[a : a + 20]}) for a in range(0, ROWS, 20))
     return b"".join(
-        export(content_of(pieces), make_array(), {}, to, Slice(columns=columns), None, marks)
+        export(
+            content_of(pieces),
+            make_array(),
+            {},
+            to,
+            Slice(columns=columns),
+            None,
+            marks,
+            options=options,
+        )
     )
 
 
@@ -177,8 +192,10 @@ def test_the_column_is_the_last_one_and_all_others_keep_their_bits(to: str) -> N
 
 
 def test_in_csv_the_other_columns_keep_their_bytes() -> None:
-    lines = exported("csv", placed(at(3 * PERIOD_NS, labels=["stone"]))).splitlines()
-    plain = exported("csv", None).splitlines()
+    whole = FormatOptions(times=False, about=False)
+    marked = placed(at(3 * PERIOD_NS, labels=["stone"]))
+    lines = exported("csv", marked, options=whole).splitlines()
+    plain = exported("csv", None, options=whole).splitlines()
     ends = [line.removeprefix(other) for line, other in zip(lines, plain, strict=True)]
     assert ends == [b',"event"', *[b',"stone"' if row == 3 else b"," for row in range(ROWS)]]
 

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from devices.frames import ArrayInfo
-from storage.formats.export import Export, content_of
+from storage.clock.bounds import Rows
+from storage.clock.table import ClockTable, StreamFacts
+from storage.formats.export import Content, Export, content_of
 from storage.formats.slice import Slice
 from storage.schema import CONTACT_UNKNOWN, Array
-from tests.builders.arrays import make_array, make_tile
+from tests.builders.arrays import UTC_NS, make_array, make_tile
 from tests.builders.frames import make_frames, with_columns
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "formats.md"
@@ -110,9 +112,39 @@ def export_of_walk(
     kept = np.arange(count) if keep is None else keep
     given = {name: np.asarray(values)[kept] for name, values in (times or {}).items()}
     frames = with_columns(make_frames(kept, len(info.tiles)), **given)
-    pieces = (
-        (frames.rows(a, a + every), {name: v[kept][a : a + every] for name, v in columns.items()})
-        for a in range(0, len(kept), every)
-    )
-    made = Export(content_of(pieces), info, notes or {}, facts.pop("part", Slice()))
+
+    def content() -> Content:
+        return content_of(
+            (
+                frames.rows(a, a + every),
+                {name: v[kept][a : a + every] for name, v in columns.items()},
+            )
+            for a in range(0, len(kept), every)
+        )
+
+    # As often as a format likes, as a sealed file gives them.
+    again = replace(content(), read=lambda names: content().read(names))
+    made = Export(again, info, notes or {}, facts.pop("part", Slice()))
     return replace(made, **facts)
+
+
+LATE_NS = 300_000_000
+BOUND_NS = 400_000
+
+
+def compared(later_ns: int) -> ClockTable:
+    """A clock that is behind the server's by so much."""
+    boot_id = ARRAY.boot_id
+    rows = Rows(*np.array([[0], [later_ns], [BOUND_NS]], dtype=np.int64))
+    return ClockTable({boot_id: rows}, [StreamFacts(boot_id, UTC_NS, True)], [boot_id])
+
+
+def two_feet(*nodes: str, **facts: Any) -> list[Export]:
+    """The same walk on two nodes, of which the clock of the second is behind the first's."""
+    first, second = nodes or ("left", "right-2")
+    return [
+        export_of_walk(
+            info=ARRAY.model_copy(update={"node": node}), clock=compared(later_ns), **facts
+        )
+        for node, later_ns in ((first, 0), (second, LATE_NS))
+    ]

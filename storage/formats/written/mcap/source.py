@@ -8,10 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
-from devices.errors import UsageError
 from devices.frames import ArrayInfo
 from storage.formats.export import Export
-from storage.schema import KNOWN, NO_INSTANT, Array
+from storage.formats.written.together import instants_of
+from storage.schema import KNOWN, SERVER_TIME, Array
 
 SHOWN_NS = 50_000_000
 """The foot is drawn twenty times a second: more no screen needs, and it is most of the bytes."""
@@ -53,12 +53,14 @@ class Frames:
         flat: flat columns.
         shown: rows of which the foot is drawn.
         marks: row and text of what was marked.
+        uncertainty_ns: greatest bound of the instants; None: they are the node's own.
     """
 
     t_ns: Array
     flat: Mapping[str, Array]
     shown: list[int]
     marks: list[tuple[int, str]]
+    uncertainty_ns: int | None
 
     def tiles(self, name: str, count: int) -> Array:
         """One quantity of all tiles, (n, tiles), NaN where it is not known."""
@@ -82,22 +84,19 @@ def frames_of(export: Export, columns: list[str]) -> Iterator[Frames]:
         UsageError: as for `Export.pieces`; the server's time of a frame is not known.
     """
     asked = [*columns, "t_ns"]
-    asked += ["t_server_ns"] if export.clock is not None else []
+    asked += [column.name for column in SERVER_TIME] if export.clock is not None else []
     asked += ["event"] if export.marks is not None else []
     last_shown = -1
     for piece in export.pieces(asked):
-        t_ns = piece.get("t_server_ns", piece["t_ns"])
-        if (t_ns == NO_INSTANT).any():
-            raise UsageError(
-                "frames of this session have no server's time: their clock was not compared",
-                remedy="Ask for the node's clock, which is the default",
-            )
+        t_ns = instants_of(export, piece)
         turns = t_ns // SHOWN_NS
         shown = np.flatnonzero(np.diff(turns, prepend=last_shown))
         last_shown = int(turns[-1]) if len(turns) else last_shown
         events = piece.get("event", ())
         marks = [(row, text) for row, text in enumerate(events) if text is not None]
-        yield Frames(t_ns, piece, shown.tolist(), marks)
+        bound_ns = piece.get(SERVER_TIME[1].name)
+        worst_ns = None if bound_ns is None else int(bound_ns.max(initial=0))
+        yield Frames(t_ns, piece, shown.tolist(), marks, worst_ns)
 
 
 def colour(force_n: float) -> tuple[float, float, float, float]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,61 +11,40 @@ import pytest
 
 from devices.errors import StorageError, UsageError
 from devices.words import printable
-from storage.clock.bounds import Rows
-from storage.clock.table import ClockTable, StreamFacts
 from storage.formats.export import Export
 from storage.formats.marks import Mark, Marks
 from storage.formats.reference import Stated, read_reference
 from storage.formats.slice import Slice
 from storage.formats.written import c3d as written_c3d
 from storage.formats.written.c3d import C3D
-from storage.formats.written.registry import format_named
 from storage.sessions.folder import Event
-from tests.builders.arrays import UTC_NS
 from tests.storage.formats.walks import (
     ARRAY,
+    BOUND_NS,
+    LATE_NS,
     RATE_HZ,
     ROWS,
     STANCES,
+    compared,
     export_of_walk,
     lines_of_documents,
     saturated,
+    two_feet,
     walk,
 )
+from tests.storage.formats.written.readers import C3dFile
 
 pytest.importorskip("ezc3d")
-python_c3d = pytest.importorskip("c3d")
+pytest.importorskip("c3d")
 
 
-class Read:
-    """A file as the library `c3d` reads it: plain Python, and no part of ezc3d."""
+class Read(C3dFile):
+    """What was written of an export, or of several."""
 
     def __init__(self, export: Export | list[Export]) -> None:
         chunks = C3D.written_together(export) if isinstance(export, list) else C3D.written(export)
         self.content = b"".join(chunks)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that there are no points
-            self.reader = python_c3d.Reader(io.BytesIO(self.content))
-            pieces = [analog for _, _, analog in self.reader.read_frames(copy=True)]
-        self.analog = np.concatenate(pieces, axis=1)
-        self.labels = self.texts("ANALOG:LABELS")
-
-    def texts(self, name: str) -> list[str]:
-        parameter = self.reader.get(name)
-        width, *_ = parameter.dimensions
-        content = bytes(parameter.bytes).decode("ascii")
-        return [content[a : a + width].strip() for a in range(0, len(content), width)]
-
-    def text(self, name: str) -> str:
-        return " ".join(self.texts(f"FOOTTILE:{name}"))
-
-    def channel(self, name: str) -> Any:
-        return self.analog[self.labels.index(name)]
-
-    def events(self) -> list[tuple[str, float]]:
-        times = self.reader.get("EVENT:TIMES").float_array
-        seconds = np.ravel(times).reshape(-1, 2) @ [60.0, 1.0]
-        return list(zip(self.texts("EVENT:LABELS"), seconds, strict=True))
+        super().__init__(self.content)
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +179,7 @@ def test_lost_frames_are_empty_samples_and_it_is_said() -> None:
     np.testing.assert_array_equal(found.channel("Fz1")[700], np.float32(walk()["grf_n"][700]))
     said = "lossy: 40 disk_full; 3 slots in which no frame was taken"
     assert found.text("COMPLETE") == said
-    assert "40 samples are empty" in found.text("TIME_BASE")
+    assert "40 samples are empty" in found.text("RESAMPLED")
 
 
 def test_a_file_says_what_it_is_of(plain: Read) -> None:
@@ -228,7 +205,7 @@ def test_long_sessions_have_several_samples_a_frame_and_none_made_up(
     np.testing.assert_array_equal(found.channel("grf_n")[:ROWS], np.float32(walk()["grf_n"]))
     assert found.analog.shape[1] == 1001
     assert np.isnan(found.analog[:, 1000:]).all()
-    assert "the last 1 samples fill the last frame: NaN" in found.text("TIME_BASE")
+    assert "at the end 1 samples, NaN, fill the last frame" in found.text("FILLED")
 
 
 def test_read_as_a_reference_a_session_gives_its_own_force_and_cop(tmp_path: Path) -> None:
@@ -329,29 +306,13 @@ def test_names_of_nodes_and_serials_are_shown_and_not_obeyed() -> None:
 
 # --- several sessions -----------------------------------------------------------------------------
 
-LATE_NS = 300_000_000
-BOUND_NS = 400_000
 
-
-def compared(later_ns: int) -> ClockTable:
-    """A clock that is behind the server's by so much."""
-    boot_id = ARRAY.boot_id
-    rows = Rows(*np.array([[0], [later_ns], [BOUND_NS]], dtype=np.int64))
-    return ClockTable({boot_id: rows}, [StreamFacts(boot_id, UTC_NS, True)], [boot_id])
-
-
-def two_feet(**facts: Any) -> list[Export]:
-    left = ARRAY.model_copy(update={"node": "left"})
-    right = ARRAY.model_copy(update={"node": "right-2"})
-    tap = marks({10: "tap"})
-    return [
-        export_of_walk(info=left, clock=compared(0), marks=tap, **facts),
-        export_of_walk(info=right, clock=compared(LATE_NS), marks=tap, **facts),
-    ]
+def tap() -> Marks:
+    return marks({10: "tap"})
 
 
 def test_two_feet_are_two_platforms_on_the_servers_axis() -> None:
-    found = Read(two_feet())
+    found = Read(two_feet(marks=tap()))
     late = round(LATE_NS * 1e-9 * RATE_HZ)
     fz = np.float32(np.where(walk()["contact"] == 1, walk()["grf_n"], 0.0))
     assert found.analog.shape[1] == ROWS + late
@@ -372,7 +333,7 @@ def test_two_feet_are_two_platforms_on_the_servers_axis() -> None:
 
 
 def test_how_far_the_clocks_may_be_apart_is_in_the_file() -> None:
-    found = Read(two_feet())
+    found = Read(two_feet(marks=tap()))
     bound_s = found.channel("1:t_server_uncertainty_s")
     assert np.nanmin(bound_s) >= BOUND_NS * 1e-9
     said = " ".join(found.texts("FOOTTILE1:CLOCK_UNCERTAINTY"))
@@ -380,7 +341,7 @@ def test_how_far_the_clocks_may_be_apart_is_in_the_file() -> None:
 
 
 def test_an_event_says_which_foot_it_is_of() -> None:
-    found = Read(two_feet())
+    found = Read(two_feet(marks=tap()))
     named = list(zip(found.texts("EVENT:CONTEXTS"), found.events(), strict=True))
     assert [(context, label) for context, (label, _) in named[:2]] == [
         ("Left", "tap"),
@@ -394,7 +355,7 @@ def test_an_event_says_which_foot_it_is_of() -> None:
 
 def test_our_reader_of_references_finds_both(tmp_path: Path) -> None:
     path = tmp_path / "take.c3d"
-    path.write_bytes(Read(two_feet()).content)
+    path.write_bytes(Read(two_feet(marks=tap())).content)
     found = read_reference(path, Stated({"grf_n": "plate2_fz", **cop_of(2)}))
     on = walk()["contact"] == 1
     np.testing.assert_allclose(found.grf_n, np.where(on, walk()["grf_n"], 0.0), atol=1e-3)
@@ -408,8 +369,6 @@ def cop_of(number: int) -> dict[str, str]:
 def test_sessions_without_a_common_axis_are_not_put_together() -> None:
     with pytest.raises(UsageError, match="the nodes' own clocks are no common axis"):
         list(C3D.written_together([export_of_walk(), export_of_walk()]))
-    with pytest.raises(UsageError, match="opensim holds one session only"):
-        list(format_named("opensim").written_together(two_feet()))
 
 
 def test_sessions_of_different_days_are_refused_and_not_joined() -> None:

@@ -18,8 +18,8 @@ from devices.frames import NO_SERVO_COUNTS, NOT_READ
 from storage.formats.options import NO_OPTIONS
 from storage.formats.sealed import export_of
 from storage.formats.slice import Slice
-from storage.formats.written import matlab
-from storage.formats.written.matlab import MATLAB
+from storage.formats.written.matlab import file as matlab
+from storage.formats.written.matlab.file import MATLAB
 from storage.schema import CONTACT_UNKNOWN
 from storage.sessions.file import SessionWriter
 from storage.sessions.reader import SessionReader

@@ -277,7 +277,7 @@ def test_frames_without_the_servers_time_are_refused_when_it_is_asked_for() -> N
     clock = ClockTable({}, [StreamFacts("a", 0, True)], ["a"])
     content = content_of(cut(frames(), estimates(), 20))
     chunks = export(content, make_array(2), NOTES, "mcap", Slice(), clock, options=NO_OPTIONS)
-    with pytest.raises(UsageError, match="no server's time"):
+    with pytest.raises(UsageError, match="the server's time is not known"):
         next(chunks)
 
 

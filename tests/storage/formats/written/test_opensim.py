@@ -20,8 +20,9 @@ from storage.formats.export import Export
 from storage.formats.marks import Mark, Marks
 from storage.formats.options import FormatOptions
 from storage.formats.reference import Stated, read_reference
-from storage.formats.written import opensim as written_opensim
-from storage.formats.written.opensim import COLUMNS, OPENSIM
+from storage.formats.written.opensim import file as written_opensim
+from storage.formats.written.opensim.file import OPENSIM
+from storage.formats.written.opensim.loads import COLUMNS
 from storage.schema import Array
 from storage.sessions.folder import Event
 from tests.storage.formats.walks import (
@@ -75,9 +76,9 @@ def ground(tmp_path: Path) -> Unpacked:
 
 def test_the_header_says_how_much_there_is(ground: Unpacked) -> None:
     assert ground.head == [
-        *("session", "version=1", f"nRows={ROWS}", f"nColumns={len(COLUMNS)}", "inDegrees=no")
+        *("session", "version=1", f"nRows={ROWS}", f"nColumns={1 + len(COLUMNS)}", "inDegrees=no")
     ]
-    assert ground.table.shape == (ROWS, len(COLUMNS))
+    assert ground.table.shape == (ROWS, 1 + len(COLUMNS))
     np.testing.assert_allclose(ground.columns["time"], np.arange(ROWS) / RATE_HZ, atol=1e-9)
 
 
@@ -254,7 +255,7 @@ def test_opensim_computes_what_the_loads_do_to_a_foot(
     found = Unpacked(export_of_walk(columns), tmp_path)
     read = opensim.TimeSeriesTable(str(found.mot))
     assert read.getNumRows() == ROWS
-    assert ("time", *read.getColumnLabels()) == COLUMNS
+    assert tuple(read.getColumnLabels()) == COLUMNS
     time_s, held = inverse_dynamics(opensim, found)
     force_n, x_m, y_m, z_m = (
         np.interp(time_s, found.columns["time"], found.columns[f"ground_force_{name}"])

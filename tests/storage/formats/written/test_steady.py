@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from devices.errors import UsageError
 from storage.formats.written.steady import SAME_PERIODS, Steady, axis_of, steady
-from storage.schema import NO_INSTANT, Array
+from storage.schema import Array
 
 BEGIN_NS = 1_700_000_000_123_456_789
 PERIOD_NS = 2_000_000
@@ -102,11 +102,6 @@ def test_time_that_runs_back_between_parts_is_refused() -> None:
         UsageError, match=r"time runs back by 3600\.02 s, 0\.018 s behind the first"
     ):
         at(t_ns, part=np.repeat([0, 1], 10))
-
-
-def test_a_clock_that_was_never_compared_gives_no_axis() -> None:
-    with pytest.raises(UsageError, match="of 10 frames the server's time is not known"):
-        at(np.full(10, NO_INSTANT))
 
 
 def test_years_between_two_parts_are_refused_and_not_filled() -> None:

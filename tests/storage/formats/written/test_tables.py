@@ -31,8 +31,8 @@ def test_a_format_that_nobody_knows_is_refused_with_those_there_are() -> None:
 
 @pytest.mark.parametrize("to", TABLES)
 def test_an_option_of_another_format_is_refused_before_the_first_chunk(to: str) -> None:
-    known = {"names", "times"} | ({"decimal"} if to == "csv" else set())
-    asked = {"names": "serial", "times": False, "decimal": "comma"}
+    known = {"names", "times"} | ({"decimal", "about"} if to == "csv" else set())
+    asked = {"names": "serial", "times": False, "decimal": "comma", "about": True}
     for name, value in asked.items():
         options = FormatOptions.model_validate({name: value})
         if name in known:
@@ -87,12 +87,12 @@ def test_which_tile_is_which_is_in_the_metadata_of_its_columns(to: str) -> None:
 
 
 def test_with_a_decimal_comma_csv_says_the_same_numbers_and_words() -> None:
-    comma = exported("csv", options=FormatOptions(times=False, decimal="comma"))
+    comma = exported("csv", options=FormatOptions(times=False, decimal="comma", about=False))
     read_back = pacsv.read_csv(
         io.BytesIO(comma),
         parse_options=pacsv.ParseOptions(delimiter=";"),
         convert_options=pacsv.ConvertOptions(decimal_point=","),
     )
-    assert read_back.equals(pacsv.read_csv(io.BytesIO(exported("csv"))))
+    assert read_back.equals(read(exported("csv"), "csv"))
     assert set(read_back["phase"].to_pylist()) == set(extra()["phase"])
     assert b"." not in comma

@@ -1,0 +1,101 @@
+"""Data that are made while they are sent: what they depend on, and how they are sent."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import AsyncIterator, Generator
+
+import pyarrow as pa
+from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
+
+from devices.errors import UnknownError, UsageError
+from service.api.routes.data_query import MadeQuery
+from service.server.server import Server
+from service.version import SOFTWARE
+from storage.clock.file import CLOCK_NAME
+from storage.file_hash import sha256_of
+from storage.formats.marks import Marks
+from storage.sessions.folder import Session
+
+Chunks = Generator[bytes, None, None]
+
+
+def known(session: Session) -> Session:
+    """One whose frames can be read.
+
+    Raises:
+        UnknownError: it was sealed without any, or its file is damaged.
+    """
+    if session.state == "sealed" and session.sha256 is None:
+        raise UnknownError(f"session {session.id}: {session.problem}")
+    return session
+
+
+async def tag_of_made(session: Session, query: MadeQuery, server: Server) -> str:
+    """What is made of a session is the same as long as this is."""
+    beside = ""
+    if query.clock_name == "server" or query.has_marks:  # marks are placed by the clocks
+        beside = await run_in_threadpool(_clocks_hash, session, server)
+    if query.has_marks:
+        beside += "".join(event.model_dump_json() for event in session.events)
+    if session.sha256 is not None:
+        content = f"{session.sha256}|{pa.__version__}"
+    else:
+        recorded = server.recorder.ledger(session.id).recorded
+        content = f"{session.id}|{session.state}|{recorded}"
+    about = f"{content}|{query.canonical}|{beside}|{SOFTWARE}"
+    return hashlib.sha256(about.encode()).hexdigest()
+
+
+def said_of_marks(marks: list[Marks]) -> dict[str, str]:
+    """The header that says how many marks are in it."""
+    total = sum(len(each.all) for each in marks)
+    left_out = sum(len(each.left_out) for each in marks)
+    return {"Foottile-Marks": f"placed={total - left_out}, left-out={left_out}"}
+
+
+async def made(
+    chunks: Chunks, query: MadeQuery, stem: str, request: Request, headers: dict[str, str]
+) -> Response:
+    """An answer of chunks, which are closed whoever goes away.
+
+    Args:
+        chunks: the file.
+        query: what was asked for.
+        stem: the file's name without its ending.
+        request: HEAD, or GET.
+        headers: that it has besides.
+    """
+    # The first chunk now: what is wrong with the query is then an answer, not a broken download.
+    first = await run_in_threadpool(next, chunks, None)
+    if first is None:
+        raise UsageError("the session has no frames")
+    headers["Content-Disposition"] = f'attachment; filename="{stem}.{query.to.ending}"'
+    if request.method == "HEAD":
+        await run_in_threadpool(chunks.close)
+        answer = Response(headers=headers, media_type=query.to.media_type)
+        del answer.headers["content-length"]  # it is not known before it is made
+        return answer
+
+    return StreamingResponse(sent(chunks, first), headers=headers, media_type=query.to.media_type)
+
+
+async def sent(chunks: Chunks, first: bytes = b"") -> AsyncIterator[bytes]:
+    """Chunks as they are made; who asked may go away: no file is left open, and none behind."""
+    try:
+        if first:
+            yield first
+        async for chunk in iterate_in_threadpool(chunks):
+            if chunk:
+                yield chunk
+    finally:
+        chunks.close()
+
+
+def _clocks_hash(session: Session, server: Server) -> str:
+    path = server.sessions.folder.path(session.id) / CLOCK_NAME
+    if session.sha256 is not None and path.is_file():
+        return sha256_of(path)
+    return hashlib.sha256(repr(session.clock).encode()).hexdigest()

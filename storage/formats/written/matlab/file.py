@@ -1,0 +1,127 @@
+"""MATLAB's .mat of version 5, which Octave and scipy read too: a variable for each quantity.
+
+scipy writes each variable, and they stand one after the other in the file, so that one is in memory
+at a time and `load("session.mat", "t_ns", "grf_n")` reads no more than that. Several sessions are
+an array of structs, `sessions`, with the same names in each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+
+import pyarrow as pa
+
+from devices.errors import UsageError
+from storage.formats.export import Export
+from storage.formats.written.format import Format
+from storage.formats.written.matlab.elements import (
+    BYTES_MAX,
+    HEADER_BYTES,
+    Field,
+    saved,
+    struct_array,
+    struct_bytes,
+    variable,
+)
+from storage.formats.written.matlab.values import (
+    class_of,
+    facts_of,
+    marks_of,
+    names_of,
+    quantities_of,
+    tiles_of,
+    values_of,
+)
+from storage.formats.written.together import instants_of
+from storage.schema import SERVER_TIME, Array, Column
+
+FRAMES_MAX = 6_000_000
+"""Three hours at 544 Hz; four tiles of them are the 24 million numbers of a variable at most."""
+_VALUES_MAX = 4 * FRAMES_MAX
+_TEXT = 116
+"""Of the header's bytes so many are for people."""
+
+
+def _write(export: Export) -> Iterator[bytes]:
+    quantities = quantities_of(export)
+    _t_ns(export)  # refuses too many frames, before anything is given away
+    yield _header(export) + variable("about", facts_of(export))
+    yield from _meanings(quantities)
+    yield variable("tiles", tiles_of(export))
+    if export.marks is not None:
+        yield variable("marks", marks_of(export))
+    for column in quantities:
+        for name, values in values_of(export, column).items():
+            yield variable(name, values)
+
+
+def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
+    found = [_fields(export) for export in exports]
+    if (size := struct_bytes(found)) > BYTES_MAX:
+        raise UsageError(
+            f"there are {size} bytes in these sessions, and {BYTES_MAX} in a variable at most",
+            expected="fewer columns, or a slice",
+        )
+    yield _header(exports[0])
+    yield from _meanings([column for export in exports for column in _on_one_axis(export)])
+    yield from struct_array("sessions", found)
+
+
+def _fields(export: Export) -> dict[str, Field]:
+    rows = len(instants_of(export, _t_ns(export)))
+    fields = {"node": Field.of(export.info.node), "about": Field.of(facts_of(export))}
+    fields["tiles"] = Field.of(tiles_of(export))
+    if export.marks is not None:
+        fields["marks"] = Field.of(marks_of(export))
+    for column in _on_one_axis(export):
+        if pa.types.is_string(column.type):
+            fields |= {name: Field.of(v) for name, v in values_of(export, column).items()}
+            continue
+        width = len(names_of(export, column))
+        make = partial(_values, export, column)
+        fields[column.name] = Field.matrix((rows, width), class_of(column), make)
+    return fields
+
+
+def _on_one_axis(export: Export) -> list[Column]:
+    """What was chosen, and the server's time, whatever was chosen: it is all that they share."""
+    return list(dict.fromkeys([*quantities_of(export), *SERVER_TIME]))
+
+
+def _values(export: Export, column: Column) -> Array:
+    return values_of(export, column)[column.name]
+
+
+def _t_ns(export: Export) -> dict[str, Array]:
+    """Instants of its frames, by each clock that was asked for."""
+    limit = min(FRAMES_MAX, _VALUES_MAX // max(len(export.info.tiles), 1))
+    asked = ["t_ns"] if export.clock is None else ["t_ns", "t_server_ns"]
+    return export.whole(asked, frames_max=limit)
+
+
+def _meanings(quantities: Sequence[Column]) -> Iterator[bytes]:
+    yield variable("units", {column.name: column.unit for column in quantities})
+    yield variable("meaning", {column.name: column.description for column in quantities})
+
+
+def _header(export: Export) -> bytes:
+    """scipy's, but for the text, in which the time of day would make each file another one."""
+    text = f"MATLAB 5.0 MAT-file, written by {export.info.software}"
+    shown = text.encode("ascii", "replace")[:_TEXT].ljust(_TEXT)
+    return shown + saved({})[_TEXT:HEADER_BYTES]
+
+
+MATLAB = Format(
+    "mat",
+    "MATLAB",
+    "MATLAB, Octave, scipy",
+    "application/x-matlab-data",
+    _write,
+    write_together=_write_together,
+    options=("times",),
+    needs_sealed=True,
+    frames_max=FRAMES_MAX,
+    extra="server",
+    packages=("scipy",),
+)

@@ -1,0 +1,68 @@
+"""On the page of a session of a take: all of its sessions in one file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Page, expect
+
+from storage.formats.written.registry import SEVERAL
+from tests.service.fake_node import FakeNode
+from tests.service.running import Running
+from tests.service.takes import Take, frames_of_long_ago
+from tests.storage.formats.written.readers import said_in
+
+OpenPage = Callable[..., Page]
+
+
+@pytest.fixture
+def take(server: Running, monkeypatch: pytest.MonkeyPatch) -> Take:
+    frames_of_long_ago(monkeypatch)
+    feet = [FakeNode(server, name) for name in ("left", "right")]
+    made = Take(server, feet).sealed()
+    for foot in feet:
+        foot.close()
+    return made
+
+
+def test_the_others_of_a_take_come_in_the_same_file(take: Take, open_page: OpenPage) -> None:
+    page = open_page(f"{take.running.url}/sessions/{take.sessions[0].id}?from=0&to=0.1")
+    expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
+    page.click("#downloads-more summary")
+    together = page.get_by_label("with the others of this take (right)")
+    offered = page.locator("#download-list [data-format]:visible")
+    everything = offered.count()
+    together.check()
+    names = offered.evaluate_all("items => items.map((item) => item.dataset.format)")
+    assert set(names) == set(SEVERAL)
+    assert everything == len(names)  # the others stand in the page, and are of this session only
+    assert not Axe().run(page).response["violations"]
+    with page.expect_download() as download:
+        page.click("#download-mcap")
+    assert download.value.suggested_filename == f"take-{take.id}.mcap"
+    said = said_in("mcap", download.value.path().read_bytes())
+    assert [(each["node"], each["end_s"]) for each in said] == [("left", "0.1"), ("right", "0.1")]
+    with page.expect_download() as alone:
+        page.click("#download-csv")
+    assert alone.value.suggested_filename == f"{take.sessions[0].id}.csv"
+    together.uncheck()
+    with page.expect_download() as one:
+        page.click("#download-mcap")
+    assert one.value.suggested_filename == f"{take.sessions[0].id}.mcap"
+
+
+def test_a_session_by_itself_offers_no_take(server: Running, open_page: OpenPage) -> None:
+    node = FakeNode(server, "alone")
+    node.connect()
+    node.tared()
+    session = node.record()
+    node.deliver(100, [20.0, 60.0], alive=True)
+    node.finish(session)
+    node.close()
+    page = open_page(f"{server.url}/sessions/{session.id}")
+    expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
+    page.click("#downloads-more summary")
+    expect(page.locator("#download-xdf")).to_be_visible()
+    expect(page.locator("#download-take")).to_be_hidden()
