@@ -174,16 +174,28 @@ def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> No
     assert desk.evaluate(_KEYS_SHOWN) > 6
 
 
-@pytest.mark.parametrize(
-    ("by", "cursor_s", "found"),
-    [(1, None, 1), (-1, None, 2), (1, 1.5, 1), (-1, 1.5, 0), (1, 2.5, 2), (-1, 2.5, 0), (1, 9, -1)],
-)
-def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(
-    server: Running, open_page: OpenPage, by: int, cursor_s: float | None, found: int
+@pytest.mark.parametrize("scheme", ["sunlight", "dark"])
+def test_axe_has_nothing_to_complain_of_in_the_sun_or_the_dark_with_a_stance_and_with_help(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage, scheme: str
 ) -> None:
-    page = open_page(f"{server.url}/docs")
-    asked = "import('/static/session/stances.js').then((m) => m.neighbour(%s, %d, %s, %s))"
-    all_ = "[{from: 0, to: 1}, {from: 2, to: 3}, {from: 4, to: 5}]"
-    cursor = "null" if cursor_s is None else str(cursor_s)
-    view = "{from: 1.2, to: 4.5}"
-    assert page.evaluate(asked % (all_, by, cursor, view)) == found
+    page = opened(open_page, hops, color_scheme="dark")
+    if scheme == "sunlight":  # whatever the machine prefers
+        page.click("#sun")
+    page.keyboard.press("]")
+    says(page, stances[0])
+    assert complaints(page) == []
+    page.keyboard.press("?")
+    expect(page.locator("#help-dialog")).to_be_visible()
+    assert complaints(page) == []
+
+
+def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(
+    server: Running, open_page: OpenPage
+) -> None:
+    asked = """import("/static/session/stances.js").then(({ neighbour }) => {
+      const all = [{ from: 0, to: 1 }, { from: 2, to: 3 }, { from: 4, to: 5 }];
+      const cursors = [null, 1.5, 2.5, 9];
+      return cursors.map((s) => [-1, 1].map((by) => neighbour(all, by, s, { from: 1.2, to: 4.5 })));
+    })"""
+    found = open_page(f"{server.url}/nodes").evaluate(asked)
+    assert found == [[2, 1], [0, 1], [0, 2], [2, -1]]  # before it and after it; -1: there is none

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from tests.web.scripted import Scripted
 from tests.web.test_accessible import complaints
@@ -45,3 +45,23 @@ def test_a_session_that_is_recorded_is_not_offered_to_be_checked(
     page.click("#ledger-card summary")
     expect(page.locator("#ledger")).to_contain_text("not sealed yet")
     expect(page.locator("#verify")).to_be_hidden()
+
+
+def test_of_a_session_whose_frames_are_damaged_the_page_says_so_and_what_to_do(
+    scripted: Scripted, browser: Browser
+) -> None:
+    session = scripted.recorded("walk")
+    path = session.folder / "frames.parquet"
+    content = bytearray(path.read_bytes())
+    content[4 : len(content) // 2] = bytes(len(content) // 2 - 4)
+    path.write_bytes(content)
+    (session.folder / "overview.arrow").unlink()
+    with browser.new_context() as context:  # its console says 500, and is right
+        page = context.new_page()
+        page.goto(f"{scripted.url}/sessions/{session.id}")
+        expect(page.locator("#state")).to_have_text("its files are damaged")
+        expect(page.locator("#message")).to_contain_text("“Check its files now”")
+        page.click("#verify")
+        expect(page.locator("#verified [data-whole=false]")).to_be_visible()
+        expect(page.locator("#verified")).to_contain_text("frames.parquet")
+        assert complaints(page) == []

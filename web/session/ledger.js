@@ -2,7 +2,7 @@
 
 import * as api from "../common/api.js";
 import { frames, lossesInWords } from "../common/losses.js";
-import { byId, bytes, el, localTime } from "../common/text.js";
+import { byId, bytes, el, localTime, setText } from "../common/text.js";
 
 /** @returns {string[]} sentences */
 export function ledgerInWords(ledger, session) {
@@ -33,7 +33,7 @@ export function verifiedInWords(found, session, at) {
   const when = localTime(at).slice(-8);
   if (!whole) {
     const other = found.problems.length ? [] : ["the file of frames is another one than this page is about: load the page again"];
-    return { whole, says: `Checked at ${when}: something is wrong with its files. Keep them as they are, and look for a copy:`, details: [...found.problems, ...other, ...found.unproven] };
+    return { whole, says: `Checked at ${when}: something is wrong with its files. Keep them as they are; a copy may be whole.`, details: [...found.problems, ...other, ...found.unproven] };
   }
   const proven = session.sha256 ? `all ${read} were read again. Frames, ledger, marks, clock, stances and hashes agree with one another` : "not one frame was recorded, and its files agree with one another";
   const rest = found.unproven.length ? ". What they cannot show:" : ": it is what was sealed.";
@@ -55,6 +55,14 @@ export class LedgerCard {
     this.card.hidden = false;
     byId("verify-box").hidden = session.state !== "sealed";
     if (grown) this.load();
+  }
+
+  /** Its files could not be read: what was sealed as complete may be so no more. */
+  doubt() {
+    const state = byId("state");
+    state.className = "state bad";
+    setText(state, "its files are damaged");
+    this.card.open = true;
   }
 
   async load() {

@@ -54,7 +54,9 @@ async function look() {
   } catch (error) {
     if (!(error instanceof api.Refusal)) throw error;
     document.body.dataset.state = "refused";
-    say("Its numbers cannot be shown", error.message);
+    const damaged = error.status === 500;
+    if (damaged) ledger.doubt();
+    say("Its numbers cannot be shown", damaged ? `Something is wrong with its files; “Check its files now”, above, says what. The server's words: ${error.message}` : error.message);
     if (error.status === 0) setTimeout(look, 3 * AGAIN_MS);
   }
 }
