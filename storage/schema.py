@@ -26,6 +26,9 @@ from devices.frames import (
     ArrayInfo,
     FrameBatch,
 )
+from storage.arrow_alone import leave_pandas_out
+
+leave_pandas_out()  # here, because nothing of ours makes an array before it has a schema
 
 ARRAY_INFO_KEY = b"foottile.array_info"
 ARRAY_HASH_KEY = b"foottile.array_info_sha256"

@@ -10,7 +10,6 @@ import sys
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 
-import pyarrow as pa
 import uvicorn
 from fastapi import FastAPI
 
@@ -28,9 +27,6 @@ async def serving(
     app: FastAPI, listening: socket.socket, bounds: Bounds | None = None
 ) -> AsyncIterator[None]:
     """Serve while the block runs; on a new machine the models are compiled meanwhile."""
-    # Arrow's own pool keeps what any of its threads has used: 190 MB after 200 pictures of a
-    # session of 3 h, and 56 with this one, in no more time.
-    pa.set_memory_pool(pa.system_memory_pool())
     compiling = None
     if not await asyncio.to_thread(load_kept):
         compiling = asyncio.create_task(_compile_aside(app.state.server))

@@ -13,6 +13,7 @@ from devices.errors import FootTileError
 from devices.words import printable
 from foottile.errors import FootTileError as ClientError
 from service.cli.table import Commands, name_all
+from service.freed import give_back_freed
 from service.version import SOFTWARE
 
 INTERRUPTED = 130
@@ -56,6 +57,7 @@ def main() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # started with it closed: whoever does wants to hear nothing
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  # as long as it runs
+    give_back_freed()
     # So that what is half-written is cleaned up when the machine is shut down, too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     try:

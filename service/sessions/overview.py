@@ -41,6 +41,8 @@ from storage.sessions.reader import SessionReader
 log = logging.getLogger("foottile.overview")
 
 POINTS_MAX = 8000
+_VALUES_MAX = 1 << 18
+"""Numbers of frames that are read at once for a zoom, of which little is left: 2 MiB."""
 _NOT_WRITTEN = f"{OVERVIEW_NAME} was not written, and is made again when it is asked for"
 
 
@@ -169,7 +171,7 @@ def _of_frames(
     found: list[Bins] = [{name: np.empty(0, type_) for name, type_ in types.items()}]
     last: tuple[int, int] | None = None
     groups = session.groups_within(*part.bounds_ns(begin_ns))
-    for piece in session.columns(*names, groups=groups):
+    for piece in session.columns(*names, groups=groups, values_max=_VALUES_MAX):
         inside = part.rows(piece["t_ns"], begin_ns)
         frames = {name: values[inside] for name, values in piece.items()}
         if not len(frames["seq"]):

@@ -119,13 +119,17 @@ class SessionReader:
             yield FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES}), values
 
     def columns(
-        self, *wanted: str, groups: Sequence[int] | None = None
+        self,
+        *wanted: str,
+        groups: Sequence[int] | None = None,
+        values_max: int | None = None,
     ) -> Iterator[dict[str, Array]]:
         """Some columns only, of `storage.schema.KNOWN`, some thousand rows at a time.
 
         Args:
             wanted: their names.
             groups: the row groups to read; None: all.
+            values_max: numbers that are read at once, for who has room for fewer than others.
 
         Raises:
             FileFormatError: as for `batches`.
@@ -133,7 +137,7 @@ class SessionReader:
         tiles = len(self.info.tiles)
         names = [flat for name in wanted for flat in KNOWN[name].flat_names(tiles)]
         for group in range(len(self.footer.group_rows)) if groups is None else groups:
-            for table in self._tables(group, names):
+            for table in self._tables(group, names, values_max):
                 with self._damage(group):
                     values = {name: from_flat(KNOWN[name], table, tiles) for name in wanted}
                 yield values
@@ -209,10 +213,12 @@ class SessionReader:
             return self.footer.extremes(name)
         return [None] * len(self.footer.group_rows)  # nothing proves what an older version wrote
 
-    def _tables(self, group: int, names: Sequence[str] | None) -> Iterator[pa.Table]:
+    def _tables(
+        self, group: int, names: Sequence[str] | None, values_max: int | None = None
+    ) -> Iterator[pa.Table]:
         """Columns of a row group, or all, in pieces."""
         width = len(self.column_names if names is None else names)
-        size = max(_PIECE_ROWS_MIN, _PIECE_VALUES // max(1, width))
+        size = max(_PIECE_ROWS_MIN, (values_max or _PIECE_VALUES) // max(1, width))
         left = self.footer.group_rows[group]
         with self._damage(group):
             if absent := set(names or ()) - self.column_names:
