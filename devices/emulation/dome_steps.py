@@ -188,9 +188,10 @@ class GasParts:
 
 
 @compiled
-def _kpa(gas_k: float, volume: float, head_kpa: float, constants: Floats) -> float:
+def _kpa(
+    gas_k: float, volume: float, head_kpa: float, seal_kpa: float, seal_k: float, c: float
+) -> float:
     """Solve p volume (1 + c (p - seal - head)) = seal T / T_seal for p."""
-    seal_kpa, seal_k, c = float(constants[0]), float(constants[1]), float(constants[2])
     linear = 1.0 - c * (seal_kpa + head_kpa)
     right = seal_kpa * gas_k / (seal_k * volume)
     return 2 * right / (linear + math.sqrt(linear**2 + 4 * c * right))
@@ -201,9 +202,10 @@ def static_kpa(wall_k: Floats, volume: Floats, head_kpa: Floats, constants: Floa
     """Pressure of gas that is as warm as its wall; arguments as of `gas_kpa`."""
     kpa = np.empty_like(volume)
     for dome in range(volume.shape[1]):
+        seal_kpa, seal_k, c = constants[dome, 0], constants[dome, 1], constants[dome, 2]
         for k in range(volume.shape[0]):
             kpa[k, dome] = _kpa(
-                wall_k[k, dome], volume[k, dome], head_kpa[k, dome], constants[dome]
+                wall_k[k, dome], volume[k, dome], head_kpa[k, dome], seal_kpa, seal_k, c
             )
     return kpa
 
@@ -238,27 +240,30 @@ def gas_kpa(
     """
     kpa = np.empty_like(volume)
     for dome in range(volume.shape[1]):
+        seal_kpa, seal_k, c = constants[dome, 0], constants[dome, 1], constants[dome, 2]
         kappa = constants[dome, 3]
-        gain_of_all = gain[dome].sum()
-        excess_k = modes_k[dome].sum()
+        # Loops and numbers, for sums and rows take numba a quarter of a second longer to compile,
+        # which a first start waits for.
+        gain_of_all, excess_k = 0.0, 0.0
+        for mode in range(decay.shape[1]):
+            gain_of_all += gain[dome, mode]
+            excess_k += modes_k[dome, mode]
         for k in range(volume.shape[0]):
             left_k = 0.0
             for mode in range(decay.shape[1]):
                 left_k += decay[dome, mode] * modes_k[dome, mode]
             drive_k = 0.0
             for _ in range(_ROUNDS_MAX):
-                p = _kpa(
-                    wall_k[k, dome] + excess_k, volume[k, dome], head_kpa[k, dome], constants[dome]
-                )
-                drive_k = kappa * (wall_k[k, dome] + excess_k) * (math.log(p) - last_ln_p[dome])
+                gas_k = wall_k[k, dome] + excess_k
+                p = _kpa(gas_k, volume[k, dome], head_kpa[k, dome], seal_kpa, seal_k, c)
+                drive_k = kappa * gas_k * (math.log(p) - last_ln_p[dome])
                 new_k = left_k + gain_of_all * drive_k
                 change_k = abs(new_k - excess_k)
                 excess_k = new_k
                 if change_k < _ROUNDS_END_K:
                     break
-            kpa[k, dome] = _kpa(
-                wall_k[k, dome] + excess_k, volume[k, dome], head_kpa[k, dome], constants[dome]
-            )
+            gas_k = wall_k[k, dome] + excess_k
+            kpa[k, dome] = _kpa(gas_k, volume[k, dome], head_kpa[k, dome], seal_kpa, seal_k, c)
             last_ln_p[dome] = math.log(kpa[k, dome])
             for mode in range(decay.shape[1]):
                 modes_k[dome, mode] = (
