@@ -1,4 +1,4 @@
-"""Elements of a .mat file of version 5, encoded by scipy, and a struct array made of them.
+"""Elements of a .mat file of version 5, encoded by scipy, and what is too large for that.
 
 scipy writes a struct as a whole. Here its fields follow one another, so that one is in memory at a
 time: what stands in front of them is scipy's, of a struct with empty fields, and says how long all
@@ -9,13 +9,30 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from storage.schema import Array
+
+_NUMBERS: Mapping[str, tuple[int, int]] = {
+    "f8": (6, 9),
+    "f4": (7, 7),
+    "i1": (8, 1),
+    "u1": (9, 2),
+    "i2": (10, 3),
+    "u2": (11, 4),
+    "i4": (12, 5),
+    "u4": (13, 6),
+    "i8": (14, 12),
+    "u8": (15, 13),
+}
+"""Classes of arrays and types of their data, as MathWorks' "MAT-File Format" numbers them."""
+_MATRIX, _FLAGS, _SIZE, _NAME = 14, 6, 5, 1
+"""Types of elements, from the same tables."""
 HEADER_BYTES = 128
 """Of a file; variables follow."""
 BYTES_MAX = 2**31 - 1
@@ -38,6 +55,35 @@ def saved(variables: Mapping[str, object]) -> bytes:
 def variable(name: str, value: object) -> bytes:
     """A variable as it stands in a file, behind the header."""
     return saved({name: value})[HEADER_BYTES:]
+
+
+def matrix(
+    name: str, shape: tuple[int, int], class_: npt.DTypeLike, pieces: Iterable[Array]
+) -> Iterator[bytes]:
+    """A variable of numbers, given away as they come.
+
+    Args:
+        name: of the variable.
+        shape: rows and columns.
+        class_: of the numbers.
+        pieces: these numbers, column after column.
+    """
+    kind = np.dtype(class_)
+    of_class, of_data = _NUMBERS[kind.str[1:]]
+    size = shape[0] * shape[1] * kind.itemsize
+    text = name.encode("ascii")
+    head = b"".join(
+        (
+            struct.pack("<IIII", _FLAGS, 8, of_class, 0),
+            struct.pack("<IIii", _SIZE, 8, *shape),
+            struct.pack("<II", _NAME, len(text)) + text + bytes(-len(text) % 8),
+            struct.pack("<II", of_data, size),
+        )
+    )
+    yield struct.pack("<II", _MATRIX, len(head) + size + -size % 8) + head
+    for piece in pieces:
+        yield piece.tobytes()
+    yield bytes(-size % 8)
 
 
 @dataclass(frozen=True)

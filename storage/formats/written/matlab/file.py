@@ -1,8 +1,9 @@
 """MATLAB's .mat of version 5, which Octave and scipy read too: a variable for each quantity.
 
-scipy writes each variable, and they stand one after the other in the file, so that one is in memory
-at a time and `load("session.mat", "t_ns", "grf_n")` reads no more than that. Several sessions are
-an array of structs, `sessions`, with the same names in each.
+Variables stand one after the other in the file, so that `load("session.mat", "t_ns", "grf_n")`
+reads no more than that. A matrix is written as it is read, a piece of a column at a time, what is
+no matrix of numbers by scipy. Several sessions are an array of structs, `sessions`, with the same
+names in each; of these one field is in memory at a time.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from storage.formats.written.matlab.elements import (
     BYTES_MAX,
     HEADER_BYTES,
     Field,
+    matrix,
     saved,
     struct_array,
     struct_bytes,
@@ -29,6 +31,7 @@ from storage.formats.written.matlab.values import (
     facts_of,
     marks_of,
     names_of,
+    pieces_of,
     quantities_of,
     tiles_of,
     values_of,
@@ -45,15 +48,20 @@ _TEXT = 116
 
 def _write(export: Export) -> Iterator[bytes]:
     quantities = quantities_of(export)
-    _t_ns(export)  # refuses too many frames, before anything is given away
+    # Refuses too many frames, before anything is given away.
+    frames = len(_t_ns(export)["t_ns"])
     yield _header(export) + variable("about", facts_of(export))
     yield from _meanings(quantities)
     yield variable("tiles", tiles_of(export))
     if export.marks is not None:
         yield variable("marks", marks_of(export))
     for column in quantities:
-        for name, values in values_of(export, column).items():
-            yield variable(name, values)
+        if pa.types.is_string(column.type):
+            for name, values in values_of(export, column).items():
+                yield variable(name, values)
+            continue
+        shape = frames, len(names_of(export, column))
+        yield from matrix(column.name, shape, class_of(column), pieces_of(export, column))
 
 
 def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:

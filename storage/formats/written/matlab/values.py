@@ -8,7 +8,7 @@ intmin("int64") then.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -45,15 +45,26 @@ def class_of(column: Column) -> npt.DTypeLike:
 def values_of(export: Export, column: Column) -> Mapping[str, Array]:
     """A quantity as a variable by name, (frames, columns); of a text its kinds beside it."""
     names = names_of(export, column)
-    is_server = column.name.startswith("t_server")
-    plain = replace(export, marks=None, clock=export.clock if is_server else None)
-    pieces = list(plain.pieces(names))
+    pieces = list(_plain(export, column).pieces(names))
     flat = [np.concatenate([piece[name] for piece in pieces]) for name in names]
     if pa.types.is_string(column.type):
         kinds, codes = np.unique(flat[0].astype(str), return_inverse=True)
         numbers = (codes + 1).astype(class_of(column))[:, None]
         return {column.name: numbers, f"{column.name}_kinds": np.array(kinds, dtype=object)}
     return {column.name: np.stack([_known(column, values) for values in flat], axis=1)}
+
+
+def pieces_of(export: Export, column: Column) -> Iterator[Array]:
+    """The numbers of a quantity, one of its columns after the other, as they are read."""
+    for name in names_of(export, column):
+        for piece in _plain(export, column).pieces([name]):
+            yield _known(column, piece[name])
+
+
+def _plain(export: Export, column: Column) -> Export:
+    """Without what a quantity does not need, and would be made for each anew."""
+    is_server = column.name.startswith("t_server")
+    return replace(export, marks=None, clock=export.clock if is_server else None)
 
 
 def _known(column: Column, values: Array) -> Array:

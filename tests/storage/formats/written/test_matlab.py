@@ -21,6 +21,7 @@ from storage.formats.slice import Slice
 from storage.formats.written.matlab import file as matlab
 from storage.formats.written.matlab.file import MATLAB
 from storage.schema import CONTACT_UNKNOWN
+from storage.sessions import reader as reader_module
 from storage.sessions.file import SessionWriter
 from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
@@ -106,6 +107,18 @@ def test_a_slice_has_its_frames_and_columns_and_seconds_of_the_session(sealed: P
 
 def test_the_same_session_gives_the_same_bytes_at_any_time_of_day(sealed: Path) -> None:
     assert written(sealed) == written(sealed)
+
+
+def test_a_matrix_is_given_away_piece_by_piece_and_is_the_same(
+    sealed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = written(sealed)
+    monkeypatch.setattr(reader_module, "_PIECE_VALUES", 1)
+    monkeypatch.setattr(reader_module, "_PIECE_ROWS_MIN", 7)
+    with SessionReader(sealed) as reader:
+        export = export_of(reader, Slice(None, None, ("force_n",)), options=NO_OPTIONS)
+        assert 7 * 4 in {len(chunk) for chunk in MATLAB.written(export)}
+    assert written(sealed) == whole
 
 
 def test_more_frames_than_its_limit_are_refused_with_the_slice_that_fits(
