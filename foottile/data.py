@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,8 @@ from foottile.http import Http
 
 if TYPE_CHECKING:
     import httpx
+
+Clock = Literal["node", "server"]
 
 _CHUNK = 1 << 16
 
@@ -31,6 +33,8 @@ class Data:
         columns: names, of all tiles (`force_n`) or one (`force_n_0`); empty: all.
         start_s: from so many seconds after the first frame on; None: from the beginning.
         end_s: before so many seconds; None: to the end.
+        clock: of `server` there are also `t_server_ns`, each frame's instant in the server's UTC,
+            as marks have it, and its bound `t_server_uncertainty_ns`.
     """
 
     _http: Http
@@ -38,6 +42,7 @@ class Data:
     columns: tuple[str, ...] = ()
     start_s: float | None = None
     end_s: float | None = None
+    clock: Clock = "node"
 
     @overload
     def __getitem__(self, what: str) -> npt.NDArray[Any]: ...
@@ -74,12 +79,17 @@ class Data:
             "columns": ",".join(self.columns) or None,
             "start_s": self.start_s,
             "end_s": self.end_s,
+            "clock": self.clock,
         }
         with self._http.stream(f"/sessions/{self.session_id}/data", query) as answer:
+            # Buffered: Arrow takes a read that gives less than it asked for as the end.
+            file = pa.PythonFile(io.BufferedReader(_Reading(answer), _CHUNK), mode="r")
             try:
-                with pa.ipc.open_stream(pa.PythonFile(_Reading(answer), mode="r")) as reader:
+                with pa.ipc.open_stream(file) as reader:
                     yield from reader
-            except (pa.ArrowInvalid, EOFError) as error:
+            except FootTileError:  # some are OSErrors, too
+                raise
+            except (pa.ArrowInvalid, OSError, EOFError) as error:
                 raise DamagedError(
                     f"session {self.session_id} did not come whole: {error}"
                 ) from error

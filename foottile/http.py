@@ -13,7 +13,7 @@ from foottile.errors import FootTileError, NoAnswerError, UsageError, refused
 try:
     import httpx
 except ModuleNotFoundError as error:  # a node needs none
-    raise FootTileError("foottile needs httpx: pip install 'foottile[client]'") from error
+    raise UsageError("foottile needs httpx: pip install 'foottile[client]'") from error
 
 API = "/api/v1"
 _TRIES = 2
@@ -52,7 +52,11 @@ class Http:
         self._client.close()
 
     def get(self, path: str, query: Mapping[str, object] | None = None) -> dict[str, Any]:
-        """Ask for JSON; what is None in the query is left out.
+        """Ask for JSON.
+
+        Args:
+            path: behind `/api/v1`.
+            query: what is None is left out, and of a list each is asked for.
 
         Raises:
             FootTileError: no answer, or one that is a problem.
@@ -85,19 +89,36 @@ class Http:
         return self._asked(method, path, tries, json=given, headers=dict(headers or {}))
 
     @contextmanager
-    def stream(self, path: str, query: Mapping[str, object]) -> Iterator[httpx.Response]:
+    def stream(
+        self,
+        path: str,
+        query: Mapping[str, object] | None = None,
+        *,
+        headers: Mapping[str, str] | None = None,
+    ) -> Iterator[httpx.Response]:
         """An answer whose content is read in pieces.
+
+        Args:
+            path: behind `/api/v1`.
+            query: as of `get`.
+            headers: further ones.
 
         Raises:
             FootTileError: no answer, one that is a problem, or one that broke off.
         """
+        has_begun = False
         try:
-            with self._client.stream("GET", path, params=_given(query)) as answer:
+            with self._client.stream(
+                "GET", path, params=_given(query), headers=dict(headers or {})
+            ) as answer:
+                has_begun = True
                 if answer.is_error:
                     answer.read()
                     raise self._problem(answer)
                 yield answer
         except httpx.HTTPError as error:
+            if has_begun:
+                raise NoAnswerError(f"{self.url}: the answer broke off: {error}.") from error
             raise self._no_answer(error) from error
 
     def _asked(self, method: str, path: str, tries: int, **how: Any) -> dict[str, Any]:
@@ -139,8 +160,12 @@ def _json(answer: httpx.Response) -> object:
     return content
 
 
-def _given(query: Mapping[str, object] | None) -> dict[str, str]:
-    return {name: _text(value) for name, value in (query or {}).items() if value is not None}
+def _given(query: Mapping[str, object] | None) -> dict[str, str | list[str]]:
+    return {
+        name: [_text(each) for each in value] if isinstance(value, list) else _text(value)
+        for name, value in (query or {}).items()
+        if value is not None
+    }
 
 
 def _text(value: object) -> str:

@@ -27,37 +27,38 @@ class Server(Closing):
     """
 
     def __init__(self, url: str, token: str | None = None, *, timeout_s: float = 10.0) -> None:
-        self._http = Http(url, token, timeout_s)
+        self.http = Http(url, token, timeout_s)
+        """Asks it what has no method here: `server.http.get("/calibrations")`."""
 
     def close(self) -> None:
         """Close its connections."""
-        self._http.close()
+        self.http.close()
 
     @property
     def url(self) -> str:
         """Its address."""
-        return self._http.url
+        return self.http.url
 
     @property
     def headers(self) -> dict[str, str]:
         """What is shown with every question: the token, if there is one."""
-        return dict(self._http.headers)
+        return dict(self.http.headers)
 
     def nodes(self) -> list[dict[str, Any]]:
         """All nodes that it knows, as the API describes them: `node`, `connected`, `tiles`, ..."""
-        items: list[dict[str, Any]] = self._http.get("/nodes")["items"]
+        items: list[dict[str, Any]] = self.http.get("/nodes")["items"]
         return items
 
     def node(self, name: str) -> dict[str, Any]:
         """One node."""
-        return self._http.get(f"/nodes/{quote(name, safe='')}")
+        return self.http.get(f"/nodes/{quote(name, safe='')}")
 
     def sessions(
         self,
         search: str | None = None,
         *,
-        node: str | None = None,
-        tag: str | None = None,
+        node: str | Sequence[str] | None = None,
+        tag: str | Sequence[str] | None = None,
         take: str | None = None,
         since: datetime | str | None = None,
         until: datetime | str | None = None,
@@ -67,8 +68,8 @@ class Server(Closing):
 
         Args:
             search: text in name, subject, notes, tags or node.
-            node: of this node only.
-            tag: with this tag only.
+            node: of this node only, or of one of these.
+            tag: with this tag only, or with each of these.
             take: of this take only.
             since: recorded at this instant or later; one without a zone is of this machine's zone.
             until: recorded before this instant.
@@ -76,8 +77,8 @@ class Server(Closing):
         """
         query: dict[str, object] = {
             "q": search,
-            "node": node,
-            "tag": tag,
+            "node": _all_of(node),
+            "tag": _all_of(tag),
             "take": take,
             "from": _instant(since),
             "to": _instant(until),
@@ -85,16 +86,16 @@ class Server(Closing):
             "limit": _PAGE,
         }
         while True:
-            page = self._http.get("/sessions", query)
+            page = self.http.get("/sessions", query)
             for facts in page["items"]:
-                yield Session(self._http, facts)
+                yield Session(self.http, facts)
             if page["next_cursor"] is None:
                 return
             query["cursor"] = page["next_cursor"]
 
     def session(self, session_id: str) -> Session:
         """One session."""
-        return Session(self._http, self._http.get(f"/sessions/{quote(session_id, safe='')}"))
+        return Session(self.http, self.http.get(f"/sessions/{quote(session_id, safe='')}"))
 
     def download_take(
         self,
@@ -120,7 +121,7 @@ class Server(Closing):
             OSError: the file cannot be written.
         """
         query = {"format": format, "start_s": start_s, "end_s": end_s}
-        return download(self._http, f"/takes/{quote(take, safe='')}/data", query, path)
+        return download(self.http, f"/takes/{quote(take, safe='')}/data", query, path)
 
     def record(
         self,
@@ -140,7 +141,7 @@ class Server(Closing):
         body |= {"subject": subject, "notes": notes, "tags": list(tags)}
         key = {"Idempotency-Key": uuid.uuid4().hex}
         return Session(
-            self._http, self._http.send("POST", "/sessions", body, headers=key, again=True)
+            self.http, self.http.send("POST", "/sessions", body, headers=key, again=True)
         )
 
     def tare(self, node: str, reason: str = "") -> dict[str, Any]:
@@ -149,18 +150,16 @@ class Server(Closing):
         Raises:
             ConflictError: the foot is loaded or moves, or the node is away.
         """
-        return self._http.send("POST", f"/nodes/{quote(node, safe='')}/tare", {"reason": reason})
+        return self.http.send("POST", f"/nodes/{quote(node, safe='')}/tare", {"reason": reason})
 
     def tares(self, node: str) -> list[dict[str, Any]]:
         """The tares of a node, the newest first."""
-        items: list[dict[str, Any]] = self._http.get(f"/nodes/{quote(node, safe='')}/tares")[
-            "items"
-        ]
+        items: list[dict[str, Any]] = self.http.get(f"/nodes/{quote(node, safe='')}/tares")["items"]
         return items
 
     def ticket(self, *, may: str = "press") -> dict[str, Any]:
         """A ticket for somebody who may `look` or `press`; this needs the server's token."""
-        return self._http.send("POST", "/tickets", {"may": may})
+        return self.http.send("POST", "/tickets", {"may": may})
 
     def live(
         self,
@@ -187,8 +186,12 @@ class Server(Closing):
             give_up_s: raise `NoAnswerError` if the server does not answer for so long; None: never,
                 once it has answered.
         """
-        asked = Asked.of(self._http.url, node, columns, policy, boot_id, from_seq)
+        asked = Asked.of(self.http.url, node, columns, policy, boot_id, from_seq)
         return Live(asked, self.headers, on_loss=on_loss, give_up_s=give_up_s)
+
+
+def _all_of(given: str | Sequence[str] | None) -> list[str]:
+    return [given] if isinstance(given, str) else list(given or ())
 
 
 def _instant(given: datetime | str | None) -> str | None:

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 from urllib.parse import quote
 
-from foottile.data import Data
+from foottile.data import Clock, Data
 from foottile.errors import ConflictError, FootTileError
 from foottile.files import download
 from foottile.http import Http
@@ -132,10 +132,18 @@ class Session:
         *,
         start_s: float | None = None,
         end_s: float | None = None,
+        clock: Clock = "node",
     ) -> Data:
-        """Its frames, or some columns and seconds of them; nothing is fetched yet."""
+        """Its frames, or some columns and seconds of them; nothing is fetched yet.
+
+        Args:
+            columns: names, of all tiles (`force_n`) or one (`force_n_0`); none: all.
+            start_s: from so many seconds after the first frame on.
+            end_s: before so many seconds.
+            clock: of `server` there are also `t_server_ns`, to compare with marks, and its bound.
+        """
         names = (columns,) if isinstance(columns, str) else tuple(columns)
-        return Data(self._http, self.id, names, start_s, end_s)
+        return Data(self._http, self.id, names, start_s, end_s, clock)
 
     def marks(self) -> list[Mark]:
         """What was marked in it, in order of time.
@@ -186,15 +194,20 @@ class Session:
     def wait(self, timeout_s: float = 60.0) -> Self:
         """Wait until it is sealed.
 
+        Args:
+            timeout_s: not longer than that; to seal an hour takes some tens of seconds, and the
+                first session of a new machine waits until models are compiled.
+
         Raises:
-            ConflictError: it is not by then, and says what it waits for.
+            ConflictError: it is not by then, and says what it waits for; it may be asked again.
             FootTileError: no answer.
         """
         end_s = time.monotonic() + timeout_s
         while self.refresh().state != "sealed":
             if time.monotonic() > end_s:
-                waits = self.facts.get("waits_for") or self.facts.get("problem") or "its end"
-                raise ConflictError(f"session {self.id} is {self.state}, and waits for {waits}")
+                raise ConflictError(
+                    f"session {self.id} is not sealed after {timeout_s:g} s: {_why_not(self.facts)}"
+                )
             time.sleep(_LOOK_EVERY_S)
         return self
 
@@ -217,3 +230,12 @@ class Session:
     @property
     def _path(self) -> str:
         return f"/sessions/{quote(self.id, safe='')}"
+
+
+def _why_not(facts: Mapping[str, Any]) -> str:
+    if facts["problem"]:
+        return str(facts["problem"])
+    return {
+        "recording": "it is still being recorded, and waits for its stop",
+        "pending": f"it is stopped, and waits for its node's {facts['waits_for'] or 'frames'}",
+    }.get(facts["state"], "the server is writing it; wait again")

@@ -16,7 +16,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from foottile.closing import AsyncClosing
-from foottile.data import Data
+from foottile.data import Clock, Data
 from foottile.errors import FootTileError
 from foottile.live_protocol import Asked, Loss, Policy
 from foottile.live_state import LiveState
@@ -87,9 +87,10 @@ class AsyncSession:
         *,
         start_s: float | None = None,
         end_s: float | None = None,
+        clock: Clock = "node",
     ) -> AsyncData:
         """As `Session.open`."""
-        return AsyncData(self.now.open(columns, start_s=start_s, end_s=end_s))
+        return AsyncData(self.now.open(columns, start_s=start_s, end_s=end_s, clock=clock))
 
     async def refresh(self) -> Self:
         """As `Session.refresh`."""

@@ -94,8 +94,9 @@ def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_late
         (("estimate", "in.parquet", "--out", "out.parquet"), "server"),
         (("calibrate", "in.parquet", "--out", "out.json"), "server"),
         (("bench", "--out", "."), "server"),
-        (("sessions",), "server"),
-        (("pull", "id", "--out", "."), "server"),
+        (("sessions",), "client"),
+        (("pull", "id", "--out", "."), "client"),
+        (("stream",), "client"),
         (("doctor", "--bus", "emulated"), "emulation"),
     ],
 )

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import foottile
 from devices.errors import FootTileError, LinkError
-from service.client import Client
+from service.pull import pull
 from storage.sessions.folder import FRAMES_NAME
 
 _SERVER_S = 120.0
@@ -126,13 +127,14 @@ class Laboratory:
             node = self._start(trial.name, arguments)
             self._nodes.append(node)
         try:
-            with Client(self._url) as client:
-                session = self._started(client, trial.name, node)
+            with foottile.connect(self._url) as server:
+                session = self._started(server, trial.name, node)
                 _wait(trial.seconds, node, trial.name)
-                client.stop(session)
-                sealed = self._await_sealed(client, session)
-                missed = client.node(trial.name)["missed_slots"]
-                pulled = client.pull(session, self._folder / "sessions")
+                sealed = session.stop().wait(_SEALED_S).facts
+                missed = server.node(trial.name)["missed_slots"]
+                pulled = pull(server, session.id, self._folder / "sessions")
+        except foottile.FootTileError as error:
+            raise LinkError(f"trial {trial.name}: {error}") from error
         finally:
             code = _end(node)
         absent = [path for path in trial.writes if not path.is_file()]
@@ -143,7 +145,7 @@ class Laboratory:
                 where=str(self._log(trial.name)),
             )
         return Recorded(
-            path=self._folder / "sessions" / session / FRAMES_NAME,
+            path=self._folder / "sessions" / session.id / FRAMES_NAME,
             session=pulled,
             lost_frames=sum(sealed["lost"].values()),
             missed_slots=int(missed or 0),
@@ -176,28 +178,18 @@ class Laboratory:
             time.sleep(_LOOK_S)
         raise FootTileError("the server does not start", where=str(self._log("server")))
 
-    def _started(self, client: Client, name: str, process: subprocess.Popen[bytes]) -> str:
+    def _started(
+        self, server: foottile.Server, name: str, process: subprocess.Popen[bytes]
+    ) -> foottile.Session:
         """The session that is recorded, as soon as the node is there."""
         until_s, why = time.monotonic() + _NODE_S, ""
         while time.monotonic() < until_s and process.poll() is None:
             try:
-                begun = client.start(name, name, pre_roll_s=PRE_ROLL_S)
-            except LinkError as error:  # the server does not know it yet
-                why = error.what
+                return server.record(name, name, pre_roll_s=PRE_ROLL_S)
+            except foottile.FootTileError as error:  # the server does not know it yet
+                why = str(error)
                 time.sleep(_LOOK_S)
-            else:
-                return str(begun["id"])
         raise FootTileError(f"node {name} does not come: {why}", where=str(self._log(name)))
-
-    def _await_sealed(self, client: Client, session: str) -> dict[str, Any]:
-        until_s = time.monotonic() + _SEALED_S
-        while True:
-            found = client.session(session)
-            if found["state"] == "sealed" and found["sha256"] is not None:
-                return found
-            if time.monotonic() > until_s:
-                raise FootTileError(f"session {session} is still {found['state']}", where=self._url)
-            time.sleep(_LOOK_S)
 
 
 def _wait(seconds: float, process: subprocess.Popen[bytes], name: str) -> None:

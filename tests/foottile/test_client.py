@@ -9,10 +9,13 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import httpx
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import foottile
+import foottile.data
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, ServeWith
 
@@ -74,6 +77,59 @@ def test_a_session_is_recorded_marked_found_and_read(
     path = session.download(tmp_path / "trial.parquet")
     assert path.stat().st_size == session.facts["bytes"]
     assert [*tmp_path.glob("*trial*")] == [path]
+
+
+def test_frames_are_read_however_small_the_pieces_are_that_they_come_in(
+    server: foottile.Server, tared: FakeNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = recorded(server, tared)
+    whole = pq.read_table(session.download(tmp_path / "trial.parquet"))
+    monkeypatch.setattr(foottile.data, "_CHUNK", 100)
+    table = session.open(whole.column_names).arrow()
+    assert table.num_rows == session.frames
+    assert table["seq"].equals(whole["seq"])
+
+
+def test_an_answer_that_breaks_off_is_said_to_be_damaged(
+    server: foottile.Server, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = recorded(server, tared)
+    given = httpx.Response.iter_bytes
+
+    def short(answer: httpx.Response, size: int | None = None) -> Iterator[bytes]:
+        yield b"".join(given(answer, size))[:-500]
+
+    monkeypatch.setattr(httpx.Response, "iter_bytes", short)
+    with pytest.raises(foottile.DamagedError, match="did not come whole"):
+        session.open("seq").arrow()
+
+
+def test_a_frames_instant_in_the_servers_utc_is_beside_its_columns_on_request(
+    server: foottile.Server, tared: FakeNode
+) -> None:
+    session = recorded(server, tared)
+    data = session.open(["t_server_ns", "grf_n"], clock="server")
+    assert data.arrow().column_names == ["t_server_ns", "grf_n"]
+    assert data["t_server_ns"].shape == data["grf_n"].shape
+    assert "t_server_uncertainty_ns" in session.open(clock="server").arrow().column_names
+    with pytest.raises(foottile.UsageError, match="no column 't_server_ns'"):
+        session.open("t_server_ns").arrow()
+
+
+def test_sessions_are_found_of_several_nodes_and_with_several_tags(
+    server: foottile.Server, tared: FakeNode
+) -> None:
+    session = recorded(server, tared).describe(tags=["mud", "wet"])
+    assert [each.id for each in server.sessions(node=["left", "bench"])] == [session.id]
+    assert [each.id for each in server.sessions(tag=("mud", "wet"))] == [session.id]
+    assert not list(server.sessions(node=["left", "right"]))
+    assert not list(server.sessions(tag=["mud", "dry"]))
+
+
+def test_what_has_no_method_is_asked_for_by_its_path(
+    server: foottile.Server, tared: FakeNode
+) -> None:
+    assert server.http.get("/calibrations", {"limit": None})["items"] == []
 
 
 def test_what_somebody_else_has_changed_is_not_overwritten(

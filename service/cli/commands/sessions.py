@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from devices.errors import UsageError, needs_extra
+from devices.errors import UsageError
 from devices.words import printable
 from service.cli.format_options import FormatOption, with_format_options
 from service.cli.many import (
@@ -48,7 +49,6 @@ ColumnsOption = Annotated[
 ]
 
 
-@needs_extra("server", "`foottile sessions`")
 def sessions_command(
     server: ServerOption = None,
     data: Annotated[
@@ -98,13 +98,7 @@ def sessions_command(
     )
     if server is not None and data is not None:
         raise UsageError("--server and --data are two places to look in", remedy="Name one")
-    if data is not None:
-        found = _in_folder(data, choice)
-    else:
-        from service.client import Client
-
-        with Client(server or SERVER) as client:
-            found = client.sessions(choice)
+    found = _of_server(server or SERVER, choice) if data is None else _in_folder(data, choice)
     if as_json:
         print_json({"items": found})
         return
@@ -133,7 +127,6 @@ def sessions_command(
 
 
 @with_format_options
-@needs_extra("server", "`foottile pull`")
 def pull_command(
     out: Annotated[Path, typer.Option(help="Folder to put it in; made if absent.")],
     session: Annotated[str | None, typer.Argument(help="Id of the session.")] = None,
@@ -159,7 +152,8 @@ def pull_command(
     are made by the server for the asking, and are one file in --out. Exit code 3: the session is
     complete on disk, but lossy.
     """
-    from service.client import Client
+    import foottile
+    from service.pull import pull, pull_made, pull_take
     from storage.formats.slice import Slice
     from storage.formats.written.parquet import PARQUET
     from storage.formats.written.registry import format_named, together_named
@@ -168,13 +162,13 @@ def pull_command(
         raise UsageError("what is to be pulled", expected="the id of a session, or --take")
     chosen = format_named(to) if take is None else together_named(to)
     part = Slice(start_s, end_s, _names(columns))
-    with Client(server or SERVER) as client, progress(f"pulling {session or take}"):
+    with foottile.connect(server or SERVER) as source, progress(f"pulling {session or take}"):
         if session is None:
-            pulled = client.pull_take(str(take), out, part, chosen, options)
+            pulled = pull_take(source, str(take), out, part, chosen, options)
         elif part.is_all and chosen is PARQUET and not options.set_names:
-            pulled = client.pull(session, out)
+            pulled = pull(source, session, out)
         else:
-            pulled = client.pull_made(session, out, part, chosen, options)
+            pulled = pull_made(source, session, out, part, chosen, options)
     if as_json:
         print_json(pulled)
     elif "resumed_bytes" not in pulled:
@@ -308,7 +302,26 @@ def _of_take(take: str, data: Path | None) -> list[str]:
     return [each["id"] for each in sorted(found, key=lambda each: (each["node"], each["id"]))]
 
 
-def _in_folder(data: Path, choice: Choice) -> list[dict[str, Any]]:
+def _of_server(url: str, choice: Choice) -> list[Mapping[str, Any]]:
+    import foottile
+
+    def instant(t_ns: int | None) -> str | None:
+        return None if t_ns is None else str(t_ns)
+
+    with foottile.connect(url) as server:
+        found = server.sessions(
+            choice.q,
+            node=choice.nodes,
+            tag=choice.tags,
+            take=choice.take,
+            since=instant(choice.from_t_ns),
+            until=instant(choice.to_t_ns),
+            complete=choice.complete,
+        )
+        return [session.facts for session in found]
+
+
+def _in_folder(data: Path, choice: Choice) -> list[Mapping[str, Any]]:
     from storage.sessions.folder import Completeness, Session, SessionFolder
 
     if not data.is_dir():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, BinaryIO
 
 import typer
 
-from devices.errors import UsageError, needs_extra
+from devices.errors import UsageError
 from service.cli.commands.sessions import SERVER, ColumnsOption, ServerOption
 from service.cli.options import remark
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 FORMATS = ("csv", "jsonl")
 
 
-@needs_extra("client", "`foottile stream`")
 def stream_command(
     node: Annotated[str | None, typer.Argument(help="Name of the node; the only one.")] = None,
     columns: ColumnsOption = None,

@@ -25,11 +25,11 @@ def ticket_command(
     Whoever opens it first is in, for twelve hours; it is good for five minutes. Run it on the
     server's own computer; the token is FOOTTILE_TOKEN, or the one that the server keeps.
     """
+    import foottile
     from service.api.address import known_token
-    from service.client import Client
 
-    with Client(server or SERVER, token=known_token(data_folder(data))) as client:
-        ticket = client.ticket("look" if viewer else "press")
+    with foottile.connect(server or SERVER, known_token(data_folder(data))) as source:
+        ticket = source.ticket(may="look" if viewer else "press")
     if as_json:
         print_json(ticket)
     else:

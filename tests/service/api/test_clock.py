@@ -15,8 +15,9 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
+import foottile
 from service import server_clock
-from service.client import Client
+from service.pull import pull
 from storage.checked_table import write_table
 from storage.clock.log import ClockLog
 from tests.service.command import command
@@ -230,8 +231,8 @@ def test_a_pulled_session_is_exported_with_the_servers_time_and_a_lone_file_is_n
 ) -> None:
     begun(node, HOUR_NS)
     session = recorded(node, HOUR_NS)
-    with Client(running.url) as client:
-        client.pull(session.id, tmp_path)
+    with foottile.connect(running.url) as server:
+        pull(server, session.id, tmp_path)
     folder = tmp_path / session.id
     out = tmp_path / "out.parquet"
     options = ("--format", "parquet", "--clock", "server", "--out", out)
@@ -264,8 +265,8 @@ def test_a_table_that_was_taken_away_is_said_to_be(
         assert_refused(answer, 404, "clock.parquet")
     answer = running.http.get(f"{session.url}/data?clock=server")
     assert_refused(answer, 422, "clock.parquet")
-    with Client(running.url) as client:
-        client.pull(session.id, tmp_path)
+    with foottile.connect(running.url) as server:
+        pull(server, session.id, tmp_path)
     assert not (tmp_path / session.id / "clock.parquet").exists()
     assert running.http.get("/sessions/20200101T000000Z-000000/clock").status_code == 404
 

@@ -12,8 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import foottile
 from devices.errors import StorageError
-from service.client import Client
+from service.pull import pull
 from storage.sessions.beside import read_events, write_events
 from storage.sessions.folder import Session
 from tests.service.command import command
@@ -215,8 +216,8 @@ def pulled(session: Recording, tmp_path: Path) -> Path:
     """The session's folder with two marks, one of them at no frame, pulled."""
     mark(session, "a stone")
     mark(session, "years ago", t_ns=5)
-    with Client(session.running.url) as client:
-        client.pull(session.id, tmp_path / "out")
+    with foottile.connect(session.running.url) as server:
+        pull(server, session.id, tmp_path / "out")
     return tmp_path / "out" / session.id
 
 

@@ -14,8 +14,9 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
-from devices.errors import LinkError, StateError, UsageError
-from service.client import Client
+import foottile
+from devices.errors import UsageError
+from service.pull import pull, pull_made
 from storage.formats.slice import Slice
 from storage.formats.written.registry import format_named
 from storage.verify.data import verdict_of, verify
@@ -25,9 +26,9 @@ from tests.storage.formats.exports import TABLES
 
 
 def test_the_client_pulls_a_session_whole(sealed: Sealed, tmp_path: Path) -> None:
-    with Client(sealed.running.url) as client:
-        assert {s["id"] for s in client.sessions()} == {sealed.id, sealed.recording.id}
-        pulled = client.pull(sealed.id, tmp_path / "out")
+    with foottile.connect(sealed.running.url) as server:
+        assert {each.id for each in server.sessions()} == {sealed.id, sealed.recording.id}
+        pulled = pull(server, sealed.id, tmp_path / "out")
         assert Path(pulled["path"]).read_bytes() == sealed.content
         assert pulled["resumed_bytes"] == 0
         folder = tmp_path / "out" / sealed.id
@@ -39,13 +40,13 @@ def test_the_client_pulls_a_session_whole(sealed: Sealed, tmp_path: Path) -> Non
             "ledger.json",
             "clock.parquet",
         }
-        again = client.pull(sealed.id, tmp_path / "out")
+        again = pull(server, sealed.id, tmp_path / "out")
         assert again["path"] == pulled["path"]
 
 
 def test_what_is_pulled_proves_itself_file_by_file(sealed: Sealed, tmp_path: Path) -> None:
-    with Client(sealed.running.url) as client:
-        client.pull(sealed.id, tmp_path)
+    with foottile.connect(sealed.running.url) as server:
+        pull(server, sealed.id, tmp_path)
         folder = tmp_path / sealed.id
         report = verify(folder)
         assert (verdict_of(report), report.as_dict()["unproven"]) == ("complete", [])
@@ -55,7 +56,7 @@ def test_what_is_pulled_proves_itself_file_by_file(sealed: Sealed, tmp_path: Pat
             assert path.name in " ".join(verify(folder).as_dict()["problems"])
             path.write_bytes(whole)
         (folder / "session.json").write_bytes(b"{")
-        client.pull(sealed.id, tmp_path)
+        pull(server, sealed.id, tmp_path)
         assert (folder / "session.json.damaged-1").read_bytes() == b"{"
         assert verdict_of(verify(folder)) == "complete"
 
@@ -63,14 +64,14 @@ def test_what_is_pulled_proves_itself_file_by_file(sealed: Sealed, tmp_path: Pat
 def test_nothing_is_pulled_into_a_servers_data_folder(sealed: Sealed, tmp_path: Path) -> None:
     folder = sealed.session.folder
     before = (folder / "session.json").read_bytes()
-    with Client(sealed.running.url) as client:
+    with foottile.connect(sealed.running.url) as server:
         for out in (folder.parent, folder.parent.parent, folder):
             with pytest.raises(UsageError, match="this is a data folder"):
-                client.pull(sealed.id, out)
+                pull(server, sealed.id, out)
         copied = tmp_path / "copied"
         shutil.copytree(folder.parent, copied)  # without the lock, but still not ours
         with pytest.raises(UsageError, match=r"not one that `foottile pull` wrote"):
-            client.pull(sealed.id, copied)
+            pull(server, sealed.id, copied)
     assert (folder / "session.json").read_bytes() == before
     assert (copied / sealed.id / "session.json").read_bytes() == before
     assert not (folder.parent.parent / sealed.id).exists()
@@ -83,8 +84,8 @@ def test_the_client_resumes_a_partial_file(
     folder = tmp_path / "out" / sealed.id
     folder.mkdir(parents=True)
     (folder / ".frames.parquet.part").write_bytes(sealed.content[:have])
-    with Client(sealed.running.url) as client:
-        pulled = client.pull(sealed.id, tmp_path / "out")
+    with foottile.connect(sealed.running.url) as server:
+        pulled = pull(server, sealed.id, tmp_path / "out")
     assert Path(pulled["path"]).read_bytes() == sealed.content
     assert pulled["resumed_bytes"] == (have or len(sealed.content))
     assert not list(folder.glob("*.part"))
@@ -99,10 +100,10 @@ def test_the_client_repairs_a_partial_file_that_is_wrong(
     folder = tmp_path / "out" / sealed.id
     folder.mkdir(parents=True)
     (folder / ".frames.parquet.part").write_bytes(partial)
-    with Client(sealed.running.url) as client:
-        with suppress(LinkError):  # it may say so, once
-            client.pull(sealed.id, tmp_path / "out")
-        client.pull(sealed.id, tmp_path / "out")
+    with foottile.connect(sealed.running.url) as server:
+        with suppress(foottile.DamagedError):  # it may say so, once
+            pull(server, sealed.id, tmp_path / "out")
+        pull(server, sealed.id, tmp_path / "out")
     assert (folder / "frames.parquet").read_bytes() == sealed.content
 
 
@@ -110,36 +111,42 @@ def test_the_client_replaces_a_file_that_is_wrong(sealed: Sealed, tmp_path: Path
     folder = tmp_path / "out" / sealed.id
     folder.mkdir(parents=True)
     (folder / "frames.parquet").write_bytes(b"something else")
-    with Client(sealed.running.url) as client:
-        client.pull(sealed.id, tmp_path / "out")
+    with foottile.connect(sealed.running.url) as server:
+        pull(server, sealed.id, tmp_path / "out")
     assert (folder / "frames.parquet").read_bytes() == sealed.content
 
 
 def test_the_client_says_that_a_session_is_not_sealed(sealed: Sealed, tmp_path: Path) -> None:
     with (
-        Client(sealed.running.url) as client,
-        pytest.raises(StateError, match=r"is recording.*Stop it"),
+        foottile.connect(sealed.running.url) as server,
+        pytest.raises(foottile.ConflictError, match=r"is recording.*Stop it"),
     ):
-        client.pull(sealed.recording.id, tmp_path / "out")
+        pull(server, sealed.recording.id, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_the_client_says_that_there_is_no_such_session(sealed: Sealed, tmp_path: Path) -> None:
-    with Client(sealed.running.url) as client, pytest.raises(LinkError, match="no session"):
-        client.pull("20200101T000000Z-000000", tmp_path)
+    with (
+        foottile.connect(sealed.running.url) as server,
+        pytest.raises(foottile.UnknownError, match="no session"),
+    ):
+        pull(server, "20200101T000000Z-000000", tmp_path)
 
 
 def test_the_client_says_that_no_server_answers(running: Running, tmp_path: Path) -> None:
     running.stop()
-    with Client(running.url) as client, pytest.raises(LinkError, match="foottile serve"):
-        client.sessions()
+    with (
+        foottile.connect(running.url) as server,
+        pytest.raises(foottile.NoAnswerError, match="foottile serve"),
+    ):
+        pull(server, "20200101T000000Z-000000", tmp_path)
 
 
 @pytest.mark.parametrize("to", TABLES)
 def test_the_client_pulls_a_slice(sealed: Sealed, tmp_path: Path, to: str) -> None:
     part = Slice(0.25, 0.5, ("t_ns", "grf_n"))
-    with Client(sealed.running.url) as client:
-        pulled = client.pull_made(sealed.id, tmp_path / "out", part, format_named(to))
+    with foottile.connect(sealed.running.url) as server:
+        pulled = pull_made(server, sealed.id, tmp_path / "out", part, format_named(to))
     path = Path(pulled["path"])
     assert path.name == f"{sealed.id}_0.25s-0.5s.{to}"
     assert pulled["bytes"] == path.stat().st_size
@@ -160,25 +167,25 @@ def test_the_client_pulls_any_format_and_one_of_sealed_sessions_waits_for_that(
     sealed: Sealed, tmp_path: Path
 ) -> None:
     begins = {"mcap": b"\x89MCAP0", "mat": b"MATLAB 5.0", "xdf": b"XDF:"}
-    with Client(sealed.running.url) as client:
+    with foottile.connect(sealed.running.url) as server:
         for name, begin in begins.items():
-            pulled = client.pull_made(sealed.id, tmp_path, Slice(0.25, 0.5), format_named(name))
+            pulled = pull_made(server, sealed.id, tmp_path, Slice(0.25, 0.5), format_named(name))
             assert Path(pulled["path"]).read_bytes().startswith(begin)
             assert Path(pulled["path"]).name == f"{sealed.id}_0.25s-0.5s.{name}"
-        with pytest.raises(LinkError, match=r"MATLAB is made when it is sealed.*xdf"):
-            client.pull_made(sealed.recording.id, tmp_path, Slice(), format_named("mat"))
+        with pytest.raises(foottile.ConflictError, match=r"MATLAB is made when it is sealed.*xdf"):
+            pull_made(server, sealed.recording.id, tmp_path, Slice(), format_named("mat"))
 
 
 def test_a_slice_that_is_refused_leaves_nothing_behind(sealed: Sealed, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Client(sealed.running.url) as client:
-        with pytest.raises(LinkError, match="no column"):
-            client.pull_made(sealed.id, out, Slice(columns=("weight_n",)), format_named("arrow"))
-        with pytest.raises(LinkError, match="is recording"):
-            client.pull_made(sealed.recording.id, out, Slice(0.0, 1.0), format_named("parquet"))
+    with foottile.connect(sealed.running.url) as server:
+        with pytest.raises(foottile.UsageError, match="no column"):
+            pull_made(server, sealed.id, out, Slice(columns=("weight_n",)), format_named("arrow"))
+        with pytest.raises(foottile.ConflictError, match="is recording"):
+            pull_made(server, sealed.recording.id, out, Slice(0.0, 1.0), format_named("parquet"))
         with pytest.raises(UsageError, match="this is a data folder"):
-            client.pull_made(
-                sealed.id, sealed.session.folder, Slice(0.0, 1.0), format_named("arrow")
+            pull_made(
+                server, sealed.id, sealed.session.folder, Slice(0.0, 1.0), format_named("arrow")
             )
     assert list(out.iterdir()) == []
 
@@ -196,8 +203,8 @@ def test_a_slice_that_is_damaged_on_its_way_is_refused(
     monkeypatch.setattr(httpx.Response, "iter_bytes", short)
     for to in ("parquet", "arrow"):
         with (
-            Client(sealed.running.url) as client,
-            pytest.raises(LinkError, match="did not come whole"),
+            foottile.connect(sealed.running.url) as server,
+            pytest.raises(foottile.DamagedError, match="did not come whole"),
         ):
-            client.pull_made(sealed.id, out, Slice(0.25, 0.5), format_named(to))
+            pull_made(server, sealed.id, out, Slice(0.25, 0.5), format_named(to))
     assert list(out.iterdir()) == []

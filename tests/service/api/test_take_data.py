@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 import foottile
-from devices.errors import LinkError
-from service.client import Client
+from service.pull import pull_take
 from storage.formats.slice import Slice
 from storage.formats.written.registry import FORMATS, SEVERAL, format_named
 from tests.service.fake_node import NodeOf
@@ -91,13 +90,13 @@ def test_what_cannot_be_one_file_is_refused_with_the_session_and_what_to_do(
 
 def test_both_clients_download_it_whole_or_not_at_all(take: Take, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Client(take.running.url) as client:
-        pulled = client.pull_take(take.id, out, Slice(0.0, 0.1), format_named("mcap"))
+    with foottile.connect(take.running.url) as server:
+        pulled = pull_take(server, take.id, out, Slice(0.0, 0.1), format_named("mcap"))
         path = Path(pulled["path"])
         assert path.name == f"take-{take.id}_0s-0.1s.mcap"
         assert len(said_in("mcap", path.read_bytes())) == 2
-        with pytest.raises(LinkError, match="csv holds one session only"):
-            client.pull_take(take.id, out, Slice(), format_named("csv"))
+        with pytest.raises(foottile.UsageError, match="csv holds one session only"):
+            pull_take(server, take.id, out, Slice(), format_named("csv"))
     assert [*out.iterdir()] == [path]
 
     with foottile.connect(take.running.url) as server:

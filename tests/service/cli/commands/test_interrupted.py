@@ -81,8 +81,8 @@ def test_ctrl_c_is_said_and_leaves_no_file_and_no_process(
         ("service.sessions.recover.recover", "recover data"),
         ("service.offline.estimate.session.estimate_session", "estimate s.parquet --out x.parquet"),
         ("service.offline.doctor.diagnose", "doctor --bus emulated"),
-        ("service.client.Client.sessions", "sessions"),
-        ("service.client.Client.pull", "pull 20200101T000000Z-000000 --out x"),
+        ("foottile.server.Server.sessions", "sessions"),
+        ("service.pull.pull", "pull 20200101T000000Z-000000 --out x"),
     ],
 )
 def test_ctrl_c_in_any_other_command_is_said_too(

@@ -1,0 +1,282 @@
+"""Sessions of a server into folders: downloaded verified, whole or a slice."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from http import HTTPStatus
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import foottile
+from devices.errors import DamagedFileError, UsageError
+from storage.checked_json import read_checked, write_checked
+from storage.checked_table import table_of
+from storage.durable import (
+    LOCK_NAME,
+    set_aside,
+    storage_errors,
+    sync_folder,
+    temporary_of,
+    write_whole,
+)
+from storage.file_hash import sha256_of
+from storage.formats.options import NO_OPTIONS, FormatOptions
+from storage.formats.slice import Slice
+from storage.formats.written.format import Format
+from storage.sessions.claims import SESSION_NAME
+from storage.sessions.folder import FRAMES_NAME
+from storage.verify.exported import FORMATS as PROVEN
+from storage.verify.exported import verify_export
+
+if TYPE_CHECKING:
+    import httpx
+
+_CHUNK = 1 << 20
+_PARQUET = b"PAR1"
+_AGAIN = "Run the same command again"
+
+
+def refuse_data_folder(folder: Path) -> None:
+    """Refuse to write where a server or node keeps this session, or others.
+
+    What was pulled before is written again; its `session.json` is set aside if it is damaged.
+
+    Args:
+        folder: of one session, perhaps not there yet.
+
+    Raises:
+        UsageError: it is theirs.
+        StorageError: what is damaged cannot be set aside.
+    """
+    remedy = "Choose a folder of your own with --out"
+    for place in (folder.resolve(), *folder.resolve().parents[:4]):
+        has_data = (place / "sessions").is_dir() or (place / "journal").is_dir()
+        if has_data and (place / LOCK_NAME).exists():
+            what = "this is a data folder, whose files are its server's or node's"
+            raise UsageError(what, where=str(place), remedy=remedy)
+    path = folder / SESSION_NAME
+    try:
+        content = json.loads(read_checked(path).text)
+    except FileNotFoundError:
+        return
+    except ValueError:  # a DamagedFileError is one
+        set_aside(path)
+        return
+    if not isinstance(content, dict) or "complete" not in content:
+        what = f"its {SESSION_NAME} is not one that `foottile pull` wrote"
+        raise UsageError(what, where=str(folder), remedy=remedy)
+
+
+def pull(server: foottile.Server, session_id: str, out: Path) -> dict[str, Any]:
+    """Download a sealed session into the folder `out`/`session_id`.
+
+    Returns:
+        Where it is, and what is known of it.
+
+    Raises:
+        foottile.NoAnswerError: the server does not answer, or the download broke off.
+        foottile.UnknownError: it has no such session.
+        foottile.ConflictError: the session is not sealed.
+        foottile.DamagedError: what came is not what the server has.
+        foottile.FootTileError: another refusal by the server.
+        UsageError: that is no id, or a folder in which a server or node keeps its sessions.
+        StorageError: it cannot be written.
+    """
+    session = _facts(server, session_id)
+    if session["sha256"] is None:
+        problem = f": {session['problem']}" if session["problem"] else ""
+        raise foottile.ConflictError(
+            f"session {session_id} is {session['state']}{problem}; expected a sealed session. "
+            "Stop it first, or wait until it is sealed"
+        )
+    folder = out / session_id
+    refuse_data_folder(folder)
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    path = folder / FRAMES_NAME
+    resumed = 0
+    if not (path.is_file() and sha256_of(path) == session["sha256"]):
+        resumed = _download(server, session, path)
+    events = server.http.get(f"/sessions/{session_id}/events")
+    ledger = server.http.get(f"/sessions/{session_id}/ledger")
+    for name, content in (("session", session), ("events", events), ("ledger", ledger)):
+        write_checked(folder / f"{name}.json", json.dumps(content, indent=1).encode())
+    for name in ("events", "clock"):
+        _pull_table(server, f"/sessions/{session_id}/{name}", folder / f"{name}.parquet")
+    return {**session, "path": str(path), "resumed_bytes": resumed}
+
+
+def pull_made(
+    server: foottile.Server,
+    session_id: str,
+    out: Path,
+    part: Slice,
+    to: Format,
+    options: FormatOptions = NO_OPTIONS,
+) -> dict[str, Any]:
+    """Download a session, or some seconds or columns of it, in some format.
+
+    It is one file in the folder `out`.
+
+    The server reads, and sends, no more than that. A slice has no hash of its own: its pages'
+    checksums prove it if it is Parquet, and its metadata say what it was made of.
+
+    Returns:
+        Where it is, and what is known of its session.
+
+    Raises:
+        foottile.DamagedError: what came cannot be read.
+        foottile.FootTileError: the server does not answer, or refuses.
+        UsageError: that is no id, or a folder in which a server or node keeps its sessions.
+        StorageError: it cannot be written.
+    """
+    session = _facts(server, session_id)
+    path = _pull_made(server, f"/sessions/{session_id}/data", session_id, out, part, to, options)
+    return {**session, "path": str(path), "bytes": path.stat().st_size}
+
+
+def pull_take(
+    server: foottile.Server,
+    take_id: str,
+    out: Path,
+    part: Slice,
+    to: Format,
+    options: FormatOptions = NO_OPTIONS,
+) -> dict[str, Any]:
+    """Download all sessions of a take, or some seconds of each, as one file in `out`.
+
+    Returns:
+        Where it is, and what is known of the take.
+
+    Raises:
+        foottile.FootTileError: the server does not answer, or refuses.
+        UsageError: that is a folder in which a server or node keeps its sessions.
+        StorageError: it cannot be written.
+    """
+    url = f"/takes/{quote(take_id, safe='')}"
+    take = server.http.get(url)
+    complete = "lossy" if any(s["complete"] == "lossy" for s in take["sessions"]) else True
+    path = _pull_made(server, f"{url}/data", f"take-{take['id']}", out, part, to, options)
+    return {**take, "complete": complete, "path": str(path), "bytes": path.stat().st_size}
+
+
+def _pull_made(
+    server: foottile.Server,
+    url: str,
+    stem: str,
+    out: Path,
+    part: Slice,
+    to: Format,
+    options: FormatOptions,
+) -> Path:
+    refuse_data_folder(out)
+    with storage_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    end = "end" if part.end_s is None else f"{part.end_s:g}s"
+    path = out / f"{stem}_{part.start_s or 0.0:g}s-{end}.{to.ending}"
+    query: dict[str, object] = {"format": to.name, "start_s": part.start_s, "end_s": part.end_s}
+    query["columns"] = ",".join(part.columns) or None
+    query |= options.model_dump(mode="json")
+    # Under a name of its own until it is proven: who is cut off begins anew.
+    partial = temporary_of(path)
+    try:
+        with (
+            _to_do_again(_AGAIN),
+            server.http.stream(url, query) as answer,
+            storage_errors(partial),
+            partial.open("xb") as file,
+        ):
+            _write(answer, file)
+        # Of other formats the connection says whether they came to their end.
+        report = verify_export(partial) if to.name in PROVEN else None
+        if to.name in PROVEN and (report is None or report.problems):
+            why = "it cannot be read" if report is None else report.problems[0]
+            raise foottile.DamagedError(
+                f"{server.url}: the slice did not come whole: {why}. {_AGAIN}"
+            )
+        with storage_errors(path):
+            partial.replace(path)
+            sync_folder(path.parent)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def _facts(server: foottile.Server, session_id: str) -> Mapping[str, Any]:
+    """What the server says of it; what is no id would be a folder elsewhere."""
+    if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
+        raise UsageError(
+            f"{session_id!r} is no session id", remedy="List them with `foottile sessions`"
+        )
+    return server.session(session_id).facts
+
+
+def _download(server: foottile.Server, session: Mapping[str, Any], path: Path) -> int:
+    """Download to a partial file that is kept if it breaks off; bytes that were there."""
+    partial = path.with_name(f".{path.name}.part")
+    have = partial.stat().st_size if partial.is_file() else 0
+    headers = {"Accept-Encoding": "identity"}
+    if have:
+        headers |= {"Range": f"bytes={have}-", "If-Range": f'"{session["sha256"]}"'}
+    resumed = have
+    try:
+        with (
+            _to_do_again(f"{_AGAIN}: it goes on where it stopped"),
+            server.http.stream(
+                f"/sessions/{session['id']}/data", {"format": "parquet"}, headers=headers
+            ) as answer,
+        ):
+            resumed = have if answer.status_code == HTTPStatus.PARTIAL_CONTENT else 0
+            with storage_errors(partial), partial.open("ab" if resumed else "wb") as file:
+                _write(answer, file)
+    except foottile.FootTileError as error:
+        # All of it is here already, and only its name was lacking.
+        if not have or error.status != HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+            raise
+    if sha256_of(partial) != session["sha256"]:
+        partial.unlink()
+        raise foottile.DamagedError(
+            f"{path}: what was downloaded has not the hash that the server states. {_AGAIN}"
+        )
+    with storage_errors(path):
+        partial.replace(path)
+        sync_folder(path.parent)
+    return resumed
+
+
+def _write(answer: httpx.Response, file: IO[bytes]) -> None:
+    """Write an answer to a file, on the disk."""
+    for chunk in answer.iter_bytes(_CHUNK):
+        file.write(chunk)
+    file.flush()
+    os.fsync(file.fileno())
+
+
+@contextmanager
+def _to_do_again(remedy: str) -> Iterator[None]:
+    try:
+        yield
+    except foottile.NoAnswerError as error:
+        raise foottile.NoAnswerError(f"{error} {remedy}") from error
+
+
+def _pull_table(server: foottile.Server, url: str, path: Path) -> None:
+    try:
+        with server.http.stream(url, {"format": "parquet"}) as answer:
+            content = answer.read()
+    except foottile.UnknownError:
+        return  # taken away, or an older server that has none
+    if not content.startswith(_PARQUET):
+        return  # an older server, which knows no format but JSON here
+    try:
+        table_of(content, where=path.name)
+    except DamagedFileError as error:
+        raise foottile.DamagedError(
+            f"{server.url}: {error}. {_AGAIN}; if it stays so, the server's file is damaged"
+        ) from error
+    write_whole(path, content)
