@@ -12,6 +12,17 @@ interface Session {
 /** Sessions of all nodes that were begun with one press, and why there is none of some. */
 interface Take { id: string; sessions: Session[]; failed: Record<string, string> }
 
+/** Of GET /calibrations. */
+interface Kept {
+  id: string; name: string; date: string; serials: string[]; absolute_scale: "measured" | "assumed"; mounted: boolean;
+}
+
+/** Of GET /nodes/NODE/calibration. */
+interface NodeCalibration {
+  source: "node" | "server"; assigned_t_ns: number | null; problem: string | null; own_id: string | null;
+  calibration: { id: string; name: string; absolute_scale: "measured" | "assumed" } | null;
+}
+
 interface Mark { id: string; label: string; t_ns: number; said: string }
 
 interface Tile {

@@ -206,6 +206,11 @@ byId("node-select").addEventListener("change", () => {
   chooseNode(chosen);
 });
 
+byId("calibration").addEventListener("click", async () => {
+  const { openCalibration } = await import("./common/calibration.js");
+  if (state.node) openCalibration(state.node);
+});
+
 /** What must also be right while the tab draws nothing: live or frozen, and the counters. */
 function tick() {
   const { node } = state;
@@ -224,6 +229,8 @@ function tick() {
   state.cannotRecord = node ? status.cannotRecord : "";
   notes.draw(node, state.frame, nowMs, state.serverNowMs(), state.problems);
   tares.draw(node);
+  byId("calibration-line").hidden = !node;
+  setText(byId("calibration-name"), node?.calibration ? `Calibration “${node.calibration.name}”` : "No calibration");
   actions.draw();
   if (node && !node.connected) past.see(node, null, trace.windowS, nowMs, tileTraces.wants(bars.unit));
 }

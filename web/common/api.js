@@ -26,7 +26,7 @@ export async function call(method, path, body, stop = null, type = JSON_TYPE, sa
   try {
     response = await fetch(PREFIX + path, {
       method, headers, cache: "no-store",
-      body: body === undefined ? undefined : JSON.stringify(body),
+      body: body === undefined || body instanceof Blob ? body : JSON.stringify(body),
       signal: AbortSignal.any([...(stop ? [stop] : []), AbortSignal.timeout(patienceS * 1e3)]),
     });
   } catch (error) {
@@ -48,6 +48,17 @@ export const recent = (node, seconds, before, tiles) =>
   call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, {});
 export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
+/** @type {(node: string) => Promise<NodeCalibration>} */
+export const calibrationOf = (node) => call("GET", `/nodes/${id(node)}/calibration`);
+/** @type {(node: string, calibration: string, said: string) => Promise<NodeCalibration>} */
+export const assignCalibration = (node, calibration, said) =>
+  call("PUT", `/nodes/${id(node)}/calibration`, { id: calibration }, null, JSON_TYPE, said);
+/** @type {(node: string, said: string) => Promise<NodeCalibration>} */
+export const takeBackCalibration = (node, said) => call("DELETE", `/nodes/${id(node)}/calibration`, undefined, null, JSON_TYPE, said);
+/** @type {() => Promise<{items: Kept[]}>} */
+export const listCalibrations = () => call("GET", "/calibrations");
+/** As it is: its hashes are of its very digits. @type {(file: Blob) => Promise<Kept>} */
+export const uploadCalibration = (file) => call("POST", "/calibrations", file);
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
 /** @type {(node: string, name: string) => Promise<Session>} */
 export const startSession = (node, name) => call("POST", "/sessions", { node, name });

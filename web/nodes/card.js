@@ -40,12 +40,17 @@ export class Card {
       facts.append(row);
       return [title, { row, value }];
     }));
+    this.calibration = el("button", { type: "button", cls: "small", text: "Calibration …", "aria-label": `Calibration of ${name}` });
+    this.calibration.addEventListener("click", async () => {
+      const { openCalibration } = await import("../common/calibration.js");
+      openCalibration(this.node);
+    });
     this.notes = part("ul", "node-notes");
     this.told = part("p", "node-session");
     this.element = el("li", { cls: "node", "data-node": name },
       el("div", { cls: "node-head" }, el("h2", {}, link), this.state),
       el("div", { cls: "node-grf" }, el("p", {}, this.bound, this.value, " ", this.unit), this.contact, this.sigma),
-      canvas, el("div", { cls: "node-more" }, facts, this.notes, this.told));
+      canvas, el("div", { cls: "node-more" }, facts, this.calibration, this.notes, this.told));
   }
 
   take(node) {
