@@ -6,6 +6,7 @@ import io
 import json
 import math
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -32,6 +33,7 @@ from tests.storage.formats.walks import (
     export_of_walk,
     lines_of_documents,
     saturated,
+    two_feet,
     walk,
 )
 
@@ -216,35 +218,38 @@ def opensim() -> Any:
 MASS_KG = 1.0
 
 
-def free_foot(opensim: Any, folder: Path) -> Path:
-    """A model of one body, free in the ground, its origin at it."""
+def free_feet(opensim: Any, folder: Path, *bodies: str) -> Path:
+    """A model of these bodies, each free in the ground, its origin at it."""
     model = opensim.Model()
-    body = opensim.Body("foot", MASS_KG, opensim.Vec3(0), opensim.Inertia(0.01, 0.01, 0.01))
-    model.addBody(body)
-    model.addJoint(opensim.FreeJoint("free", model.getGround(), body))
+    for name in bodies:
+        body = opensim.Body(name, MASS_KG, opensim.Vec3(0), opensim.Inertia(0.01, 0.01, 0.01))
+        model.addBody(body)
+        model.addJoint(opensim.FreeJoint(f"free_{name}", model.getGround(), body))
     model.finalizeConnections()
-    model.printToXML(str(folder / "foot.osim"))
-    names = [model.getCoordinateSet().get(i).getName() for i in range(6)]
-    rows = "".join(f"{i * 0.01:.2f}" + "\t0" * 6 + "\n" for i in range(201))
-    head = "still\nversion=1\nnRows=201\nnColumns=7\ninDegrees=no\nendheader\n"
+    model.printToXML(str(folder / "feet.osim"))
+    coordinates = model.getCoordinateSet()
+    names = [coordinates.get(i).getName() for i in range(coordinates.getSize())]
+    rows = "".join(f"{i * 0.01:.2f}" + "\t0" * len(names) + "\n" for i in range(201))
+    head = f"still\nversion=1\nnRows=201\nnColumns={1 + len(names)}\ninDegrees=no\nendheader\n"
     (folder / "still.mot").write_text(head + "\t".join(["time", *names]) + "\n" + rows)
-    return folder / "foot.osim"
+    return folder / "feet.osim"
 
 
-def inverse_dynamics(opensim: Any, found: Unpacked) -> tuple[Array, Array]:
-    """Times, and what holds the foot still under these loads: moments and forces, (n, 6)."""
+def inverse_dynamics(opensim: Any, folder: Path, *bodies: str) -> tuple[Array, list[Array]]:
+    """Times, and what holds each foot still under these loads: moments and forces, (n, 6)."""
     tool = opensim.InverseDynamicsTool()
-    tool.setModelFileName(str(free_foot(opensim, found.folder)))
-    tool.setCoordinatesFileName(str(found.folder / "still.mot"))
-    tool.setExternalLoadsFileName(str(next(found.folder.glob("s*.xml"))))
+    tool.setModelFileName(str(free_feet(opensim, folder, *bodies)))
+    tool.setCoordinatesFileName(str(folder / "still.mot"))
+    tool.setExternalLoadsFileName(str(next(folder.glob("*.xml"))))
     tool.setStartTime(0.3)
     tool.setEndTime(1.7)
-    tool.setResultsDir(str(found.folder))
+    tool.setResultsDir(str(folder))
     tool.setOutputGenForceFileName("held.sto")
     assert tool.run()
-    table = opensim.TimeSeriesTable(str(found.folder / "held.sto"))
+    table = opensim.TimeSeriesTable(str(folder / "held.sto"))
     columns = [table.getDependentColumn(label).to_numpy() for label in table.getColumnLabels()]
-    return np.array(table.getIndependentColumn()), np.stack(columns, axis=1)
+    held = np.stack(columns, axis=1)
+    return np.array(table.getIndependentColumn()), np.split(held, len(bodies), axis=1)
 
 
 @pytest.mark.slow
@@ -256,7 +261,7 @@ def test_opensim_computes_what_the_loads_do_to_a_foot(
     read = opensim.TimeSeriesTable(str(found.mot))
     assert read.getNumRows() == ROWS
     assert tuple(read.getColumnLabels()) == COLUMNS
-    time_s, held = inverse_dynamics(opensim, found)
+    time_s, (held,) = inverse_dynamics(opensim, found.folder, "foot")
     force_n, x_m, y_m, z_m = (
         np.interp(time_s, found.columns["time"], found.columns[f"ground_force_{name}"])
         for name in ("vy", "px", "py", "pz")
@@ -270,11 +275,28 @@ def test_opensim_computes_what_the_loads_do_to_a_foot(
 
 
 @pytest.mark.slow
+def test_opensim_presses_each_foot_of_a_take_with_its_own_force(
+    opensim: Any, tmp_path: Path
+) -> None:
+    options = FormatOptions(body="calcn_l,calcn_r")
+    content = OPENSIM.written_together([replace(e, options=options) for e in two_feet()])
+    with zipfile.ZipFile(io.BytesIO(b"".join(content))) as file:
+        file.extractall(tmp_path)
+    mot = opensim.TimeSeriesTable(str(next(tmp_path.glob("*.mot"))))
+    time_s, feet = inverse_dynamics(opensim, tmp_path, "calcn_l", "calcn_r")
+    for held, node in zip(feet, ("left", "right-2"), strict=True):
+        read = mot.getDependentColumn(f"{node}_ground_force_vy").to_numpy()
+        force_n = np.interp(time_s, np.array(mot.getIndependentColumn()), read)
+        assert force_n.max() > 1.0
+        np.testing.assert_allclose(held[:, 4], MASS_KG * GRAVITY - force_n, atol=0.02)
+
+
+@pytest.mark.slow
 def test_the_lines_in_the_documents_compute_torques(
     opensim: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Unpacked(export_of_walk(on_the_ground(), source={"session": "ID"}), tmp_path)
-    free_foot(opensim, tmp_path).rename(tmp_path / "leg.osim")
+    free_feet(opensim, tmp_path, "foot").rename(tmp_path / "leg.osim")
     (tmp_path / "still.mot").rename(tmp_path / "leg.mot")
     monkeypatch.chdir(tmp_path)
     exec(lines_of_documents("OpenSim"), {})  # noqa: S102  # our own
@@ -287,5 +309,5 @@ def test_opensim_says_which_body_is_not_in_the_model(
 ) -> None:
     found = Unpacked(export_of_walk(options=FormatOptions(body="calcn_r")), tmp_path)
     with pytest.raises(RuntimeError, match="InverseDynamicsTool Failed"):
-        inverse_dynamics(opensim, found)
+        inverse_dynamics(opensim, found.folder, "foot")
     assert "Could not find body 'calcn_r'" in capfd.readouterr().out
