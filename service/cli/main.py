@@ -77,7 +77,16 @@ def main() -> None:
         sys.exit(INTERRUPTED)
     except OSError as error:
         sys.stderr.write(f"foottile: {printable(str(error))}\n")
+        _leave_unwritten()
         sys.exit(1)
+
+
+def _leave_unwritten() -> None:
+    """What could not be written is not tried again when Python ends, which would say so again."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _say_interrupted() -> None:
