@@ -1,17 +1,18 @@
-"""How long `foottile demo` takes to its first bar and its first force: `... first_bar.py [RUNS]`.
+"""How long `foottile demo` takes to its first bar and force: `... first_bar.py [RUNS] [--empty]`.
 
 Wall time from the start of the process, and CPU of all its processes until then. A bar is the first
 message with a reading; the first force comes a second later, after the lead that is its tare. One
 run before the others is not counted: parts are pressed on the bench and models compiled in it, once
-for a machine.
+for a machine. With `--empty` every run is that of a new machine: nothing is kept from before.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -29,12 +30,15 @@ def family(pid: int) -> Iterator[int]:
         yield from family(child)
 
 
-def begun() -> tuple[float, float, float]:
+def begun(*, is_new: bool) -> tuple[float, float, float]:
     """Seconds to the first bar and to the first force, and CPU seconds until that."""
     with tempfile.TemporaryDirectory() as folder:
+        kept = dict.fromkeys(("XDG_CACHE_HOME", "NUMBA_CACHE_DIR"), f"{folder}/cache")
+        environment = os.environ | (kept if is_new else {})
         began_s = time.monotonic()
         demo = subprocess.Popen(
-            [*COMMAND, "demo", "--port=0", f"--data={folder}"],
+            [*COMMAND, "demo", "--port=0", f"--data={folder}/data"],
+            env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
@@ -61,9 +65,13 @@ def begun() -> tuple[float, float, float]:
 
 
 def main() -> None:
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 5
-    begun()
-    found = [begun() for _ in range(runs)]
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=int, nargs="?", default=5)
+    parser.add_argument("--empty", action="store_true")
+    given = parser.parse_args()
+    if not given.empty:
+        begun(is_new=False)
+    found = [begun(is_new=given.empty) for _ in range(given.runs)]
     print("| first bar s | first force s | CPU s until then |\n|--:|--:|--:|")
     cells = (
         f"{statistics.median(column):.2f} ({min(column):.2f} to {max(column):.2f})"

@@ -91,10 +91,9 @@ def test_the_age_of_a_frame_is_known_once_the_clocks_are(running: Running, tared
 def test_frames_come_at_the_rate_that_was_asked_for(running: Running, tared: FakeNode) -> None:
     with running.socket(f"{LIVE}?rate_hz=20") as live, Play(tared, 10.0):
         next_frame_from(live, tared.seq)
-        begin_s = time.monotonic()
         frames = [next_of(live, "frame") for _ in range(20)]
-        took_s = time.monotonic() - begin_s
-    assert 0.9 < took_s < 2.0
+    # By the node's clock: where this process is late, several come at once.
+    assert 0.7e9 < frames[-1]["t_ns"] - frames[0]["t_ns"] < 2.0e9
     assert (
         sum(frame["n"] for frame in frames)
         == frames[-1]["seq"] - frames[0]["seq"] + (frames[0]["n"])

@@ -11,7 +11,7 @@ from devices.errors import ServoSetupError
 from tests.builders.servo import FaultyServo
 
 # In real time; ample for an emulated servo even where the machine is busy.
-TIMEOUT_S = 0.1
+TIMEOUT_S = 0.3
 
 
 @pytest.mark.real_time
