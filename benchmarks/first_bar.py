@@ -30,7 +30,7 @@ def family(pid: int) -> Iterator[int]:
         yield from family(child)
 
 
-def begun(*, is_new: bool) -> tuple[float, float, float]:
+def begun(*, is_new: bool = False) -> tuple[float, float, float]:
     """Seconds to the first bar and to the first force, and CPU seconds until that."""
     with tempfile.TemporaryDirectory() as folder:
         kept = dict.fromkeys(("XDG_CACHE_HOME", "NUMBA_CACHE_DIR"), f"{folder}/cache")
@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--empty", action="store_true")
     given = parser.parse_args()
     if not given.empty:
-        begun(is_new=False)
+        begun()
     found = [begun(is_new=given.empty) for _ in range(given.runs)]
     print("| first bar s | first force s | CPU s until then |\n|--:|--:|--:|")
     cells = (
