@@ -7,7 +7,7 @@ export function helpWithKeys() {
   const open = () => { if (!dialog.open) dialog.showModal(); };
   byId("help").addEventListener("click", open);
   document.addEventListener("keydown", (event) => {
-    if (event.key !== "?" || event.ctrlKey || event.metaKey || event.altKey || isInside(event, "input, textarea, select, dialog")) return;
+    if (event.key !== "?" || event.ctrlKey || event.metaKey || event.altKey || isInside(event, "input, textarea, select, dialog[open]")) return;
     event.preventDefault();
     open();
   });

@@ -20,7 +20,7 @@ export function byId(id, kind = HTMLElement) {
   return element;
 }
 
-/** Did it happen in something of this selector? @param {Event} event @param {string} selector */
+/** Did it happen in something of this selector? A dialog keeps the focus for a moment after it has closed: ask for `dialog[open]`. @param {Event} event @param {string} selector */
 export const isInside = ({ target }, selector) => target instanceof Element && target.closest(selector) !== null;
 
 /**

@@ -48,7 +48,7 @@ export class Actions {
 
   shortcut(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
-    if (isInside(event, "input, textarea, select, dialog, [contenteditable]")) return;
+    if (isInside(event, "input, textarea, select, dialog[open], [contenteditable]")) return;
     const name = { t: "tare", r: "record", s: "stop", m: "mark", p: "pause" }[event.key];
     if (!name) return;
     event.preventDefault();

@@ -38,7 +38,7 @@ export class Takes {
     }
     document.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
-      if (isInside(event, "input, dialog") || !KEYS[event.key]) return;
+      if (isInside(event, "input, dialog[open]") || !KEYS[event.key]) return;
       event.preventDefault();
       this.run(KEYS[event.key]);
     });

@@ -109,7 +109,7 @@ export function listen(box, means) {
 
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (isInside(event, "input, textarea, select, dialog")) return;
+    if (isInside(event, "input, textarea, select, dialog[open]")) return;
     if (means.key(event)) event.preventDefault();
   });
 }
