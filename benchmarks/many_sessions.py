@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from service.api.routes.sessions import list_sessions
+from service.api.routes.recordings.sessions import list_sessions
 from service.server.server import TICK_S, Server
 from storage.checked_json import write_checked
 from storage.sessions.folder import Ledger, Part, PartLedger, Session

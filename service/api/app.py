@@ -18,29 +18,21 @@ from service.api.described import DOCS_FILES, say_who_may, swagger_folder
 from service.api.guard import Guard
 from service.api.logins import Logins
 from service.api.page import PageFiles
-from service.api.routes import (
-    access,
+from service.api.routes import access, calibrations, formats, health, index, login, nodes
+from service.api.routes.downloads import data, take_data, zips
+from service.api.routes.recordings import (
     array,
-    calibrations,
     clock,
     comparisons,
-    data,
-    formats,
-    health,
-    index,
-    login,
-    nodes,
     overview,
     sessions,
     stances,
-    take_data,
     takes,
     trash,
     verification,
-    zips,
 )
-from service.api.routes.ingest import ingest
-from service.api.routes.live import live
+from service.api.routes.sockets.ingest import ingest
+from service.api.routes.sockets.live import live
 from service.link import INGEST_PATH, LIVE_PATH
 from service.server.server import Server
 from service.version import SOFTWARE

@@ -25,7 +25,7 @@ def data_folder(folder: Path) -> Path:
     with (
         patch("service.server.server.TICK_S", 0.02),
         patch("service.server.recorder.BEHIND_S", 1e9),  # its frames are long ago
-        patch("service.api.routes.sessions.SETTLE_S", 0.02),
+        patch("service.api.routes.recordings.sessions.SETTLE_S", 0.02),
     ):
         _record(folder)
     (folder / "token").write_text("a-token-of-an-earlier-start\n")

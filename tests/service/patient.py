@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-import service.api.routes.ingest
-import service.api.routes.sessions
+import service.api.routes.recordings.sessions
+import service.api.routes.sockets.ingest
 import service.server.recorder
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S
@@ -20,8 +20,8 @@ def be_patient(
 ) -> None:
     """Servers of this process listen in vain for so long, and take frames of long ago."""
     patch.setattr(service.server.recorder, "BEHIND_S", 1e9)
-    patch.setattr(service.api.routes.sessions, "SETTLE_S", settle_s)
-    patch.setattr(service.api.routes.ingest, "SILENCE_S", silence_s)
+    patch.setattr(service.api.routes.recordings.sessions, "SETTLE_S", settle_s)
+    patch.setattr(service.api.routes.sockets.ingest, "SILENCE_S", silence_s)
 
 
 @contextmanager

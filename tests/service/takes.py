@@ -7,7 +7,7 @@ from typing import Self
 import httpx
 import pytest
 
-import service.api.routes.sessions
+import service.api.routes.recordings.sessions
 import service.server.recorder
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
@@ -16,7 +16,7 @@ from tests.service.running import Running
 def frames_of_long_ago(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let sessions have them, though they began later."""
     monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.2)
+    monkeypatch.setattr(service.api.routes.recordings.sessions, "SETTLE_S", 0.2)
 
 
 class Take:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-import service.api.routes.ingest
+import service.api.routes.sockets.ingest
 from service.link import SILENCE_S
 from tests.service.fake_node import Play
 from tests.service.recording import Recording
@@ -89,7 +89,7 @@ def test_a_page_opened_after_the_node_died_tells_one_story(
 def test_a_node_out_of_reach_is_silent_on_the_page_and_then_away(
     scripted: Scripted, open_page: OpenPage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service.api.routes.ingest, "SILENCE_S", SILENCE_S)
+    monkeypatch.setattr(service.api.routes.sockets.ingest, "SILENCE_S", SILENCE_S)
     with Play(scripted.node):
         page = open_page(scripted.url)
         expect(page.locator(LIVE)).to_have_count(1)

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-import service.api.routes.ingest
+import service.api.routes.sockets.ingest
 import service.server
 import service.server.streams
 from devices.frames import FrameBatch
@@ -188,7 +188,7 @@ def test_a_node_that_has_left_may_come_back_with_another_boot(
 def test_a_node_that_says_nothing_is_let_go(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, greeted: bool
 ) -> None:
-    monkeypatch.setattr(service.api.routes.ingest, "SILENCE_S", 0.3)
+    monkeypatch.setattr(service.api.routes.sockets.ingest, "SILENCE_S", 0.3)
     if greeted:
         node.connect()
     else:

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-import service.api.routes.ingest
+import service.api.routes.sockets.ingest
 import service.server
 import service.server.node
 import service.server.streams

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import service.api.routes.sessions
+import service.api.routes.recordings.sessions
 import service.server.recorder
 from devices.frames import FrameBatch
 from tests.builders.frames import assert_same_bits
@@ -45,7 +45,7 @@ def test_a_stop_answers_sealed_while_the_node_streams(
     tared: FakeNode,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", PATIENCE_S)
+    monkeypatch.setattr(service.api.routes.recordings.sessions, "SETTLE_S", PATIENCE_S)
     with Play(tared, 10.0):
         until(lambda: running.node()["last_seq"] > 100)
         session = tared.record()

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import service.api.routes.sessions
+import service.api.routes.recordings.sessions
 import service.server.settling
 from devices.errors import StorageError
 from service.sessions.sealing import seal

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-import service.api.routes.sessions
+import service.api.routes.recordings.sessions
 import service.server.recorder
 from devices.errors import StorageError
 from service.sessions.restore import restore
@@ -23,7 +23,7 @@ NOBODY = "20200101T000000Z-000000"
 @pytest.fixture(autouse=True)
 def _frames_of_long_ago(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.2)
+    monkeypatch.setattr(service.api.routes.recordings.sessions, "SETTLE_S", 0.2)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-import service.api.routes.sessions
+import service.api.routes.recordings.sessions
 import service.server
 import service.server.settling
 from devices.errors import StorageError

@@ -10,7 +10,7 @@ from fastapi.responses import StreamingResponse
 
 from devices.errors import StateError, UnknownError, UsageError
 from service.api.routes.access import ServerState, present, problems
-from service.api.routes.made import sent
+from service.api.routes.downloads.made import sent
 from storage.formats.zipped import Sealed, zipped
 from storage.sessions.folder import FRAMES_NAME, Session
 

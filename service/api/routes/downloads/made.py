@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from devices.errors import UnknownError, UsageError
-from service.api.routes.data_query import MadeQuery
+from service.api.routes.downloads.data_query import MadeQuery
 from service.server.server import Server
 from service.version import SOFTWARE
 from storage.clock.file import CLOCK_NAME

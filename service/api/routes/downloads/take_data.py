@@ -12,8 +12,8 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError
 from service.api.routes.access import ServerState, has_it, problems
-from service.api.routes.data_query import TakeDataQuery
-from service.api.routes.made import Chunks, known, made, said_of_marks, tag_of_made
+from service.api.routes.downloads.data_query import TakeDataQuery
+from service.api.routes.downloads.made import Chunks, known, made, said_of_marks, tag_of_made
 from service.server.server import Server
 from storage.formats.marks import Marks
 from storage.formats.sealed import export_of, marks_of

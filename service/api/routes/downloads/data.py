@@ -15,8 +15,8 @@ from starlette.datastructures import MutableHeaders
 from devices.errors import StateError
 from service.api.problems import problem
 from service.api.routes.access import ServerState, has_it, present, problems
-from service.api.routes.data_query import DataQuery
-from service.api.routes.made import Chunks, known, made, said_of_marks, tag_of_made
+from service.api.routes.downloads.data_query import DataQuery
+from service.api.routes.downloads.made import Chunks, known, made, said_of_marks, tag_of_made
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.sessions.frames_so_far import FramesSoFar

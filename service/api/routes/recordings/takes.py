@@ -9,8 +9,8 @@ from typing import Annotated
 from fastapi import APIRouter, Response
 from pydantic import Field
 
-from service.api.routes import sessions as one
 from service.api.routes.access import IdempotencyKey, ServerState, asked_with, problems
+from service.api.routes.recordings import sessions as one
 from service.server.screens.views import SessionView, View
 from service.server.server import Server
 from service.server.takes import Take

@@ -12,7 +12,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from service.api.protocols import OUTLET, send
 from service.api.protocols import WebSocket as Connection
-from service.api.routes.live_frames import LiveFrames
+from service.api.routes.sockets.live_frames import LiveFrames
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
 from service.server.index import age_of
 from service.server.screens.fan_out import RATES_HZ, framed

@@ -1,0 +1,1 @@
+"""What was recorded, as files: in any format, a slice, a take, several at once."""

@@ -1,0 +1,1 @@
+"""What stays open: nodes that bring frames, screens and programs that take them."""
