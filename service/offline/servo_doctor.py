@@ -9,6 +9,10 @@ from devices.chips.dynamixel.probe import BAUDRATES, FoundServo, probe
 from devices.clock import Clock
 from devices.scene.hardware import ServoScene
 
+TIMEOUTS_S = (0.05, 0.25)
+"""For how long an answer is waited for; again, and longer, where nobody answered at all: a machine
+that is busy may be late itself, and a servo that is there must not be looked for in its cable."""
+
 
 @dataclass(frozen=True)
 class ServoDiagnosis:
@@ -40,7 +44,11 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
     """
     servo_id = wanted.id if wanted is not None else 1
     rates = dict.fromkeys((*((wanted.baudrate,) if wanted is not None else ()), *BAUDRATES))
-    found = tuple(probe(port, clock, servo_ids=[servo_id], baudrates=rates))
+    found: tuple[FoundServo, ...] = ()
+    for timeout_s in TIMEOUTS_S:
+        found = found or tuple(
+            probe(port, clock, servo_ids=[servo_id], baudrates=rates, timeout_s=timeout_s)
+        )
     said = [
         f"{servo.model or f'model {servo.model_number}'}, protocol {servo.protocol}, "
         f"{servo.baudrate} baud, id {servo.servo_id}."

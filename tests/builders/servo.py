@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -21,6 +22,7 @@ class FaultyServo(EmulatedServo):
     def __init__(self, position: Callable[[int], int], clock: Clock, **options: Any) -> None:
         self._is_silent = self._corrupts = False
         self._garbage = b""
+        self._late_s = 0.0
         super().__init__(position, clock, **options)
 
     def silent(self) -> contextlib.AbstractContextManager[None]:
@@ -30,6 +32,10 @@ class FaultyServo(EmulatedServo):
     def garbage_before_reply(self, garbage: bytes) -> contextlib.AbstractContextManager[None]:
         """Send `garbage` before every answer. Unrealistic: it is always the same."""
         return self._with("_garbage", garbage)
+
+    def late(self, late_s: float) -> contextlib.AbstractContextManager[None]:
+        """Answer so much later, as if the machine that asks had been busy elsewhere."""
+        return self._with("_late_s", late_s)
 
     def corrupt_crc(self) -> contextlib.AbstractContextManager[None]:
         """Invert the last byte of every answer, which is of its CRC or checksum.
@@ -67,6 +73,7 @@ class FaultyServo(EmulatedServo):
             super()._answer(packet, received_ns)
 
     def _reply(self, packet: Packet, t_ns: int) -> bytes:
+        time.sleep(self._late_s)
         reply = super()._reply(packet, t_ns)
         if self._corrupts:
             reply = reply[:-1] + bytes([reply[-1] ^ 0xFF])

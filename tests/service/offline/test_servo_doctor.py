@@ -1,0 +1,35 @@
+"""Which servo is found, and how patiently it is asked for."""
+
+from __future__ import annotations
+
+import pytest
+
+from devices.clock import VirtualClock
+from devices.scene.file import load_scene
+from service.offline import servo_doctor
+from service.offline.servo_doctor import diagnose_servo
+from tests.builders.servo import FaultyServo
+
+
+@pytest.mark.real_time
+def test_an_answer_that_a_busy_machine_hears_late_is_still_an_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wanted = load_scene("rolling").servo
+    monkeypatch.setattr(servo_doctor, "TIMEOUTS_S", (0.01, 1.0))
+    # One rate: what is said at others comes after the answer to the first.
+    monkeypatch.setattr(servo_doctor, "BAUDRATES", ())
+    with FaultyServo(lambda _: 0, VirtualClock(), model="MX-28") as servo, servo.late(0.05):
+        diagnosis = diagnose_servo(servo.port, VirtualClock(), wanted)
+    assert [found.model for found in diagnosis.found] == ["MX-28"]
+    assert diagnosis.is_well
+
+
+def test_who_never_answers_is_not_found_however_patient_one_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(servo_doctor, "TIMEOUTS_S", (0.01, 0.02))
+    with FaultyServo(lambda _: 0, VirtualClock()) as servo, servo.silent():
+        diagnosis = diagnose_servo(servo.port, VirtualClock(), None)
+    assert not diagnosis.is_well
+    assert "No servo answers as id 1" in diagnosis.verdict
