@@ -255,9 +255,7 @@ def test_one_that_was_let_go_and_goes_on_sending_takes_no_nodes_place(
     word = b"\x81\x81" + bytes(4) + b"x"
     with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as connection:
         connection.sendall(upgrade(INGEST_PATH) + word)
-        said = b""
-        while b"\x88" not in said.partition(b"\r\n\r\n")[2]:  # a close frame, never answered
-            said += connection.recv(65536)
+        read_until(connection, b"\x88")  # a close frame, never answered
         for _ in range(3):
             connection.sendall(word)
             time.sleep(0.05)
@@ -268,15 +266,23 @@ def test_one_that_goes_on_talking_is_not_cut_off_before_it_has_heard_why(running
     word = b"\x81\x81" + bytes(4) + b"x"
     with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as connection:
         connection.sendall(upgrade(LIVE_PATH))
-        said = connection.recv(65536)
+        read_until(connection, b"hello")
         connection.sendall(word)
-        while b"only {" not in said:  # of the close frame
-            said += connection.recv(65536)
+        read_until(connection, b"only {")  # of the close frame
         for _ in range(100):  # into a closed connection: the first brings a reset, the next breaks
             connection.sendall(word)
         connection.sendall(b"\x88\x82" + bytes(4) + int(Close.POLICY).to_bytes(2))
         while connection.recv(65536):  # to the end, which is not a reset
             pass
+
+
+def read_until(connection: socket.socket, wanted: bytes) -> None:
+    """Read until these bytes have come, which have to come before the end."""
+    said = b""
+    while wanted not in said:
+        more = connection.recv(65536)
+        assert more, f"it ended with {said!r}"
+        said += more
 
 
 def upgrade(path: str) -> bytes:

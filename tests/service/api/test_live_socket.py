@@ -212,7 +212,8 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
     tared: FakeNode,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(service.server.screens.fan_out, "TOO_SLOW_S", 1.0)
+    too_slow_s = 3.0
+    monkeypatch.setattr(service.server.screens.fan_out, "TOO_SLOW_S", too_slow_s)
     slow = sockets.socket()
     slow.setsockopt(sockets.SOL_SOCKET, sockets.SO_RCVBUF, 2048)
     slow.connect(("127.0.0.1", running.port))
@@ -226,14 +227,16 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
         # Buffers of the kernel and of the server fill first: give it more to say.
         notice = {"type": "node", "node": {"padding": "x" * 200_000}}
         end_s = time.monotonic() + 15.0
-        gaps_s, at_s = [], time.monotonic()
+        told_s = []
         while running.server.hub.subscribers == 2:
             assert time.monotonic() < end_s, "it is never let go"
             running.call(lambda: running.server.hub.notice(notice))
             next_of(live, "frame")
-            gaps_s.append(time.monotonic() - at_s)
-            at_s = time.monotonic()
-        assert max(gaps_s) < 0.8
+            told_s.append(time.monotonic())
+        # Who waited for it would have told nothing while it was waited for. One long gap says
+        # something about a busy machine, not about this.
+        behind_since_s = time.monotonic() - too_slow_s
+        assert sum(at_s > behind_since_s for at_s in told_s) > 5
         last = tared.seq - 1
         tared.acknowledged(last)
         assert playing.problem is None
