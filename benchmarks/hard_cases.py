@@ -1,6 +1,7 @@
 """What an estimate makes of tiles that are wrong and answer all the same, and of healthy ones.
 
-    python benchmarks/hard_cases.py [--out docs/results/hard_cases.md] [--healthy HOURS --data DIR]
+    python benchmarks/hard_cases.py [--out docs/results/hard_cases.md]
+    python benchmarks/hard_cases.py --healthy HOURS [--lost SHARE] [--data DIR]
 
 Each case is a fault of an emulated foot of four tiles that walks on the spot: half sines of 0.6 s,
 each as heavy as it likes. Its frames are estimated live (10 ms of look-ahead) twice, with the watch
@@ -8,7 +9,7 @@ and without. Wrong is a GRF that is off by more than 1 N and by more than 1.96 o
 
 With `--healthy` no fault is there, and every flag is a false alarm: built-in scenes and recorded
 loads, over and over again, for so long each, with white noise, with noise correlated over 10 ms,
-and with repeatability 0.03.
+and with repeatability 0.03; with `--lost` less a share of frames.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ from service.rig.emulated import EmulatedFoot
 from storage.formats.load_trace import read_load_trace
 
 LAG_MS = 10.0
+AT_A_TIME = 50
+"""Frames that are lost by a machine that is busy elsewhere: 0.1 s."""
 CHUNK = 4096
 MARK = "<!-- table -->"
 WRONG_N = 1.0
@@ -257,13 +260,23 @@ def converted(
         yield FrameBatch(**columns)
 
 
-def healthy(data: Path, hours: float) -> Iterator[str]:
+def without(frames: Iterable[FrameBatch], share: float, seed: int) -> Iterator[FrameBatch]:
+    """But for this share, and for all of the lead."""
+    rng = np.random.default_rng(seed)
+    for batch in frames:
+        begins = rng.random(len(batch)) < share / AT_A_TIME
+        lost = np.convolve(begins, np.ones(AT_A_TIME))[: len(batch)] > 0
+        yield batch.select(~lost | (batch.frame_status & FrameStatus.LEAD != 0))
+
+
+def healthy(data: Path, hours: float, lost: float) -> Iterator[str]:
     """A line for each kind of foot: how long, and how many alarms."""
     found: dict[str, list[float]] = {}
     for seed in range(len(NOISES)):
         for name, scene, foot in healthy_feet(data, seed):
             recorded = record(scene, replace(foot, seed=0), 3.0)
-            count_alarms(recorded, converted(scene, foot, recorded.info, hours), found, name)
+            frames = without(converted(scene, foot, recorded.info, hours), lost, seed)
+            count_alarms(recorded, frames, found, name)
             print(name, NOISES[seed], found[name], file=sys.stderr, flush=True)
     yield from alarm_lines(found)
 
@@ -302,11 +315,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--healthy", type=float, default=0.0, metavar="HOURS")
+    parser.add_argument("--lost", type=float, default=0.0, metavar="SHARE")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     options = parser.parse_args()
     if options.healthy:
         print("| foot | hours | stuck | clipped | baseline_lost |\n|---|--:|--:|--:|--:|")
-        print("\n".join(healthy(options.data, options.healthy)))
+        print("\n".join(healthy(options.data, options.healthy, options.lost)))
         return
     table = [
         "| case | ladder | worst error N | wrong and silent before | now | flags | first after s "

@@ -9,6 +9,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from devices.frames import FrameBatch, FrameStatus, zero_columns
+
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
@@ -40,6 +42,20 @@ def test_a_case_is_a_row_with_what_it_was_without_the_watch(
     assert int(columns[4]) < int(columns[3])
     assert "`stuck`" in columns[5]
     assert 0.0 < float(columns[6]) < 0.1
+
+
+def test_frames_are_lost_a_tenth_of_a_second_at_a_time_and_never_of_the_lead(
+    hard: ModuleType,
+) -> None:
+    n = 20_000
+    columns = zero_columns(n, 1)
+    columns["seq"][:] = np.arange(n)
+    columns["frame_status"][: n // 2] = FrameStatus.LEAD
+    (left,) = hard.without([FrameBatch(**columns)], 0.1, seed=1)
+    gaps = np.diff(left.seq.astype(int)) - 1
+    assert (left.seq[: n // 2] == np.arange(n // 2)).all()
+    assert 0.05 < 1.0 - (len(left) - n // 2) / (n // 2) < 0.15
+    assert gaps[gaps > 0].min() >= 50
 
 
 def test_alarms_are_counted_as_onsets_and_added_up(hard: ModuleType) -> None:

@@ -135,7 +135,9 @@ def _judge(
     as_read = cell.kpa
     if scene_law.watched == 1:
         if law.bears == 1:
-            end_of_range(tile.clip, as_read, law.baseline_kpa, law.unloaded_kpa, law.noise_kpa)
+            end_of_range(
+                tile.clip, as_read, row.t_ns, law.baseline_kpa, law.unloaded_kpa, law.noise_kpa
+            )
         above_kpa = math.nan if as_read >= law.end_kpa else as_read - law.baseline_kpa
         stuck, scene.toggles = is_stuck(
             scene_law, law.repeats, tile.repeats, cell.padc, above_kpa, law.unloaded_kpa,

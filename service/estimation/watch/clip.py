@@ -38,8 +38,12 @@ that ends below it ..."""
 NEAR = 12.0
 """... by so little, in units of the noise: loads end there for themselves."""
 OTHER = 0.06
-"""Loadings that stay at the edge equally long, within this part, are one load again and again, and
-say nothing: a plate that rolls over a foot at one speed."""
+"""While loadings stay at the edge equally long, within this part, they are one load again and
+again, and say nothing: a plate that rolls over a foot at one speed."""
+HOLE = 0.03
+"""A loading says nothing if for this part of its stay, at one go, it was not read, and more than
+one reading is missing: what is lost would make one load again and again look like loads that
+differ."""
 RECENT = 0.25
 """Weight of a new loading in what is usual."""
 READINGS_MIN = 20
@@ -60,9 +64,12 @@ STATE = record_type(
         ("inside", np.int64),  # is it loaded?
         ("smooth_kpa", np.float64),
         ("peak_kpa", np.float64),  # of this loading
+        ("read_ns", np.int64),  # when it was read last
+        ("hole_ns", np.int64),  # longest time without a reading of this loading
         ("at", np.int64),  # readings of this loading at the edge, ...
-        ("at_usual", np.float64),  # of loadings lately, ...
-        ("at_apart", np.float64),  # ... and how far from it they are
+        ("stay_ns", np.int64),  # ... and how long it was there
+        ("usual_ns", np.float64),  # stay of loadings lately, ...
+        ("apart_ns", np.float64),  # ... and how far from it they are
         ("middle", np.int64),
         ("slope", np.int64),
         ("over", np.int64),
@@ -82,24 +89,32 @@ def at_rest(tiles: int) -> Records:
 
 @compiled
 def end_of_range(
-    tile: Record, kpa: float, baseline_kpa: float, unloaded_kpa: float, noise_kpa: float
+    tile: Record,
+    kpa: float,
+    t_ns: int,
+    baseline_kpa: float,
+    unloaded_kpa: float,
+    noise_kpa: float,
 ) -> float:
     """Above which pressure a reading may have been clipped; infinite where nothing shows it.
 
     Args:
         tile: state from its readings before; becomes that after this one.
         kpa: absolute; NaN where there is none.
+        t_ns: when.
         baseline_kpa: absolute, unloaded.
         unloaded_kpa: so near the baseline no load is seen.
         noise_kpa: standard deviation of a reading.
     """
     above = kpa - baseline_kpa
     if not math.isnan(above):
+        passed_ns, tile.read_ns = t_ns - tile.read_ns, t_ns
         if tile.inside == 0 and above > 2.0 * unloaded_kpa:
             tile.inside, tile.at, tile.middle, tile.slope, tile.over = 1, 0, 0, 0, 0
-            tile.at_kpa = 0.0
+            tile.hole_ns, tile.stay_ns, tile.at_kpa = 0, 0, 0.0
             tile.smooth_kpa = tile.peak_kpa = kpa
         if tile.inside == 1:
+            tile.hole_ns = max(tile.hole_ns, passed_ns)
             tile.smooth_kpa += (kpa - tile.smooth_kpa) / SMOOTH
             tile.peak_kpa = max(tile.peak_kpa, tile.smooth_kpa)
             off = kpa - tile.edge_kpa
@@ -107,6 +122,7 @@ def end_of_range(
                 tile.over += 1
             elif off > -EDGE * noise_kpa:
                 tile.at += 1
+                tile.stay_ns += passed_ns
                 tile.at_kpa += off
                 if abs(off) < 0.5 * EDGE * noise_kpa:
                     tile.middle += 1
@@ -127,20 +143,20 @@ def _end_of_loading(tile: Record, noise: float) -> None:
         return  # a lighter one says nothing
     if tile.over > OVER_SHARE * tile.at or math.isnan(tile.edge_kpa):
         tile.edge_kpa, tile.evidence, tile.end_kpa = tile.peak_kpa, 0.0, math.inf
-        tile.at_usual = tile.at_apart = 0.0
+        tile.usual_ns = tile.apart_ns = 0.0
         return
-    if tile.at < READINGS_MIN:
+    if tile.at < READINGS_MIN or tile.hole_ns > max(HOLE, 2.5 / tile.at) * tile.stay_ns:
         return
     if tile.middle < STEEP * tile.slope:
         tile.evidence = max(0.0, tile.evidence - ROUND)
         return
     off = tile.at_kpa / (tile.at * noise)
-    if tile.at_usual == 0.0:
-        tile.at_usual = tile.at
-    tile.at_apart += RECENT * (abs(tile.at - tile.at_usual) - tile.at_apart)
-    tile.at_usual += RECENT * (tile.at - tile.at_usual)
+    if tile.usual_ns == 0.0:
+        tile.usual_ns = tile.stay_ns
+    tile.apart_ns += RECENT * (abs(tile.stay_ns - tile.usual_ns) - tile.apart_ns)
+    tile.usual_ns += RECENT * (tile.stay_ns - tile.usual_ns)
+    tile.edge_kpa += FOLLOW * off * noise
     likelier = -0.5 * (off / SAME) ** 2 - math.log(SAME * math.sqrt(2.0 * math.pi) * ELSEWHERE)
     tile.evidence = max(0.0, tile.evidence + likelier)
-    tile.edge_kpa += FOLLOW * off * noise
-    if tile.evidence >= ENOUGH and tile.at_apart > OTHER * tile.at_usual:
+    if tile.evidence >= ENOUGH and tile.apart_ns > OTHER * tile.usual_ns:
         tile.end_kpa = tile.edge_kpa - BOUND * noise

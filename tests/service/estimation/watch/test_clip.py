@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats, Times
 from devices.compiled import compiled
 from service.estimation.records import Records
 from service.estimation.watch.clip import at_rest, end_of_range
@@ -25,16 +25,19 @@ def steps(count: int, *, scatter: float, top_kpa: float = 11.0, seed: int = 0) -
     )
 
 
-def ends(kpa: Floats) -> Floats:
-    out = np.empty(len(kpa))
-    _judge(at_rest(1), kpa, out)
+def ends(kpa: Floats, is_taken: Bools | None = None) -> Floats:
+    """After each reading; `is_taken`: but for those of frames that are lost."""
+    t_ns = np.round(1e9 / RATE_HZ * np.arange(1, len(kpa) + 1)).astype(np.int64)
+    taken = np.full(len(kpa), True) if is_taken is None else is_taken
+    out = np.empty(np.count_nonzero(taken))
+    _judge(at_rest(1), t_ns[taken], kpa[taken], out)
     return out
 
 
 @compiled
-def _judge(state: Records, kpa: Floats, out: Floats) -> None:
+def _judge(state: Records, t_ns: Times, kpa: Floats, out: Floats) -> None:
     for i in range(len(kpa)):
-        out[i] = end_of_range(state[0], kpa[i], 100.0, 4.0 * NOISE_KPA, NOISE_KPA)
+        out[i] = end_of_range(state[0], kpa[i], t_ns[i], 100.0, 4.0 * NOISE_KPA, NOISE_KPA)
 
 
 def noise(n: int, seed: int = 1) -> Floats:
@@ -74,6 +77,28 @@ def test_a_thousand_steps_with_flat_tops_that_differ_have_no_edge() -> None:
 def test_the_same_load_again_and_again_has_no_edge_even_if_its_top_is_flat() -> None:
     whole = np.minimum(steps(1000, scatter=0.0), 107.0)
     assert np.isinf(ends(whole + noise(len(whole)))).all()
+
+
+@pytest.mark.parametrize(("share", "at_a_time"), [(0.1, 1), (0.1, 9), (0.1, 90), (0.1, 900)])
+def test_frames_that_are_lost_make_the_same_load_no_edge(share: float, at_a_time: int) -> None:
+    # As a plate that rolls over a foot, taken by a machine that is busy: a demo of ten minutes.
+    whole = np.minimum(steps(1000, scatter=0.0), 107.0)
+    begins = np.random.default_rng(7).random(len(whole)) < share / at_a_time
+    lost = np.convolve(begins, np.ones(at_a_time))[: len(whole)] > 0
+    assert 0.5 * share < lost.mean() < 1.5 * share
+    assert np.isinf(ends(whole + noise(len(whole)), ~lost)).all()
+
+
+def test_a_clip_is_found_at_90_frames_a_second() -> None:
+    whole = np.minimum(steps(30, scatter=0.12), CLIP_KPA)
+    every_fifth = np.arange(len(whole)) % 5 == 0
+    assert np.isfinite(ends(whole + noise(len(whole)), every_fifth)[-1])
+
+
+def test_a_clip_is_found_where_a_frame_in_ten_is_lost() -> None:
+    whole = np.minimum(steps(30, scatter=0.12), CLIP_KPA)
+    taken = np.random.default_rng(8).random(len(whole)) > 0.1
+    assert np.isfinite(ends(whole + noise(len(whole)), taken)[-1])
 
 
 def test_an_edge_that_is_exceeded_was_none() -> None:
