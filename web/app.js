@@ -216,7 +216,6 @@ function tick() {
   const { node } = state;
   const reached = link.open || node;
   byId("empty").hidden = Boolean(node) || !reached;
-  byId("live").hidden = !node && Boolean(reached);
   document.body.dataset.nodes = String(state.nodes.size);
   byId("node-choice").hidden = state.nodes.size < 2;
   byId("node-name").hidden = state.nodes.size >= 2;
@@ -227,6 +226,12 @@ function tick() {
   // The chosen node may not be known yet: the banner still says that the server is not there.
   status.draw(node ?? { node: "?", tiles: [] }, state.heard, nowMs, state.serverNowMs());
   state.cannotRecord = node ? status.cannotRecord : "";
+  // Without a picture of any age, what was recorded comes first.
+  const isAway = Boolean(node) && link.open && !node.connected && status.isBlank;
+  byId("away").hidden = !isAway;
+  byId("live").hidden = isAway || (!node && Boolean(reached));
+  setText(byId("away-title"), isAway ? `Node ${node.node} is away` : "");
+  document.body.dataset.away = String(isAway);
   notes.draw(node, state.frame, nowMs, state.serverNowMs(), state.problems);
   tares.draw(node);
   byId("calibration-line").hidden = !node;

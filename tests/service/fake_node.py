@@ -110,8 +110,10 @@ class FakeNode:
         calibration: Calibration | str | None = "by hand",
         tiles: int = 2,
         token: str | None = None,
+        is_emulated: bool = False,
     ) -> None:
         self.running = running
+        self.is_emulated = is_emulated
         self.name = name
         self.token = token
         self.calibration = calibration
@@ -164,7 +166,7 @@ class FakeNode:
             "next_seq": self.seq,
             "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
             "scene": {"name": "test"},
-            "emulated": False,
+            "emulated": self.is_emulated,
             "calibration": calibration,
             "calibration_problem": None if calibration else "for this test",
         }

@@ -71,6 +71,9 @@ export function number(value, decimals = 1) {
   return text.replace("-", MINUS);
 }
 
+/** A rate; tenths of many are of no use to anybody. @param {number} hz */
+export const perSecond = (hz) => number(hz, hz < 100 ? 1 : 0);
+
 /** @param {unknown} value @returns {value is number} */
 const isFiniteNumber = (value) => Number.isFinite(value);
 

@@ -149,9 +149,10 @@ export class Foot {
     label.hidden = !node.servo;
     const angle = frame?.angle_rad ?? null;
     const stale = Boolean((frame?.frame_status ?? 0) & FRAME.SERVO_STALE);
-    const degrees = angle === null ? "angle unknown" : `${angle > 0 ? "+" : ""}${number((angle * 180) / Math.PI)}°`;
+    const degrees = angle === null ? "no angle" : `${angle > 0 ? "+" : ""}${number((angle * 180) / Math.PI)}°`;
     setText(label, stale ? `${degrees} servo stale` : degrees);
     setData(label, "stale", String(stale));
+    setData(label, "known", String(angle !== null));
   }
 
   turn(node, frame) {

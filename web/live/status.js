@@ -1,6 +1,6 @@
 // How good the picture is: rate, loss, latency, age; and when it is no picture of now at all.
 
-import { byId, number, roughly, setData, setText } from "../common/text.js";
+import { byId, number, perSecond, roughly, setData, setText } from "../common/text.js";
 
 const FROZEN_AFTER_MS = 600; // with a tick of 100 ms well within the promised second
 const LATE_MS = 1000; // frames that old when they arrive show the past
@@ -13,6 +13,7 @@ export class Status {
   constructor(link) {
     this.link = link;
     this.live = false;
+    this.isBlank = true; // nothing has ever come from this node, as far as the server knows
     this.writtenMs = 0;
     this.delayMs = null;
     this.cannotRecord = ""; // why, in a sentence
@@ -33,6 +34,7 @@ export class Status {
   /** Decide on live or frozen, and show it. Returns true while live. */
   draw(node, heard, nowMs, serverNowMs) {
     const sinceMs = silence(node, heard, nowMs, serverNowMs);
+    this.isBlank = sinceMs === null;
     const late = this.delayMs !== null && this.delayMs > LATE_MS;
     const live = sinceMs !== null && sinceMs <= FROZEN_AFTER_MS && !late;
     const banner = byId("frozen");
@@ -73,8 +75,8 @@ export class Status {
     const nominalHz = node.nominal_rate_hz;
     const slow = rateHz !== null && nominalHz && rateHz < SLOW * nominalHz;
     // A rate that proves the nominal one wrong stands alone.
-    const of = rateHz !== null && rateHz <= nominalHz ? ` of ${number(nominalHz)}` : "";
-    write("rate", `${number(rateHz ?? NaN)}${of}`, slow);
+    const of = rateHz !== null && rateHz <= nominalHz ? ` of ${perSecond(nominalHz)}` : "";
+    write("rate", `${perSecond(rateHz ?? NaN)}${of}`, slow);
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;

@@ -1,6 +1,6 @@
 // One node among others: is it live, what does it bear, how good is its link, what is recorded on it.
 
-import { duration, el, number, plain, roughly, setData, setText } from "../common/text.js";
+import { duration, el, number, perSecond, plain, roughly, setData, setText } from "../common/text.js";
 import { whyNot } from "../live/grf.js";
 import { plainState } from "../sessions/state.js";
 import { SmallFoot } from "./small_foot.js";
@@ -117,8 +117,8 @@ export class Card {
       setData(this.facts[title].value, "bad", String(bad));
     };
     const rateHz = node.connected ? beat.rate_hz ?? node.rate_hz : null;
-    const of = rateHz !== null && rateHz <= node.nominal_rate_hz ? ` of ${number(node.nominal_rate_hz)}` : "";
-    fact("Frames/s", `${number(rateHz ?? NaN)}${of}`, rateHz !== null && rateHz < SLOW * node.nominal_rate_hz);
+    const of = rateHz !== null && rateHz <= node.nominal_rate_hz ? ` of ${perSecond(node.nominal_rate_hz)}` : "";
+    fact("Frames/s", `${perSecond(rateHz ?? NaN)}${of}`, rateHz !== null && rateHz < SLOW * node.nominal_rate_hz);
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;
     fact("Lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} not taken`, lost > 0 || missed > 0);
