@@ -9,6 +9,7 @@ one second that took all of the frames would show there.
 from __future__ import annotations
 
 import argparse
+import functools
 import shutil
 import tempfile
 from dataclasses import dataclass
@@ -107,7 +108,7 @@ def measured(data: Path, turns: int) -> list[str]:
         rows[name] = len(ask(find_sessions(places), asked[name]))
         read[name] = bytes_read() - before
 
-    times = in_turns({name: lambda name=name: job(name) for name in asked}, turns)  # type: ignore[misc]
+    times = in_turns({name: functools.partial(job, name) for name in asked}, turns)
     count = len(find_sessions(places).sessions)
     return [
         f"| {count} | {name} | {rows[name]} | {spread(taken.wall_s, 1e3, 0)} "

@@ -48,6 +48,7 @@ class Scratch:
         stored = pa.compress(content, codec="zstd", asbytes=True)
         try:
             if self._file is None:
+                # Open for as long as this object lives.
                 self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
                 weakref.finalize(self, self._file.close)
             descriptor, written = self._file.fileno(), 0

@@ -87,7 +87,7 @@ class _Sink(io.RawIOBase):
 
     def write(self, piece: object) -> int:
         """Keep a piece."""
-        content = bytes(piece)  # type: ignore[call-overload]
+        content = bytes(piece)  # type: ignore[call-overload]  # whatever has a buffer
         self._pieces.append(content)
         return len(content)
 
