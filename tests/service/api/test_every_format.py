@@ -81,6 +81,7 @@ def test_who_goes_away_in_between_ends_the_making_of_it(
     monkeypatch.setitem(FORMATS, to, replace(FORMATS[to], write=endless))
     query = {"format": to, "start_s": "0.1"}
     with sealed.running.http.stream("GET", f"{sealed.session.url}/data", params=query) as answer:
-        next(answer.iter_bytes())
+        pieces = answer.iter_bytes()  # once it is let go, so is the connection
+        next(pieces)
         assert not ended.is_set()
     until(ended.is_set)
