@@ -11,6 +11,7 @@ from playwright.sync_api import Page, expect
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
+from tests.waiting import until
 from tests.web.test_accessible import complaints
 
 pytestmark = pytest.mark.real_time
@@ -85,6 +86,17 @@ def in_view(page: Page, stance: dict[str, Any], begin_ns: int) -> None:
     assert end_s - begin_s < 2 * stance["duration_s"]
 
 
+def middle_of(page: Page, stance: dict[str, Any], hops: Recording) -> tuple[float, float]:
+    """Where it is in the plots of a narrow screen, which show everything."""
+    box = settled(page).bounding_box()
+    duration_s = float(page.locator("#plots").get_attribute("data-to") or "nan")
+    left, right = 40, 12  # axis, and air
+    begin_ns = int(hops.column("t_ns")[0])
+    middle_s = (0.5 * (stance["begin_t_ns"] + stance["end_t_ns"]) - begin_ns) * 1e-9
+    at = left + (box["width"] - left - right) * middle_s / duration_s
+    return box["x"] + at, box["y"] + 100
+
+
 def test_a_stance_is_gone_to_from_its_row_and_by_keys(
     hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
 ) -> None:
@@ -113,7 +125,7 @@ def test_on_a_phone_the_peak_of_the_third_stance_is_three_taps_away(
     hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
 ) -> None:
     page = opened(open_page, hops, **PHONE)
-    expect(page.locator("#stance-says")).to_have_text(f"{STANCES} stances")
+    expect(page.locator("#stance-says")).to_have_text(f"Step through {STANCES} stances")
     assert page.evaluate(_IN_SIGHT, ["#stance-line", 44])  # without scrolling
     for stance in stances[:3]:
         page.tap("#stance-next")
@@ -145,16 +157,71 @@ def test_where_the_plots_are_touched_the_stance_is_said_and_the_next_one_follows
     page.tap("#stance-next")
     says(page, stances[0])
     page.tap("#zoom-all")
-    box = settled(page).bounding_box()
-    duration_s = float(page.locator("#plots").get_attribute("data-to") or "nan")
-    left, right = 40, 12  # of the plots on a narrow screen: axis, and air
-    begin_ns = int(hops.column("t_ns")[0])
-    middle_s = (0.5 * (stances[6]["begin_t_ns"] + stances[6]["end_t_ns"]) - begin_ns) * 1e-9
-    at = left + (box["width"] - left - right) * middle_s / duration_s
-    page.touchscreen.tap(box["x"] + at, box["y"] + 100)
+    page.touchscreen.tap(*middle_of(page, stances[6], hops))
     says(page, stances[6])
     page.tap("#stance-next")
     says(page, stances[7])
+
+
+def test_what_is_laid_one_upon_another_follows_the_cursor(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops, **PHONE)
+    page.locator("#overlay-card").scroll_into_view_if_needed()
+    legend = page.locator("#overlay-legend")
+    expect(legend).to_contain_text("mean")
+    page.locator("#stances-rows tr").nth(4).tap()
+    expect(legend).to_contain_text("stance 5,")
+    page.tap("#zoom-all")
+    page.touchscreen.tap(*middle_of(page, stances[6], hops))
+    expect(legend).to_contain_text("stance 7,")
+
+
+def test_a_finger_that_scrolls_the_page_leaves_the_cursor_where_it_was(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops, **PHONE)
+    for _ in range(3):
+        page.tap("#stance-next")
+    says(page, stances[2])
+    page.tap("#zoom-all")
+    x, y = middle_of(page, stances[8], hops)
+    finger = page.context.new_cdp_session(page)
+
+    def touch(kind: str, *points: dict[str, float]) -> None:
+        finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": list(points)})
+
+    touch("touchStart", {"x": x, "y": y})
+    for up in range(15, 240, 15):
+        touch("touchMove", {"x": x, "y": y - up})
+    touch("touchEnd")
+    until(lambda: page.evaluate("scrollY") > 100)
+    says(page, stances[2])
+
+
+def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
+    server: Running, open_page: OpenPage
+) -> None:
+    node = FakeNode(server, "late")
+    node.connect()
+    node.tared()
+    session = node.record(name="begun too late")
+    node.send(60, [12.0, 20.0], alive=True)
+    node.send(100, [0.0, 0.0], alive=True)
+    node.send(100, [12.0, 20.0], alive=True)
+    node.deliver(100, [0.0, 0.0], alive=True)
+    node.finish(session)
+    node.close()
+    page = opened(open_page, session, **PHONE)
+    page.tap("#stance-next")
+    expect(page.locator("#stance-says")).to_contain_text("its beginning is not there")
+    row = page.locator("#stances-rows tr").first
+    expect(row.get_by_text("its beginning is not there")).to_be_visible()
+    page.tap("#stance-next")
+    expect(page.locator("#stance-which")).to_have_text("Stance 2 of 2")
+    expect(page.locator("#stance-flags")).to_be_empty()
+    assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
+    assert complaints(page) == []
 
 
 def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> None:

@@ -61,6 +61,10 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         running.stop()
 
 
+LOW = (1280, 400)
+"""So low that the twenty rows of a first answer reach beyond what is fetched ahead."""
+
+
 def names(page: Page) -> list[str]:
     return page.locator("#sessions .session-name").all_text_contents()
 
@@ -68,7 +72,7 @@ def names(page: Page) -> list[str]:
 def test_a_thousand_sessions_come_as_one_scrolls_each_once_and_in_order(
     archive: Running, open_page: OpenPage
 ) -> None:
-    page = open_page(archive.url, 1280, 800)
+    page = open_page(archive.url, *LOW)
     rows = page.locator("#sessions .session")
     expect(rows).to_have_count(20)
     expect(page.locator("#sessions-more")).to_be_visible()
@@ -100,7 +104,7 @@ def test_the_first_load_with_a_thousand_sessions_is_small(
 
 
 def test_what_is_searched_for_is_found_by_the_server(archive: Running, open_page: OpenPage) -> None:
-    page = open_page(archive.url, 1280, 800)
+    page = open_page(archive.url, *LOW)
     rows = page.locator("#sessions .session")
     expect(rows).to_have_count(20)
     page.fill("#sessions-search", "MUD")
@@ -118,7 +122,7 @@ def test_what_is_searched_for_is_found_by_the_server(archive: Running, open_page
 def test_sessions_with_missing_frames_are_found_among_all(
     archive: Running, open_page: OpenPage
 ) -> None:
-    page = open_page(archive.url, 1280, 800)
+    page = open_page(archive.url, *LOW)
     rows = page.locator("#sessions .session")
     expect(rows).to_have_count(20)
     page.select_option("#sessions-complete", label="Frames missing")
@@ -138,7 +142,7 @@ def searched(page: Page) -> None:
 def test_several_are_chosen_and_come_as_one_zip_file(
     archive: Running, open_page: OpenPage, tmp_path: Path
 ) -> None:
-    page = open_page(archive.url, 1280, 800)
+    page = open_page(archive.url, *LOW)
     searched(page)
     expect(page.locator("#chosen")).to_be_hidden()
     for name in ("mud 7", "mud 107"):

@@ -3,6 +3,7 @@
 import { isInside } from "../common/text.js";
 
 const CLICK_PX = 4;
+const SIDEWAYS_PX = 8; // of a finger; upwards it scrolls the page
 const DOUBLE_MS = 350;
 const WHEEL_STEP = 0.0018;
 
@@ -26,6 +27,7 @@ export function listen(box, means) {
   let fromPx = null; // of a stretch that is chosen with the mouse
   let lastTap = { atMs: -Infinity, px: 0 };
   let pinch = null;
+  let touchedPx = null; // where a finger came down that may yet scroll the page
   let grabbedPx = null; // where something was taken hold of that can be moved
   const place = (event) => event.clientX - box.getBoundingClientRect().left;
 
@@ -40,9 +42,10 @@ export function listen(box, means) {
     }
     if (down.size === 2) {
       if (grabbedPx !== null) means.drop(null);
-      grabbedPx = fromPx = null;
+      grabbedPx = fromPx = touchedPx = null;
       pinch = spanOf(down);
-    } else if (event.pointerType === "mouse" && !event.shiftKey) fromPx = place(event);
+    } else if (event.pointerType !== "mouse") touchedPx = place(event);
+    else if (!event.shiftKey) fromPx = place(event);
     else means.point(place(event));
   });
 
@@ -67,7 +70,10 @@ export function listen(box, means) {
       means.point(px);
       if (Math.abs(px - fromPx) > CLICK_PX) means.choosing(fromPx, px);
     } else if (event.pointerType === "mouse") means.move(before - px);
-    else if (!pinch) means.point(px);
+    else if (!pinch && (touchedPx === null || Math.abs(px - touchedPx) > SIDEWAYS_PX)) {
+      touchedPx = null;
+      means.point(px);
+    }
   });
 
   const up = (event) => {

@@ -4,7 +4,7 @@ import { byId, duration, el, localTime, setText } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
 
 const WORDS = {
-  complete: "complete: every frame is in it",
+  complete: "complete: no frame was lost",
   lossy: "frames are missing",
   incomplete: "not complete",
 };

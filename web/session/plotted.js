@@ -272,6 +272,7 @@ export class Plotted {
     box.dataset.from = view.from.toFixed(4);
     box.dataset.to = view.to.toFixed(4);
     this.stances.follow(this.cursorS, this.replay.playing.going);
+    this.overlay?.follow(this.replay.playing.going ? -1 : this.stances.current);
     const drawnKey = [view.from, view.to, plots.width, plots.whole, plots.detail, this.marks.version, plots.stances.length, plots.asHeat,
       this.stances.current, plots.colours, devicePixelRatio];
     if (drawnKey.some((one, i) => one !== this.drawnKey?.[i])) {

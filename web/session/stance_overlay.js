@@ -9,6 +9,7 @@ import { CopPaths } from "./cop_paths.js";
 const HIT_PX = 18;
 const FRAMES_MOST = 4000; // of the stance that was chosen: bins of a longer one, from least to greatest
 const HEIGHT_PX = 320;
+const RESTS_MS = 250; // of a cursor
 
 /** @typedef {{number: number, grf_n: (number | null)[], cop_x_m: (number | null)[], cop_y_m: (number | null)[]}} Curve */
 
@@ -23,6 +24,7 @@ export class StanceOverlay {
     this.stances = stances;
     this.onGo = onGo;
     this.canvas = byId("overlay-canvas", HTMLCanvasElement);
+    this.resting = 0;
     this.chosen = null; // number of a stance, and its frames
     this.hover = null; // number of a curve, and the percentage
     this.paths = new CopPaths(() => this.draw(), (curve) => this.go(curve.number));
@@ -77,6 +79,13 @@ export class StanceOverlay {
   go(wanted) {
     const index = this.stances.findIndex((stance) => stance.number === wanted);
     if (index >= 0) this.onGo(index);
+  }
+
+  /** The stance that the cursor is in, once it rests there; -1: none. */
+  follow(index) {
+    clearTimeout(this.resting);
+    if (index < 0 || this.stances[index].number === this.chosen?.number) return;
+    this.resting = setTimeout(() => this.choose(index), RESTS_MS);
   }
 
   /** The stance that the page went to: drawn frame by frame over all others. */

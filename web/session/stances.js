@@ -50,7 +50,8 @@ export const figuresOf = (stance) => ({
 
 function figuresInWords(stance) {
   const { duration, peak, impulse } = figuresOf(stance);
-  return stance.peak_grf_n === null ? `force not known, ${duration}` : `peak ${peak}, ${duration}, ${impulse}`;
+  const sure = stance.peak_sigma_n === null ? "" : "\u00a0(95\u00a0%)";
+  return stance.peak_grf_n === null ? `force not known, ${duration}` : `peak ${peak}${sure}, ${duration}, ${impulse}`;
 }
 
 export class Stances {
@@ -82,14 +83,14 @@ export class Stances {
   row(stance, index) {
     const { duration, peak, impulse } = figuresOf(stance);
     const go = el("button", { type: "button", cls: "small", text: String(stance.number), "aria-label": `${stance.number}: show this stance` });
-    const row = el("tr", { "data-stance": String(stance.number) },
-      el("td", {}, go),
-      el("td", { text: timeWords(stance.from, 0.01) }),
-      el("td", { text: duration }),
-      el("td", { text: peak }),
-      el("td", { text: impulse }),
-      el("td", { text: known(stance.cop_x_range_m, 1, "mm", 1e3) }),
-      el("td", { cls: "why", text: flagsOf(stance) }));
+    const row = el("tr", { role: "row", "data-stance": String(stance.number) },
+      el("td", { role: "cell" }, go),
+      el("td", { role: "cell", text: timeWords(stance.from, 0.01) }),
+      el("td", { role: "cell", text: duration }),
+      el("td", { role: "cell", text: peak }),
+      el("td", { role: "cell", text: impulse }),
+      el("td", { role: "cell", text: known(stance.cop_x_range_m, 1, "mm", 1e3), "data-label": "COP travel" }),
+      el("td", { role: "cell", cls: "why", text: flagsOf(stance) }));
     row.addEventListener("click", () => this.onGo(index));
     return row;
   }
@@ -120,8 +121,9 @@ export class Stances {
   say(stance, isPlaying) {
     this.says.ariaLive = isPlaying ? "off" : "polite"; // at four times the speed nobody can listen
     const many = this.stances.length.toLocaleString("en-GB");
-    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : many === "1" ? "1 stance" : `${many} stances`);
+    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : many === "1" ? "1 stance" : `Step through ${many} stances`);
     setText(byId("stance-figures"), stance ? figuresInWords(stance) : "");
+    setText(byId("stance-flags"), stance ? flagsOf(stance) : "");
     setData(this.says, "stance", stance ? String(stance.number) : "");
   }
 
