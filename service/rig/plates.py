@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
 
 from devices.errors import needs_extra
 from storage.durable import write_whole
@@ -75,6 +73,10 @@ def injected_beside(path: Path) -> Path:
 def _force_plate(
     world: World, end_s: float, trial: str, plate: int
 ) -> tuple[bytes, dict[str, object]]:
+    # Here, because a foot without plates is there sooner without it.
+    import pyarrow as pa
+    import pyarrow.csv
+
     with needs_extra("emulation", "an emulated plate"):
         from devices.emulation.parts import random_of
         from devices.emulation.plates.force_plate import CHANNELS, ForcePlate

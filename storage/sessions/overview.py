@@ -188,7 +188,11 @@ def open_overview(path: Path) -> Overview:
         DamagedFileError: it is not what was written.
         StorageError: it cannot be read now.
     """
-    return Overview(pa.PythonFile(open_own(path), "r"), where=str(path))
+    # Not through Python's file: Arrow reads a footer on a thread of its own, and a process that ends
+    # while that one waits for Python is aborted.
+    with open_own(path):
+        source = pa.OSFile(str(path), "r")
+    return Overview(source, where=str(path))
 
 
 class Overview:

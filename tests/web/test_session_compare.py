@@ -15,8 +15,8 @@ from tests.service.fake_node import FakeNode
 from tests.service.plates import LAG_S, compare, hopped, write_plate
 from tests.service.recording import Recording
 from tests.service.running import Running
+from tests.web.session_page import grf
 from tests.web.test_accessible import complaints
-from tests.web.test_session_page import grf
 
 pytestmark = pytest.mark.real_time
 

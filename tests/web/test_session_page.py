@@ -1,57 +1,31 @@
-"""The page of one session: its plots at every zoom, cursor, keys, stances, and what waits."""
+"""The page of one session: what it is, while it is recorded and after, and how large it is."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from storage.formats.written.registry import FORMATS
 from tests.service.fake_node import FakeNode, Play
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.web.conftest import wait_until
 from tests.web.received import Received
 from tests.web.scripted import Scripted
+from tests.web.session_page import LABEL, LOST, grf, recorded_walk, settled, summary, url_of
 from tests.web.test_accessible import complaints
 
 pytestmark = pytest.mark.real_time
 
 OpenPage = Callable[..., Page]
 
-LOST = 40
-LABEL = "a <b>stone</b>"
-
 
 @pytest.fixture(scope="module")
 def walk(server: Running) -> Recording:
-    """Six stances of 80 N, one frame of 90 N, a saturated tile, and forty frames that are lost."""
-    node = FakeNode(server)
-    node.connect()
-    node.tared()
-    session = node.record(name="walk", subject="leg 2", tags=["wet"], notes="slow")
-    for _ in range(6):
-        node.send(200, [0.0, 0.0], alive=True)
-        node.send(200, [20.0, 60.0], alive=True)
-    node.send(1, [20.0, 70.0])
-    node.send(200, [0.0, 0.0], alive=True)
-    node.send(50, [20.0, 200.0], alive=True)
-    node.send(200, [0.0, 0.0], alive=True)
-    first = node.seq
-    node.frames(LOST)
-    node.say_lost(evicted=[[first, first + LOST - 1]])
-    node.deliver(200, [0.0, 0.0], alive=True)
-    node.finish(session)
-    t_ns = int(session.column("t_ns")[700])
-    answer = server.http.post(f"{session.url}/events", json={"label": LABEL, "t_ns": t_ns})
-    assert answer.status_code == 201
-    node.close()
-    return session
+    return recorded_walk(server)
 
 
 @pytest.fixture(scope="module")
@@ -95,51 +69,6 @@ def live_page(server: Running, browser: Browser) -> Iterator[Page]:
         yield page
 
 
-def url_of(session: Recording, query: str = "") -> str:
-    return f"{session.running.url}/sessions/{session.id}{query}"
-
-
-def settled(page: Page) -> Any:
-    """The plots, once all bins of the view have come."""
-    plots = page.locator("#plots[data-settled=true]")
-    expect(plots).to_have_count(1)
-    return plots
-
-
-def seen(page: Page) -> tuple[float, float]:
-    plots = settled(page)
-    return float(plots.get_attribute("data-from")), float(plots.get_attribute("data-to"))
-
-
-def summary(page: Page, name: str) -> float:
-    return float(page.locator("#summary").get_attribute(f"data-{name}") or "nan")
-
-
-def grf(session: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds after the first frame, and the GRF, by the sealed file alone."""
-    table = pq.read_table(session.folder / "frames.parquet", columns=["t_ns", "grf_n"])
-    t_ns = table["t_ns"].to_numpy()
-    return (t_ns - t_ns[0]) * 1e-9, table["grf_n"].to_numpy().astype(float)
-
-
-@pytest.mark.parametrize(
-    "query", ["", "?from=0.5&to=4.1", "?from=4.6&to=5.1", "?from=4.79&to=4.83", "?from=1.85&to=1.9"]
-)
-def test_no_peak_hides_at_any_zoom(walk: Recording, open_page: OpenPage, query: str) -> None:
-    page = open_page(url_of(walk, query))
-    since_s, grf_n = grf(walk)
-    begin_s, end_s = seen(page)
-    first_s, last_s = summary(page, "first-s"), summary(page, "last-s")
-    in_bin = int(page.locator("#plots").get_attribute("data-frames-in-bin") or 0)
-    # Bins at the edges reach a little beyond what is in view.
-    assert begin_s - 0.002 * in_bin <= first_s <= begin_s + 0.002
-    assert end_s - 0.002 <= last_s <= end_s + 0.002 * in_bin
-    inside = (since_s >= first_s - 1e-6) & (since_s <= last_s + 1e-6)
-    assert summary(page, "frames") == inside.sum()
-    assert summary(page, "grf-max") == pytest.approx(np.nanmax(grf_n[inside]), abs=1e-5)
-    assert summary(page, "grf-min") == pytest.approx(np.nanmin(grf_n[inside]), abs=1e-5)
-
-
 def test_the_page_says_what_the_session_is_and_what_is_drawn(
     walk: Recording, open_page: OpenPage
 ) -> None:
@@ -165,149 +94,6 @@ def test_the_page_says_what_the_session_is_and_what_is_drawn(
     expect(legend.locator("[data-kind=stance]")).to_have_count(1)
     expect(legend.locator("[data-kind=lost]")).to_have_count(0)
     expect(legend.locator("[data-kind=saturated]")).to_have_count(0)
-
-
-def test_what_is_shown_is_in_the_link_and_comes_back_with_it(
-    walk: Recording, open_page: OpenPage
-) -> None:
-    page = open_page(url_of(walk))
-    all_s = seen(page)
-    box = page.locator("#plots").bounding_box()
-    assert box is not None
-    page.mouse.move(box["x"] + 300, box["y"] + 100)
-    page.mouse.down()
-    page.mouse.move(box["x"] + 600, box["y"] + 100, steps=4)
-    page.mouse.up()
-    expect(page).to_have_url(re.compile(r"\?from=[0-9.]+&to=[0-9.]+$"))
-    chosen = seen(page)
-    assert 0 < chosen[0] < chosen[1] < all_s[1]
-    again = open_page(page.url)
-    assert seen(again) == pytest.approx(chosen, abs=1e-3)
-    again.mouse.move(box["x"] + 400, box["y"] + 100)
-    again.mouse.wheel(0, -300)
-    expect(again.locator("#plots")).not_to_have_attribute("data-from", f"{chosen[0]:.4f}")
-    closer = seen(again)
-    assert chosen[0] < closer[0] < closer[1] < chosen[1]
-    again.mouse.dblclick(box["x"] + 400, box["y"] + 100)
-    expect(again).to_have_url(url_of(walk))
-    assert seen(again) == all_s
-
-
-def test_keys_zoom_move_the_cursor_and_show_all(walk: Recording, open_page: OpenPage) -> None:
-    page = open_page(url_of(walk))
-    all_s = seen(page)
-    for _ in range(9):
-        page.keyboard.press("+")
-    expect(page).to_have_url(re.compile("from="))
-    close = seen(page)
-    assert close[1] - close[0] < (all_s[1] - all_s[0]) / 30
-    page.keyboard.press("-")
-    wider = seen(page)
-    assert close[1] - close[0] < wider[1] - wider[0] < all_s[1]
-    since_s, grf_n = grf(walk)
-    readout = page.locator("#readout")
-    page.keyboard.press("ArrowRight")
-    expect(readout).not_to_have_attribute("data-time-s", "")
-    for key, by in (("ArrowRight", 1), ("ArrowRight", 1), ("ArrowLeft", -1)):
-        before_s = float(readout.get_attribute("data-time-s") or "nan")
-        at = int(np.argmin(np.abs(since_s - before_s)))
-        page.keyboard.press(key)
-        expect(readout).not_to_have_attribute("data-time-s", str(before_s))
-        after_s = float(readout.get_attribute("data-time-s") or "nan")
-        assert after_s == pytest.approx(since_s[at + by], abs=1e-6)
-        shown = f"{grf_n[at + by]:.1f} N"
-        expect(readout.locator("[data-key=grf]")).to_contain_text(shown)
-        expect(page.locator("#plots")).to_have_attribute("aria-valuetext", re.compile(shown))
-    page.keyboard.press("Home")
-    expect(page).to_have_url(url_of(walk))
-    assert seen(page) == all_s
-
-
-def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
-    walk: Recording, open_page: OpenPage
-) -> None:
-    page = open_page(url_of(walk))
-    canvas = page.locator("#overlay-canvas")
-    canvas.scroll_into_view_if_needed()
-    says = page.locator("#overlay-says")
-    expect(says).to_contain_text("6 whole stances")
-    expect(says).to_contain_text("1 stance not seen whole is left out")
-    box = canvas.bounding_box()
-    assert box is not None
-    at = page.locator("#overlay-at")
-    expect(at).to_contain_text("The mean is greatest")
-    overlay = walk.running.http.get(f"{walk.url}/stances/overlay").json()
-    half = overlay["points"] // 2
-    for down in range(0, int(box["height"]), 6):  # from above: some curve is met
-        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + down)
-        page.evaluate("new Promise(requestAnimationFrame)")
-        if (at.text_content() or "").startswith("Stance"):
-            break
-    found = re.match(r"Stance (\d+): ([0-9.]+) N at (\d+) %", at.text_content() or "")
-    assert found is not None
-    curve = next(one for one in overlay["curves"] if one["number"] == int(found[1]))
-    assert abs(int(found[3]) - half) <= 4
-    assert float(found[2]) == pytest.approx(curve["grf_n"][int(found[3])], abs=0.06)
-    page.mouse.down()
-    page.mouse.up()
-    gone_to = page.locator("#stances-rows [aria-current]")
-    expect(gone_to).to_have_attribute("data-stance", found[1])
-    legend = page.locator("#overlay-legend")
-    expect(legend).to_have_attribute("data-chosen", found[1])
-    expect(legend).to_contain_text(f"stance {found[1]}, frame by frame")
-    page.locator("#stances-rows tr").nth(6).click()  # saturated: it has no place among them
-    expect(legend).to_contain_text("stance 7 was not seen whole")
-
-
-def test_paths_of_the_centre_of_pressure_are_coloured_by_time_or_by_stance(
-    walk: Recording, open_page: OpenPage
-) -> None:
-    page = open_page(url_of(walk))
-    canvas = page.locator("#cop-canvas")
-    canvas.scroll_into_view_if_needed()
-    expect(canvas).to_have_attribute("data-plan", "false")  # two tiles in a line
-    expect(page.locator("#cop-title")).to_contain_text("along the foot")
-    legend = page.locator("#cop-legend")
-    expect(legend).to_contain_text("first contact to lift-off")
-    page.locator("#stances-rows tr").nth(1).click()
-    expect(legend).to_contain_text("ends: stance 2")
-    by_time = canvas.screenshot()
-    page.get_by_role("button", name="stance", exact=True).click()
-    expect(legend).to_contain_text("first stance to last stance")
-    assert canvas.screenshot() != by_time
-
-
-def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
-    walk: Recording, open_page: OpenPage
-) -> None:
-    page = open_page(url_of(walk, "?from=1&to=1.2"))
-    settled(page)
-    page.keyboard.press("ArrowRight")
-    readout = page.locator("#readout")
-    expect(readout).to_have_attribute("data-time-s", re.compile("."))
-    at_s = readout.get_attribute("data-time-s")
-    page.fill("#new-mark-label", "here")
-    page.press("#new-mark-label", "Enter")
-    expect(page.locator("#notices")).to_contain_text("Marked “here”")
-    events = walk.running.http.get(f"{walk.url}/events").json()["items"]
-    t_ns = next(event["t_ns"] for event in events if event["label"] == "here")
-    since_s = (t_ns - int(walk.column("t_ns")[0])) * 1e-9
-    assert since_s == pytest.approx(float(at_s or "nan"), abs=1e-5)
-    with page.expect_download() as download:
-        page.click("#download-csv")
-    lines = download.value.path().read_text("utf-8").splitlines()
-    assert len([line for line in lines if not line.startswith("#")]) == 101
-    page.click("#downloads-more summary")
-    offered = page.locator("#download-list [data-format]")
-    names = offered.evaluate_all("items => items.map((item) => item.dataset.format)")
-    assert set(names) == set(FORMATS) - {"parquet", "arrow", "csv"}
-    with page.expect_download() as further:
-        page.click("#download-xdf")
-    assert further.value.suggested_filename == f"{walk.id}.xdf"
-    assert further.value.path().read_bytes().startswith(b"XDF:")
-    with page.expect_download() as picture:
-        page.click("#picture")
-    assert picture.value.path().read_bytes().startswith(b"\x89PNG")
 
 
 def test_where_the_node_was_started_again_is_shown(twice: Recording, open_page: OpenPage) -> None:
@@ -451,3 +237,17 @@ def test_axe_has_nothing_to_complain_of_and_nothing_is_wider_than_the_screen(
     expect(page.locator("#overlay-legend")).to_contain_text("mean")
     assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
     assert complaints(page) == []
+
+
+def test_an_answer_that_breaks_off_is_as_if_there_were_none(
+    walk: Recording, browser: Browser
+) -> None:
+    with browser.new_context() as context:
+        page = context.new_page()
+        wrong: list[str] = []
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.route("**/comparisons", lambda route: route.fulfill(body='{"items": [', status=200))
+        page.goto(url_of(walk))
+        settled(page)
+        expect(page.locator("#compare")).to_be_visible()
+        assert wrong == []

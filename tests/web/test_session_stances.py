@@ -12,6 +12,7 @@ from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import until
+from tests.web.session_page import settled
 from tests.web.test_accessible import complaints
 
 pytestmark = pytest.mark.real_time
@@ -56,12 +57,6 @@ def opened(open_page: OpenPage, session: Recording, **options: Any) -> Page:
     expect(page.locator("#stance-line")).to_be_visible()
     settled(page)
     return page
-
-
-def settled(page: Page) -> Any:
-    plots = page.locator("#plots[data-settled=true]")
-    expect(plots).to_have_count(1)
-    return plots
 
 
 def says(page: Page, stance: dict[str, Any]) -> None:

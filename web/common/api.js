@@ -34,7 +34,8 @@ export async function call(method, path, body, stop = null, type = JSON_TYPE, sa
     throw new Refusal(slow ? `The server did not answer within ${patienceS} s.` : "The server cannot be reached.", 0);
   }
   const read = () => (response.ok && type !== JSON_TYPE ? response.text() : response.json());
-  const answer = response.status === 204 ? null : await read().catch(() => null);
+  const [answer, isWhole] = response.status === 204 ? [null, true] : await read().then((all) => [all, true], () => [null, false]);
+  if (response.ok && !isWhole) throw new Refusal("The server's answer broke off.", 0);
   if (response.ok) return answer;
   const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
   if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop, type, said, patienceS);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import storage.sessions.overview
 from devices.errors import DamagedFileError
+from storage.durable import open_own
 from storage.sessions.overview import Overview, open_overview, overview_content, write_overview
 from storage.sessions.pyramid import Bins
 from tests.storage.sessions.test_pyramid import TILES, frames, gathered, same
@@ -35,6 +38,24 @@ def test_every_level_is_read_as_it_was_written(tmp_path: Path) -> None:
             found = overview.bins(number, None, None)
             same({name: level[name].astype(found[name].dtype) for name in found}, found)
             assert overview.count(number, None, None) == len(level["part"])
+
+
+def test_no_thread_of_arrow_reads_through_python(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # It would abort a process that ends meanwhile.
+    levels, _ = content(1000)
+    write_overview(tmp_path / "overview.arrow", levels, tiles=TILES, frames_sha256=HASH)
+    opened: list[io.BufferedReader] = []
+
+    def kept(path: Path) -> io.BufferedReader:
+        opened.append(open_own(path))
+        return opened[-1]
+
+    monkeypatch.setattr(storage.sessions.overview, "open_own", kept)
+    with open_overview(tmp_path / "overview.arrow") as overview:
+        assert [file.closed for file in opened] == [True]
+        assert len(overview.bins(0, None, None)["part"]) == len(levels[0]["part"])
 
 
 def test_some_time_is_all_bins_that_have_a_frame_in_it(tmp_path: Path) -> None:

@@ -1,0 +1,68 @@
+"""A walk to look at on a session's page, and what is read off the page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from playwright.sync_api import Page, expect
+
+from tests.service.fake_node import FakeNode
+from tests.service.recording import Recording
+from tests.service.running import Running
+
+LOST = 40
+LABEL = "a <b>stone</b>"
+
+
+def recorded_walk(server: Running) -> Recording:
+    """Six stances of 80 N, one frame of 90 N, a saturated tile, and forty frames that are lost."""
+    node = FakeNode(server)
+    node.connect()
+    node.tared()
+    session = node.record(name="walk", subject="leg 2", tags=["wet"], notes="slow")
+    for _ in range(6):
+        node.send(200, [0.0, 0.0], alive=True)
+        node.send(200, [20.0, 60.0], alive=True)
+    node.send(1, [20.0, 70.0])
+    node.send(200, [0.0, 0.0], alive=True)
+    node.send(50, [20.0, 200.0], alive=True)
+    node.send(200, [0.0, 0.0], alive=True)
+    first = node.seq
+    node.frames(LOST)
+    node.say_lost(evicted=[[first, first + LOST - 1]])
+    node.deliver(200, [0.0, 0.0], alive=True)
+    node.finish(session)
+    t_ns = int(session.column("t_ns")[700])
+    answer = server.http.post(f"{session.url}/events", json={"label": LABEL, "t_ns": t_ns})
+    assert answer.status_code == 201
+    node.close()
+    return session
+
+
+def url_of(session: Recording, query: str = "") -> str:
+    return f"{session.running.url}/sessions/{session.id}{query}"
+
+
+def settled(page: Page) -> Any:
+    """The plots, once all bins of the view have come."""
+    plots = page.locator("#plots[data-settled=true]")
+    expect(plots).to_have_count(1)
+    return plots
+
+
+def seen(page: Page) -> tuple[float, float]:
+    plots = settled(page)
+    return float(plots.get_attribute("data-from")), float(plots.get_attribute("data-to"))
+
+
+def summary(page: Page, name: str) -> float:
+    return float(page.locator("#summary").get_attribute(f"data-{name}") or "nan")
+
+
+def grf(session: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds after the first frame, and the GRF, by the sealed file alone."""
+    table = pq.read_table(session.folder / "frames.parquet", columns=["t_ns", "grf_n"])
+    t_ns = table["t_ns"].to_numpy()
+    return (t_ns - t_ns[0]) * 1e-9, table["grf_n"].to_numpy().astype(float)

@@ -1,0 +1,185 @@
+"""The plots of a session's page: true at any zoom, moved by keys and clicks, and in the link."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+from storage.formats.written.registry import FORMATS
+from tests.service.recording import Recording
+from tests.service.running import Running
+from tests.web.session_page import grf, recorded_walk, seen, settled, summary, url_of
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+
+
+@pytest.fixture(scope="module")
+def walk(server: Running) -> Recording:
+    return recorded_walk(server)
+
+
+@pytest.mark.parametrize(
+    "query", ["", "?from=0.5&to=4.1", "?from=4.6&to=5.1", "?from=4.79&to=4.83", "?from=1.85&to=1.9"]
+)
+def test_no_peak_hides_at_any_zoom(walk: Recording, open_page: OpenPage, query: str) -> None:
+    page = open_page(url_of(walk, query))
+    since_s, grf_n = grf(walk)
+    begin_s, end_s = seen(page)
+    first_s, last_s = summary(page, "first-s"), summary(page, "last-s")
+    in_bin = int(page.locator("#plots").get_attribute("data-frames-in-bin") or 0)
+    # Bins at the edges reach a little beyond what is in view.
+    assert begin_s - 0.002 * in_bin <= first_s <= begin_s + 0.002
+    assert end_s - 0.002 <= last_s <= end_s + 0.002 * in_bin
+    inside = (since_s >= first_s - 1e-6) & (since_s <= last_s + 1e-6)
+    assert summary(page, "frames") == inside.sum()
+    assert summary(page, "grf-max") == pytest.approx(np.nanmax(grf_n[inside]), abs=1e-5)
+    assert summary(page, "grf-min") == pytest.approx(np.nanmin(grf_n[inside]), abs=1e-5)
+
+
+def test_what_is_shown_is_in_the_link_and_comes_back_with_it(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk))
+    all_s = seen(page)
+    box = page.locator("#plots").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 300, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 600, box["y"] + 100, steps=4)
+    page.mouse.up()
+    expect(page).to_have_url(re.compile(r"\?from=[0-9.]+&to=[0-9.]+$"))
+    chosen = seen(page)
+    assert 0 < chosen[0] < chosen[1] < all_s[1]
+    again = open_page(page.url)
+    assert seen(again) == pytest.approx(chosen, abs=1e-3)
+    again.mouse.move(box["x"] + 400, box["y"] + 100)
+    again.mouse.wheel(0, -300)
+    expect(again.locator("#plots")).not_to_have_attribute("data-from", f"{chosen[0]:.4f}")
+    closer = seen(again)
+    assert chosen[0] < closer[0] < closer[1] < chosen[1]
+    again.mouse.dblclick(box["x"] + 400, box["y"] + 100)
+    expect(again).to_have_url(url_of(walk))
+    assert seen(again) == all_s
+
+
+def test_keys_zoom_move_the_cursor_and_show_all(walk: Recording, open_page: OpenPage) -> None:
+    page = open_page(url_of(walk))
+    all_s = seen(page)
+    for _ in range(9):
+        page.keyboard.press("+")
+    expect(page).to_have_url(re.compile("from="))
+    close = seen(page)
+    assert close[1] - close[0] < (all_s[1] - all_s[0]) / 30
+    page.keyboard.press("-")
+    wider = seen(page)
+    assert close[1] - close[0] < wider[1] - wider[0] < all_s[1]
+    since_s, grf_n = grf(walk)
+    readout = page.locator("#readout")
+    page.keyboard.press("ArrowRight")
+    expect(readout).not_to_have_attribute("data-time-s", "")
+    for key, by in (("ArrowRight", 1), ("ArrowRight", 1), ("ArrowLeft", -1)):
+        before_s = float(readout.get_attribute("data-time-s") or "nan")
+        at = int(np.argmin(np.abs(since_s - before_s)))
+        page.keyboard.press(key)
+        expect(readout).not_to_have_attribute("data-time-s", str(before_s))
+        after_s = float(readout.get_attribute("data-time-s") or "nan")
+        assert after_s == pytest.approx(since_s[at + by], abs=1e-6)
+        shown = f"{grf_n[at + by]:.1f} N"
+        expect(readout.locator("[data-key=grf]")).to_contain_text(shown)
+        expect(page.locator("#plots")).to_have_attribute("aria-valuetext", re.compile(shown))
+    page.keyboard.press("Home")
+    expect(page).to_have_url(url_of(walk))
+    assert seen(page) == all_s
+
+
+def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk))
+    canvas = page.locator("#overlay-canvas")
+    canvas.scroll_into_view_if_needed()
+    says = page.locator("#overlay-says")
+    expect(says).to_contain_text("6 whole stances")
+    expect(says).to_contain_text("1 stance not seen whole is left out")
+    box = canvas.bounding_box()
+    assert box is not None
+    at = page.locator("#overlay-at")
+    expect(at).to_contain_text("The mean is greatest")
+    overlay = walk.running.http.get(f"{walk.url}/stances/overlay").json()
+    half = overlay["points"] // 2
+    for down in range(0, int(box["height"]), 6):  # from above: some curve is met
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + down)
+        page.evaluate("new Promise(requestAnimationFrame)")
+        if (at.text_content() or "").startswith("Stance"):
+            break
+    found = re.match(r"Stance (\d+): ([0-9.]+) N at (\d+) %", at.text_content() or "")
+    assert found is not None
+    curve = next(one for one in overlay["curves"] if one["number"] == int(found[1]))
+    assert abs(int(found[3]) - half) <= 4
+    assert float(found[2]) == pytest.approx(curve["grf_n"][int(found[3])], abs=0.06)
+    page.mouse.down()
+    page.mouse.up()
+    gone_to = page.locator("#stances-rows [aria-current]")
+    expect(gone_to).to_have_attribute("data-stance", found[1])
+    legend = page.locator("#overlay-legend")
+    expect(legend).to_have_attribute("data-chosen", found[1])
+    expect(legend).to_contain_text(f"stance {found[1]}, frame by frame")
+    page.locator("#stances-rows tr").nth(6).click()  # saturated: it has no place among them
+    expect(legend).to_contain_text("stance 7 was not seen whole")
+
+
+def test_paths_of_the_centre_of_pressure_are_coloured_by_time_or_by_stance(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk))
+    canvas = page.locator("#cop-canvas")
+    canvas.scroll_into_view_if_needed()
+    expect(canvas).to_have_attribute("data-plan", "false")  # two tiles in a line
+    expect(page.locator("#cop-title")).to_contain_text("along the foot")
+    legend = page.locator("#cop-legend")
+    expect(legend).to_contain_text("first contact to lift-off")
+    page.locator("#stances-rows tr").nth(1).click()
+    expect(legend).to_contain_text("ends: stance 2")
+    by_time = canvas.screenshot()
+    page.get_by_role("button", name="stance", exact=True).click()
+    expect(legend).to_contain_text("first stance to last stance")
+    assert canvas.screenshot() != by_time
+
+
+def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk, "?from=1&to=1.2"))
+    settled(page)
+    page.keyboard.press("ArrowRight")
+    readout = page.locator("#readout")
+    expect(readout).to_have_attribute("data-time-s", re.compile("."))
+    at_s = readout.get_attribute("data-time-s")
+    page.fill("#new-mark-label", "here")
+    page.press("#new-mark-label", "Enter")
+    expect(page.locator("#notices")).to_contain_text("Marked “here”")
+    events = walk.running.http.get(f"{walk.url}/events").json()["items"]
+    t_ns = next(event["t_ns"] for event in events if event["label"] == "here")
+    since_s = (t_ns - int(walk.column("t_ns")[0])) * 1e-9
+    assert since_s == pytest.approx(float(at_s or "nan"), abs=1e-5)
+    with page.expect_download() as download:
+        page.click("#download-csv")
+    lines = download.value.path().read_text("utf-8").splitlines()
+    assert len([line for line in lines if not line.startswith("#")]) == 101
+    page.click("#downloads-more summary")
+    offered = page.locator("#download-list [data-format]")
+    names = offered.evaluate_all("items => items.map((item) => item.dataset.format)")
+    assert set(names) == set(FORMATS) - {"parquet", "arrow", "csv"}
+    with page.expect_download() as further:
+        page.click("#download-xdf")
+    assert further.value.suggested_filename == f"{walk.id}.xdf"
+    assert further.value.path().read_bytes().startswith(b"XDF:")
+    with page.expect_download() as picture:
+        page.click("#picture")
+    assert picture.value.path().read_bytes().startswith(b"\x89PNG")
