@@ -188,8 +188,8 @@ def open_overview(path: Path) -> Overview:
         DamagedFileError: it is not what was written.
         StorageError: it cannot be read now.
     """
-    # Not through Python's file: Arrow reads a footer on a thread of its own, and a process that ends
-    # while that one waits for Python is aborted.
+    # Not through Python's file: Arrow reads a footer on a thread of its own, and a process that
+    # ends while that one waits for Python is aborted.
     with open_own(path):
         source = pa.OSFile(str(path), "r")
     return Overview(source, where=str(path))
