@@ -66,7 +66,7 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
         StorageError: it may be whole and cannot be read now: it is another user's, or memory or
             descriptors are used up. Nobody may set it aside, or write another in its place.
     """
-    with open_own(path) as file, _read_errors(path):
+    with open_own(path) as file, read_errors(path):
         size = os.fstat(file.fileno()).st_size
         if size > bytes_max:
             raise DamagedFileError(
@@ -77,7 +77,7 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
 
 def open_own(path: Path) -> io.BufferedReader:
     """Open a file of ours for reading, whatever its length; raises as `read_whole`."""
-    with _read_errors(path):
+    with read_errors(path):
         # A link may lead anywhere, and a pipe would be waited for.
         if not stat.S_ISREG(path.lstat().st_mode):
             raise DamagedFileError("it is not a file", where=str(path))
@@ -85,7 +85,8 @@ def open_own(path: Path) -> io.BufferedReader:
 
 
 @contextmanager
-def _read_errors(path: Path) -> Iterator[None]:
+def read_errors(path: Path) -> Iterator[None]:
+    """What opening or reading a file of ours raises, as `read_whole` says it."""
     try:
         yield
     except FileNotFoundError:

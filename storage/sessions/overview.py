@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from devices.errors import DamagedFileError
-from storage.durable import open_own, whole_file
+from storage.durable import open_own, read_errors, whole_file
 from storage.sessions.pyramid import FACTOR, ROWS, Bins, bin_columns, joined
 
 OVERVIEW_NAME = "overview.arrow"
@@ -190,7 +190,7 @@ def open_overview(path: Path) -> Overview:
     """
     # Not through Python's file: Arrow reads a footer on a thread of its own, and a process that
     # ends while that one waits for Python is aborted.
-    with open_own(path):
+    with open_own(path), read_errors(path):
         source = pa.OSFile(str(path), "r")
     return Overview(source, where=str(path))
 

@@ -108,11 +108,11 @@ PLACE = np.array([(1.0, 5.0)], [("near", np.float64), ("far", np.float64)])
 
 
 def at_near(x: float) -> float:
-    return x * PLACE[0].near  # type: ignore[no-any-return]
+    return x * PLACE[0].near  # type: ignore[no-any-return]  # a field of a record
 
 
 def at_far(x: float) -> float:
-    return x * PLACE[0].far  # type: ignore[no-any-return]
+    return x * PLACE[0].far  # type: ignore[no-any-return]  # a field of a record
 
 
 @pytest.mark.usefixtures("kept")

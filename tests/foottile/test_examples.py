@@ -49,7 +49,7 @@ def test_every_python_example_runs(
     for block in blocks("python"):
         if "pandas()" in block and lacking:
             continue
-        exec(compile(block.replace(URL, running.url), str(PAGE), "exec"), names)  # noqa: S102
+        exec(compile(block.replace(URL, running.url), str(PAGE), "exec"), names)  # noqa: S102  # our own page
     names["server"].close()
     assert len(names["grf_n"]) == len(names["force_n"]) == names["session"].frames
     assert names["session"].facts["notes"] == "wetter than the second"

@@ -165,7 +165,7 @@ def protocol(**asked: object) -> LiveProtocol:
         "columns": (),
         "policy": "lossless",
     }
-    return LiveProtocol(Asked(**(content | asked)))  # type: ignore[arg-type]
+    return LiveProtocol(Asked(**(content | asked)))  # type: ignore[arg-type]  # of several types
 
 
 def test_a_stream_that_is_gone_is_a_loss_and_the_next_one_is_begun() -> None:

@@ -31,7 +31,7 @@ def constant(load: Array) -> object:
 
 
 def recorded(plate: ForcePlate, wrench: object, end_s: float = 4.0) -> tuple[Array, Array]:
-    return plate.record(wrench, end_s, random_of("noise"))  # type: ignore[arg-type]
+    return plate.record(wrench, end_s, random_of("noise"))  # type: ignore[arg-type]  # a function, typed where it is made
 
 
 @pytest.mark.parametrize("load", range(6))

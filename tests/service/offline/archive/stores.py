@@ -98,7 +98,7 @@ class BadWay:
             def handle_any(self) -> None:
                 way.handle(self)
 
-            do_GET = do_PUT = do_HEAD = do_POST = do_DELETE = handle_any  # noqa: N815
+            do_GET = do_PUT = do_HEAD = do_POST = do_DELETE = handle_any  # noqa: N815  # http.server's names
 
             def log_message(self, *_: object) -> None:
                 pass

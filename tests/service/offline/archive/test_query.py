@@ -70,7 +70,7 @@ def test_frames_have_the_numbers_of_the_sealed_file(made: Path) -> None:
         (columns,) = session.columns("t_ns", "padc", "grf_n")
     rows = ask(
         find_sessions([str(made)]),
-        f"SELECT t_ns, padc_1, grf_n FROM frames WHERE session_id = '{IDS[1]}' ORDER BY t_ns",  # noqa: S608
+        f"SELECT t_ns, padc_1, grf_n FROM frames WHERE session_id = '{IDS[1]}' ORDER BY t_ns",  # noqa: S608  # our own words
     )
     assert rows["t_ns"].to_pylist() == columns["t_ns"].tolist()
     assert rows["padc_1"].to_pylist() == columns["padc"][:, 1].tolist()
@@ -78,7 +78,7 @@ def test_frames_have_the_numbers_of_the_sealed_file(made: Path) -> None:
 
 
 def test_frames_without_estimates_are_null_there(made: Path) -> None:
-    sql = f"SELECT count(*) AS n, count(grf_n) AS known FROM frames WHERE session_id = '{IDS[3]}'"  # noqa: S608
+    sql = f"SELECT count(*) AS n, count(grf_n) AS known FROM frames WHERE session_id = '{IDS[3]}'"  # noqa: S608  # our own words
     (row,) = answer(sql, made)
     assert row["n"] > 0
     assert row["known"] == 0

@@ -42,7 +42,7 @@ def test_the_pooled_spread_has_its_truth_in_95_of_100_intervals() -> None:
 
 
 def test_every_dome_is_pressed_past_its_expected_end_and_within_the_mill_s_range() -> None:
-    loads_n = [table_scene(dome).ground.load_n for dome in DOMES]  # type: ignore[union-attr]
+    loads_n = [table_scene(dome).ground.load_n for dome in DOMES]  # type: ignore[union-attr]  # it has one
     assert pytest.approx(max(loads_n), rel=1e-3) == OVERLOAD * 41.65
     assert max(loads_n) < 50.0
 

@@ -247,7 +247,7 @@ def test_a_journal_that_cannot_be_read_now_is_not_taken_for_one_that_is_not_ther
     def opens(folder: Path, **how: object) -> Journal:
         if folder.name == FIRST:
             raise StorageError("no descriptor is left", errno=errno.EMFILE)
-        return whole(folder, **how)  # type: ignore[arg-type]
+        return whole(folder, **how)  # type: ignore[arg-type]  # of several types
 
     monkeypatch.setattr(Journal, "open", opens)
     world.restart()

@@ -44,7 +44,7 @@ def test_pandas_reads_parquet_and_csv_with_instants_to_the_nanosecond(tmp_path: 
 def test_duckdb_reads_parquet_and_csv(tmp_path: Path) -> None:
     paths = put(tmp_path, "parquet"), put(tmp_path, "csv")
     for path, how in zip(paths, ("read_parquet", "read_csv"), strict=True):
-        question = f"SELECT count(*), max(time_s), sum(t_ns % 1000), max(grf_n) FROM {how}(?)"  # noqa: S608
+        question = f"SELECT count(*), max(time_s), sum(t_ns % 1000), max(grf_n) FROM {how}(?)"  # noqa: S608  # our own words
         (row,) = duckdb.execute(question, [str(path)]).fetchall()
         count, time_s, rest, grf_n = row
         batch = frames()
