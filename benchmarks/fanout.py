@@ -29,7 +29,7 @@ from typing import Any
 
 import websockets.asyncio.client
 import websockets.sync.client
-from served import cpu_s
+from served import TOKEN, cpu_s
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -175,7 +175,7 @@ def a_node(url: str) -> Iterator[None]:
             **options,
         )
 
-    node = FakeNode(SimpleNamespace(socket=connected), tiles=TILES)  # type: ignore[arg-type]  # all it needs of a server here
+    node = FakeNode(SimpleNamespace(socket=connected), tiles=TILES, token=TOKEN)  # type: ignore[arg-type]  # all it needs of a server here
     node.connect()
     node.send(60, lead=True)
     over = threading.Event()

@@ -20,8 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import httpx
-from served import COMMAND, served
+from served import COMMAND, api_of, served
 from websockets.sync.client import connect
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -74,7 +73,7 @@ def cut(how: str, rate: float | None, seconds: float) -> dict[str, Any]:
 def measure(
     url: str, proxy: Proxy, how: str, rate: float | None, seconds: float, folder: Path
 ) -> dict[str, Any]:
-    with httpx.Client(base_url=f"{url}/api/v1", trust_env=False, timeout=20.0) as api:
+    with api_of(url) as api:
 
         def node() -> dict[str, Any]:
             found: dict[str, Any] = api.get("/nodes/foot").json()

@@ -9,6 +9,7 @@ stream in memory (there is no disk behind it), its link, its probes and question
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 import uuid
 from collections import deque
@@ -226,7 +227,9 @@ class ReplayedNode:
             wanted=lambda server_id, wanted, known: None,
             damaged=lambda stream, numbers: None,
         )
-        self.publisher = Publisher(server, source, token=None, report=self.said.append)
+        self.publisher = Publisher(
+            server, source, token=os.environ.get("FOOTTILE_TOKEN"), report=self.said.append
+        )
         self.late_ms: list[float] = []
         self._kept: deque[Intervals] = deque()
 

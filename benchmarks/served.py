@@ -16,6 +16,8 @@ import httpx
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 SEALED_S, END_S = 300.0, 30.0
 _CREATED = 201
+TOKEN = os.environ.setdefault("FOOTTILE_TOKEN", "a-token-of-all-benchmarks")
+"""Of every server, node and client of a benchmark, which have it from the environment."""
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -31,6 +33,16 @@ def children(pid: int) -> list[int]:
     return [int(word) for task in tasks for word in task.read_text().split()]
 
 
+def api_of(url: str) -> httpx.Client:
+    """A client of a server's API, with its token."""
+    return httpx.Client(
+        base_url=f"{url}/api/v1",
+        headers={"Authorization": f"Bearer {TOKEN}"},
+        trust_env=False,
+        timeout=60.0,
+    )
+
+
 class Server:
     """`foottile serve` as a process."""
 
@@ -43,7 +55,7 @@ class Server:
         )
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().split()[-1].rstrip("/")
-        self.http = httpx.Client(base_url=f"{self.url}/api/v1", trust_env=False, timeout=60.0)
+        self.http = api_of(self.url)
 
     @property
     def cpu_s(self) -> float:

@@ -37,6 +37,7 @@ from recording_memory import BOOT_ID, UTC_NS, array, minute
 from side_by_side import in_turns, note, spread, table
 
 from service.api.app import make_app
+from service.api.logins import Logins
 from service.estimation import OFFLINE_LAG_MS
 from service.offline.estimate.request import EstimateRequest
 from service.offline.estimate.session import Estimated, estimate_session
@@ -179,7 +180,9 @@ class Rest:
         self._loop, self._end = asyncio.new_event_loop(), asyncio.Event()
         self._thread = Thread(target=self._loop.run_until_complete, args=(self._end.wait(),))
         self._thread.start()
-        transport = httpx.ASGITransport(make_app(self._server))
+        transport = httpx.ASGITransport(
+            make_app(self._server, logins=Logins("a-token-of-this-benchmark"))
+        )
         self._http = httpx.AsyncClient(transport=transport, base_url="http://localhost/api/v1")
 
     def get(self, path: str, **query: str) -> bytes:

@@ -59,8 +59,8 @@ def connect(url: str, token: str | None = None, *, timeout_s: float = 10.0) -> S
 
     Args:
         url: its address, `http://HOST:PORT`.
-        token: its token; None: that of FOOTTILE_TOKEN, if it is set. To look, none is needed unless
-            the server is private.
+        token: its token; None: FOOTTILE_TOKEN, else that of a server which this user runs on this
+            machine. To read, none is needed unless the server is private.
         timeout_s: how long an answer may keep one waiting.
 
     Raises:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from foottile.errors import FootTileError, NoAnswerError, UsageError, refused
+from foottile.local_server import find_local_server
 
 try:
     import httpx
@@ -24,7 +25,7 @@ class Http:
 
     Args:
         url: its address.
-        token: its token; None: FOOTTILE_TOKEN, if that is set.
+        token: its token; None: FOOTTILE_TOKEN, else that of this user's server on this machine.
         timeout_s: how long an answer may keep one waiting.
 
     Raises:
@@ -32,8 +33,10 @@ class Http:
     """
 
     def __init__(self, url: str, token: str | None, timeout_s: float) -> None:
-        self.url = url.rstrip("/")
         token = token or os.environ.get("FOOTTILE_TOKEN")
+        if not token and (local := find_local_server(url)) is not None:
+            url, token = local.url, local.token
+        self.url = url.rstrip("/")
         self.headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
             self._client = httpx.Client(

@@ -12,6 +12,7 @@ from storage.durable import LOCK_NAME, intended_name, make_folder, storage_error
 _OURS = {
     *(LOCK_NAME, ".writable", "journal", "nodes", "server_id", "sessions", "token", "trash"),
     "demo",  # a data folder of its own, within the user's
+    "servers",  # foottile.local_server keeps it beside a node's journal
 }
 """All that servers and nodes write in their folder."""
 

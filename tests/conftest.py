@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from tests.tokens import SHARED_TOKEN
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # As of what a shell runs behind: processes of the tests would not hear Ctrl-C, either.
@@ -21,6 +24,16 @@ pytest.register_assert_rewrite("tests.builders")
 settings.register_profile("chance", deadline=None)
 settings.register_profile("foottile", deadline=None, derandomize=True)
 settings.load_profile("foottile")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Commands, and programs that use `foottile`, have the token that tests share, and leave no
+    record of a server in the home of whoever runs the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FOOTTILE_TOKEN", SHARED_TOKEN)
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -20,6 +20,7 @@ from devices.scene.emulated import EmulationScene, FaultScene, GroundScene, MudG
 from devices.scene.file import Scene, builtin_scenes, load_scene
 from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
 from service.api.app import make_app
+from service.api.logins import Logins
 from service.api.settings import Settings
 from service.cli.table import SUMMARIES, loaded
 from service.estimation.calibration import TileCalibration
@@ -30,6 +31,7 @@ from service.server.screens.spans import span_of
 from service.server.server import Server
 from storage.schema import KNOWN
 from tests.builders.frames import make_frames
+from tests.tokens import SHARED_TOKEN
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = (ROOT / "docs" / "scenes.md").read_text("utf-8")
@@ -166,7 +168,7 @@ def test_the_calibration_file_is_described() -> None:
 def openapi() -> dict[str, Any]:
     with TemporaryDirectory() as folder:
         server = Server(Path(folder))
-        described = make_app(server).openapi()
+        described = make_app(server, logins=Logins(SHARED_TOKEN)).openapi()
         asyncio.run(server.close())
     plain: dict[str, Any] = json.loads(json.dumps(described))
     return plain

@@ -5,15 +5,17 @@ Nothing here needs what the server itself is made of, which takes long to import
 
 from __future__ import annotations
 
-import ipaddress
 import logging
-import os
 import re
 import secrets
 import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from devices.errors import DamagedFileError, LinkError
+from foottile.local_server import LocalServer, is_loopback, publish_local_server
 from storage.durable import put_aside, read_whole, storage_errors, write_whole
 
 log = logging.getLogger("foottile.serve")
@@ -43,6 +45,8 @@ def listen(host: str, port: int) -> socket.socket:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # those that come to it inherit this
             listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
+        if family == socket.AF_INET6:  # `::` is every address, whatever the machine's default
+            listening.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         listening.bind(address)
         listening.listen(_BACKLOG)
     except OSError as error:
@@ -90,16 +94,17 @@ def _own_addresses() -> list[str]:
         return [name for name in (probe.getsockname()[0],) if not is_loopback(name)]
 
 
-def token_for(host: str, given: str | None, data: Path, *, is_private: bool = False) -> str | None:
-    """The token to ask for: the one given, else one that is kept in the data folder.
+def token_for(given: str | None, data: Path) -> str:
+    """Return the token to ask for: the one given, else the one that is kept in the data folder.
 
-    On loopback it is None if none is given, unless the server is private.
+    There is always one: through a reverse proxy, `ssh -L` or a container's port everybody comes
+    from loopback.
 
     Raises:
         StorageError: it cannot be read or kept.
     """
-    if given or (is_loopback(host) and not is_private):
-        return given or None
+    if given:
+        return given
     path = data / KEPT_IN
     try:
         return kept_token(data)
@@ -129,28 +134,23 @@ def kept_token(data: Path) -> str:
     return kept
 
 
-def known_token(data: Path) -> str | None:
-    """The token of this machine's server: FOOTTILE_TOKEN, else the one in its data folder.
+@contextmanager
+def published(listening: socket.socket, token: str) -> Iterator[None]:
+    """Let programs of this user on this machine find the token while the block runs.
 
-    Raises:
-        DamagedFileError: the file holds no token.
-        StorageError: it cannot be read: it is its user's alone.
+    Args:
+        listening: socket of the server.
+        token: of the server.
     """
-    try:
-        return os.environ.get("FOOTTILE_TOKEN") or kept_token(data)
-    except FileNotFoundError:
-        return None
+    url = urls_of(listening, listening.getsockname()[0])[-1]
+    with ExitStack() as stack:
+        if is_loopback(urlsplit(url).hostname or ""):
+            try:
+                stack.enter_context(publish_local_server(LocalServer(url, token)))
+            except OSError as error:
+                log.warning("%s: commands on this machine need FOOTTILE_TOKEN", error)
+        yield
 
 
 _TOKEN = re.compile(r"[!-~]{8,200}")
 """What people may have put there themselves, too."""
-
-
-def is_loopback(host: str) -> bool:
-    """Does this address reach only this machine?"""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

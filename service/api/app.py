@@ -51,21 +51,18 @@ websocket `/api/v1/live`; nodes connect to `/api/v1/ingest` with the subprotocol
 def make_app(
     server: Server,
     *,
+    logins: Logins,
     hosts: Iterable[str] = (),
-    token: str | None = None,
-    logins: Logins | None = None,
     urls: Sequence[str] = (),
 ) -> FastAPI:
     """Build the application.
 
     Args:
         server: the state it serves.
+        logins: token, tickets and cookies: asked for on every change of state and on ingest.
         hosts: names under which it is reached, in addition to addresses and localhost.
-        token: asked for on every change of state and on ingest; None: not asked for.
-        logins: of this token, if more is to be said of them.
         urls: its addresses, as they are said to people; the first one is shown to phones.
     """
-    logins = logins if logins is not None else Logins(token)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -94,7 +91,7 @@ def make_app(
         prefix=API,
         responses=access.problems(
             _400="This is not a request as HTTP/1.1 has them, or its body is not UTF-8.",
-            _401="Off loopback a change needs the token or a login; if it is private, all does.",
+            _401="A change needs the token or a login; on a private server everything does.",
             _403="The Host header, or the Origin of a change, is not this server's; or the login "
             "that was shown is a viewer's.",
             _408="Its headers or its body did not come in time.",

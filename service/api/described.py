@@ -18,8 +18,8 @@ _METHODS = ("get", "post", "put", "patch", "delete")
 _TOKEN = {
     "type": "http",
     "scheme": "bearer",
-    "description": "The server's token. On loopback, and to look at a server that is not private, "
-    "none is needed; a browser that has logged in needs none either.",
+    "description": "The server's token. To read from a server that is not private none is needed; "
+    "a browser that has logged in needs none either.",
 }
 
 

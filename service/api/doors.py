@@ -15,7 +15,7 @@ import time
 from collections import Counter
 from typing import Annotated, Protocol
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, IPvAnyNetwork
 
 log = logging.getLogger("foottile.doors")
 
@@ -28,6 +28,7 @@ OWN_FILES = 96
 """Descriptors that recording needs: journals, logs and locks, a session that is being sealed."""
 _FILES_MAX = 65_536
 _SAY_EVERY_S = 60.0
+_IPV4 = 4
 
 
 class Bounds(BaseModel):
@@ -36,7 +37,8 @@ class Bounds(BaseModel):
     max_connections: _Connections = 512
     """Requests and screens at once; beyond them 503, or 1013 on a websocket. Nodes do not count."""
     max_connections_per_address: _Connections = 256
-    """The same from one address. A phone's hotspot and a reverse proxy are one address."""
+    """The same from one address. A phone's hotspot is one address, and so is a reverse proxy that
+    is not trusted."""
     max_nodes: _Connections = 32
     """Nodes at once."""
     max_header_bytes: Annotated[int, Field(ge=4096, le=1 << 20)] = 32 << 10
@@ -47,6 +49,18 @@ class Bounds(BaseModel):
     """A request's body has to come within; else 408."""
     idle_timeout_s: _Seconds = 30.0
     """A connection may wait for its next request for so long."""
+    trusted_proxy: tuple[IPvAnyNetwork, ...] = ()
+    """Addresses of reverse proxies whose X-Forwarded-For and X-Forwarded-Proto count."""
+
+    @property
+    def trusted_peers(self) -> list[str]:
+        """The same as addresses of peers: a socket of IPv6 has an IPv4 peer as ::ffff:A.B.C.D."""
+        mapped = [
+            f"::ffff:{proxy.network_address}/{96 + proxy.prefixlen}"
+            for proxy in self.trusted_proxy
+            if proxy.version == _IPV4
+        ]
+        return [*map(str, self.trusted_proxy), *mapped]
 
 
 class Visitor(Protocol):
@@ -99,11 +113,16 @@ class Doors:
         while len(self._waiting) > max(RESERVE, self.connections_max - len(self._busy)):
             self.turn_out()
 
-    def admit(self, visitor: Visitor) -> bool:
-        """A request or a screen, from one that waited; False: there are too many."""
+    def admit(self, visitor: Visitor, client: str | None = None) -> bool:
+        """A request or a screen, from one that waited; False: there are too many.
+
+        Args:
+            visitor: the connection.
+            client: address of whoever asks, if a trusted proxy stands between; None: the peer's.
+        """
         if visitor in self._busy:
             return True
-        address = self._waiting.get(visitor, "")
+        address = client if client is not None else self._waiting.get(visitor, "")
         from_there = sum(1 for each in self._busy.values() if each == address)
         if len(self._busy) >= self.connections_max:
             self.say("full", f"{len(self._busy)} connections at once: further ones are refused")

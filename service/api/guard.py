@@ -1,8 +1,9 @@
-"""Who may ask: Host and Origin are checked, and except on loopback a right for every change.
+"""Who may ask: Host and Origin are checked, and a right for every change.
 
 A web page of another site can make a browser send requests here; it cannot choose the Host header
-nor hide its Origin. On loopback that is what has to be kept out; on a network others are, too.
-What a request shows of who asks is in `service.api.logins`.
+nor hide its Origin. The address of a peer is no proof of identity: through a reverse proxy,
+`ssh -L` or a container's port everybody comes from loopback. What a request shows of who asks is in
+`service.api.logins`.
 """
 
 from __future__ import annotations
@@ -30,16 +31,20 @@ LOGIN_PATH = "/api/v1/login"
 TICKETS_PATH = "/api/v1/tickets"
 
 _HERE = "the computer on which `foottile serve` runs"
+_AS_PROGRAM = (
+    "A program sends the token as Authorization: Bearer TOKEN, and commands of foottile take it "
+    "from FOOTTILE_TOKEN; the server keeps it in the file `token` of its data folder, unless it "
+    "was given one"
+)
 _ASKED = (
-    "To change something here the server's token is needed, or a login: the token is shown, or "
-    f"where it is, on {_HERE}, and `foottile ticket` gives a login there. A program sends the "
-    "token as Authorization: Bearer TOKEN"
+    "To change something here the server's token is needed, or a login: `foottile ticket`, on "
+    f"{_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
 _PRIVATE = (
-    "This server is private: to look, too, a login is needed, which `foottile ticket` gives on "
-    f"{_HERE}, or its token. A program sends the token as Authorization: Bearer TOKEN"
+    "This server is private: to look, too, the server's token is needed, or a login: `foottile "
+    f"ticket`, on {_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
-_WRONG = f"This is not the server's token: that is shown, or where it is, on {_HERE}"
+_WRONG = f"This is not the server's token. {_AS_PROGRAM}"
 _ENDED = (
     "This login has ended: the server was started again, or 12 hours are over. "
     f"`foottile ticket` gives a new one, on {_HERE}"
@@ -101,9 +106,15 @@ class Guard:
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"
         changes = not websocket and scope["method"] not in SAFE_METHODS
+        # A proxy with TLS that is not trusted to say so makes https of what looks like http here.
+        is_https = scope["scheme"] in ("https", "wss")
+        ours = {f"https://{host}"} if is_https else {f"http://{host}", f"https://{host}"}
         for origin in headers.getlist("origin") if websocket or changes else ():
-            if origin not in (f"http://{host}", f"https://{host}"):
-                what = f"Origin {origin[:80]!r} is another site than {host[:80]!r}"
+            if origin not in ours:
+                what = (
+                    f"Origin {origin[:80]!r} is another site than {host[:80]!r}; a reverse proxy "
+                    "has to pass on the Host header that the browser sent"
+                )
                 return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > _most(scope):

@@ -120,23 +120,18 @@ class Logins:
     """The token of a server, its tickets, and the cookies they were changed for.
 
     Args:
-        token: None: nothing is asked for, and everybody may do everything.
+        token: of the server.
         is_private: is a login asked for to look, too?
         now_s: a clock that never steps.
-
-    Raises:
-        ValueError: private, and no token.
     """
 
     def __init__(
         self,
-        token: str | None,
+        token: str,
         *,
         is_private: bool = False,
         now_s: Callable[[], float] = _boot_s,
     ) -> None:
-        if is_private and token is None:
-            raise ValueError("a private server needs a token")
         self.token = token
         self.is_private = is_private
         self.tickets = Secrets(lasts_s=TICKET_S, most=TICKETS_MAX, now_s=now_s)
@@ -144,8 +139,6 @@ class Logins:
 
     def shown_by(self, request: HTTPConnection) -> Shown:
         """What a request shows; of a token and a cookie only the token counts."""
-        if self.token is None:
-            return Shown(Right.OWN)
         if "authorization" in request.headers:
             given = bearer_token(request.headers.getlist("authorization"))
             if given is not None and hmac.compare_digest(given.encode(), self.token.encode()):

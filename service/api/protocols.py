@@ -12,7 +12,7 @@ import errno
 import logging
 import socket
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from http import HTTPStatus
 from typing import Any
@@ -22,6 +22,7 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket as StarletteWebSocket
 from starlette.websockets import WebSocketDisconnect
 from uvicorn._types import ASGIReceiveEvent
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -52,6 +53,18 @@ class DoorsConfig(uvicorn.Config):
 
     doors: Doors
 
+    proxies: ProxyHeadersMiddleware
+
+    def forwarded_client(self, peer: str, forwarded_for: Sequence[str]) -> str | None:
+        """Return the address that a trusted proxy names as its client's; None: it is the peer's.
+
+        uvicorn puts it into the scope of a request when that has been admitted already.
+        """
+        trusted = self.proxies.trusted_hosts
+        if not forwarded_for or peer not in trusted:
+            return None
+        return trusted.get_trusted_client_address(", ".join(forwarded_for))[0] or None
+
 
 class Http(HttpToolsProtocol):
     """HTTP whose headers and bodies come in time and in bounds, or not at all."""
@@ -72,7 +85,7 @@ class Http(HttpToolsProtocol):
         super().connection_made(transport)
         self._asked: deque[RequestResponseCycle] = deque()
         """Requests that are not answered yet, in their order; uvicorn knows but the newest."""
-        self.config.doors.come(transport, self.client[0] if self.client else "")
+        self.config.doors.come(transport, _address(self.client))
         self._expect(self.config.doors.bounds.header_timeout_s)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -115,7 +128,9 @@ class Http(HttpToolsProtocol):
         self._in_head = False
         self._expect(None)
         is_websocket = self.parser.should_upgrade() and self._should_upgrade()
-        if not is_websocket and not self.config.doors.admit(self.transport):
+        named = [v.decode("latin-1") for name, v in self.headers if name == b"x-forwarded-for"]
+        client = self.config.forwarded_client(_address(self.client), named)
+        if not is_websocket and not self.config.doors.admit(self.transport, client):
             self.app = refuse
         before: RequestResponseCycle | None = self.cycle  # None before the first one
         super().on_headers_complete()
@@ -227,7 +242,9 @@ class WebSocket(WebSocketsSansIOProtocol):
         self._is_node = event.path.partition("?")[0] == INGEST_PATH
         if not self._is_node:
             self.conn.max_message_size = SAID_ON_LIVE_BYTES_MAX
-        if doors.nodes_are_full if self._is_node else not doors.admit(self.transport):
+        named = event.headers.get_all("X-Forwarded-For")
+        client = self.config.forwarded_client(_address(self.client), named)
+        if doors.nodes_are_full if self._is_node else not doors.admit(self.transport, client):
             self.app = refuse
         super().handle_connect(event)
         if not self.close_sent:
@@ -279,6 +296,10 @@ class WebSocket(WebSocketsSansIOProtocol):
         """Serve it; then it only has to go, which one that does not read does not do by itself."""
         await super().run_asgi()
         self.config.doors.rest(self.transport)
+
+
+def _address(peer: tuple[str, int] | None) -> str:
+    return peer[0] if peer else ""
 
 
 async def send(socket: StarletteWebSocket, message: str | bytes) -> None:

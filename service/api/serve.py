@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager, contextmanager, suppress
 
 import uvicorn
 from fastapi import FastAPI
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from service.api.doors import Bounds, Doors, open_files_max
 from service.api.protocols import DoorsConfig, Http, WebSocket, accept
@@ -44,8 +45,10 @@ async def serving(
         ws_ping_timeout=20.0,
         timeout_keep_alive=bounds.idle_timeout_s,  # type: ignore[arg-type]  # it takes fractions
         timeout_graceful_shutdown=_GRACE_S,
+        forwarded_allow_ips=bounds.trusted_peers,  # uvicorn trusts loopback by itself
     )
     config.doors = Doors(bounds, open_files_max())
+    config.proxies = ProxyHeadersMiddleware(app, bounds.trusted_peers)
     logging.getLogger("uvicorn.error").addFilter(_is_news)
     server = _Uvicorn(config)
     task = asyncio.create_task(server.serve([listening]))

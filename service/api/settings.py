@@ -35,8 +35,7 @@ class Settings(Bounds, BaseSettings):
     data: Path = Field(default_factory=lambda: user_data_path("foottile"))
     """Folder for sessions, journals and what is known of nodes."""
     token: Annotated[str, Field(min_length=8)] | None = None
-    """Asked for on every change of state; made and kept in the data folder if none is given and
-    the host is not loopback, or the server is private."""
+    """Asked for on every change of state; made and kept in the data folder if none is given."""
     private: bool = False
     """Is a login, or the token, asked for to look, too?"""
     allow_host: tuple[str, ...] = ()

@@ -7,6 +7,7 @@ say goes to files beside the sessions.
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -87,6 +88,7 @@ class Laboratory:
         self._folder = folder
         self._stack = ExitStack()
         self._url = ""
+        self._token = secrets.token_urlsafe(18)
         self._nodes: list[subprocess.Popen[bytes]] = []
         self._is_over = False
         self._lock = threading.Lock()
@@ -127,7 +129,7 @@ class Laboratory:
             node = self._start(trial.name, arguments)
             self._nodes.append(node)
         try:
-            with foottile.connect(self._url) as server:
+            with foottile.connect(self._url, self._token) as server:
                 session = self._started(server, trial.name, node)
                 _wait(trial.seconds, node, trial.name)
                 sealed = session.stop().wait(_SEALED_S).facts
@@ -157,7 +159,7 @@ class Laboratory:
         with log.open("wb") as file:
             process = subprocess.Popen(  # noqa: S603  # ourselves, with arguments of our own
                 [sys.executable, "-c", _CODE, *arguments],
-                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                env={**os.environ, "PYTHONUNBUFFERED": "1", "FOOTTILE_TOKEN": self._token},
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,

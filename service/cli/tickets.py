@@ -16,7 +16,7 @@ _USUAL = "\x1b[0m"
 
 def reaches_others(url: str) -> bool:
     """Is this an address that a phone could open?"""
-    from service.api.address import is_loopback
+    from foottile.local_server import is_loopback
 
     return not is_loopback(urlsplit(url).hostname or "")
 

@@ -20,7 +20,7 @@ class NodeOptions:
         record: name of a session to record on the node itself; None: no recording.
         calibration: of its tiles, for the server to estimate with.
         calibration_problem: why there is no calibration.
-        token: for servers that want one.
+        token: of the server; None: that of a server which this user runs on this machine.
     """
 
     rig: RigOptions

@@ -15,6 +15,7 @@ from websockets.exceptions import WebSocketException
 from websockets.frames import CloseCode
 
 from devices.errors import LinkError
+from foottile.local_server import find_local_server
 from service.link import MESSAGE_BYTES_MAX, SILENCE_S, SUBPROTOCOL, Hello, Welcome, say
 from service.node.connection import Connection, parse
 from service.node.dial import BackOff, dial, ingest_url, reason_of
@@ -27,16 +28,17 @@ class Publisher:
     Args:
         server: http(s) or ws(s) address of the server.
         source: the node.
-        token: for servers that want one.
+        token: of the server; None: that of a server which this user runs on this machine.
         report: told what happened, once for every change.
     """
 
     def __init__(
         self, server: str, source: Source, *, token: str | None, report: Callable[[str], None]
     ) -> None:
+        self._server = server
         self._url = ingest_url(server)
         self._source = source
-        self._headers = {"Authorization": f"Bearer {token}"} if token else {}
+        self._token = token
         self._report = report
         self._last_report = ""
         self._connected = False
@@ -56,10 +58,14 @@ class Publisher:
         back_off = BackOff()
         while True:
             self._renewed.clear()
+            # Before each attempt: the server may be started after its node.
+            local = None if self._token else find_local_server(self._server)
+            server, token = (local.url, local.token) if local else (self._server, self._token)
+            self._url = ingest_url(server)
             try:
                 tcp = await dial(self._url)
                 try:
-                    await self._speak(tcp, back_off)
+                    await self._speak(tcp, token, back_off)
                 finally:
                     tcp.close()  # if it was not handed over, or not yet let go
             except (OSError, ValueError, WebSocketException) as error:
@@ -73,7 +79,7 @@ class Publisher:
         """Has a server welcomed it?"""
         return self._connected
 
-    async def _speak(self, tcp: sockets.socket, back_off: BackOff) -> None:
+    async def _speak(self, tcp: sockets.socket, token: str | None, back_off: BackOff) -> None:
         async with connect(
             self._url,
             sock=tcp,
@@ -83,7 +89,7 @@ class Publisher:
             ping_interval=None,  # we ask ourselves, and measure by the answers
             open_timeout=SILENCE_S,
             close_timeout=1.0,
-            additional_headers=self._headers,
+            additional_headers={"Authorization": f"Bearer {token}"} if token else {},
             proxy=None,
         ) as socket:
             hello, welcome = await self._greet(socket)

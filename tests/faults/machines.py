@@ -19,6 +19,7 @@ from tests.faults.clock_step import WallClock
 from tests.faults.disk import SlowSync
 from tests.faults.power import Disk
 from tests.faults.product import NODE, REPOSITORY, clean_environment, command, product
+from tests.tokens import SHARED_BEARER, SHARED_TOKEN
 from tests.waiting import PATIENCE_S
 
 T = TypeVar("T")
@@ -85,6 +86,8 @@ class Machine:
             **self.disk.environment(),
             **self.clock.environment(),
             **self.slow.environment(),
+            "FOOTTILE_TOKEN": SHARED_TOKEN,
+            "XDG_STATE_HOME": str(self.arm.parent / "state"),
             "FAULTS_KILL_FILE": str(self.arm),
             "FAULTS_KILL": kill_at,
             "FAULTS_PARENT": str(os.getpid()),
@@ -160,7 +163,10 @@ class ServerMachine(Machine):
         super().__init__("server", folder, small)
         self.port = free_port()
         self._http = httpx.Client(
-            base_url=f"http://127.0.0.1:{self.port}/api/v1", timeout=PATIENCE_S, trust_env=False
+            base_url=f"http://127.0.0.1:{self.port}/api/v1",
+            headers=SHARED_BEARER,
+            timeout=PATIENCE_S,
+            trust_env=False,
         )
 
     def start(self, kill_at: str = "") -> None:

@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.stage import Served, recording
 from tests.web.conftest import CHROMIUM, CHROMIUM_OPTIONS
+from tests.web.login import log_in
 
 NAMES = "MAP evil.example 127.0.0.1, MAP rebound.example 127.0.0.1"
 """What a foreign DNS says: its own page is here, and, when asked again, so is our server."""
@@ -52,9 +53,10 @@ START = '{"node": "bench", "name": "of an attacker"}'
 def page_of_an_attacker(play: Play) -> Outcome:
     """Requests, forms, beacons and websockets of a foreign page, and of one rebound by its DNS.
 
-    A node records meanwhile, so what is asked for would succeed if it were let through: the last
-    request, of the server's own page, does. A try is one of them. It fails if a page reads anything
-    of the server's, if a websocket opens, or if anything has changed on the server.
+    A node records meanwhile and the browser has logged in, so what is asked for would succeed if it
+    were let through: the last request, of the server's own page, does. A try is one of them. It
+    fails if a page reads anything of the server's, if a websocket opens, or if anything has changed
+    on the server.
     """
     if CHROMIUM is None:
         pytest.skip("no Chromium; on Debian: sudo apt-get install chromium")
@@ -81,7 +83,7 @@ def page_of_an_attacker(play: Play) -> Outcome:
 
 
 def _from_another_site(browser: Browser, site: str, served: Served, outcome: Outcome) -> None:
-    with _page(browser, site) as page:
+    with _page(browser, served, site) as page:
         for host in (f"127.0.0.1:{served.port}", f"localhost:{served.port}"):
             api = f"http://{host}/api/v1"
             for request in _requests(api):
@@ -97,7 +99,7 @@ def _from_another_site(browser: Browser, site: str, served: Served, outcome: Out
 
 def _rebound(browser: Browser, served: Served, outcome: Outcome) -> None:
     site = f"http://rebound.example:{served.port}"
-    with _page(browser, site) as page:
+    with _page(browser, served, site) as page:
         if "FootTile" in page.title():
             outcome.failures.append("the page is served under a foreign name")
         for request in _requests("/api/v1"):
@@ -141,7 +143,7 @@ def _judge_socket(page: Page, url: str, outcome: Outcome) -> None:
 
 def _of_its_own_page(browser: Browser, served: Served, outcome: Outcome) -> None:
     """That the requests would do something, did they come from where they may."""
-    with _page(browser, served.url) as page:
+    with _page(browser, served, served.url) as page:
         _, status, text = page.evaluate(ASK, _requests("/api/v1")[1])
         if status != 201 or page.evaluate(SOCKET, f"ws://127.0.0.1:{served.port}/api/v1/live") != (
             "open"
@@ -162,9 +164,10 @@ def _state(served: Served) -> list[Any]:
 
 
 @contextmanager
-def _page(browser: Browser, url: str) -> Iterator[Page]:
+def _page(browser: Browser, served: Served, url: str) -> Iterator[Page]:
     context = browser.new_context()
     try:
+        log_in(context, served.url)
         page = context.new_page()
         page.goto(url + "/")
         yield page

@@ -41,6 +41,12 @@ CHECKS: list[CheckFunction] = [
 def play_drawn(served: Served, play: Play, *, token: str | None = None) -> Outcome:
     """Requests of every kind, an operation and right or wrong data for it; of few tries, each of
     another kind, and those of the next turn of the kinds that follow.
+
+    Args:
+        served: the server.
+        play: how many, and from which draw.
+        token: half of the requests have this token and the others none; None: all have the one
+            that tests share.
     """
     schema = schemathesis.openapi.from_url(served.url + "/api/v1/openapi.json")
     operations = [result.ok() for result in schema.get_all_operations() if isinstance(result, Ok)]
@@ -97,7 +103,9 @@ def _ask(
     named = case.path_parameters or {}
     chosen = {name: ids[name] for name in named if name in ids and outcome.tries % 2}
     case.path_parameters = {**named, **chosen}
-    headers = {"Authorization": f"Bearer {token}"} if token and outcome.tries % 4 < 2 else {}
+    headers = dict(served.shown)
+    if token and outcome.tries % 4 < 2:
+        headers = {"Authorization": f"Bearer {token}"}
     answer = case.call(session=session, headers=headers, timeout=20)
     command = case.as_curl_command()
     try:

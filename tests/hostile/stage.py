@@ -11,8 +11,8 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from urllib.parse import urlsplit
 
-import httpx
 from websockets.exceptions import ConnectionClosed
 
 from tests.hostile.attack import Outcome
@@ -39,7 +39,7 @@ class Served(Running):
         files_max: int | None = None,
         **environment: str,
     ) -> None:
-        super().__init__(folder / "data")
+        super().__init__(folder / "data", token=environment.get("FOOTTILE_TOKEN"))
         self._arguments = arguments or ("serve",)
         self._files_max = files_max
         self._environment = environment
@@ -54,8 +54,8 @@ class Served(Running):
             # It has asked for as many as it may when it comes to listen.
             resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (self._files_max,) * 2)
         line = self.process.said("FootTile is at ", 60.0)
-        self.port = int(line.strip().rstrip("/").rsplit(":", 1)[1])
-        self.http = httpx.Client(base_url=self.url + "/api/v1", timeout=10.0, trust_env=False)
+        self.port = urlsplit(line.split()[-1]).port or 0
+        self.http = self.client()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.tokens import SHARED_TOKEN
 from tests.waiting import PATIENCE_S, until
 
 Start = Callable[..., "Process"]
@@ -32,6 +33,7 @@ class Process:
                 "COLUMNS": "200",
                 "PYTHONUNBUFFERED": "1",
                 "XDG_STATE_HOME": str(folder.parent / "state"),  # journals of nodes
+                "FOOTTILE_TOKEN": SHARED_TOKEN,
                 **environment,
             },
             stdin=subprocess.DEVNULL,

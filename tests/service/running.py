@@ -26,6 +26,7 @@ from service.link import SUBPROTOCOL
 from service.server.server import Server
 from storage.journal.journal import Journal
 from tests.service.recording import Recording
+from tests.tokens import SHARED_BEARER, SHARED_TOKEN
 from tests.waiting import PATIENCE_S
 
 T = TypeVar("T")
@@ -39,7 +40,11 @@ def assert_refused(answer: httpx.Response, status: int, *words: str) -> None:
 
 
 class Running:
-    """A server in a thread with an event loop of its own."""
+    """A server in a thread with an event loop of its own.
+
+    Without a token of the test's own, `http`, sockets and nodes of it show the one that tests
+    share. A test that gives a token is about tokens: then each request shows what the test says.
+    """
 
     def __init__(
         self,
@@ -55,7 +60,9 @@ class Running:
         self.server: Server
         self.http: httpx.Client
         self.port = 0
-        self._token = token
+        self._token = token if token is not None else SHARED_TOKEN
+        self.shown = dict(SHARED_BEARER) if token is None else {}
+        """Headers that every request of `http`, socket and node has."""
         self._is_private = is_private
         self.logins: Logins
         self._hosts = tuple(hosts)
@@ -83,7 +90,13 @@ class Running:
             self._thread.join()
             self._thread = None
             raise self._problem
-        self.http = httpx.Client(base_url=self.url + "/api/v1", timeout=PATIENCE_S, trust_env=False)
+        self.http = self.client()
+
+    def client(self) -> httpx.Client:
+        """A client of the API."""
+        return httpx.Client(
+            base_url=self.url + "/api/v1", headers=self.shown, timeout=PATIENCE_S, trust_env=False
+        )
 
     def stop(self) -> None:
         if self._thread is None:
@@ -113,6 +126,7 @@ class Running:
     def socket(self, path: str, *, small: bool = False, **options: Any) -> ClientConnection:
         """A websocket to the server."""
         options.setdefault("subprotocols", [SUBPROTOCOL])
+        options["additional_headers"] = self.shown | (options.get("additional_headers") or {})
         if not small:
             options.setdefault("max_queue", None)
         connection: ClientConnection = connect(
@@ -176,8 +190,10 @@ class Running:
         self._stop = asyncio.Event()
         with listen("127.0.0.1", self.port) as listening:
             self.server = Server(self.data, exact=self._exact)
-            self.logins = Logins(self._token, is_private=self._is_private)
-            app = make_app(self.server, hosts=self._hosts, logins=self.logins)
+            if not self.shown or not hasattr(self, "logins"):
+                # Where a test is about something else, its pages stay logged in over a restart.
+                self.logins = Logins(self._token, is_private=self._is_private)
+            app = make_app(self.server, logins=self.logins, hosts=self._hosts)
             async with serving(app, listening, self._bounds):
                 self.port = int(urls_of(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])
                 ready.set()

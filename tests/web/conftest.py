@@ -20,6 +20,7 @@ import service.server.server
 from tests.service.patient import be_patient, patient_server
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S
+from tests.web.login import log_in
 from tests.web.scripted import Scripted
 
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
@@ -134,6 +135,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
             viewport={"width": width, "height": height}, accept_downloads=True, **options
         )
         contexts.append(context)
+        log_in(context, url)
         page = context.new_page()
         page.set_default_timeout(1e3 * PATIENCE_S)
         page.on("pageerror", lambda error: complaints.append(str(error)))

@@ -16,7 +16,7 @@ class Scripted:
     def __init__(self, folder: Path, *, token: str | None = None, is_private: bool = False) -> None:
         self.running = Running(folder / "data", token=token, is_private=is_private)
         self.running.start()
-        if token is not None:
+        if token is not None:  # what the test itself asks; its pages log in
             self.running.http.headers["Authorization"] = f"Bearer {token}"
         self.node = FakeNode(self.running, token=token)
         self.node.connect()

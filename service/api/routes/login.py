@@ -9,9 +9,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from starlette.exceptions import HTTPException
 
-from devices.errors import StateError
 from service.api.logins import LOGIN_S, TICKET_S, Logins, Right, cookie_name
-from service.api.routes.access import problems
 from service.server.screens.views import View
 from service.server_clock import utc_ns
 
@@ -22,7 +20,6 @@ _NOT_TAKEN = (
     "a new one with `foottile ticket` on the computer on which `foottile serve` runs"
 )
 _NOTHING_SHOWN = "A login needs a ticket, or the token as Authorization: Bearer TOKEN"
-_OPEN_TO_ALL = "this server asks for no token: who reaches it may do everything"
 
 May = Literal["look", "press"]
 _RIGHTS: dict[str, Right] = {"look": Right.LOOK, "press": Right.PRESS}
@@ -31,8 +28,7 @@ _RIGHTS: dict[str, Right] = {"look": Right.LOOK, "press": Right.PRESS}
 class LoginView(View):
     """What the one who asks may do."""
 
-    asked: bool = Field(description="Is a login asked for, for anything? Not without a token.")
-    private: bool = Field(description="Is it asked for to look, too?")
+    private: bool = Field(description="Is a login asked for to look, too?")
     may: May | None = Field(
         description="By the login that was shown; null: none was. Then one may look unless the "
         "server is private."
@@ -89,8 +85,6 @@ async def log_in(
     body: LogIn, request: Request, response: Response, logins: LoginsState
 ) -> LoginView:
     """The cookie is HttpOnly and SameSite=Strict, and ends after 12 hours or with the server."""
-    if logins.token is None:
-        return _view(logins, Right.OWN, None)
     if body.ticket is not None:
         given = logins.tickets.take(body.ticket)
         right = None if given is None else given.right
@@ -129,12 +123,9 @@ async def log_out(request: Request, response: Response, logins: LoginsState) -> 
     operation_id="giveTicket",
     summary="A ticket for somebody else",
     status_code=HTTPStatus.CREATED,
-    responses=problems(_409="This server asks for no token."),
 )
 async def give_ticket(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
     """Good once, for five minutes. It takes the token itself; a login is not enough."""
-    if logins.token is None:
-        raise StateError(_OPEN_TO_ALL, remedy="Open its page without a ticket")
     ticket = logins.tickets.new(_RIGHTS[body.may])
     urls = request.app.state.urls or (str(request.base_url).rstrip("/"),)
     return TicketView(
@@ -154,7 +145,6 @@ def _view(
     logins: Logins, right: Right | None, left_s: float | None, *, has_ended: bool = False
 ) -> LoginView:
     return LoginView(
-        asked=logins.token is not None,
         private=logins.is_private,
         may=None if right is None else "look" if right is Right.LOOK else "press",
         ended=has_ended,

@@ -6,7 +6,7 @@ import asyncio
 import os
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,7 +51,7 @@ def demo_command(
         typer.Option(min=0.0, max=SECONDS_MAX, help="End after so long; default: at Ctrl-C."),
     ] = None,
 ) -> None:
-    """Run a server and an emulated node, and show where the live page is.
+    """Run a server and an emulated node, and print a link to the live page.
 
     The scene never ends; a recorded load is pressed over and over again. Ctrl-C stops what is
     being recorded, seals it, and ends both.
@@ -76,22 +76,23 @@ def demo_command(
 async def _demo(
     host: str, port: int, data: Path, seconds: float | None, node_arguments: list[str]
 ) -> None:
-    from service.api.address import listen, token_for, urls_of
+    from service.api.address import listen, published, token_for, urls_of
     from service.api.logins import Logins
     from storage.private import keep_private
 
     stop = stop_on_signals()
     keep_private(data)
-    with listen(host, port) as listening:
+    with listen(host, port) as listening, ExitStack() as stack:
         given = os.environ.get("FOOTTILE_TOKEN")
-        token = token_for(host, given, data)
+        token = token_for(given, data)
+        stack.enter_context(published(listening, token))
         logins = Logins(token)
         urls = urls_of(listening, host)
         # First: while the server is imported and prepared, the tiles are found and measured.
         node = await _start_node(urls[-1], token, node_arguments)
         try:
             async with _server(listening, data, logins, urls) as server:
-                announce(urls, data, logins, is_kept=not given)
+                announce(urls, data, logins, is_kept=not given, is_demo=True)
                 remark(f"what was recorded: foottile sessions --server {urls[-1]}")
                 ended = asyncio.create_task(node.wait())
                 stopped = asyncio.create_task(stop.wait())
@@ -128,11 +129,9 @@ async def _server(
         yield server
 
 
-async def _start_node(
-    url: str, token: str | None, arguments: list[str]
-) -> asyncio.subprocess.Process:
+async def _start_node(url: str, token: str, arguments: list[str]) -> asyncio.subprocess.Process:
     code = "from service.cli.main import main; main()"
-    environment = {**os.environ, **({"FOOTTILE_TOKEN": token} if token else {})}
+    environment = {**os.environ, "FOOTTILE_TOKEN": token}
     return await asyncio.create_subprocess_exec(
         *(sys.executable, "-c", code, "node", f"--server={url}", f"--name={NODE}"),
         "--end-with-parent",

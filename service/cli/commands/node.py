@@ -66,8 +66,8 @@ def node_command(
     Every frame is journaled: what sessions need stays until the server has it on its disk, the rest
     for ten minutes. It keeps trying: when the server is away, or this node was switched off, frames
     follow when both are back. With --record it needs no server: at Ctrl-C the session is sealed in
-    the folder of --journal. A server that wants a token gets the one in FOOTTILE_TOKEN. Options
-    from --load on are for emulated tiles.
+    the folder of --journal. The server's token is FOOTTILE_TOKEN; that of a server which this user
+    runs on this machine is found. Options from --load on are for emulated tiles.
 
     Exit code 3: frames of a session are lost, or wait on this disk for their server.
     """

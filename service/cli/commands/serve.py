@@ -47,6 +47,14 @@ def serve_command(
             help="Seal sessions with estimates as computed: do not round off their noise.",
         ),
     ] = None,
+    trusted_proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Reverse proxy whose X-Forwarded-For and X-Forwarded-Proto count; may be given "
+            "several times; default: none.",
+        ),
+    ] = None,
     max_connections: Annotated[int | None, _bound("Requests and screens at once; 512.")] = None,
     max_connections_per_address: Annotated[
         int | None, _bound("The same from one address, as all phones of a hotspot are; 256.")
@@ -63,9 +71,11 @@ def serve_command(
 ) -> None:
     """Take in nodes, estimate, show live, record, and give sessions away over HTTP.
 
-    Settings come from options, else from FOOTTILE_HOST and the like, else from --config. On any
-    other address than loopback, changes need a token: FOOTTILE_TOKEN, or one that is made and kept
-    in the data folder. Ctrl-C ends it; what is being recorded goes on when it runs again.
+    Settings come from options, else from FOOTTILE_HOST and the like, else from --config. Changes
+    need a token: FOOTTILE_TOKEN, or one that is made and kept in the data folder. On a terminal a
+    link is printed that logs a browser in; `foottile ticket` prints others. Commands of this user
+    on this machine find the token by themselves. Ctrl-C ends it; what is being recorded goes on
+    when it runs again.
     """
     import uvloop
 
@@ -80,6 +90,7 @@ def serve_command(
         allow_host=tuple(allow_host or ()) or None,
         private=private,
         exact=exact,
+        trusted_proxy=tuple(trusted_proxy or ()) or None,
         max_connections=max_connections,
         max_connections_per_address=max_connections_per_address,
         max_nodes=max_nodes,
@@ -94,7 +105,7 @@ def serve_command(
 
 async def _serve(settings: Settings) -> None:
     from devices.realtime import spare_what_is_loaded
-    from service.api.address import listen, own_names, token_for, urls_of
+    from service.api.address import listen, own_names, published, token_for, urls_of
     from service.api.app import make_app
     from service.api.logins import Logins
     from service.api.serve import serving
@@ -105,28 +116,32 @@ async def _serve(settings: Settings) -> None:
     keep_private(settings.data)
     with listen(settings.host, settings.port) as listening:
         server = Server(settings.data, exact=settings.exact)
-        token = token_for(settings.host, settings.token, settings.data, is_private=settings.private)
+        token = token_for(settings.token, settings.data)
         logins = Logins(token, is_private=settings.private)
         urls = urls_of(listening, settings.host)
         hosts = (*settings.allow_host, *own_names())
-        app = make_app(server, hosts=hosts, logins=logins, urls=urls)
-        async with serving(app, listening, settings):
-            spare_what_is_loaded()
-            announce(urls, settings.data, logins, is_kept=not settings.token)
-            await stop.wait()
+        app = make_app(server, logins=logins, hosts=hosts, urls=urls)
+        with published(listening, token):
+            async with serving(app, listening, settings):
+                spare_what_is_loaded()
+                announce(urls, settings.data, logins, is_kept=not settings.token)
+                await stop.wait()
 
 
-def announce(urls: list[str], data: Path, logins: Logins, *, is_kept: bool) -> None:
-    """Say where the page is, how a phone gets in, and how a node gets there.
+def announce(
+    urls: list[str], data: Path, logins: Logins, *, is_kept: bool, is_demo: bool = False
+) -> None:
+    """Print where the page is, how a phone gets in, and how a node gets there.
 
-    Token and ticket are shown on a terminal only: what is not one is often a log, which others may
-    read.
+    The token is shown on a terminal only: what is not one is often a log, which others may read. A
+    demo prints a ticket there, which is good once and soon ends.
 
     Args:
         urls: addresses of the server.
         data: its data folder.
-        logins: what it asks for.
+        logins: token and tickets of the server.
         is_kept: is its token the one that is kept in the data folder?
+        is_demo: has every link to log a browser in?
     """
     from service.api.address import KEPT_IN
     from service.api.logins import Right
@@ -135,17 +150,19 @@ def announce(urls: list[str], data: Path, logins: Logins, *, is_kept: bool) -> N
 
     token, has_screen = logins.token, sys.stdout.isatty()
     for url in urls:
-        say(f"FootTile is at {url}/" + (f"#token={token}" if token and has_screen else ""))
-    if token and has_screen and reaches_others(urls[0]):
+        if has_screen:
+            link = f"{url}/#token={token}"
+        else:
+            link = with_ticket(url, logins.tickets.new(Right.PRESS)) if is_demo else f"{url}/"
+        say(f"FootTile is at {link}")
+    if has_screen and reaches_others(urls[0]):
         show_code(with_ticket(urls[0], logins.tickets.new(Right.PRESS)))
     remark(f"data in {data}; Ctrl-C ends it")
     if is_warming():
         remark(WARMING)
-    if not token:
-        return
     where = f"$(cat {shlex.quote(str(data / KEPT_IN))})" if is_kept else '"$FOOTTILE_TOKEN"'
-    if not sys.stdout.isatty():
+    if not has_screen:
         place = f"in {data / KEPT_IN}" if is_kept else "the one that was given"
-        remark(f"its token is {place}; on the page it is asked for, or put #token=TOKEN behind /")
+        remark(f"its token is {place}; `foottile ticket` prints a link that logs a browser in")
     shown = token if sys.stderr.isatty() else where
     remark(f"a node: FOOTTILE_TOKEN={shown} foottile node --scene FILE --server {urls[0]}")

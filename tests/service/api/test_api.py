@@ -15,11 +15,13 @@ import pytest
 from devices.errors import StorageError
 from service.api.app import make_app
 from service.api.guard import BODY_BYTES_MAX
+from service.api.logins import Logins
 from service.server.server import Server
 from storage.sessions.folder import Part, Session, new_session_id
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
 from tests.storage.faulty_disk import refusing
+from tests.tokens import SHARED_TOKEN
 from tests.waiting import until
 
 UNKNOWN_ID = "20200101T000000Z-000000"
@@ -244,7 +246,7 @@ def test_a_cursor_that_is_none_harms_nothing(running: Running, many: list[str]) 
 def test_every_operation_is_described(tmp_path: Path) -> None:
     server = Server(tmp_path)
     try:
-        schema = make_app(server).openapi()
+        schema = make_app(server, logins=Logins(SHARED_TOKEN)).openapi()
     finally:
         server.folder.close()
     ids = []
@@ -309,7 +311,9 @@ def test_no_get_changes_anything(running: Running, node: FakeNode) -> None:
     node.taken_in()
     node.acknowledged(node.seq - 1)
     session = node.record()
-    schema = make_app(running.server).openapi_schema  # made without asking for it
+    schema = make_app(
+        running.server, logins=running.logins
+    ).openapi_schema  # made without asking for it
     assert schema is None
     paths = [
         *("/health", "/ready", "/version", "/nodes", "/nodes/bench", "/nodes/bench/scene"),

@@ -20,6 +20,7 @@ from service.api.protocols import accept
 from service.link import INGEST_PATH, LIVE_PATH, Close
 from tests.service.fake_node import NodeOf, Play, Spoken
 from tests.service.running import Running, ServeWith, closed
+from tests.tokens import SHARED_TOKEN
 from tests.waiting import PATIENCE_S, in_a_loop, until
 
 PLENTY = 10_000
@@ -289,6 +290,7 @@ def upgrade(path: str) -> bytes:
     """A request for a websocket."""
     return (
         f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
+        f"Authorization: Bearer {SHARED_TOKEN}\r\n"
         "Upgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
         "Sec-WebSocket-Version: 13\r\n\r\n"
     ).encode()

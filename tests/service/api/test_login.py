@@ -196,20 +196,6 @@ def test_another_site_can_log_nobody_in_or_out(guarded: Running) -> None:
     assert guarded.http.delete("/login", headers=headers).status_code == 403
 
 
-def test_without_a_token_everybody_may_press_and_there_are_no_tickets(running: Running) -> None:
-    assert running.http.get("/login").json() == {
-        "asked": False,
-        "private": False,
-        "may": "press",
-        "ended": False,
-        "ends_t_ns": None,
-    }
-    answer = running.http.post("/login", json={"ticket": "from yesterday"})
-    assert answer.json()["may"] == "press"
-    assert "set-cookie" not in answer.headers
-    assert_refused(running.http.post("/tickets", json={}), 409, "asks for no token")
-
-
 OPEN_PATHS = {"/api/v1/login", "/api/v1/ready"}
 
 

@@ -82,8 +82,3 @@ def test_no_two_secrets_are_alike_and_none_is_kept(logins: Logins) -> None:
     assert all(len(ticket) >= 22 for ticket in tickets)  # 128 bits
     kept = repr(vars(logins.tickets))
     assert not any(ticket in kept for ticket in tickets)
-
-
-def test_nobody_can_be_kept_out_without_a_token() -> None:
-    with pytest.raises(ValueError, match="needs a token"):
-        Logins(None, is_private=True)

@@ -25,7 +25,7 @@ def _umask() -> Iterator[None]:
 def test_a_folder_that_a_server_has_used_is_closed_to_others(
     running: Running, tared: FakeNode
 ) -> None:
-    token_for("0.0.0.0", None, running.data)  # noqa: S104  # nothing listens there
+    token_for(None, running.data)
     deleted = tared.record()
     tared.deliver(10)
     tared.finish(deleted)

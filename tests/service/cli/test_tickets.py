@@ -10,7 +10,7 @@ import httpx
 import pytest
 import segno
 
-from service.api.logins import Logins
+from service.api.logins import Logins, Right
 from service.cli.commands.serve import announce
 from service.cli.tickets import qr_lines
 from tests.service.cli.outcome import Run
@@ -35,10 +35,10 @@ def test_a_code_is_drawn_with_light_blocks_module_by_module() -> None:
 
 
 def announced(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], url: str, token: str | None
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], url: str, **how: bool
 ) -> tuple[str, Logins]:
-    logins = Logins(token)
-    announce([url], tmp_path, logins, is_kept=True)
+    logins = Logins(TOKEN)
+    announce([url], tmp_path, logins, is_kept=True, **how)
     return capsys.readouterr().out, logins
 
 
@@ -50,7 +50,7 @@ def test_a_server_that_phones_reach_shows_a_code_on_a_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    shown, logins = announced(tmp_path, capsys, AWAY, TOKEN)
+    shown, logins = announced(tmp_path, capsys, AWAY)
     assert f"{AWAY}/#token={TOKEN}" in shown
     assert "█▀" in shown
     assert tickets_of(logins) == 1
@@ -59,22 +59,32 @@ def test_a_server_that_phones_reach_shows_a_code_on_a_terminal(
 def test_a_log_gets_neither_code_nor_token(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shown, logins = announced(tmp_path, capsys, AWAY, TOKEN)
+    shown, logins = announced(tmp_path, capsys, AWAY)
     assert shown == f"FootTile is at {AWAY}/\n"
     assert tickets_of(logins) == 0
 
 
-@pytest.mark.parametrize("token", [None, TOKEN])
+def test_a_demo_gives_its_log_a_link_that_logs_in_once_and_no_token(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown, logins = announced(tmp_path, capsys, AWAY, is_demo=True)
+    link, _, ticket = shown.strip().partition("#ticket=")
+    assert link == f"FootTile is at {AWAY}/"
+    given = logins.tickets.take(ticket)
+    assert given is not None
+    assert given.right is Right.PRESS
+    assert TOKEN not in shown
+
+
 @pytest.mark.parametrize("url", ["http://127.0.0.1:8000", "http://[::1]:8000"])
 def test_a_server_that_no_phone_reaches_shows_no_code(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     url: str,
-    token: str | None,
 ) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    shown, logins = announced(tmp_path, capsys, url, token)
+    shown, logins = announced(tmp_path, capsys, url)
     assert "█" not in shown
     assert tickets_of(logins) == 0
 
@@ -101,11 +111,11 @@ def test_ticket_prints_an_address_that_lets_in_who_opens_it(
 
 
 def test_ticket_as_json_by_the_token_of_the_environment(
-    serve_with: ServeWith, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    serve_with: ServeWith, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = serve_with(token=TOKEN)
     monkeypatch.setenv("FOOTTILE_TOKEN", TOKEN)
-    done = run("ticket", "--server", running.url, "--data", str(tmp_path), "--json")
+    done = run("ticket", "--server", running.url, "--json")
     assert json.loads(done.out)["may"] == "press"
     assert TOKEN not in done.out
 
@@ -114,10 +124,9 @@ def test_ticket_without_the_token_says_what_is_lacking(
     serve_with: ServeWith, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = serve_with(token=TOKEN)
-    monkeypatch.delenv("FOOTTILE_TOKEN", raising=False)
-    done = run("ticket", "--server", running.url, "--data", str(tmp_path))
-    assert done.code == 1
-    assert "token is needed" in done.err
+    monkeypatch.delenv("FOOTTILE_TOKEN")
+    run("ticket", "--server", running.url).fails(1, "token is needed", "FOOTTILE_TOKEN")
+    run("ticket", "--server", running.url, "--data", tmp_path).fails(2, "no token", "--data")
 
 
 def test_a_private_server_is_read_with_its_token(

@@ -74,7 +74,7 @@ def _server_id(folder: Path) -> None:
 
 
 def _token(folder: Path) -> None:
-    token_for("0.0.0.0", None, folder)  # noqa: S104  # not listened on
+    token_for(None, folder)
 
 
 def _calibration(folder: Path) -> None:

@@ -20,6 +20,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
+from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
@@ -44,10 +45,12 @@ class Demo:
     process: subprocess.Popen[str]
 
     def get(self, path: str) -> httpx.Response:
-        return httpx.get(f"{self.url}/api/v1{path}", trust_env=False)
+        return httpx.get(f"{self.url}/api/v1{path}", headers=SHARED_BEARER, trust_env=False)
 
     def post(self, path: str, body: object = None) -> httpx.Response:
-        return httpx.post(f"{self.url}/api/v1{path}", json=body, trust_env=False)
+        return httpx.post(
+            f"{self.url}/api/v1{path}", json=body, headers=SHARED_BEARER, trust_env=False
+        )
 
 
 def tiny_scene(folder: Path) -> Path:
@@ -70,7 +73,7 @@ def start_demo(folder: Path, *options: str, tared: bool = True) -> Demo:
             [*COMMAND, *arguments, *options], stdout=subprocess.PIPE, stderr=stderr, text=True
         )
     assert process.stdout is not None
-    url = process.stdout.readline().split()[-1].rstrip("/")
+    url = process.stdout.readline().split()[-1].partition("/#ticket=")[0]
     demo = Demo(url, folder / "data", process)
     end = time.monotonic() + 30
     while tared and not any(node["tare"] for node in demo.get("/nodes").json()["items"]):
@@ -313,11 +316,15 @@ def test_settings_come_from_option_environment_and_file_in_that_order(tmp_path: 
     assert "prot" in done.stderr
 
 
-def test_off_loopback_a_token_is_made_kept_and_asked_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])  # noqa: S104  # of this test
+def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, host: str
+) -> None:
+    monkeypatch.delenv("FOOTTILE_TOKEN")
     log = tmp_path.with_name("log")
     with log.open("w") as stderr:
         serve = subprocess.Popen(
-            [*COMMAND, "serve", "--host=0.0.0.0", "--port", "0", "--data", str(tmp_path)],
+            [*COMMAND, "serve", f"--host={host}", "--port", "0", "--data", str(tmp_path)],
             stdout=subprocess.PIPE,
             stderr=stderr,
             text=True,
@@ -335,6 +342,8 @@ def test_off_loopback_a_token_is_made_kept_and_asked_for(tmp_path: Path) -> None
     assert (refused.status_code, allowed.status_code) == (401, 404)
     by_name = httpx.get(f"{url}/api/v1/nodes", headers={"Host": "evil.example"}, trust_env=False)
     assert by_name.status_code == 403
+    found = run("ticket", "--server", url)
+    assert "/#ticket=" in found.stdout, found.stderr
     serve.terminate()
     assert ended(serve) == 0
     said = log.read_text()
