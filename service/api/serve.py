@@ -48,7 +48,7 @@ async def serving(
         forwarded_allow_ips=bounds.trusted_peers,  # uvicorn trusts loopback by itself
     )
     config.doors = Doors(bounds, open_files_max())
-    config.proxies = ProxyHeadersMiddleware(app, bounds.trusted_peers)
+    config.proxies = ProxyHeadersMiddleware(app, bounds.trusted_peers)  # type: ignore[arg-type]  # Starlette's scope is wider
     logging.getLogger("uvicorn.error").addFilter(_is_news)
     server = _Uvicorn(config)
     task = asyncio.create_task(server.serve([listening]))
