@@ -8,11 +8,13 @@ the seam, so the emulation exercises it too.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import fcntl
 from typing import Protocol
 
 from smbus2 import SMBus, i2c_msg
+from smbus2.smbus2 import I2C_RDWR, i2c_rdwr_ioctl_data
 
 from devices.errors import (
     BusFaultError,
@@ -29,6 +31,12 @@ __all__ = ["I2cAdapter", "I2cBus", "i2c_msg", "open_bus"]
 # about 1 s would stall the loop for hundreds of frames on one wedged transfer.
 I2C_TIMEOUT = 0x0702
 TIMEOUT_10MS = 3
+
+POISON = 0xFF
+"""What a read buffer holds before the transfer: no working part gives it (see `is_impossible`), and
+no mux was ever told to connect all its channels and none other. So bytes of an earlier read that an
+adapter leaves in place cannot pass as a reading."""
+_READ = 0x0001  # I2C_M_RD, include/uapi/linux/i2c.h
 
 _NACK = {errno.ENXIO, errno.EREMOTEIO}
 _BUS = {errno.EIO, errno.ETIMEDOUT, errno.EAGAIN, errno.EBUSY}
@@ -49,7 +57,22 @@ class I2cAdapter(Protocol):
 
 
 class _Smbus(SMBus):
-    """smbus2's adapter, with the one call that it lacks."""
+    """smbus2's adapter, with the call that it lacks and the result that it drops."""
+
+    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
+        """Run the messages as one transaction.
+
+        The ioctl returns how many of them were transferred, which smbus2 ignores: an adapter that
+        stops early without an errno leaves the read buffer as it was.
+
+        Raises:
+            OSError: the kernel's; EREMOTEIO after fewer messages than asked.
+        """
+        data = i2c_rdwr_ioctl_data.create(*i2c_msgs)
+        done = fcntl.ioctl(self.fd, I2C_RDWR, data)
+        if done != len(i2c_msgs):
+            what = f"{done} of {len(i2c_msgs)} messages transferred"
+            raise OSError(errno.EREMOTEIO, what)
 
     def set_timeout(self, units_10ms: int) -> None:
         if self.fd is not None:
@@ -77,6 +100,9 @@ class I2cBus:
             BusMisuseError: the adapter cannot do this sequence (a bug in the driver).
             BusSetupError: the bus went away or may not be used.
         """
+        for message in messages:
+            if message.flags & _READ:
+                ctypes.memset(message.buf, POISON, message.len)
         try:
             self._i2c_rdwr(*messages)
         except OSError as error:

@@ -14,6 +14,7 @@ COUNTS_MAX = 4095
 COUNTS_PER_VREF = 4096
 """Volts are counts * vref / 4096 (hardware.md 6)."""
 
+_BYTES = 3
 _START_SINGLE_ENDED = 0x06  # start bit, SGL/DIFF, and the place of D2
 _NULL_BIT = 0x10  # in the second byte, before B11
 _HIGH_BITS = 0x0F  # B11 to B8
@@ -46,13 +47,21 @@ class Mcp3208:
             SpiError: the transfer failed.
         """
         try:
-            _, high, low = self._xfer2(list(self._requests[channel]))
+            received = self._xfer2(list(self._requests[channel]))
         except OSError as error:
             raise SpiError(
                 f"the transfer failed ({error.strerror or error})",
                 where=f"{self._where}, channel {channel}",
                 remedy="Check that the device is still there",
             ) from error
+        if len(received) != _BYTES:
+            raise SpiError(
+                f"the transfer was cut short ({len(received)} bytes came)",
+                where=f"{self._where}, channel {channel}",
+                expected=f"{_BYTES} bytes",
+                remedy="Check the SPI controller's driver",
+            )
+        _, high, low = received
         if high & _NULL_BIT:
             raise AdcSilentError(
                 f"no converter drives the line (received {high:02x} {low:02x})",

@@ -6,6 +6,7 @@ here, so that no mistake in a measurement can move a robot.
 
 from __future__ import annotations
 
+import errno
 from dataclasses import dataclass
 
 from devices.buses.serial_line import PORT_ERRORS, SerialPort, latency_remark, open_line
@@ -158,7 +159,9 @@ class Dynamixel:
             # Packets carry no number: a late answer to an older request would pass for this one's.
             self._port.reset_input_buffer()
             asked_ns = self._clock.now_ns()
-            self._port.write(request)
+            sent = self._port.write(request)
+            if sent is not None and sent != len(request):
+                raise OSError(errno.EIO, f"{sent} of {len(request)} bytes sent")
             status, done_ns = self._await_status(request, asked_ns + self._timeout_ns)
         except ServoError:  # a ServoTimeoutError is an OSError too
             raise

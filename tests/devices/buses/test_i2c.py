@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import pickle
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
+from devices.array.health import is_impossible
 from devices.buses.i2c import I2cBus, PatientBus, open_bus
+from devices.chips.mpl115a2 import Mpl115a2
 from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter, Line
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
@@ -22,8 +28,10 @@ from devices.errors import (
     FootTileError,
     I2cError,
     NoAcknowledgeError,
+    TileSetupError,
     UsageError,
 )
+from devices.frames import TileStatus
 from tests.devices.adapters import Adapter
 
 
@@ -99,17 +107,23 @@ def test_what_a_field_worker_can_do_is_said() -> None:
 
 
 class Pi:
-    """A machine on which smbus2 opens any bus; transactions and ioctls are noted."""
+    """A machine on which smbus2 opens any bus; transactions and other ioctls are noted."""
 
     def __init__(self) -> None:
         self.opened: list[str] = []
         self.transactions: list[tuple[i2c_msg, ...]] = []
         self.ioctls: list[tuple[int, int, int]] = []
         self.closed = 0
+        self.done: int | None = None
+        """How many messages a transaction transfers; None: all."""
 
-    def ioctl(self, fd: int, request: int, value: int) -> int:
-        self.ioctls.append((fd, request, value))
-        return 0
+    def ioctl(self, fd: int, request: int, value: Any) -> int:
+        if request != 0x0707:  # include/uapi/linux/i2c-dev.h: I2C_RDWR
+            self.ioctls.append((fd, request, value))
+            return 0
+        messages = tuple(value.msgs[i] for i in range(value.nmsgs))
+        self.transactions.append(messages)
+        return len(messages) if self.done is None else self.done
 
 
 @pytest.fixture
@@ -120,14 +134,10 @@ def pi(monkeypatch: pytest.MonkeyPatch) -> Pi:
         pi.opened.append(name)
         self.fd = 77
 
-    def i2c_rdwr(self: SMBus, *i2c_msgs: i2c_msg) -> None:
-        pi.transactions.append(i2c_msgs)
-
     def close(self: SMBus) -> None:
         pi.closed += 1
 
     monkeypatch.setattr(SMBus, "open", open_)
-    monkeypatch.setattr(SMBus, "i2c_rdwr", i2c_rdwr)
     monkeypatch.setattr(SMBus, "close", close)
     monkeypatch.setattr("devices.buses.i2c.fcntl.ioctl", pi.ioctl)
     return pi
@@ -162,13 +172,35 @@ def test_messages_reach_the_adapter_unchanged_and_in_one_transaction(pi: Pi) -> 
     write, read = i2c_msg.write(0x60, [0x00]), i2c_msg.read(0x60, 4)
     bus.transfer(write, read)
     bus.transfer(write)
-    first, second = pi.transactions
-    assert len(first) == 2
-    assert first[0] is write
-    assert first[1] is read
-    assert len(second) == 1
-    assert second[0] is write
+    wanted = [(0x60, 0, b"\x00"), (0x60, 1, b"\xff" * 4)]
+    told = [[(m.addr, m.flags, bytes(m)) for m in messages] for messages in pi.transactions]
+    assert told == [wanted, wanted[:1]]
     assert len(pi.ioctls) == 1, "the time-out is sticky"
+
+
+@pytest.mark.parametrize("done", [0, 1])
+def test_fewer_messages_than_asked_are_no_acknowledge(pi: Pi, done: int) -> None:
+    bus = open_bus("/dev/i2c-1")
+    pi.done = done
+    with pytest.raises(NoAcknowledgeError) as caught:
+        bus.transfer(i2c_msg.write(0x60, [0x00]), i2c_msg.read(0x60, 4))
+    assert caught.value.errno == errno.EREMOTEIO
+    assert f"{done} of 2 messages" in str(caught.value.__cause__)
+
+
+@given(stale=st.binary(min_size=1, max_size=16))
+def test_bytes_of_an_earlier_read_do_not_pass_as_a_reading(stale: bytes) -> None:
+    read = i2c_msg.read(0x60, len(stale))
+    ctypes.memmove(read.buf, stale, len(stale))
+    I2cBus(FakeAdapter(), "/dev/i2c-7").transfer(read)  # fills nothing in
+    assert bytes(read) == b"\xff" * len(stale)
+
+
+def test_a_buffer_that_no_adapter_filled_is_never_a_plausible_reading() -> None:
+    chip = Mpl115a2(I2cBus(FakeAdapter(), "/dev/i2c-7"))
+    assert is_impossible(*chip.read_counts()) == TileStatus.IMPLAUSIBLE
+    with pytest.raises(TileSetupError):
+        chip.read_coefficient_words(where="tile A17")
 
 
 def test_closing_a_bus_closes_its_adapter(pi: Pi) -> None:

@@ -54,6 +54,12 @@ def test_every_value_of_every_channel_arrives(channel: int, counts: int, floats_
     assert adc.read_counts(channel) == counts
 
 
+@pytest.mark.parametrize("answer", [(), (0,), (0, 0x08), (0, 0x08, 0, 0)])
+def test_a_transfer_of_another_length_is_an_error(answer: tuple[int, ...]) -> None:
+    with pytest.raises(SpiError, match=rf"{len(answer)} bytes came\); expected 3 bytes"):
+        Mcp3208(Line(*answer), where="rig").read_counts(0)
+
+
 @pytest.mark.parametrize("channel", range(8))
 def test_a_request_is_the_documented_three_bytes(channel: int) -> None:
     line = Line(0, 0, 0)

@@ -53,6 +53,18 @@ class ScriptedPort:
         pass
 
 
+class ShortPort(ScriptedPort):
+    """A port that takes one byte less than it is given, and answers all the same."""
+
+    def write(self, data: bytes, /) -> int:
+        return super().write(data) - 1
+
+
+def test_a_request_that_was_not_sent_whole_has_no_answer() -> None:
+    with pytest.raises(ServoSetupError, match="13 of 14 bytes sent"):
+        servo_on(ShortPort(STATUS_OF_1_AT_166)).read_position()
+
+
 def servo_on(
     port: ScriptedPort, clock: VirtualClock | None = None, *, protocol: int = 2
 ) -> Dynamixel:
