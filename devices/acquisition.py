@@ -127,7 +127,7 @@ class Acquisition:
             Batches of at least one frame; the last one may be short.
 
         Raises:
-            BusMisuseError, BusSetupError: as for `TileArray.scan`; other faults are flags.
+            BusMisuseError: as for `TileArray.scan`; other faults are flags.
         """
         slot_ns = self._clock.now_ns()
         while not stop():

@@ -8,6 +8,7 @@
      +-- I2cError              (OSError)
      |    +-- NoAcknowledgeError               no answer at an address
      |    +-- BusFaultError                    the bus itself failed: time-out, arbitration, reset
+     |    |    +-- BusLostError                the adapter went away: unplugged, driver unbound
      |    +-- BusMisuseError                   the adapter cannot do what we asked: our bug
      |    +-- BusSetupError                    no such bus, no permission
      +-- TileSetupError                        a tile's coefficients are absent or implausible
@@ -159,6 +160,10 @@ class NoAcknowledgeError(I2cError):
 
 class BusFaultError(I2cError):
     """The bus failed, not one device: ETIMEDOUT, EAGAIN (arbitration), EBUSY, EIO."""
+
+
+class BusLostError(BusFaultError):
+    """The adapter of an open bus went away (ENODEV, ENOENT, ESHUTDOWN and the like)."""
 
 
 class BusMisuseError(I2cError):

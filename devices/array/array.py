@@ -141,9 +141,8 @@ class TileArray:
     def troubles(self) -> dict[str, str]:
         """What is wrong now, in words, by serial; the bus's trouble is under ""."""
         found: dict[str, str] = {}
-        if self.bus.is_down:
-            unhelped = f" and could not be helped: {self.bus.problem}" if self.bus.problem else ""
-            found[""] = f"the bus is stuck or cut{unhelped}"
+        if self.bus.trouble:
+            found[""] = self.bus.trouble
         for tile, health in zip(self.tiles, self.health, strict=True):
             where = f"tile {tile.serial} (mux 0x{tile.mux:02x} channel {tile.channel})"
             if health.replaced:
@@ -161,7 +160,6 @@ class TileArray:
 
         Raises:
             BusMisuseError: the adapter refuses our transfers: a bug, not a fault of the field.
-            BusSetupError: the bus went away.
         """
         begin_ns = self._clock.now_ns()
         budget_ns = self._budget_ns * (_DISTURBED_BUDGETS if self._judge.is_disturbed else 1)

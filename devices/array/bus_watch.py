@@ -14,6 +14,9 @@ from devices.recovery.recovery import BusRecovery
 _RECOVERY_NS = (10_000_000, 1_000_000_000)
 """A stuck bus is helped at once, then less and less often."""
 
+RENEWAL_NS = 1_000_000_000
+"""A bus that does not move for so long is opened anew."""
+
 
 @dataclass(frozen=True)
 class Help:
@@ -64,6 +67,7 @@ class BusWatch:
         self._clock = clock
         self._recovery = recovery
         self._wait_ns, self._due_ns = _RECOVERY_NS[0], 0
+        self._renewal_due_ns = 0
 
     def look(self, scan: Scan) -> None:
         """Nothing but zeros, or no answer at all: if it is the bus, the frame is given up."""
@@ -75,10 +79,30 @@ class BusWatch:
         self.is_down = True
         self.problem = ""
         self._wait_ns, self._due_ns = _RECOVERY_NS[0], 0
+        self._renewal_due_ns = self._clock.now_ns() + RENEWAL_NS
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the bus, in words; empty if nothing is."""
+        if not self.is_down:
+            return ""
+        if not self._router.bus.is_open:
+            why = f": {self._router.bus.problem}" if self._router.bus.problem else ""
+            return f"the adapter of the bus is away, and is opened again every second{why}"
+        unhelped = f" and could not be helped: {self.problem}" if self.problem else ""
+        return f"the bus is stuck or cut{unhelped}"
 
     def comes_back(self) -> bool:
         """Check whether a bus that was down moves again; help it if need be."""
+        bus = self._router.bus
+        if not bus.reopen(self._clock.now_ns()):
+            return False
         back = self._moves()
+        if not back and bus.is_open and self._clock.now_ns() >= self._renewal_due_ns:
+            # The open file of a USB adapter that was plugged in again fails with EIO for ever.
+            self._renewal_due_ns = self._clock.now_ns() + RENEWAL_NS
+            bus.let_go()
+            return False
         if not back and self._recovery is not None and self._clock.now_ns() >= self._due_ns:
             self.recoveries += 1
             given = help_bus(self._recovery, self._moves)

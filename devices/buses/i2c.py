@@ -8,16 +8,20 @@ the seam, so the emulation exercises it too.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import fcntl
+import os
 from typing import Protocol
 
 from smbus2 import SMBus, i2c_msg
 from smbus2.smbus2 import I2C_RDWR, i2c_rdwr_ioctl_data
 
+from devices.buses.reopening import Reopener
 from devices.errors import (
     BusFaultError,
+    BusLostError,
     BusMisuseError,
     BusSetupError,
     I2cError,
@@ -84,21 +88,39 @@ class I2cBus:
 
     Not thread-safe: one thread owns a bus (smbus2's advice), because a mux selection and the access
     behind it are two transactions that nothing may come between.
+
+    Args:
+        adapter: an open one.
+        name: for errors.
+        reopener: opens the adapter again after it went away; None: it is used as it is.
     """
 
-    def __init__(self, adapter: I2cAdapter, name: str) -> None:
+    def __init__(
+        self, adapter: I2cAdapter, name: str, reopener: Reopener[I2cAdapter] | None = None
+    ) -> None:
         self.name = name
-        self._adapter = adapter
+        self._adapter: I2cAdapter | None = adapter
         self._i2c_rdwr = adapter.i2c_rdwr
+        self._reopener = reopener
+
+    @property
+    def is_open(self) -> bool:
+        """Is there an adapter, as far as is known?"""
+        return self._adapter is not None
+
+    @property
+    def problem(self) -> str:
+        """Why the adapter could not be opened again the last time; empty if it is open."""
+        return "" if self._reopener is None or self.is_open else self._reopener.problem
 
     def transfer(self, *messages: i2c_msg) -> None:
         """Run `messages` as one transaction; read messages are filled in place.
 
         Raises:
             NoAcknowledgeError: an address or a byte was not acknowledged.
+            BusLostError: the adapter went away; `reopen` gets it back.
             BusFaultError: time-out, lost arbitration, or an unspecified I/O error.
             BusMisuseError: the adapter cannot do this sequence (a bug in the driver).
-            BusSetupError: the bus went away or may not be used.
         """
         for message in messages:
             if message.flags & _READ:
@@ -106,11 +128,41 @@ class I2cBus:
         try:
             self._i2c_rdwr(*messages)
         except OSError as error:
-            raise _classified(error, self.name, messages) from error
+            found = _classified(error, self.name, messages)
+            if isinstance(found, BusLostError):
+                self.let_go()
+            raise found from error
+
+    def let_go(self) -> None:
+        """Close an adapter that no longer works; while it is open it keeps its number occupied.
+
+        Without a `reopener` nothing happens.
+        """
+        if self._adapter is None or self._reopener is None:
+            return
+        with contextlib.suppress(OSError):
+            self._adapter.close()
+        self._adapter = None
+        self._i2c_rdwr = _refuse
+
+    def reopen(self, now_ns: int) -> bool:
+        """Return whether the bus is open; if it is not, attempt it, at most once a second."""
+        if self._adapter is None and self._reopener is not None:
+            self._adapter = self._reopener.poll(now_ns)
+            if self._adapter is not None:
+                self._i2c_rdwr = self._adapter.i2c_rdwr
+        return self._adapter is not None
 
     def close(self) -> None:
         """Close the adapter."""
-        self._adapter.close()
+        if self._reopener is not None:
+            self._reopener.close()
+        if self._adapter is not None:
+            self._adapter.close()
+
+
+def _refuse(*_: i2c_msg) -> None:
+    raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
 
 
 class PatientBus(I2cBus):
@@ -119,7 +171,8 @@ class PatientBus(I2cBus):
     TRIES = 4
 
     def __init__(self, bus: I2cBus) -> None:
-        super().__init__(bus._adapter, bus.name)  # noqa: SLF001  # the same class
+        self.name = bus.name
+        self._bus = bus
         self.repeated = 0
         """Count of transfers that were acknowledged only on a later try."""
 
@@ -127,7 +180,7 @@ class PatientBus(I2cBus):
         """As `I2cBus.transfer`, up to `TRIES` times."""
         for attempt in range(self.TRIES):
             try:
-                super().transfer(*messages)
+                self._bus.transfer(*messages)
             except NoAcknowledgeError:
                 if attempt + 1 == self.TRIES:
                     raise
@@ -161,13 +214,33 @@ def _classified(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cE
             expected="at most 42 messages, of which one read message, and it last",
             errno=number,
         )
-    return BusSetupError(
-        f"the bus cannot be used ({name})",
+    return BusLostError(
+        f"the adapter is not there any more ({name})",
         where=where,
-        remedy="Check that the device exists, that I2C is enabled (dtparam=i2c_arm=on) and that "
-        "this user is in the group i2c",
+        remedy="Check its plug and its supply; it is opened again when it is back",
         errno=number,
     )
+
+
+def _open_adapter(name: str, emulated: I2cAdapter | None) -> I2cAdapter:
+    adapter = emulated
+    try:
+        if adapter is None:
+            adapter = _Smbus(name)
+        adapter.set_timeout(TIMEOUT_10MS)
+    except OSError as error:
+        if adapter is not None:
+            adapter.close()
+        number = error.errno
+        reason = errno.errorcode.get(number, str(number)) if number is not None else str(error)
+        raise BusSetupError(
+            f"the bus cannot be used ({reason})",
+            where=name,
+            remedy="Check that the device exists, that I2C is enabled (dtparam=i2c_arm=on) and "
+            "that this user is in the group i2c",
+            errno=number,
+        ) from error
+    return adapter
 
 
 def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
@@ -179,18 +252,9 @@ def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
         BusSetupError: the device is missing or may not be opened.
         UsageError: `"emulated"` without an emulated adapter.
     """
-    if name == "emulated":
-        if emulated is None:
-            raise UsageError("bus 'emulated' needs an emulated world, and none was given")
-        adapter = emulated
-    else:
-        try:
-            adapter = _Smbus(name)
-        except OSError as error:
-            raise _classified(error, name, ()) from error
-    try:
-        adapter.set_timeout(TIMEOUT_10MS)
-    except OSError as error:
-        adapter.close()
-        raise _classified(error, name, ()) from error
-    return I2cBus(adapter, name)
+    if name != "emulated":
+        emulated = None
+    elif emulated is None:
+        raise UsageError("bus 'emulated' needs an emulated world, and none was given")
+    reopener = Reopener(lambda: _open_adapter(name, emulated), at_once=emulated is not None)
+    return I2cBus(_open_adapter(name, emulated), name, reopener)

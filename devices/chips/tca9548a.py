@@ -46,6 +46,7 @@ class MuxRouter:
     """
 
     def __init__(self, bus: I2cBus, addresses: Iterable[int]) -> None:
+        self.bus = bus
         self._muxes = {address: Tca9548a(bus, address) for address in sorted(set(addresses))}
         self._masks: dict[int, int | None] = dict.fromkeys(self._muxes)
         self._refusals = dict.fromkeys(self._muxes, 0)

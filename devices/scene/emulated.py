@@ -162,7 +162,15 @@ SenseFault = Literal["over_range", "frozen", "puncture"]
 """Of a tile, before its registers: what is converted is wrong already."""
 TileFault = Literal[PartFault, SenseFault]
 MuxFault = Literal["brown_out", "mux_reset"]
-BusFault = Literal["sda_low", "sda_high", "scl_low", "adapter_timeout", "nack_storm", "bit_errors"]
+BusFault = Literal[
+    "sda_low",
+    "sda_high",
+    "scl_low",
+    "adapter_timeout",
+    "adapter_unplugged",
+    "nack_storm",
+    "bit_errors",
+]
 FaultKind = Literal[TileFault, MuxFault, BusFault]
 
 LEAK_S = 2.0

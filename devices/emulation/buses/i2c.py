@@ -27,6 +27,8 @@ MESSAGE_BYTES_MAX = 8192  # the kernel's limit of one message
 _FLAG_READ = 0x0001  # I2C_M_RD, include/uapi/linux/i2c.h
 _TIMEOUT_UNIT_NS = 10_000_000  # of the ioctl I2C_TIMEOUT
 _TIMEOUT_DEFAULT = 100  # the i2c core's second
+_FAILING_TRANSFERS = 3
+_UDEV_NS = 300_000_000  # assumed
 _NOT_ACKNOWLEDGED_BITS = 11  # START, address with direction and missing acknowledge, STOP
 
 
@@ -48,6 +50,9 @@ class I2cDevice(Protocol):
 
     def stop(self, t_ns: int) -> None:
         """STOP of a transaction that it acknowledged; called once for each acknowledge."""
+
+    def lose_supply(self) -> None:
+        """Its supply was gone for a moment."""
 
 
 class MuxDevice(I2cDevice, Protocol):
@@ -82,12 +87,43 @@ class EmulatedI2cAdapter:
         self._clock = clock
         self._ns_per_bit = 1e9 / scl_hz
         self._timeout_ns = _TIMEOUT_DEFAULT * _TIMEOUT_UNIT_NS
+        self._is_dead = False
+        self._refused = 0
+        self._opened_ns = clock.now_ns()
         self._wires: dict[tuple[int, ...], dict[int, list[I2cDevice]]] = {}
         self._wire = self._devices_by_address()
 
     def set_timeout(self, units_10ms: int) -> None:
-        """How long a wedged transfer lasts, as by the ioctl I2C_TIMEOUT."""
+        """How long a wedged transfer lasts, as by the ioctl I2C_TIMEOUT.
+
+        An adapter is opened by this: its file is not there while it is unplugged, and belongs to
+        root for a moment when it is back, until udev gives it to its group. With the adapter the
+        chips on its wires lose their supply.
+
+        Raises:
+            OSError: ENOENT, EACCES.
+        """
+        now_ns = self._clock.now_ns()
+        if self._has_died(now_ns):
+            unplugged = self.line.adapter_unplugged
+            if unplugged(now_ns):
+                raise _refusal(errno.ENOENT)
+            if unplugged.struck(now_ns - _UDEV_NS, now_ns):
+                raise _refusal(errno.EACCES)
+            for mux in self._muxes:
+                mux.lose_supply()
+            self._wire = self._devices_by_address()
+            self._is_dead = False
+        self._refused = 0
+        self._opened_ns = now_ns
         self._timeout_ns = units_10ms * _TIMEOUT_UNIT_NS
+
+    def _has_died(self, now_ns: int) -> bool:
+        """Was the adapter unplugged since it was opened? Then its open file is of no use."""
+        unplugged = self.line.adapter_unplugged
+        if unplugged.possible and unplugged.struck(self._opened_ns, now_ns):
+            self._is_dead = True
+        return self._is_dead
 
     def reset_muxes(self) -> None:
         """The RESET line of all multiplexers, pulsed."""
@@ -106,6 +142,10 @@ class EmulatedI2cAdapter:
         _refuse_unsupported(i2c_msgs)
         disturbed = None if self.line.sound else self.line
         if disturbed is not None:
+            if self._has_died(begin_ns):
+                # First the USB transfers that were under way fail, then the device is gone.
+                self._refused += 1
+                raise _refusal(errno.EIO if self._refused <= _FAILING_TRANSFERS else errno.ENODEV)
             for mux in self._muxes:
                 mux.suffer(begin_ns)
             self._wire = self._devices_by_address()
@@ -251,6 +291,7 @@ class Line:
         self.sda_low = faults.of("sda_low")
         self.sda_high = faults.of("sda_high")
         self.scl_low = faults.of("scl_low")
+        self.adapter_unplugged = faults.of("adapter_unplugged")
         self.adapter_timeout = faults.of("adapter_timeout")
         self._nack_storm = faults.of("nack_storm")
         self._bit_errors = faults.of("bit_errors")

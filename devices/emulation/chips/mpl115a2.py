@@ -90,9 +90,10 @@ class EmulatedMpl115a2:
         self._scene_faults = self._faults.scene
         self._seen_ns = 0
         self._t_ns = 0
-        self._power_up()
+        self.lose_supply()
 
-    def _power_up(self) -> None:
+    def lose_supply(self) -> None:
+        """Begin anew: all registers but the coefficients are zero, nothing converts."""
         self._registers = bytearray(_REGISTERS)
         self._registers[0x04:0x0C] = struct.pack(">4H", *self._silicon.coefficient_words)
         self._pointer = 0
@@ -119,9 +120,9 @@ class EmulatedMpl115a2:
         if faults.replaced.possible and faults.replaced.struck(since_ns, t_ns):
             if self._spare is not None:
                 self._silicon, self._spare = self._spare(), None
-            self._power_up()
+            self.lose_supply()
         if faults.unplugged.possible and faults.unplugged.struck(since_ns, t_ns):
-            self._power_up()
+            self.lose_supply()
         return not (faults.no_answer(t_ns) or faults.unplugged(t_ns) or faults.replaced(t_ns))
 
     def write(self, value: int) -> bool:

@@ -44,6 +44,12 @@ class EmulatedTca9548a:
         """As by its RESET line: nothing is connected any more."""
         self._latched = self.mask = 0
 
+    def lose_supply(self) -> None:
+        """Its supply and that of all chips behind it was gone for a moment."""
+        self.reset()
+        for device in self._channels.values():
+            device.lose_supply()
+
     def start(self, reading: bool, t_ns: int) -> bool:
         """Acknowledge, in both directions, if it has a supply."""
         return not self._brown_out(t_ns)

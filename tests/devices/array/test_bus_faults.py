@@ -8,6 +8,8 @@ from itertools import pairwise
 import pytest
 from smbus2 import i2c_msg
 
+from devices.buses.i2c import I2cBus
+from devices.buses.reopening import Reopener
 from devices.errors import BusMisuseError, BusSetupError
 from devices.frames import NOT_READ, TileStatus
 from devices.scene.emulated import FaultKind
@@ -22,6 +24,7 @@ from tests.devices.rigs import (
     Wires,
     array_on,
     scanned,
+    settled,
     settled_on,
 )
 
@@ -68,31 +71,94 @@ def test_a_fault_of_the_bus_shows_although_the_second_attempt_succeeded() -> Non
     assert scan.padc == [padc + 1 for padc in last]
 
 
-@pytest.mark.parametrize(
-    ("number", "kind"), [(22, BusMisuseError), (95, BusMisuseError), (19, BusSetupError)]
-)
+@pytest.mark.parametrize("number", [22, 95])
 @every_schedule
-def test_a_bug_of_ours_and_a_bus_that_is_gone_are_raised_and_not_flagged(
-    schedule: ScheduleName, number: int, kind: type[Exception]
-) -> None:
+def test_a_bug_of_ours_is_raised_and_not_flagged(schedule: ScheduleName, number: int) -> None:
     wires = Wires(FOUR)
     array = array_on(wires, schedule)
     array.scan()
     wires.on_transaction = failing(number, to_tiles)
-    with pytest.raises(kind):
+    with pytest.raises(BusMisuseError):
         array.scan()
 
 
 @every_schedule
-def test_a_bus_that_is_gone_is_raised_wherever_it_is_noticed(schedule: ScheduleName) -> None:
+def test_an_adapter_that_goes_away_is_a_flag_wherever_it_is_noticed(schedule: ScheduleName) -> None:
     for after in range(60):
         wires, array = settled_on(FOUR, schedule)
         with wires.fault("no_answer", "T02"):  # one tile is looked for, too
             array.scan()
         wires.log.clear()
         wires.on_transaction = failing(19, partial(later_than, after))
-        with pytest.raises(BusSetupError):
-            scanned(array, 20)
+        for _ in range(20):
+            scan = array.scan()
+        assert scan.bus_fault
+        assert scan.padc == [NOT_READ] * 4
+        assert all(status & TileStatus.NO_ANSWER for status in scan.status)
+        wires.on_transaction = lambda _, __: None
+        assert scanned(array, 10).status == [0] * 4
+        assert array.troubles() == {}
+
+
+class ReopenedWires(Wires):
+    """Wires whose adapter is opened by its path, as a USB adapter's is."""
+
+    def __init__(self, plugs: Plugs, *, opens: bool = True) -> None:
+        super().__init__(plugs)
+        self.opens = opens
+        self.opened_ns: list[int] = []
+        self.closed = 0
+
+    @property
+    def bus(self) -> I2cBus:
+        return I2cBus(self, "/dev/i2c-3", Reopener(self.open, at_once=True))
+
+    def open(self) -> ReopenedWires:
+        self.opened_ns.append(self.clock.now_ns())
+        if not self.opens:
+            raise BusSetupError("the bus cannot be used (ENOENT)", where="/dev/i2c-3", errno=2)
+        return self
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_an_adapter_that_is_away_is_opened_once_a_second_while_frames_go_on() -> None:
+    wires = ReopenedWires(FOUR, opens=False)
+    array = settled(wires)
+    wires.on_transaction = failing(19, lambda _, __: True)
+    begin_ns = wires.clock.now_ns()
+    frames = 0
+    while wires.clock.now_ns() < begin_ns + 3_500_000_000:
+        scan = array.scan()
+        frames += 1
+        assert scan.bus_fault
+        assert scan.padc == [NOT_READ] * 4
+    assert wires.closed == 1
+    assert len(wires.opened_ns) == 4
+    assert min(b - a for a, b in pairwise(wires.opened_ns)) >= 1_000_000_000
+    assert frames > 3.5 * 300, "the rate of frames is kept"
+    assert "away" in array.troubles()[""]
+    assert "ENOENT" in array.troubles()[""]
+    wires.opens, wires.on_transaction = True, lambda _, __: None
+    end_ns = wires.clock.now_ns() + 1_100_000_000
+    while wires.clock.now_ns() < end_ns:
+        scan = array.scan()
+    assert not scan.bus_fault
+    assert scan.status == [0] * 4
+    assert array.troubles() == {}
+
+
+def test_an_open_file_that_fails_for_good_is_opened_anew() -> None:
+    # i2c-tiny-usb that was plugged in again: every transfer through the old file is EIO.
+    wires = ReopenedWires(FOUR)
+    array = settled(wires)
+    wires.on_transaction = failing(5, lambda _, __: not wires.opened_ns)
+    end_ns = wires.clock.now_ns() + 1_500_000_000
+    while wires.clock.now_ns() < end_ns:
+        scan = array.scan()
+    assert (wires.closed, len(wires.opened_ns)) == (1, 1)
+    assert scan.status == [0] * 4
 
 
 @every_schedule

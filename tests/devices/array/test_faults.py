@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 KINDS: list[FaultKind] = [*get_args(TileFault), *get_args(MuxFault), *get_args(BusFault)]
 GONE: list[FaultKind] = ["no_answer", "unplugged", "replaced", "all_ones"]
 """A tile of which nothing can be known."""
-STUCK: list[FaultKind] = ["sda_low", "sda_high", "scl_low", "brown_out"]
+STUCK: list[FaultKind] = ["sda_low", "sda_high", "scl_low", "adapter_unplugged", "brown_out"]
 """A bus, or the only mux on it, of which nothing can be known."""
 BY_CHANCE: list[FaultKind] = ["adapter_timeout", "nack_storm", "bit_errors"]
 

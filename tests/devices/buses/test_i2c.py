@@ -23,6 +23,7 @@ from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.faults import Faults
 from devices.errors import (
     BusFaultError,
+    BusLostError,
     BusMisuseError,
     BusSetupError,
     FootTileError,
@@ -33,6 +34,7 @@ from devices.errors import (
 )
 from devices.frames import TileStatus
 from tests.devices.adapters import Adapter
+from tests.waiting import until
 
 
 class BrokenAdapter(Adapter):
@@ -63,9 +65,10 @@ TABLE = [
     (16, "EBUSY", BusFaultError),
     (22, "EINVAL", BusMisuseError),
     (95, "EOPNOTSUPP", BusMisuseError),
-    (19, "ENODEV", BusSetupError),
-    (2, "ENOENT", BusSetupError),
-    (13, "EACCES", BusSetupError),
+    (19, "ENODEV", BusLostError),
+    (2, "ENOENT", BusLostError),
+    (13, "EACCES", BusLostError),
+    (108, "ESHUTDOWN", BusLostError),
 ]
 
 
@@ -93,7 +96,7 @@ def test_a_failure_names_the_bus_and_the_address_and_keeps_both_through_pickling
 
 def test_an_error_without_a_number_is_not_taken_for_a_missing_tile() -> None:
     error = failure_of(OSError("the adapter melted"), i2c_msg.write(0x60, [0]))
-    assert type(error) is BusSetupError
+    assert type(error) is BusLostError
     assert "the adapter melted" in str(error)
     assert error.errno is None
 
@@ -102,7 +105,7 @@ def test_what_a_field_worker_can_do_is_said() -> None:
     message = i2c_msg.write(0x60, [0])
     assert "mux channel" in failure_of(OSError(121, ""), message).remedy
     assert "SDA and SCL" in failure_of(OSError(110, ""), message).remedy
-    assert "i2c_arm=on" in failure_of(OSError(2, ""), message).remedy
+    assert "plug" in failure_of(OSError(19, ""), message).remedy
     assert "42 messages" in failure_of(OSError(22, ""), message).expected
 
 
@@ -114,10 +117,13 @@ class Pi:
         self.transactions: list[tuple[i2c_msg, ...]] = []
         self.ioctls: list[tuple[int, int, int]] = []
         self.closed = 0
+        self.error: OSError | None = None
         self.done: int | None = None
         """How many messages a transaction transfers; None: all."""
 
     def ioctl(self, fd: int, request: int, value: Any) -> int:
+        if self.error is not None:
+            raise self.error
         if request != 0x0707:  # include/uapi/linux/i2c-dev.h: I2C_RDWR
             self.ioctls.append((fd, request, value))
             return 0
@@ -288,6 +294,43 @@ def test_an_adapter_that_knows_no_time_out_is_closed_again(
     with pytest.raises(BusSetupError, match="ENOTTY"):
         open_bus("/dev/i2c-1")
     assert pi.closed >= 1
+
+
+# An adapter that goes away
+
+
+def test_a_lost_adapter_is_closed_at_once_and_opened_again_by_its_path(pi: Pi) -> None:
+    bus, message = open_bus("/dev/i2c-1"), i2c_msg.write(0x70, [1])
+    pi.error = OSError(errno.ENODEV, "unplugged")
+    with pytest.raises(BusLostError):
+        bus.transfer(message)
+    assert pi.closed == 1, "an open file keeps its number from the adapter that comes back"
+    with pytest.raises(BusLostError):
+        bus.transfer(message)
+    assert (pi.closed, len(pi.transactions)) == (1, 0)
+    pi.error = None
+    assert until(lambda: bus.reopen(0))
+    bus.transfer(message)
+    assert pi.opened == ["/dev/i2c-1"] * 2
+    assert len(pi.transactions) == 1
+    assert len(pi.ioctls) == 2, "its time-out is set again"
+
+
+def test_why_an_adapter_cannot_be_opened_again_is_said(
+    pi: Pi, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = open_bus("/dev/i2c-1")
+    pi.error = OSError(errno.ENODEV, "unplugged")
+    with pytest.raises(BusLostError):
+        bus.transfer(i2c_msg.write(0x70, [1]))
+
+    def denied(self: SMBus, name: str) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SMBus, "open", denied)
+        assert until(lambda: not bus.reopen(0) and bus.problem != "")
+    assert "group i2c" in bus.problem
 
 
 # A patient bus

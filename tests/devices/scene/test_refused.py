@@ -177,11 +177,10 @@ def test_a_fault_of_a_mux_that_is_not_there_is_refused() -> None:
 def test_every_fault_names_what_fails_and_nothing_else(kind: str) -> None:
     line = f"[[fault]]\nkind='{kind}'\nt_s=0\nduration_s=1\n"
     targets = {"tile": "tile='T01'", "mux": "mux=0x70", "bus": ""}
+    bus = "sda_low sda_high scl_low adapter_timeout adapter_unplugged nack_storm bit_errors"
     belongs_to = {
         **dict.fromkeys(("brown_out", "mux_reset"), "mux"),
-        **dict.fromkeys(
-            ("sda_low", "sda_high", "scl_low", "adapter_timeout", "nack_storm", "bit_errors"), "bus"
-        ),
+        **dict.fromkeys(bus.split(), "bus"),
     }.get(kind, "tile")
     for target, key in targets.items():
         if target == belongs_to:
