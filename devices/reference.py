@@ -21,6 +21,8 @@ class ReferenceForce:
         """Readings that failed: no transfer, or no converter."""
         self.on_rail = 0
         """Readings at either end of the converter, which say nothing about a force."""
+        self.trouble = ""
+        """Why the last reading gave no force, in words; empty if it gave one."""
         self._adc = adc
         self._channel = scene.channel
         self._zero_v = scene.zero_v
@@ -35,10 +37,13 @@ class ReferenceForce:
         """
         try:
             counts = self._adc.read_counts(self._channel)
-        except SpiError:
+        except SpiError as error:
             self.failures += 1
+            self.trouble = f"no reference force: {error}"
             return math.nan
         if counts in (0, COUNTS_MAX):
             self.on_rail += 1
+            self.trouble = "no reference force: the amplifier is off, unplugged or overloaded"
             return math.nan
+        self.trouble = ""
         return (counts * self._volts_per_count - self._zero_v) * self._n_per_v

@@ -6,8 +6,13 @@ method. Both raise bare `OSError`; the driver says what it means.
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import os
+import time
 from typing import Protocol
 
+from devices.buses.reopening import Reopener
 from devices.errors import SpiSetupError, UsageError, needs_extra
 
 MAX_SPEED_HZ = 1_000_000
@@ -33,6 +38,39 @@ class SpiDevice(Protocol):
         """Release the device."""
 
 
+class SpiPort:
+    """An SPI device by its path, opened again after it went away (its driver was unbound)."""
+
+    def __init__(self, device: SpiDevice, reopener: Reopener[SpiDevice]) -> None:
+        self._device: SpiDevice | None = device
+        self._reopener = reopener
+
+    def xfer2(self, data: list[int], /) -> list[int]:
+        """As `SpiDevice.xfer2`.
+
+        Raises:
+            OSError: the transfer failed, or the device is away.
+        """
+        if self._device is None:
+            self._device = self._reopener.poll(time.monotonic_ns())
+        if self._device is None:
+            raise OSError(errno.ENODEV, self._reopener.problem or os.strerror(errno.ENODEV))
+        try:
+            return self._device.xfer2(data)
+        except OSError:
+            # A transfer of three bytes fails for no other reason than that the device is away.
+            device, self._device = self._device, None
+            with contextlib.suppress(OSError):
+                device.close()
+            raise
+
+    def close(self) -> None:
+        """Release the device."""
+        self._reopener.close()
+        if self._device is not None:
+            self._device.close()
+
+
 def open_spi(name: str, emulated: SpiDevice | None = None) -> SpiDevice:
     """Open the device `name`: a path such as `/dev/spidev0.0`, or `"emulated"`.
 
@@ -47,6 +85,10 @@ def open_spi(name: str, emulated: SpiDevice | None = None) -> SpiDevice:
         if emulated is None:
             raise UsageError("SPI device 'emulated' needs an emulated world, and none was given")
         return emulated
+    return SpiPort(_open_device(name), Reopener(lambda: _open_device(name)))
+
+
+def _open_device(name: str) -> SpiDevice:
     with needs_extra("rig", f"the SPI device {name}", remedy=_INSTALL):
         from spidev import SpiDev
     device = SpiDev()

@@ -92,13 +92,14 @@ class Simulation:
         self._clock = VirtualClock()
         self.world = options.foot.world(scene, self._clock, self.pressed)
         duration_ns = _duration_ns(options, self.world.ground.duration_s)
+        reference = open_reference_sensor(scene, self.world, stack)
         ready = make_ready(
             open_bus("emulated", self.world.i2c_adapter),
             scene,
             self._clock,
             schedule=options.schedule,
             recovery=open_recovery_lines(scene, self._clock, self.world),
-            reference_n=open_reference_sensor(scene, self.world, stack),
+            reference_n=None if reference is None else reference.read_n,
         )
         self.choice = ready.choice
         self.unmeasured = ready.unmeasured

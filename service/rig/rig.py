@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 
 def open_reference_sensor(
     scene: Scene, world: World | None, stack: ExitStack
-) -> Callable[[], float] | None:
-    """A function that reads the scene's reference force in newtons; None if it has no sensor.
+) -> ReferenceForce | None:
+    """Open the scene's reference force sensor; None if it has none.
 
     Raises:
         UsageError: an emulated sensor for a ground that has none.
@@ -59,7 +59,7 @@ def open_reference_sensor(
         emulated = mill.adc(reference, world.clock)
     device = open_spi(reference.port, emulated)
     stack.callback(device.close)
-    return ReferenceForce(Mcp3208(device, where=reference.port), reference).read_n
+    return ReferenceForce(Mcp3208(device, where=reference.port), reference)
 
 
 def open_recovery_lines(scene: Scene, clock: Clock, world: World | None) -> BusRecovery | None:
@@ -108,7 +108,8 @@ class Rig:
         self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
         stack.callback(self._bus.close)
         self._recovery = open_recovery_lines(scene, self._clock, world)
-        self._reference_n = open_reference_sensor(scene, world, stack)
+        self._reference = open_reference_sensor(scene, world, stack)
+        self._reference_n = None if self._reference is None else self._reference.read_n
         self._ready = make_ready(
             self._bus,
             scene,
@@ -195,7 +196,10 @@ class Rig:
 
     def troubles(self) -> dict[str, str]:
         """What is wrong now, in words, by what it is wrong with."""
-        return self._ready.array.troubles()
+        found = self._ready.array.troubles()
+        if self._reference is not None and self._reference.trouble:
+            found["reference"] = self._reference.trouble
+        return found
 
     def counts(self) -> dict[str, dict[str, int]]:
         """How often what went wrong since the stream began, by serial and reason."""

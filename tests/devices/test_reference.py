@@ -76,6 +76,17 @@ def test_a_failed_reading_is_counted_and_is_no_force(
     assert math.isnan(sensor.read_n())
     assert math.isnan(sensor.read_n())
     assert (sensor.failures, sensor.on_rail) == (2, 0)
+    assert sensor.trouble.startswith("no reference force: rig, channel 3: ")
+
+
+def test_what_is_wrong_is_said_until_a_force_arrives() -> None:
+    volts = 0.0
+    sensor = reference(connected(lambda channel, t_ns: volts))
+    sensor.read_n()
+    assert "amplifier" in sensor.trouble
+    volts = 1.65
+    assert sensor.read_n() == pytest.approx(0.0, abs=0.02)
+    assert sensor.trouble == ""
 
 
 def test_a_line_that_is_stuck_low_is_no_force() -> None:

@@ -9,8 +9,10 @@ from types import ModuleType
 
 import pytest
 
-from devices.buses.spi import open_spi
+from devices.buses.reopening import PERIOD_NS
+from devices.buses.spi import SpiDevice, open_spi
 from devices.errors import MissingExtraError, SpiSetupError, UsageError
+from tests.waiting import until
 
 
 class FakeSpiDev:
@@ -23,6 +25,7 @@ class FakeSpiDev:
     def __init__(self) -> None:
         self.path = ""
         self.closed = False
+        self.is_unbound = False
 
     def open_path(self, path: str) -> None:
         if self.failure is not None:
@@ -30,6 +33,8 @@ class FakeSpiDev:
         self.path = path
 
     def xfer2(self, data: list[int], /) -> list[int]:
+        if self.is_unbound:
+            raise OSError(errno.ESHUTDOWN, os.strerror(errno.ESHUTDOWN))
         return data
 
     def close(self) -> None:
@@ -53,7 +58,7 @@ def devices(monkeypatch: pytest.MonkeyPatch) -> list[FakeSpiDev]:
 
 def test_a_device_is_opened_in_mode_0_at_1_mhz(devices: list[FakeSpiDev]) -> None:
     opened = open_spi("/dev/spidev0.1")
-    assert opened is devices[0]
+    assert opened.xfer2([1, 2, 3]) == [1, 2, 3]
     assert devices[0].path == "/dev/spidev0.1"
     # hardware.md 6: SPI mode 0,0; at 3.3 V stay at or below 1 MHz
     assert (devices[0].mode, devices[0].max_speed_hz) == (0, 1_000_000)
@@ -70,6 +75,37 @@ def test_a_device_that_cannot_be_opened_is_closed_and_said(
     assert caught.value.where == "/dev/spidev0.0"
     assert "dtparam=spi=on" in caught.value.remedy
     assert devices[0].closed
+
+
+def test_a_device_that_went_away_is_closed_and_opened_again_by_its_path(
+    devices: list[FakeSpiDev], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = 0
+    monkeypatch.setattr("devices.buses.spi.time.monotonic_ns", lambda: now_ns)
+    opened = open_spi("/dev/spidev0.0")
+    devices[0].is_unbound = True
+    with pytest.raises(OSError, match="shutdown"):
+        opened.xfer2([1, 2, 3])
+    assert devices[0].closed
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeSpiDev, "failure", OSError(errno.EACCES, "Permission denied"))
+        assert until(lambda: "group spi" in why_not(opened))
+    assert [device.closed for device in devices] == [True, True]
+    now_ns = PERIOD_NS
+    until(lambda: not why_not(opened))
+    assert opened.xfer2([1, 2, 3]) == [1, 2, 3]
+    assert (len(devices), devices[2].path) == (3, "/dev/spidev0.0")
+    opened.close()
+    assert devices[2].closed
+
+
+def why_not(opened: SpiDevice) -> str:
+    """Why a transfer fails; empty if it does not."""
+    try:
+        opened.xfer2([0])
+    except OSError as error:
+        return str(error)
+    return ""
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
