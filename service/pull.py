@@ -18,6 +18,7 @@ from storage.checked_json import read_checked, write_checked
 from storage.checked_table import table_of
 from storage.durable import (
     LOCK_NAME,
+    make_folder,
     set_aside,
     storage_errors,
     sync_folder,
@@ -97,7 +98,8 @@ def pull(server: foottile.Server, session_id: str, out: Path) -> dict[str, Any]:
     folder = out / session_id
     refuse_data_folder(folder)
     with storage_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
+        sync_folder(folder)
     path = folder / FRAMES_NAME
     resumed = 0
     if not (path.is_file() and sha256_of(path) == session["sha256"]):

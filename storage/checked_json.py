@@ -44,7 +44,7 @@ def write_checked(path: Path, text: bytes, *, mode: int = 0o666) -> None:
         mode: permissions, of which the umask takes its share.
 
     Raises:
-        StorageError: the disk is full or not writable; nothing is left behind then.
+        StorageError: the disk is full or not writable; raises as `whole_file`.
     """
     write_whole(path, with_check(text), mode=mode)
 

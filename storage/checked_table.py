@@ -50,7 +50,7 @@ def write_table(
         group_rows: of a row group at most; None: as many as there are, nearly.
 
     Raises:
-        StorageError: the disk is full or not writable; nothing is left behind then.
+        StorageError: the disk is full or not writable; raises as `whole_file`.
     """
     said = {**(table.schema.metadata or {}), FORMAT_KEY: FORMAT}
     table = table.replace_schema_metadata(said)

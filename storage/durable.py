@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import io
+import logging
 import os
 import re
 import secrets
@@ -22,6 +23,8 @@ from pathlib import Path
 
 from devices.errors import DamagedFileError, FolderGoneError, FootTileError, StorageError
 from devices.words import printable
+
+log = logging.getLogger("foottile.storage")
 
 _TEMPORARY = re.compile(
     r"\.(?P<name>.+)\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp"
@@ -41,7 +44,7 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
         mode: permissions, of which the umask takes its share.
 
     Raises:
-        StorageError: the disk is full or not writable; nothing is left behind then.
+        StorageError: the disk is full or not writable; raises as `whole_file`.
     """
     with whole_file(path, mode=mode) as file:
         file.write(content)
@@ -112,7 +115,9 @@ def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
     """A file to write that takes its place, whole and on the disk, when the block ends well.
 
     Raises:
-        StorageError: the disk is full or not writable; nothing is left behind then.
+        StorageError: the disk is full or not writable. The old file is still there, unless only the
+            folder could not be synced: then the new file is there, and its name may be lost with
+            the power.
     """
     temporary = temporary_of(path)
     check_held(path)
@@ -197,11 +202,40 @@ def make_folder(folder: Path) -> None:
         sync_folder(each.parent)
 
 
+_CANNOT_SYNC_FOLDERS = {
+    *(errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF)
+}
+"""Answers of file systems that sync files only, such as CIFS, vboxsf, WSL's and some of FUSE.
+
+PostgreSQL and SQLite go on after them, too: no program can do more there.
+"""
+_warned_devices: set[int] = set()
+"""File systems (`st_dev`) that cannot sync folders, and that were warned of."""
+
+
 def sync_folder(folder: Path) -> None:
-    """Put the names in a folder on the disk: a rename is not there until its folder is synced."""
+    """Put the names in a folder on the disk: a rename is not there until its folder is synced.
+
+    A file system that cannot do so is warned of once; the files themselves are synced there, too.
+
+    Raises:
+        OSError: the disk failed.
+    """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _CANNOT_SYNC_FOLDERS:
+            raise
+        device = os.fstat(descriptor).st_dev
+        if device not in _warned_devices:
+            _warned_devices.add(device)
+            log.warning(
+                "%s: this file system cannot sync folders (%s). Files are synced, but the name of a "
+                "new file may be lost if the power fails. Use a local disk where that matters",
+                printable(str(folder)),
+                error.strerror,
+            )
     finally:
         os.close(descriptor)
 
@@ -227,6 +261,10 @@ def storage_errors(path: Path, remedy: str = "") -> Iterator[None]:
 
 
 LOCK_NAME = ".lock"
+_NO_LOCKS = (
+    "Use a folder on a local disk, or mount it with locks (NFS: start rpc.statd, or the mount "
+    "option local_lock=flock if no other machine writes there)"
+)
 
 
 @contextmanager
@@ -246,7 +284,8 @@ def locked(
         remedy: what to do then.
 
     Raises:
-        StorageError: another process holds it (`errno` is None), or it cannot be opened.
+        StorageError: another process holds it (`errno` is None), it cannot be opened, or the file
+            system has no locks.
     """
     path = folder / LOCK_NAME
     with storage_errors(folder):
@@ -260,6 +299,17 @@ def locked(
     except BlockingIOError as error:
         os.close(descriptor)
         raise StorageError(refusal, where=str(folder), remedy=remedy) from error
+    except OSError as error:
+        os.close(descriptor)
+        raise StorageError(
+            f"its file system gives no lock: {error.strerror}",
+            where=str(folder),
+            expected="a folder that can be locked, so that two processes do not write in it",
+            remedy=_NO_LOCKS,
+            errno=error.errno,
+        ) from error
+    with suppress(OSError):  # to warn at the start; a disk that fails is an error where it matters
+        sync_folder(folder)
     if not is_shared:
         _held[folder] = descriptor
     try:

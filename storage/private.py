@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
-from contextlib import suppress
 from pathlib import Path
 
+from devices.errors import StorageError
 from storage.durable import LOCK_NAME, intended_name, make_folder, storage_errors
 
 _OURS = {
@@ -15,6 +16,10 @@ _OURS = {
     "servers",  # foottile.local_server keeps it beside a node's journal
 }
 """All that servers and nodes write in their folder."""
+_NO_MODES = {
+    *(errno.EPERM, errno.EACCES, errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+}
+"""The folder is another user's, or its file system has no permissions, such as vfat and CIFS."""
 
 
 def keep_private(folder: Path) -> None:
@@ -28,7 +33,7 @@ def keep_private(folder: Path) -> None:
         folder: where it will write; made if absent.
 
     Raises:
-        StorageError: it cannot be made.
+        StorageError: it cannot be made, or not be closed to others.
     """
     os.umask(0o077)
     with storage_errors(folder):
@@ -37,8 +42,16 @@ def keep_private(folder: Path) -> None:
     if mode & 0o050 and not mode & 0o007:
         os.umask(0o027)
     elif mode & 0o077 and _is_ours(folder):
-        with suppress(PermissionError):  # another user's, as some mounted disks are
+        try:
             folder.chmod(mode & ~0o077)
+        except OSError as error:
+            if error.errno not in _NO_MODES:
+                raise StorageError(
+                    f"cannot be closed to other users: {error.strerror}",
+                    where=str(folder),
+                    remedy="Choose another folder with --data",
+                    errno=error.errno,
+                ) from error
 
 
 def _is_ours(folder: Path) -> bool:

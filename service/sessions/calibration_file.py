@@ -39,6 +39,6 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     """Write a calibration file.
 
     Raises:
-        StorageError: the disk is full or not writable; nothing is left behind then.
+        StorageError: the disk is full or not writable; raises as `whole_file`.
     """
     write_checked(path, calibration.to_json().encode())

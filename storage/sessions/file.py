@@ -114,7 +114,7 @@ class SessionWriter:
 
         Raises:
             FileFormatError: not one frame was appended.
-            StorageError: the disk is full or not writable; nothing is left behind then.
+            StorageError: the disk is full or not writable; raises as `whole_file`.
         """
         self._end_piece()
         self._write_group()
@@ -126,6 +126,7 @@ class SessionWriter:
             self._writer = None
             write_file_hash(self._temporary)
             self._temporary.replace(self.path)
+        with storage_errors(self.path, "The file is whole; its name may be lost with the power"):
             sync_folder(self.path.parent)
 
     def __enter__(self) -> Self:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -14,13 +17,16 @@ from hypothesis import strategies as st
 from devices.errors import FileFormatError, StorageError
 from storage import durable
 from storage.durable import (
+    locked,
     make_folder,
     remove_stale_temporaries,
+    set_aside,
     storage_errors,
     sync_folder,
     temporary_of,
     write_whole,
 )
+from storage.private import keep_private
 from tests.storage.faulty_disk import IO_ERROR, disk_with_room_for, refusing
 
 
@@ -137,6 +143,95 @@ def test_only_a_folder_can_be_synced_as_one(tmp_path: Path) -> None:
     descriptors = len(os.listdir("/proc/self/fd"))
     sync_folder(tmp_path)
     assert len(os.listdir("/proc/self/fd")) == descriptors
+
+
+def folders_answer(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """Have every fsync of a folder fail with this error, as on a file system without it."""
+    fsync = os.fsync
+
+    def answer(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", answer)
+    monkeypatch.setattr(durable, "_warned_devices", set())
+
+
+@pytest.mark.parametrize(
+    "number", [errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF]
+)
+def test_a_file_system_that_cannot_sync_folders_is_used_and_warned_of_once(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    number: int,
+) -> None:
+    folders_answer(monkeypatch, number)
+    with locked(tmp_path):
+        [warning] = caplog.messages  # at the start, before anything is written
+        make_folder(tmp_path / "a" / "b")
+        write_whole(tmp_path / "a" / "b" / "file", b"content")
+        set_aside(tmp_path / "a" / "b" / "file")
+    assert str(tmp_path) in warning
+    assert "power" in warning
+    assert caplog.messages == [warning]
+    assert files_in(tmp_path / "a" / "b") == {"file.damaged-1": b"content"}
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_disk_that_fails_to_sync_a_folder_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    folders_answer(monkeypatch, number)
+    with pytest.raises(StorageError) as caught:
+        write_whole(tmp_path / "file", b"new")
+    assert caught.value.errno == number
+    assert caught.value.where == str(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    "number", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL, errno.EIO]
+)
+def test_a_folder_without_locks_is_refused_by_name_and_with_a_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    monkeypatch.setattr(fcntl, "flock", refusing(OSError, number, os.strerror(number)))
+    descriptors = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(StorageError, match="no lock") as caught, locked(tmp_path):
+        pass
+    assert caught.value.where == str(tmp_path)
+    assert caught.value.errno == number
+    assert "local disk" in caught.value.remedy
+    assert len(os.listdir("/proc/self/fd")) == descriptors
+
+
+@pytest.mark.parametrize("number", [errno.EPERM, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS])
+def test_a_file_system_without_permissions_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    (tmp_path / "data").mkdir(mode=0o755)
+    monkeypatch.setattr(os, "chmod", refusing(OSError, number, os.strerror(number)))
+    umask = os.umask(0o022)
+    try:
+        keep_private(tmp_path / "data")
+        assert os.umask(0o022) == 0o077
+    finally:
+        os.umask(umask)
+
+
+def test_a_folder_that_cannot_be_closed_to_others_is_an_error_that_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "chmod", refusing(*IO_ERROR))
+    umask = os.umask(0o022)
+    try:
+        (tmp_path / "data").mkdir(mode=0o755)
+        with pytest.raises(StorageError, match="closed to other users") as caught:
+            keep_private(tmp_path / "data")
+    finally:
+        os.umask(umask)
+    assert caught.value.where == str(tmp_path / "data")
 
 
 def test_an_error_of_the_system_becomes_one_that_names_the_path() -> None:
