@@ -41,6 +41,34 @@ def can_be_shown(text: str) -> str:
     return text
 
 
+_MISLEADING = re.compile("[\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ufffe\uffff]")
+"""Line separators, overrides of the direction of writing, byte order marks, no characters.
+
+Joiners and other marks without width stay: Persian, Hindi and emoji are written with them.
+"""
+
+
+def check_new_text(text: str) -> str:
+    """Return a text that somebody sets; files of older versions may hold others.
+
+    Raises:
+        ValueError: it has a character that a reader does not see, or that makes it look like
+            another text.
+    """
+    if found := _MISLEADING.search(text):
+        raise ValueError(f"has the character U+{ord(found[0]):04X}, which cannot be seen")
+    return can_be_shown(text)
+
+
+def check_new_name(text: str) -> str:
+    """Return a name that somebody sets: one line, and a text as of `check_new_text`.
+
+    Raises:
+        ValueError: it is none.
+    """
+    return check_new_text(_is_one_line(text))
+
+
 def _is_one_line(text: str) -> str:
     if "\n" in text or "\t" in text:
         raise ValueError("has a line break or tab in it")

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 
-def printable(text: str) -> str:
-    r"""One line that a terminal shows and does not obey, and that UTF-8 can carry.
+def printable(text: str, *, keeps_lines: bool = False) -> str:
+    r"""Return text that a terminal shows and does not obey, and that UTF-8 can carry.
 
-    A byte of a file's name that is no UTF-8 is a lone surrogate in Python: it is shown as `\udcff`.
+    Whatever is not printable is shown as an escape: `\x1b`, `\u202e`. A byte of a file's name that
+    is no UTF-8 is a lone surrogate in Python: it is shown as `\udcff`.
+
+    Args:
+        text: from anywhere.
+        keeps_lines: line breaks, tabs and runs of spaces stay; else it becomes one line.
     """
-    line = " ".join(text.split())
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    if not keeps_lines:
+        text = " ".join(text.split())
+    elif text.isascii() and text.replace("\n", "").isprintable():
+        return text
+    kept = "\n\t" if keeps_lines else ""
+    return "".join(
+        c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text
+    )

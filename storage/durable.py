@@ -202,9 +202,7 @@ def make_folder(folder: Path) -> None:
         sync_folder(each.parent)
 
 
-_CANNOT_SYNC_FOLDERS = {
-    *(errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF)
-}
+_CANNOT_SYNC_FOLDERS = {*(errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF)}
 """Answers of file systems that sync files only, such as CIFS, vboxsf, WSL's and some of FUSE.
 
 PostgreSQL and SQLite go on after them, too: no program can do more there.
@@ -231,8 +229,8 @@ def sync_folder(folder: Path) -> None:
         if device not in _warned_devices:
             _warned_devices.add(device)
             log.warning(
-                "%s: this file system cannot sync folders (%s). Files are synced, but the name of a "
-                "new file may be lost if the power fails. Use a local disk where that matters",
+                "%s: this file system cannot sync folders (%s). Files are synced, but the name of "
+                "a new file may be lost if the power fails. Use a local disk where that matters",
                 printable(str(folder)),
                 error.strerror,
             )

@@ -15,7 +15,6 @@ from typing import IO, TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
-from devices.words import printable
 from service.cli.options import remark, say, stderr
 
 if TYPE_CHECKING:
@@ -205,7 +204,7 @@ def _progress(command: str, count: Callable[[], Iterator[Any]]) -> Iterator[Call
 
         def tell(outcome: Outcome) -> None:
             if outcome.state == "failed":
-                remark(printable(_failure(outcome)))
+                remark(_failure(outcome))
             bar.advance(shown)
 
         yield tell
@@ -226,6 +225,6 @@ def _tell(summary: Summary, command: str, out: str | None, *, as_json: bool) -> 
         failed = f", {states['failed']} failed" if states["failed"] else ""
         say(f"{where}{command}: {', '.join(counts)}{failed}{'; ' if verdicts else ''}{verdicts}")
     for outcome in () if stderr.is_terminal else summary.failures:
-        remark(printable(_failure(outcome)))
+        remark(_failure(outcome))
     if states["failed"] > len(summary.failures):
         remark(f"and {states['failed'] - len(summary.failures)} more, which the report lists")

@@ -20,10 +20,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
+from rich.text import Text
 
 from devices.errors import UsageError
 from devices.scene.file import Scene, load_scene
 from devices.scene.hardware import EMULATED
+from devices.words import printable
 from service.plain_json import json_text
 
 if TYPE_CHECKING:
@@ -45,7 +48,14 @@ StartOption = Annotated[
 EndOption = Annotated[float | None, typer.Option(help="Before so many seconds.")]
 
 
-class _Output(Console):
+class _Screen(Console):
+    """A console that shows control characters of any text or cell of a table, and obeys none."""
+
+    def render_str(self, text: str, **how: Any) -> Text:
+        return super().render_str(printable(text, keeps_lines=True), **how)
+
+
+class _Output(_Screen):
     def on_broken_pipe(self) -> None:
         # The reader has seen enough, as with `| head -1`: that is no failure.
         self.quiet = True
@@ -60,7 +70,7 @@ def _width() -> int | None:
 
 # Data goes to stdout; progress and remarks to stderr, progress only on a terminal.
 stdout = _Output(width=_width())
-stderr = Console(stderr=True)
+stderr = _Screen(stderr=True)
 
 
 def pair(text: str | None, option: str) -> tuple[float, float] | None:
@@ -126,18 +136,24 @@ def progress(message: str) -> Iterator[Callable[[str], None]]:
     if not stderr.is_terminal:
         yield remark
         return
-    with stderr.status(message) as status:
-        yield status.update
+    with stderr.status(escape(printable(message))) as status:
+        yield lambda text: status.update(escape(printable(text)))
 
 
 def say(message: str) -> None:
-    """A line of the result on stdout, as it is."""
-    stdout.print(message, highlight=False, soft_wrap=True, markup=False)
+    """Print one line of the result on stdout; what is in it cannot make a second one."""
+    indent = " " * (len(message) - len(message.lstrip(" ")))
+    say_lines(indent + printable(message))
+
+
+def say_lines(text: str) -> None:
+    """Print a report of several lines on stdout; names in it must be `printable` already."""
+    stdout.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def remark(message: str) -> None:
-    """A line on stderr that a user should see, wherever it goes."""
-    stderr.print(message, style="dim", highlight=False, markup=False, soft_wrap=True)
+    """Print one line on stderr that a user should see, wherever it goes."""
+    stderr.print(printable(message), style="dim", highlight=False, markup=False, soft_wrap=True)
 
 
 @dataclass(frozen=True)

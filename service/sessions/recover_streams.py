@@ -128,7 +128,7 @@ def open_streams(
             (folder / NOTES_FILE).exists() or any(folder.glob("*" + SUFFIX))
         ):
             continue
-        tell(printable(f"journal {folder.parent.name}/{folder.name}"))
+        tell(f"journal {folder.parent.name}/{folder.name}")
         remove_stale_temporaries(folder)
         try:
             journal = Journal.open(folder)

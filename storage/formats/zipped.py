@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import time
 import zipfile
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
@@ -22,6 +23,11 @@ from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.stances import STANCES_NAME
 
 _PIECE = 1 << 20
+_DATED_S = (315_619_200, 4_354_732_800)
+"""From 2 January 1980 to 30 December 2107, in any time zone: a zip file can state no other dates.
+
+A machine without a clock writes files of 1970; they get the nearest date.
+"""
 _BESIDE = (EVENTS_NAME, CLOCK_NAME, STANCES_NAME)
 """Each has its own checksum; older sessions lack some."""
 
@@ -59,7 +65,8 @@ def _put(
 ) -> Generator[bytes, None, None]:
     found = hashlib.sha256()
     try:
-        about = zipfile.ZipInfo.from_file(path, f"{path.parent.name}/{path.name}")
+        dated_s = min(max(int(path.stat().st_mtime), _DATED_S[0]), _DATED_S[1])
+        about = zipfile.ZipInfo(f"{path.parent.name}/{path.name}", time.localtime(dated_s)[:6])
         about.external_attr = 0o644 << 16
         with path.open("rb") as source, file.open(about, "w", force_zip64=True) as entry:
             while piece := source.read(_PIECE):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import stat
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,6 +41,18 @@ def present(path: Path) -> Path:
     return path
 
 
+_DATED_S = (-62_135_596_800, 253_402_300_799)
+"""The first second of the year 1 and the last one of 9999: `Last-Modified` can state no others."""
+
+
+def file_answer(path: Path, **about: Any) -> FileResponse:
+    """Answer with a file as it is, whatever its date; some file systems know years beyond 9999."""
+    found = path.stat()
+    fields = list(found)
+    fields[stat.ST_MTIME] = min(max(fields[stat.ST_MTIME], _DATED_S[0]), _DATED_S[1])
+    return FileResponse(path, stat_result=os.stat_result(fields), **about)
+
+
 def stored_table(session: Session, path: Path) -> FileResponse:
     """A table that lies beside a session's frames, as it is.
 
@@ -51,7 +65,7 @@ def stored_table(session: Session, path: Path) -> FileResponse:
             f"session {session.id} is {session.state}, and {path.name} is not written yet",
             remedy="Stop it, or ask for format=json",
         )
-    return FileResponse(
+    return file_answer(
         present(path), media_type=PARQUET.media_type, filename=f"{session.id}.{path.name}"
     )
 

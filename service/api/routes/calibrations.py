@@ -7,9 +7,10 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Header, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
 from devices.errors import CalibrationError, FootTileError, UsageError
+from devices.facts import check_new_name
 from service.api.routes.access import FULL, ServerState, has_it, problems, tag_of
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
@@ -37,9 +38,8 @@ _NO_NODE = problems(_404="No such node.")
 
 Line = Annotated[
     str,
-    StringConstraints(
-        strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$"
-    ),
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=200),
+    AfterValidator(check_new_name),
 ]
 SessionId = Annotated[str, StringConstraints(max_length=100)]
 

@@ -7,8 +7,9 @@ from math import isfinite
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from devices.facts import check_new_name
 from service.api.routes.access import ServerState, problems, tag_of
 from service.server.book import expect
 from service.server.node import ServerNode
@@ -27,7 +28,7 @@ class TareRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    reason: str = Field(
+    reason: Annotated[str, AfterValidator(check_new_name)] = Field(
         default="", max_length=REASON_LENGTH_MAX, description='For the history; else "by hand".'
     )
 

@@ -18,6 +18,7 @@ from service.cli.options import (
     progress,
     remark,
     say,
+    say_lines,
 )
 from service.cli.result_folder import result_folder
 from service.plain_json import json_text
@@ -175,7 +176,7 @@ def bench_command(
     if as_json:
         print_json(bench.as_dict())
     else:
-        say(text)
+        say_lines(text)
         say(f"{folder}: bench.json, bench.md, bench.png")
     for name, failure in bench.failures:
         remark(f"not measured: {name}, {failure.what}: {failure.why}")

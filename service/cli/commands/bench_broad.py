@@ -10,7 +10,7 @@ import typer
 
 from devices.errors import UsageError
 from devices.scene.emulated import Family
-from service.cli.options import print_json, remark, say
+from service.cli.options import print_json, remark, say, say_lines
 from service.plain_json import json_text
 
 ARRAYS, QUICK_ARRAYS = 200, 3
@@ -85,7 +85,7 @@ def bench_broad(
     if as_json:
         print_json(content)
     else:
-        say(text)
+        say_lines(text)
         say(f"{folder}: broad.json, broad.md, broad.png")
     refused = [(f"array {r.number}, {f.what}", f.why) for r in bench.results for f in r.refusals]
     for what, why in [*refused, *((f.what, f.why) for f in bench.lost)]:

@@ -13,7 +13,7 @@ from devices.errors import UsageError, needs_extra
 from service.cli.commands.sessions import sealed_file
 from service.cli.compare_many import MISSED, compare_many, options_of
 from service.cli.many import NOT_ALL, JobsOption, ManifestOption, SchedulerOption
-from service.cli.options import JsonOption, print_json, progress, remark, say
+from service.cli.options import JsonOption, print_json, progress, remark, say, say_lines
 from service.cli.reference_options import (
     ColumnsOfReference,
     LagRange,
@@ -143,7 +143,7 @@ def compare_command(
     if as_json:
         print_json(done.content)
     else:
-        say(done.text)
+        say_lines(done.text)
         say(f"{folder}: compare.json, compare.md, compare.png, series.parquet")
     for line in done.missed:
         remark(f"limit missed: {line}")

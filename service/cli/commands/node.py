@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import CalibrationError, MissingExtraError, StorageError, UsageError
+from devices.facts import check_new_name
 from service.cli.options import (
     FootOptions,
     remark,
@@ -90,6 +91,11 @@ def node_command(
         raise UsageError(f"--journal {str(journal)!r} is no folder", remedy="Choose another one")
     if record is not None and not record.strip():
         raise UsageError("--record without a name", expected="the name of the session")
+    if record is not None:
+        try:
+            check_new_name(record)
+        except ValueError as error:
+            raise UsageError(f"--record {record!r} {error}", expected="one line of text") from error
     the_scene = scene_with(scene, bus=bus, servo=servo)
     rig = RigOptions(the_scene, _name(name), options.foot(the_scene))
     calibration, problem = calibration_of(rig)

@@ -84,7 +84,7 @@ def query_command(
     else:
         _print(answer)
     for place, reason in archive.left_out.items():
-        remark(printable(f"{place} is left out: {reason}"))
+        remark(f"{place} is left out: {reason}")
     if archive.left_out:
         raise typer.Exit(_LEFT_OUT)
 

@@ -16,6 +16,7 @@ from service.cli.options import (
     progress,
     remark,
     say,
+    say_lines,
 )
 from service.cli.result_folder import result_folder
 from service.plain_json import json_text
@@ -80,7 +81,7 @@ def reproduce_command(
     if as_json:
         print_json(result)
     else:
-        say(text)
+        say_lines(text)
         say(f"{folder}: reproduce.json, reproduce.md, {', '.join(figures)}")
     for name, why in result.failures.items():
         remark(f"not measured: {name}: {why}")

@@ -117,7 +117,7 @@ def sessions_command(
         table.add_row(
             session["id"],
             escape(printable(session["name"])),
-            session["node"],
+            escape(printable(session["node"])),
             f"{session['duration_s']:.1f}",
             str(session["frames"]),
             str(session.get("marks", "")),
@@ -328,7 +328,7 @@ def _in_folder(data: Path, choice: Choice) -> list[Mapping[str, Any]]:
         raise UsageError(f"no data folder {str(data)!r}")
     sessions, unreadable = SessionFolder(data / "sessions").load_all()
     for session_id, error in unreadable.items():
-        remark(printable(f"session {session_id} is left out: {error}"))
+        remark(f"session {session_id} is left out: {error}")
 
     def complete(session: Session) -> Completeness:
         return False if session.ledger is None else session.ledger.completeness

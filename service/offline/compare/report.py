@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
+from devices.words import printable
 from service.offline.accuracy import PHASES
 from service.offline.compare.align import Alignment
 from service.offline.compare.blocks import Estimate
@@ -58,7 +59,7 @@ def markdown(
     notes: Sequence[str],
 ) -> str:
     """All of a comparison that people read."""
-    lines = [f"# {title}", "", *(f"- {note}" for note in notes), ""]
+    lines = [f"# {printable(title)}", "", *(f"- {printable(note)}" for note in notes), ""]
     lines += _alignment(alignment, by_clocks, pairs)
     lines += _figures(errors, trials_are)
     lines += _trials(errors)
@@ -132,7 +133,7 @@ def _trials(errors: Errors) -> Iterator[str]:
     for trial in errors.trials:
         of, (low_n, high_n) = trial.figures, trial.limits_of_agreement_n
         cop = ", ".join(str(trial.cop_frames[name]) for name in ("ours", "reference", "both"))
-        name = trial.name.replace("|", "\\|")
+        name = _cell(trial.name)
         yield (
             f"| {name} | {number(of['grf_bias_n'])} | {number(of['grf_mae_n'])} | "
             f"{number(of['grf_rmse_n'])} | {number(of['grf_r2'])} | {number(low_n)} to "
@@ -153,10 +154,15 @@ def _phases(errors: Errors) -> Iterator[str]:
             phase = trial.phases[name]
             share = math.nan if phase.covered is None else 100.0 * phase.covered.share
             yield (
-                f"| {trial.name.replace('|', chr(92) + '|')} | {name.replace('_', '-')} | "
+                f"| {_cell(trial.name)} | {name.replace('_', '-')} | "
                 f"{phase.frames} | {number(phase.bias_n)} | {number(phase.mae_n)} | "
                 f"{number(share)} |"
             )
+
+
+def _cell(name: str) -> str:
+    """Return a name as a cell of a table in Markdown."""
+    return printable(name).replace("|", "\\|")
 
 
 def _interval(found: OverTrials) -> str:

@@ -282,3 +282,47 @@ def test_a_damaged_table_of_events_is_an_error_and_marks_can_be_left_out(
     assert "events.parquet" in capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
     assert command(monkeypatch, "export", *arguments, "--no-marks") == 0
+
+
+SET = {
+    "PATCH": [{"name": "{}"}, {"subject": "{}"}, {"tags": ["{}"]}, {"notes": "{}"}],
+    "POST": [{"label": "{}"}],
+}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "a\x1b[2J",
+        "a\x07b",
+        "a\x00b",
+        "a\x7fb",
+        "a\x9bb",
+        "a\u202eb",
+        "a\u2066b",
+        "a\u2028b",
+        "\ufeffa",
+    ],
+)
+def test_a_text_that_cannot_be_seen_is_refused_wherever_it_is_set(
+    session: Recording, wrong: str
+) -> None:
+    path = f"/sessions/{session.id}"
+    for method, bodies in SET.items():
+        for body in bodies:
+            content = json.dumps(body).replace('"{}"', json.dumps(wrong))
+            url = f"{path}/events" if method == "POST" else path
+            answer = session.running.http.request(
+                method, url, content=content, headers={"Content-Type": "application/json"}
+            )
+            assert_refused(answer, 422, "U+")
+
+
+def test_a_line_break_is_for_notes_only(session: Recording) -> None:
+    http, path = session.running.http, f"/sessions/{session.id}"
+    assert http.patch(path, json={"notes": "one\n\ttwo"}).json()["notes"] == "one\n\ttwo"
+    for body in ({"name": "one\ntwo"}, {"subject": "one\ttwo"}, {"tags": ["one\ntwo"]}):
+        assert_refused(http.patch(path, json=body), 422, "line break or tab")
+    assert_refused(http.post(f"{path}/events", json={"label": "one\ntwo"}), 422, "line break")
+    words = "\u0645\u06cc\u200c\u062e \U0001f469\u200d\U0001f52c"  # with joiners
+    assert http.patch(path, json={"name": words}).json()["name"] == words

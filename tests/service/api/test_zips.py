@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import threading
 import tracemalloc
 import zipfile
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +16,14 @@ import httpx
 import pytest
 
 import storage.formats.zipped
+from service.api.routes.access import file_answer
 from storage.file_hash import sha256_of
 from storage.formats.zipped import Sealed, zipped
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
+from tests.storage.faulty_disk import refusing
 
 FILES = {"frames.parquet", "session.json"}
 
@@ -36,6 +41,63 @@ def two(tared: FakeNode) -> list[Recording]:
 
 def asked(running: Running, *ids: str) -> httpx.Response:
     return running.http.get("/sessions/zip", params={"ids": ",".join(ids)})
+
+
+DATES_S = [0, -1, -(2**31) - 1, 315_532_799, 4_354_819_200, 2**32, 253_402_300_800, 2**56]
+"""1970, before it, 1901, just outside of what a zip can state, 2106, 10000, beyond all years."""
+
+
+def date_files(monkeypatch: pytest.MonkeyPatch, dated_s: int) -> None:
+    """Have every file's last change at some instant, which not every file system can keep."""
+    real = Path.stat
+
+    def stat(self: Path, **how: Any) -> os.stat_result:
+        fields = list(real(self, **how))
+        fields[8] = dated_s
+        return os.stat_result(fields)
+
+    monkeypatch.setattr(Path, "stat", stat)
+
+
+@pytest.mark.parametrize("dated_s", DATES_S)
+def test_a_zip_is_whole_whatever_the_date_of_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dated_s: int
+) -> None:
+    folder = tmp_path / "20200101T000000Z-00000a"
+    folder.mkdir()
+    for name in FILES:
+        (folder / name).write_bytes(name.encode())
+    sealed = Sealed(folder, sha256_of(folder / "frames.parquet"))
+    date_files(monkeypatch, dated_s)
+    content = b"".join(zipped([sealed]))
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        assert file.testzip() is None
+        for entry in file.infolist():
+            assert entry.filename.split("/")[1] in FILES
+            years = entry.date_time[0]
+            assert 1980 <= years <= 2107
+            assert (years < 2000) == (dated_s < 946_684_800)
+
+
+@pytest.mark.parametrize("dated_s", DATES_S)
+def test_a_stored_file_is_sent_whatever_its_date(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dated_s: int
+) -> None:
+    path = tmp_path / "frames.parquet"
+    path.write_bytes(b"PAR1")
+    date_files(monkeypatch, dated_s)
+    answer = file_answer(path)
+    assert answer.headers["content-length"] == "4"
+    said = parsedate_to_datetime(answer.headers["last-modified"])
+    assert (said.year < 1970) == (dated_s < 0)
+
+
+def test_what_fails_before_the_first_byte_is_an_error_and_no_empty_file(
+    two: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zipfile.ZipFile, "open", refusing(OSError, errno.EIO, "Input/output error"))
+    answer = asked(two[0].running, two[0].id)
+    assert_refused(answer, 507, "Input/output error")
 
 
 def test_a_zip_has_the_very_files_and_they_are_proven(two: list[Recording], tmp_path: Path) -> None:

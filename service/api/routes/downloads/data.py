@@ -8,13 +8,12 @@ from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
 
 from devices.errors import StateError
 from service.api.problems import problem
-from service.api.routes.access import ServerState, has_it, present, problems
+from service.api.routes.access import ServerState, file_answer, has_it, present, problems
 from service.api.routes.downloads.data_query import DataQuery
 from service.api.routes.downloads.made import Chunks, known, made, said_of_marks, tag_of_made
 from service.server.server import Server
@@ -111,12 +110,8 @@ def _stored(
                 f"the range {wanted[:80]!r} is outside the file's {size} bytes",
                 {"Content-Range": f"bytes */{size}"},
             )
-    answer = FileResponse(
-        path,
-        headers=headers,
-        media_type=PARQUET.media_type,
-        filename=f"{session.id}.parquet",
-        stat_result=path.stat(),
+    answer = file_answer(
+        path, headers=headers, media_type=PARQUET.media_type, filename=f"{session.id}.parquet"
     )
     answer.chunk_size = _CHUNK
     return answer

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
+from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError, UnknownError, UsageError
 from service.api.routes.access import ServerState, present, problems
@@ -57,7 +58,10 @@ async def zip_sessions(
         "Content-Disposition": f'attachment; filename="{name}.zip"',
         "Cache-Control": "private, no-store",
     }
-    return StreamingResponse(sent(zipped(chosen)), headers=headers, media_type="application/zip")
+    pieces = zipped(chosen)
+    # The first piece now: what is wrong with it is then an answer, not a broken download.
+    first = await run_in_threadpool(next, pieces)
+    return StreamingResponse(sent(pieces, first), headers=headers, media_type="application/zip")
 
 
 def _sealed(session: Session, folder: Path) -> Sealed:

@@ -8,8 +8,9 @@ from itertools import islice, takewhile
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Response
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
+from devices.facts import check_new_name, check_new_text
 from service.api.routes.access import (
     CHANGED,
     FULL,
@@ -35,9 +36,17 @@ SETTLE_S = 5.0
 _UNKNOWN = problems(_404="No such session.", _409="Its files are damaged.")
 _NO_EVENT = problems(_404="No such session or event.", _409="Its files are damaged.")
 
-Name = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]
-Text = Annotated[str, StringConstraints(max_length=10_000)]
-Tag = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=100)]
+Name = Annotated[
+    str,
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=200),
+    AfterValidator(check_new_name),
+]
+Text = Annotated[str, StringConstraints(max_length=10_000), AfterValidator(check_new_text)]
+Tag = Annotated[
+    str,
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=100),
+    AfterValidator(check_new_name),
+]
 Tags = Annotated[tuple[Tag, ...], Field(max_length=50)]
 
 
@@ -77,7 +86,7 @@ class ChangeSession(_Body):
     """What people say of a session; what is left out stays."""
 
     name: Name | None = None
-    subject: Text | None = None
+    subject: Annotated[Text, AfterValidator(check_new_name)] | None = None
     notes: Text | None = None
     tags: Tags | None = None
 

@@ -1,0 +1,114 @@
+"""What a session is called never controls a terminal, and never forges a line of a report.
+
+Files may come from anywhere, so names in them are hostile whatever the server refuses today.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from service.cli.table import SUMMARIES
+from storage.journal.journal import Journal
+from storage.journal.stream_notes import StreamNotes
+from storage.sessions.folder import Event, Part, Session, SessionFolder
+from tests.builders.arrays import UTC_NS, make_array
+from tests.builders.frames import make_frames
+from tests.service.cli.outcome import Run
+
+ID = "20200101T000000Z-00000a"
+BOOT = "a" * 32
+FORGED = "FORGED: everything is whole"
+HOSTILE = (
+    f"walk\n{FORGED}\r\n{FORGED}\x1b[2J\x1b]0;title\x07\x9b31m\u202egnp\u200b\ufeff\u2028{FORGED}"
+)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A folder whose session has a hostile text wherever a text can be."""
+    root, info = tmp_path / "data", make_array(boot_id=BOOT)
+    folder = root / "journal" / "bench" / BOOT
+    journal = Journal(folder, info)
+    journal.append(make_frames(100, status=7))
+    journal.close()
+    StreamNotes(array_info=info, next_seq=100).save(folder)
+    kept = Session(
+        id=ID,
+        name=HOSTILE,
+        node="bench",
+        state="recording",
+        started_t_ns=UTC_NS,
+        parts=(Part(boot_id=BOOT, seq_first=0),),
+        scene="test",
+        subject=HOSTILE,
+        notes=HOSTILE,
+        tags=(HOSTILE,),
+        events=(Event(id="0" * 12, label=HOSTILE, t_ns=UTC_NS),),
+        take="20200101T000000Z-00000b",
+        problem=HOSTILE,
+    )
+    SessionFolder(root / "sessions").save(kept)
+    return root
+
+
+COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
+    "calibrate": ((ID, "--out", "cal.json"),),
+    "compare": ((ID, "--reference", "gone.csv", "--out", "o"),),
+    "estimate": ((ID, "--out", "x.parquet"),),
+    "export": (
+        (ID, "--format", "csv", "--out", "x.csv"),
+        (ID, "--format", "csv", "--out", f"gone{HOSTILE}/x.csv"),
+    ),
+    "node": (("--record", HOSTILE), ("--scene", HOSTILE), ("--name", HOSTILE)),
+    "query": (
+        ("SELECT name, tags FROM sessions",),
+        (f"SELECT '{HOSTILE}' AS \"{HOSTILE}\"",),
+        (HOSTILE,),
+    ),
+    "recover": ((),),
+    "sessions": ((), ("--node", HOSTILE), ("--from", HOSTILE)),
+    "verify": ((ID,), (), (HOSTILE,), ("--manifest", HOSTILE)),
+    # What these print of names is the user's own, or a scene's, which has to be one of a few words.
+    "bench": (("--scene", HOSTILE, "--out", "o"),),
+    "demo": (("--scene", HOSTILE),),
+    "doctor": (("--scene", HOSTILE),),
+    "domes": (("--family", HOSTILE),),
+    "pull": ((HOSTILE, "--out", "o", "--server", "http://127.0.0.1:1"),),
+    "reproduce": (("--out", "/dev/null/x" + HOSTILE),),
+    "serve": (("--host", HOSTILE),),
+    "simulate": (("--scene", HOSTILE, "--out", "x.parquet"),),
+    "stream": ((HOSTILE, "--server", "http://127.0.0.1:1"),),
+    "ticket": (("--server", HOSTILE),),
+}
+_IN_FOLDER = {"calibrate", "compare", "estimate", "export", "query", "sessions", "verify"}
+
+
+def test_every_command_is_tried() -> None:
+    assert set(COMMANDS) == set(SUMMARIES)
+
+
+@pytest.mark.parametrize("is_sealed", [False, True])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_name_controls_a_terminal_or_makes_a_line(
+    run: Run, data: Path, command: str, is_sealed: bool
+) -> None:
+    if is_sealed:
+        run("recover", data)
+    for arguments in COMMANDS[command]:
+        where = ("--data", data) if command in _IN_FOLDER else ()
+        if command == "recover":
+            where = (data,)
+        outcome = run(command, *arguments, *where)
+        for text in (outcome.out, outcome.err):
+            lines = text.split("\n")
+            assert [line for line in lines if not line.isprintable()] == []
+            assert [line for line in lines if line.lstrip(" │|").startswith("FORGED")] == []
+
+
+def test_json_keeps_the_name_as_it_is(run: Run, data: Path) -> None:
+    recovered = run("recover", data, "--json")
+    assert recovered.out.isascii()
+    assert json.loads(recovered.out)["sessions"][0]["name"] == HOSTILE
