@@ -52,6 +52,7 @@ interface Dressed {
 
 interface Overview {
   begin_t_ns: number; duration_s: number; frames_in_bin: number; serials: string[]; provisional?: boolean; behind?: boolean;
+  time_axis: { part: number; shift_ns: number; by: "node" | "server" | "joined" }[];
   columns: Record<string, (number | null)[]>;
 }
 

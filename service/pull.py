@@ -26,6 +26,7 @@ from storage.durable import (
     write_whole,
 )
 from storage.file_hash import sha256_of
+from storage.formats.export import ClockName
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
 from storage.formats.written.format import Format
@@ -120,6 +121,7 @@ def pull_made(
     part: Slice,
     to: Format,
     options: FormatOptions = NO_OPTIONS,
+    clock: ClockName = "node",
 ) -> dict[str, Any]:
     """Download a session, or some seconds or columns of it, in some format.
 
@@ -138,7 +140,8 @@ def pull_made(
         StorageError: it cannot be written.
     """
     session = _facts(server, session_id)
-    path = _pull_made(server, f"/sessions/{session_id}/data", session_id, out, part, to, options)
+    url = f"/sessions/{session_id}/data"
+    path = _pull_made(server, url, session_id, out, part, to, options, clock)
     return {**session, "path": str(path), "bytes": path.stat().st_size}
 
 
@@ -175,6 +178,7 @@ def _pull_made(
     part: Slice,
     to: Format,
     options: FormatOptions,
+    clock: ClockName | None = None,
 ) -> Path:
     refuse_data_folder(out)
     with storage_errors(out):
@@ -182,7 +186,7 @@ def _pull_made(
     end = "end" if part.end_s is None else f"{part.end_s:g}s"
     path = out / f"{stem}_{part.start_s or 0.0:g}s-{end}.{to.ending}"
     query: dict[str, object] = {"format": to.name, "start_s": part.start_s, "end_s": part.end_s}
-    query["columns"] = ",".join(part.columns) or None
+    query["columns"], query["clock"] = ",".join(part.columns) or None, clock
     query |= options.model_dump(mode="json")
     # Under a name of its own until it is proven: who is cut off begins anew.
     partial = temporary_of(path)

@@ -132,6 +132,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     with SessionReader(path) as session:
         columns, force_n = _columns(session)
         marks, notes = _marks(session, path, columns)
+        notes += [remark] if (remark := session.axis.remark()) else []
         tiles, identity = session.info.tiles, session.identity
     known = np.isfinite(columns["grf_n"])
     if not known.any():
@@ -180,7 +181,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
 
 
 def _columns(session: SessionReader) -> tuple[Columns, Floats]:
-    """What is compared, in order of time, and the forces of the tiles."""
+    """What is compared, `t_ns` on the session's time axis, and the forces of the tiles."""
     wanted = [*COMPARED, "force_n"]
     if absent := [name for name in wanted if not session.has(name)]:
         raise FileFormatError(
@@ -196,12 +197,13 @@ def _columns(session: SessionReader) -> tuple[Columns, Floats]:
     if not pieces:
         raise FileFormatError("the session has no frames", where=str(session.path))
     columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in wanted}
+    columns["t_ns"] = session.axis.at(columns["t_ns"], columns.get("part"))
     if (np.diff(columns["t_ns"]) <= 0).any():
         raise ComparisonError(
-            "the session's clock was set back while it was recorded",
+            "time runs back within a part of the session",
             where=str(session.path),
             expected="frames whose t_ns rises",
-            remedy="Compare a part of it: foottile export --start-s --end-s",
+            remedy="See what is wrong with it: foottile verify",
         )
     force_n = columns.pop("force_n").astype(np.float64)
     columns["grf_n"] = columns["grf_n"].astype(np.float64)
@@ -237,7 +239,7 @@ def _clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:
 
 
 def _server_offset(path: Path, at_ns: int) -> tuple[int, int] | None:
-    """The server's time less the node's in ns, and its bound, at the frame nearest to then."""
+    """The server's time less that of the session's axis, and its bound, at the frame nearest."""
     with SessionReader(path) as session:
         try:
             clock = clock_beside(session)
@@ -246,16 +248,18 @@ def _server_offset(path: Path, at_ns: int) -> tuple[int, int] | None:
         wanted = ("t_mono_ns", "t_ns", *(("part",) if session.has("part") else ()))
         nearest: dict[str, npt.NDArray[Any]] | None = None
         for piece in session.columns(*wanted):
-            row = int(np.argmin(np.abs(piece["t_ns"] - at_ns)))
+            piece["axis_ns"] = session.axis.at(piece["t_ns"], piece.get("part"))
+            row = int(np.argmin(np.abs(piece["axis_ns"] - at_ns)))
             one = {name: values[row : row + 1] for name, values in piece.items()}
-            if nearest is None or abs(one["t_ns"][0] - at_ns) < abs(nearest["t_ns"][0] - at_ns):
+            apart_ns = abs(int(one["axis_ns"][0]) - at_ns)
+            if nearest is None or apart_ns < abs(int(nearest["axis_ns"][0]) - at_ns):
                 nearest = one
     assert nearest is not None  # noqa: S101  # both have been compared
     said = clock.columns(nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part"))
     server_ns = int(said["t_server_ns"][0])
     if server_ns == NO_INSTANT:
         return None
-    return server_ns - int(nearest["t_ns"][0]), int(said["t_server_uncertainty_ns"][0])
+    return server_ns - int(nearest["axis_ns"][0]), int(said["t_server_uncertainty_ns"][0])
 
 
 def _reference(data: ReferenceData, begin_ns: int, cop_offset_m: tuple[float, float]) -> Reference:

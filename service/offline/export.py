@@ -43,6 +43,8 @@ class Exported:
     """Marks that are at no frame."""
     lacks_marks: bool
     """Nothing lies beside the frames that would say what was marked."""
+    remarks: tuple[str, ...]
+    """What a person should know of the time axes."""
 
 
 def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
@@ -113,4 +115,9 @@ def _written(
         for chunk in chunks:
             file.write(chunk)
     left_out = [mark for export in exports if export.marks for mark in export.marks.left_out]
-    return Exported(out.stat().st_size, tuple(left_out), lacks_marks)
+    remarks = [
+        f"{export.called}: {remark}"
+        for export in exports
+        if (remark := export.content.axis.remark())
+    ]
+    return Exported(out.stat().st_size, tuple(left_out), lacks_marks, tuple(remarks))

@@ -20,6 +20,7 @@ from storage.formats.export import Content, content_of
 from storage.formats.slice import Slice
 from storage.intervals import NO_END
 from storage.schema import ROUNDED_TO
+from storage.sessions.time_axis import NODE_AXIS
 
 Pieces = Iterator[tuple[FrameBatch, Columns]]
 
@@ -42,6 +43,7 @@ class FramesSoFar:
         self._places = so_far.places(sources)
         self._sources = sources
         self._part = part
+        self._axis = NODE_AXIS
 
     def content(self) -> Content:
         """Its frames, with estimates if there are any; the first of them are read.
@@ -52,6 +54,7 @@ class FramesSoFar:
         first = next(raw_from(self._sources), None)
         if first is None:
             raise UsageError("the session has no frames")
+        self._axis = self._sources.time_axis()
         span_ns = int(first[0].t_ns[0]), self._latest_ns()
         begin_ns, end_ns = self._part.bounds_ns(span_ns[0])
         legs = self._legs(begin_ns, end_ns)
@@ -59,15 +62,20 @@ class FramesSoFar:
         some = next(pieces, None)
         if some is None:  # none is of that time: then these say which columns there are
             some = next(self._run(0, 1, None))
-        return content_of(chain((some,), pieces), span_ns)
+        return content_of(chain((some,), pieces), span_ns, self._axis)
 
     def _legs(self, begin_ns: int | None, end_ns: int | None) -> list[tuple[int, int]]:
         """Between which places are frames of some time? Behind the last one is what follows."""
         newest = len(self._places) - 1
-        wanted = [at for at in range(newest) if self._places[at].overlaps(begin_ns, end_ns)]
+        wanted = [
+            at
+            for at, place in enumerate(self._places[:newest])
+            if place.left < self._places[at + 1].left
+            and self._axis.may_overlap(place.begin_ns, place.end_ns, begin_ns, end_ns)
+        ]
         last = self._places[newest].last
         # Those that wait there are younger than the last one that does not, or of a later part.
-        if end_ns is None or last is None or min(last[1], self._begins_ns(last[0] + 1)) < end_ns:
+        if end_ns is None or last is None or self._is_before(*last, end_ns):
             wanted.append(newest)
         legs: list[tuple[int, int]] = []
         for at in wanted:
@@ -95,30 +103,35 @@ class FramesSoFar:
             part = int(columns["part"][-1])
             if count <= 0:
                 return
-            if (
-                end_ns is not None
-                and min(int(frames.t_ns[-1]), self._begins_ns(part + 1)) >= end_ns
-            ):
+            if end_ns is not None and not self._is_before(part, int(frames.t_ns[-1]), end_ns):
                 return
 
+    def _is_before(self, part: int, t_ns: int, end_ns: int) -> bool:
+        """Whether a frame, or a later one than it, may be before an instant of the time axis."""
+        return min(t_ns + self._axis.shift_ns(part), self._begins_ns(part + 1)) < end_ns
+
     def _begins_ns(self, number: int) -> int:
-        """No frame of this part, nor of a later one, is older than that."""
+        """No frame of this part, nor of a later one, is older than that on the time axis."""
         begins = [
-            journal.t_ns_near(part.seq_first, newest=False)
-            for part in self._sources.session.parts[number:]
-            if (journal := self._sources.journals.get(part.boot_id)) is not None
+            t_ns + self._axis.shift_ns(at)
+            for at, part in enumerate(self._sources.session.parts)
+            if at >= number
+            and (journal := self._sources.journals.get(part.boot_id)) is not None
+            and (t_ns := journal.t_ns_near(part.seq_first, newest=False)) is not None
         ]
-        return min((t_ns for t_ns in begins if t_ns is not None), default=NO_END)
+        return min(begins, default=NO_END)
 
     def _latest_ns(self) -> int:
-        """`t_ns` of the youngest frame."""
+        """Instant of the youngest frame on the time axis."""
         latest = -NO_END
-        for part in self._sources.session.parts:
+        for number, part in enumerate(self._sources.session.parts):
             journal = self._sources.journals.get(part.boot_id)
             end = NO_END if part.seq_last is None else part.seq_last
             last = None if journal is None else journal.held.within(part.seq_first, end).last
             if journal is not None and last is not None:
-                latest = max(latest, *(int(f.t_ns[-1]) for f in journal.read(last, last)))
+                shift_ns = self._axis.shift_ns(number)
+                ends_ns = (int(f.t_ns[-1]) + shift_ns for f in journal.read(last, last))
+                latest = max(latest, *ends_ns)
         return latest
 
 

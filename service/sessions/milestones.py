@@ -55,11 +55,6 @@ class Milestone:
     begin_ns: int = _EVER_NS
     end_ns: int = -_EVER_NS
 
-    def overlaps(self, begin_ns: int | None, end_ns: int | None) -> bool:
-        """Are there frames of some time until the next place?"""
-        begins_before = end_ns is None or self.begin_ns < end_ns
-        return begins_before and (begin_ns is None or self.end_ns >= begin_ns)
-
 
 class Milestones:
     """Those of one session, in their order. One thread adds; any may read.

@@ -35,8 +35,10 @@ from storage.sessions.pyramid import (
     frame_columns,
     joined,
     merged,
+    on_axis,
 )
 from storage.sessions.reader import SessionReader
+from storage.sessions.time_axis import TimeAxis
 
 log = logging.getLogger("foottile.overview")
 
@@ -92,16 +94,18 @@ class Seen:
     """Some time of a session as bins.
 
     Attributes:
-        bins: of `storage.sessions.pyramid`, in the order of the file.
+        bins: of `storage.sessions.pyramid`, in the order of the file, instants on the time axis.
         frames_in_bin: how many frames a bin stands for: 1, these are the frames themselves.
         begin_ns: `t_ns` of the session's first frame.
-        end_ns: of its last.
+        end_ns: last instant on the axis.
+        axis: the session's time axis.
     """
 
     bins: Bins
     frames_in_bin: int
     begin_ns: int
     end_ns: int
+    axis: TimeAxis
 
 
 def overview_of_session(
@@ -126,18 +130,22 @@ def overview_of_session(
     bounds = part.bounds_ns(begin_ns)
     try:
         with open_overview(path) as kept:
-            found = _of_levels(kept, frames_sha256, bounds, points)
+            found = _of_levels(kept, frames_sha256, bounds, points, session.axis)
     except (FileNotFoundError, FileFormatError, StorageError):
         with _made(path, session, frames_sha256) as made:
-            found = _of_levels(made, frames_sha256, bounds, points)
+            found = _of_levels(made, frames_sha256, bounds, points, session.axis)
     if isinstance(found, int):
         found = _of_frames(session, part, begin_ns, points, found)
     bins, size = found
-    return Seen(bins, size, begin_ns, end_ns)
+    return Seen(bins, size, begin_ns, end_ns, session.axis)
 
 
 def _of_levels(
-    overview: Overview, frames_sha256: str, bounds: tuple[int | None, int | None], points: int
+    overview: Overview,
+    frames_sha256: str,
+    bounds: tuple[int | None, int | None],
+    points: int,
+    axis: TimeAxis,
 ) -> tuple[Bins, int] | int:
     """Bins of the coarsest level that has enough, and of how many frames each is.
 
@@ -149,11 +157,11 @@ def _of_levels(
     if overview.index.frames_sha256 != frames_sha256:
         raise DamagedFileError("is of other frames")
     for level in reversed(range(overview.index.levels)):
-        if overview.count(level, *bounds) >= points:
-            bins = overview.bins(level, *bounds)
+        if overview.count(level, *bounds, axis) >= points:
+            bins = overview.bins(level, *bounds, axis)
             if len(bins["part"]) >= points:
                 return bins, ROWS * FACTOR**level
-    return ROWS * len(overview.bins(0, *bounds)["part"])
+    return ROWS * len(overview.bins(0, *bounds, axis)["part"])
 
 
 def _of_frames(
@@ -172,7 +180,7 @@ def _of_frames(
     last: tuple[int, int] | None = None
     groups = session.groups_within(*part.bounds_ns(begin_ns))
     for piece in session.columns(*names, groups=groups, values_max=_VALUES_MAX):
-        inside = part.rows(piece["t_ns"], begin_ns)
+        inside = part.rows(session.axis.at(piece["t_ns"], piece.get("part")), begin_ns)
         frames = {name: values[inside] for name, values in piece.items()}
         if not len(frames["seq"]):
             continue
@@ -180,7 +188,7 @@ def _of_frames(
         before = last[1] if last is not None and last[0] == of else None
         found.append(bins_of_frames(frames, before))
         last = int(frames["part"][-1]) if "part" in frames else 0, int(frames["seq"][-1])
-    bins = joined([{name: piece[name] for name in types} for piece in found])
+    bins = on_axis(joined([{name: piece[name] for name in types} for piece in found]), session.axis)
     return (bins if size == 1 else merged(bins, size)), size
 
 

@@ -22,7 +22,7 @@ from service.sessions.milestones import Milestone, Milestones, stream_of
 from service.sessions.overview import Seen
 from service.sessions.sources import Sources
 from storage.formats.slice import Slice
-from storage.sessions.pyramid import frame_columns
+from storage.sessions.pyramid import frame_columns, on_axis
 from storage.sessions.so_far import BinsSoFar, thinned
 
 AT_ONCE_S = 0.5
@@ -132,15 +132,18 @@ class SoFar:
 
         Raises:
             StateError: there is no frame yet.
+            FootTileError: a journal is damaged, or cannot be read.
         """
         bins = self._bins.bins()
         if bins is None:
             raise StateError(
                 f"session {self._sources.session.id} has no frames yet", remedy="Ask again"
             )
+        axis = self._sources.time_axis()
+        bins = on_axis(bins, axis)
         begin_ns, end_ns = int(bins["t_first_ns"][0]), int(bins["t_last_ns"].max())
         found, count = thinned(bins, *part.bounds_ns(begin_ns), 4 * points)
-        return Seen(found, count * self._bins.frames_in_bin, begin_ns, end_ns)
+        return Seen(found, count * self._bins.frames_in_bin, begin_ns, end_ns, axis)
 
     def _feed(self, frames: FrameBatch, extra: Columns) -> None:
         """Take the next frames."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from devices.errors import FootTileError
-from devices.frames import ArrayInfo
+from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
 from service.sessions.ends import RATE_MAX_HZ, SessionStream
@@ -19,6 +19,7 @@ from storage.intervals import NO_END
 from storage.journal.journal import Journal
 from storage.sessions.folder import Session
 from storage.sessions.ledger import lost_numbers, states_of
+from storage.sessions.time_axis import NODE_AXIS, PartSpan, TimeAxis, time_axis
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,34 @@ class Sources:
         where = f"session {self.session.id}"
         rows = rows_by_stream(self.session.clock, where=where)
         return ClockTable(rows, self.streams, parts, where=where)
+
+    def time_axis(self) -> TimeAxis:
+        """Find the time axis of a session that is not sealed yet, by what there is of it.
+
+        Raises:
+            FootTileError: a journal is damaged, or cannot be read.
+        """
+        parts = self.session.parts
+        if len({part.boot_id for part in parts}) < 2:
+            return NODE_AXIS
+        spans = []
+        for number, part in enumerate(parts):
+            journal = self.journals.get(part.boot_id)
+            if journal is None:
+                continue
+            end = NO_END if part.seq_last is None else part.seq_last
+            held = journal.held.within(part.seq_first, end)
+            if held.first is None or held.last is None:
+                continue
+            first, last = (
+                FrameBatch.concatenate(list(journal.read(seq, seq)))
+                for seq in (held.first, held.last)
+            )
+            t_mono_ns = int(first.t_mono_ns[0]), int(last.t_mono_ns[-1])
+            t_ns = int(first.t_ns[0]), int(last.t_ns[-1])
+            spans.append(PartSpan(number, part.boot_id, t_mono_ns, t_ns))
+        period_ns = round(1e9 / self.info.nominal_rate_hz)
+        return time_axis(spans, self.clock_table(), period_ns=period_ns)
 
 
 def sources_of(

@@ -66,7 +66,8 @@ def overlay_of_session(
     gathered = StanceOverlay(part, begin_ns, end_ns, points=points, rows=rows.tolist())
     if taken.num_rows:
         names = ("t_ns", *OVERLAID, *(("part",) if session.has("part") else ()))
-        groups = session.groups_within(int(begin_ns.min()), int(end_ns.max()) + 1)
+        begins_ns, ends_ns = (session.axis.at(t_ns, part) for t_ns in (begin_ns, end_ns))
+        groups = session.groups_within(int(begins_ns.min()), int(ends_ns.max()) + 1)
         for piece in session.columns(*names, groups=groups):
             gathered.feed(piece["t_ns"].astype(np.int64), piece)
     overlay = gathered.finish()

@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pyarrow as pa
 
+from devices.arrays import Times
 from devices.errors import UsageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
@@ -35,6 +36,7 @@ from storage.schema import (
 )
 from storage.sessions.file import EXPORT_KEY
 from storage.sessions.footer import NOTES_KEY
+from storage.sessions.time_axis import NODE_AXIS, TIME_AXIS_NOTE, TimeAxis
 
 ClockName = Literal["node", "server"]
 CLOCKS: tuple[ClockName, ...] = get_args(ClockName)
@@ -57,25 +59,29 @@ class Content:
         names: its quantities, of `storage.schema.KNOWN`, in the order of their columns.
         read: gives these flat columns, and others if it likes, of frames in order.
         begin_t_ns: `t_ns` of the session's first frame.
-        end_t_ns: the latest `t_ns`; None: `read` gives the session from its first frame to its
-            last, not only where the slice is, and gives it once.
+        end_t_ns: the latest instant on the time axis; None: `read` gives the session from its
+            first frame to its last, not only where the slice is, and gives it once.
+        axis: the session's time axis.
     """
 
     names: Sequence[str]
     read: Callable[[Sequence[str]], Iterable[Flat]]
     begin_t_ns: int
     end_t_ns: int | None = None
+    axis: TimeAxis = NODE_AXIS
 
 
 def content_of(
     pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]],
     span_ns: tuple[int, int] | None = None,
+    axis: TimeAxis = NODE_AXIS,
 ) -> Content:
     """The content of a session of which frames are given; the first of them are read.
 
     Args:
         pieces: frames with their further columns, in order.
-        span_ns: `t_ns` of the session's first frame, and the latest; None: these are all frames.
+        span_ns: first and last instant on the session's time axis; None: these are all frames.
+        axis: the session's time axis.
 
     Raises:
         UsageError: there are no frames.
@@ -87,7 +93,7 @@ def content_of(
     names = [column.name for column in FRAMES] + list(first[1])
     flat = (_flat(frames, extra) for frames, extra in chain((first,), there))
     begin_t_ns, end_t_ns = span_ns or (int(first[0].t_ns[0]), None)
-    return Content(names, lambda _: flat, begin_t_ns, end_t_ns)
+    return Content(names, lambda _: flat, begin_t_ns, end_t_ns, axis)
 
 
 @dataclass(frozen=True)
@@ -133,6 +139,8 @@ class Export:
             "columns": list(part.columns),
         }
         chosen["clock"] = "node" if self.clock is None else "server"
+        if self.content.axis.is_shifted:
+            chosen[TIME_AXIS_NOTE] = self.content.axis.as_dicts()
         has_server_time = self.clock is not None
         facts = facts_of(self.notes, self.source, has_server_time=has_server_time)
         return {**self.source, "node": self.info.node, **chosen, **facts}
@@ -167,6 +175,14 @@ class Export:
             return chosen
         return {name: of for name, of in chosen.items() if of not in _TIME_NAMES}
 
+    def at_ns(self, columns: Mapping[str, Array]) -> Times:
+        """Return instants of frames on the session's time axis, int64[n].
+
+        Args:
+            columns: `t_ns`, and `part` if the session has parts.
+        """
+        return self.content.axis.at(columns["t_ns"], columns.get("part"))
+
     def pieces(self, columns: Sequence[str] = ()) -> Iterator[dict[str, Array]]:
         """Flat columns of the slice's frames, in pieces of some thousand rows.
 
@@ -185,22 +201,22 @@ class Export:
         end_t_ns = content.begin_t_ns if content.end_t_ns is None else content.end_t_ns
         header: dict[str, Array] | None = None
         has_rows = False
-        for flat in content.read(_needed(chosen, made, content.names)):
-            t_ns = flat["t_ns"]
+        has_parts = bool(made) or content.axis.is_shifted
+        for flat in content.read(_needed(chosen, made, content.names, has_parts=has_parts)):
+            at_ns = self.at_ns(flat)
             if content.end_t_ns is None:
-                end_t_ns = max(end_t_ns, int(t_ns.max()))
-            values = _of_rows(flat, self.part.rows(t_ns, content.begin_t_ns))
+                end_t_ns = max(end_t_ns, int(at_ns.max()))
+            values = _of_rows(flat, self.part.rows(at_ns, content.begin_t_ns))
             if self.clock is not None:
                 times = (values["t_mono_ns"], values["t_ns"], values.get("part"))
                 values |= self.clock.columns(*times)
             if self.marks is not None:
                 values["event"] = self.marks.column(values["seq"], values.get("part"))
-            t_ns = values["t_ns"]
-            values["time_s"] = (t_ns - content.begin_t_ns) * 1e-9
-            values["time_utc"] = t_ns.view("datetime64[ns]")
+            values["time_s"] = (self.at_ns(values) - content.begin_t_ns) * 1e-9
+            values["time_utc"] = values["t_ns"].view("datetime64[ns]")
             piece = {name: values[name] for name in chosen}
             header = header or piece
-            if len(t_ns):
+            if len(values["t_ns"]):
                 has_rows = True
                 yield piece
         if has_rows or header is None:
@@ -248,7 +264,7 @@ class Export:
             left -= len(piece["t_ns"])
             pieces.append(piece)
             if left < 0:
-                fits_ns = int(piece["t_ns"][left]) - self.content.begin_t_ns
+                fits_ns = int(self.at_ns(piece)[left]) - self.content.begin_t_ns
                 start_s, end_s = self.part.start_s or 0.0, np.floor(fits_ns * 1e-6) * 1e-3
                 raise UsageError(
                     f"there are more than {frames_max} frames, the limit of this format",
@@ -298,9 +314,11 @@ def _of_rows(flat: Flat, rows: Array) -> dict[str, Array]:
     return {name: value[at] for name, value in flat.items()}
 
 
-def _needed(chosen: Mapping[str, str], made: Sequence[str], names: Sequence[str]) -> list[str]:
+def _needed(
+    chosen: Mapping[str, str], made: Sequence[str], names: Sequence[str], *, has_parts: bool
+) -> list[str]:
     """Columns to read: those chosen, and those by which rows are found and others made."""
-    by = ["t_ns", *(("t_mono_ns", "seq", "part") if made else ())]
+    by = ["t_ns", *(("t_mono_ns", "seq") if made else ()), *(("part",) if has_parts else ())]
     read = [name for name, of in chosen.items() if of not in (*made, *_TIME_NAMES)]
     return list(dict.fromkeys([*read, *(name for name in by if name in names)]))
 

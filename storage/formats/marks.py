@@ -17,6 +17,7 @@ from storage.clock.table import ClockTable
 from storage.formats.slice import Slice
 from storage.schema import NO_INSTANT, Array
 from storage.sessions.folder import Event
+from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 NEAREST_NS = 1_000_000_000
 """A mark further from every frame than this stands at none of them."""
@@ -101,6 +102,7 @@ def place(
     clock: ClockTable,
     part: Slice,
     begin_t_ns: int | None = None,
+    axis: TimeAxis = NODE_AXIS,
 ) -> Marks:
     """Find the frame of every event.
 
@@ -111,6 +113,7 @@ def place(
         clock: of the session.
         part: the slice that is wanted; a mark whose frame is not in it is left out.
         begin_t_ns: instant of the session's first frame; None: the first that comes.
+        axis: of the session.
 
     Returns:
         The marks. Of two frames that are as near the earlier one has it.
@@ -122,7 +125,8 @@ def place(
             continue
         begin_t_ns = int(piece["t_ns"][0]) if begin_t_ns is None else begin_t_ns
         times = clock.columns(piece["t_mono_ns"], piece["t_ns"], piece.get("part"))
-        nearest.look_at(piece, times, part.rows(piece["t_ns"], begin_t_ns))
+        at_ns = axis.at(piece["t_ns"], piece.get("part"))
+        nearest.look_at(piece, times, part.rows(at_ns, begin_t_ns))
     return Marks([nearest.mark(i, event) for i, event in enumerate(ordered)])
 
 

@@ -109,12 +109,15 @@ def read_session(path: Path, named: Collection[str]) -> Table | None:
         return None
     with SessionReader(path) as reader:
         single = [name for name in KNOWN if not KNOWN[name].per_tile and reader.has(name)]
-        wanted = [name for name in ("t_ns", *OURS, *sorted(named)) if name in single]
+        wanted = [name for name in ("t_ns", "part", *OURS, *sorted(named)) if name in single]
         pieces = list(reader.columns(*dict.fromkeys(wanted)))
+        axis = reader.axis
     if not pieces:
         raise FileFormatError("the session has no frames", where=where)
     joined = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
-    t_ns = joined.pop("t_ns")
+    t_ns = axis.at(joined.pop("t_ns"), joined.get("part"))
+    if "part" not in named:
+        joined.pop("part", None)
     columns = {name: values.astype(np.float64) for name, values in joined.items()}
     columns["time_s"] = (t_ns - t_ns[0]) * 1e-9
     return Table(where, tuple(single), columns, frozenset(columns), epoch_ns=int(t_ns[0]))

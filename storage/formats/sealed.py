@@ -36,7 +36,7 @@ def marks_of(reader: SessionReader, events: Sequence[Event], part: Slice) -> Mar
         return Marks([Mark(event, left_out=error.what) for event in events])
     names = (*TIMES, "part") if reader.has("part") else TIMES
     pieces = reader.columns(*names, groups=_near(reader, clock, events))
-    return place(events, pieces, clock, part, reader.span_ns()[0])
+    return place(events, pieces, clock, part, reader.span_ns()[0], reader.axis)
 
 
 def _near(reader: SessionReader, clock: ClockTable, events: Sequence[Event]) -> list[int]:
@@ -92,7 +92,9 @@ def export_of(
     bounds_ns = part.bounds_ns(begin_t_ns)
     names = [*(column.name for column in FRAMES), *extra]
     return Export(
-        Content(names, lambda flat: reader.flat(flat, *bounds_ns), begin_t_ns, end_t_ns),
+        Content(
+            names, lambda flat: reader.flat(flat, *bounds_ns), begin_t_ns, end_t_ns, reader.axis
+        ),
         reader.info,
         reader.notes,
         part,

@@ -70,7 +70,7 @@ class Slice:
         """Which frames are in it, bool[n].
 
         Args:
-            t_ns: int64[n], instants of frames.
+            t_ns: int64[n], instants of frames on the session's time axis.
             begin_t_ns: instant of the session's first frame.
         """
         start_ns, end_ns = self.bounds_ns(begin_t_ns)

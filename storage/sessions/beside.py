@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pyarrow as pa
 from pydantic import TypeAdapter
@@ -13,7 +14,9 @@ from storage.checked_table import read_table, write_table
 from storage.clock.file import CLOCK_NAME, read_clock
 from storage.clock.table import ClockTable, StreamFacts
 from storage.sessions.folder import Event, Session
-from storage.sessions.reader import SessionReader
+
+if TYPE_CHECKING:
+    from storage.sessions.reader import SessionReader
 
 EVENTS_NAME = "events.parquet"
 
@@ -80,13 +83,17 @@ def clock_beside(reader: SessionReader) -> ClockTable:
     stored, info = read_clock(path), reader.info
     facts = dict(stored.facts)
     facts.setdefault(info.boot_id, StreamFacts(info.boot_id, info.utc_offset_ns, info.clock_set))
-    parts = _parts(reader)
+    parts = stream_ids(reader)
     streams = [facts.get(boot_id, StreamFacts(boot_id)) for boot_id in dict.fromkeys(parts)]
     return ClockTable(stored.rows, streams, parts, where=str(path))
 
 
-def _parts(reader: SessionReader) -> list[str]:
-    """Streams by number of part; a file that was never recorded has one part."""
+def stream_ids(reader: SessionReader) -> list[str]:
+    """Return the streams by number of part; a file that was never recorded has one part.
+
+    Raises:
+        FileFormatError: the session's notes are damaged.
+    """
     session = reader.notes.get("session")
     if session is None:
         return [reader.info.boot_id]

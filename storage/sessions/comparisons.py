@@ -36,7 +36,7 @@ ROWS_MAX = 2_500_000
 """Of a series: more would not be read at once (`storage.durable.BYTES_MAX`)."""
 
 SERIES = (
-    Column("t_ns", pa.int64(), "ns", "of our frame"),
+    Column("t_ns", pa.int64(), "ns", "of our frame, on the session's time axis"),
     Column("grf_n", _F32, "N", "ours"),
     Column("reference_grf_n", _F32, "N", "of the reference at our frame; less its zero if asked"),
     Column("reference_cop_x_m", _F32, "m", "of the reference where it bears load, forward"),

@@ -30,6 +30,7 @@ from storage.file_hash import (
 )
 from storage.schema import ARRAY_INFO_KEY, array_info
 from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, content_hash
+from storage.sessions.time_axis import TimeAxis
 
 NOTES_KEY = b"foottile.notes"
 _MAGIC = b"PAR1"
@@ -51,7 +52,8 @@ class Footer:
         size_bytes: length of the footer.
         is_proven: is it what was sealed, by a hash of its own?
         is_whole: was every byte of the file held against its hash?
-        span_ns: `t_ns` of the first frame, and the latest of all; None: not looked for yet.
+        span_ns: first and last instant on the session's time axis; None: not looked for yet.
+        axis: the session's time axis; None: not looked for yet.
     """
 
     def __init__(
@@ -118,6 +120,7 @@ class Footer:
         if not self.frame_count:
             raise FileFormatError("the session has no frames", where=where)
         self.span_ns: tuple[int, int] | None = None
+        self.axis: TimeAxis | None = None
         self._extremes: dict[str, list[tuple[int, int] | None]] = {}
 
     def prove(self, path: Path, *, only_slices: bool) -> None:

@@ -22,7 +22,8 @@ import pyarrow as pa
 
 from devices.errors import DamagedFileError
 from storage.durable import open_own, read_errors, whole_file
-from storage.sessions.pyramid import FACTOR, ROWS, Bins, bin_columns, joined
+from storage.sessions.pyramid import FACTOR, ROWS, Bins, bin_columns, joined, on_axis
+from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 OVERVIEW_NAME = "overview.arrow"
 _KEY, _CHECK_KEY = b"foottile.overview", b"foottile.overview_sha256"
@@ -225,20 +226,38 @@ class Overview:
         """Close the file."""
         self._source.close()
 
-    def count(self, level: int, begin_ns: int | None, end_ns: int | None) -> int:
+    def count(
+        self,
+        level: int,
+        begin_ns: int | None,
+        end_ns: int | None,
+        axis: TimeAxis = NODE_AXIS,
+    ) -> int:
         """About how many bins of a level lie in some time: all of the pieces that do."""
-        return sum(self.index.pieces[i].bins for i in self._within(level, begin_ns, end_ns))
+        return sum(self.index.pieces[i].bins for i in self._within(level, begin_ns, end_ns, axis))
 
-    def bins(self, level: int, begin_ns: int | None, end_ns: int | None) -> Bins:
-        """The bins of a level that have frames from one instant on and before another.
+    def bins(
+        self,
+        level: int,
+        begin_ns: int | None,
+        end_ns: int | None,
+        axis: TimeAxis = NODE_AXIS,
+    ) -> Bins:
+        """Return the bins of a level that have frames of some time, instants on the time axis.
+
+        Args:
+            level: 0 is the finest.
+            begin_ns: first instant on the axis; None: no bound.
+            end_ns: behind the last; None: no bound.
+            axis: of the session.
 
         Raises:
             DamagedFileError: a piece is damaged.
         """
         types = bin_columns(self.index.tiles, estimated=self.index.estimated)
         found = [{name: np.empty(0, type_) for name, type_ in types.items()}]
-        for i in self._within(level, begin_ns, end_ns):
-            piece = self._piece(i, list(types))
+        for i in self._within(level, begin_ns, end_ns, axis):
+            piece = on_axis(self._piece(i, list(types)), axis)
             rows = np.ones(len(piece["part"]), dtype=np.bool_)
             if begin_ns is not None:
                 rows &= piece["t_last_ns"] >= begin_ns
@@ -247,13 +266,14 @@ class Overview:
             found.append({name: values[rows] for name, values in piece.items()})
         return joined(found)
 
-    def _within(self, level: int, begin_ns: int | None, end_ns: int | None) -> list[int]:
+    def _within(
+        self, level: int, begin_ns: int | None, end_ns: int | None, axis: TimeAxis
+    ) -> list[int]:
         return [
             i
             for i, piece in enumerate(self.index.pieces)
             if piece.level == level
-            and (begin_ns is None or piece.end_ns >= begin_ns)
-            and (end_ns is None or piece.begin_ns < end_ns)
+            and axis.may_overlap(piece.begin_ns, piece.end_ns, begin_ns, end_ns)
         ]
 
     def _piece(self, i: int, names: list[str]) -> Bins:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from devices.frames import NOT_READ
 from storage.schema import CONTACT_UNKNOWN, Array
+from storage.sessions.time_axis import TimeAxis
 
 ROWS = 64
 """Frames of a bin of the finest level that is kept."""
@@ -178,6 +179,12 @@ def _joined_at(bins: Bins, starts: npt.NDArray[np.intp]) -> Bins:
 def joined(pieces: list[Bins]) -> Bins:
     """One after the other."""
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+def on_axis(bins: Bins, axis: TimeAxis) -> Bins:
+    """Return bins with their instants on the session's time axis."""
+    names = ("t_first_ns", "t_last_ns")
+    return bins | {name: axis.at(bins[name], bins["part"]) for name in names}
 
 
 class Pyramid:

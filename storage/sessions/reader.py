@@ -12,14 +12,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from devices.errors import FileFormatError
+from devices.errors import DamagedFileError, FileFormatError, UsageError
 from devices.frames import FrameBatch
 from storage.file_hash import FILE_HASH_KEY, FORMAT
 from storage.schema import FRAMES, KNOWN, Array, flat_of, flat_values, from_flat
+from storage.sessions.beside import clock_beside, stream_ids
 from storage.sessions.footer import Footer, stamps_of
+from storage.sessions.time_axis import NODE_AXIS, TIME_AXIS_NOTE, PartSpan, TimeAxis, time_axis
 
 _PIECE_VALUES = 1 << 20
 _PIECE_ROWS_MIN = 1024
@@ -142,13 +145,31 @@ class SessionReader:
                     values = {name: from_flat(KNOWN[name], table, tiles) for name in wanted}
                 yield values
 
+    @property
+    def axis(self) -> TimeAxis:
+        """The session's time axis.
+
+        Raises:
+            FileFormatError: as for `batches`.
+        """
+        if self.footer.axis is None:
+            self.footer.axis = self._time_axis()
+        return self.footer.axis
+
     def span_ns(self) -> tuple[int, int]:
-        """`t_ns` of the first frame, and the latest `t_ns` of all.
+        """`t_ns` of the first frame, and the last instant, both on the session's time axis.
 
         Raises:
             FileFormatError: as for `batches`.
         """
         if self.footer.span_ns is not None:
+            return self.footer.span_ns
+        if self.axis.is_shifted:
+            on_axis = [
+                [t_ns + self.axis.shift_ns(span.number) for t_ns in span.t_ns]
+                for span in self._part_spans()
+            ]
+            self.footer.span_ns = on_axis[0][0], max(last for _, last in on_axis)
             return self.footer.span_ns
         first, *_ = self._tables(0, ["t_ns"])  # all: Arrow leaves out a page it does not know
         with self._damage(0):
@@ -169,7 +190,7 @@ class SessionReader:
 
         Args:
             names: of the columns, each n rows.
-            begin_t_ns: of the first instant; None: from the beginning.
+            begin_t_ns: of the first instant on the time axis; None: from the beginning.
             end_t_ns: of the instant behind the last; None: to the end.
 
         Yields:
@@ -193,10 +214,12 @@ class SessionReader:
 
     def groups_within(self, begin_t_ns: int | None, end_t_ns: int | None) -> list[int]:
         """Row groups that may hold frames of some time; bounds as for `flat`."""
+        if begin_t_ns is None and end_t_ns is None:
+            return list(range(len(self.footer.group_rows)))
         return [
             group
             for group, said in enumerate(self.extremes("t_ns"))
-            if said is None or _overlap(said, begin_t_ns, end_t_ns)
+            if said is None or self.axis.may_overlap(*said, begin_t_ns, end_t_ns)
         ]
 
     def frames(self) -> FrameBatch:
@@ -212,6 +235,42 @@ class SessionReader:
         if self._has_true_statistics:
             return self.footer.extremes(name)
         return [None] * len(self.footer.group_rows)  # nothing proves what an older version wrote
+
+    def _time_axis(self) -> TimeAxis:
+        ids = stream_ids(self)
+        if len(set(ids)) < 2 or not self.has("part"):
+            return NODE_AXIS
+        if stated := self.notes.get(TIME_AXIS_NOTE):
+            return TimeAxis.from_dicts(stated, where=str(self.path))
+        try:
+            clock = clock_beside(self)
+        except (UsageError, DamagedFileError):  # the frames are worth more than the clock
+            clock = None
+        period_ns = round(1e9 / self.info.nominal_rate_hz)
+        return time_axis(self._part_spans(), clock, period_ns=period_ns)
+
+    def _part_spans(self) -> list[PartSpan]:
+        """First and last frame of every part that has some; of most row groups the footer says."""
+        names, ids = ("part", "t_mono_ns", "t_ns"), stream_ids(self)
+        found: dict[int, list[tuple[int, int]]] = {}
+        unsaid: list[int] = []
+        for group, said in enumerate(zip(*(self.extremes(name) for name in names), strict=True)):
+            part, t_mono_ns, t_ns = said
+            if part is None or t_mono_ns is None or t_ns is None or part[0] != part[1]:
+                unsaid.append(group)
+            else:
+                found.setdefault(part[0], []).extend(zip(t_mono_ns, t_ns, strict=True))
+        for piece in self.columns(*names, groups=unsaid):
+            for number in np.unique(piece["part"]).tolist():
+                here = piece["part"] == number
+                ends = [[int(v.min()), int(v.max())] for v in (piece[n][here] for n in names[1:])]
+                found.setdefault(number, []).extend(zip(*ends, strict=True))
+        spans = []
+        for number, instants in sorted(found.items()):
+            (mono_first, first), (mono_last, last) = min(instants), max(instants)
+            stream_id = ids[number] if number < len(ids) else ""
+            spans.append(PartSpan(number, stream_id, (mono_first, mono_last), (first, last)))
+        return spans
 
     def _tables(
         self, group: int, names: Sequence[str] | None, values_max: int | None = None
@@ -241,11 +300,6 @@ class SessionReader:
             raise FileFormatError(
                 f"row group {group} cannot be read: {error}", where=str(self.path)
             ) from error
-
-
-def _overlap(said: tuple[int, int], begin_ns: int | None, end_ns: int | None) -> bool:
-    least, greatest = said
-    return (begin_ns is None or greatest >= begin_ns) and (end_ns is None or least < end_ns)
 
 
 def _opened(

@@ -26,6 +26,7 @@ export class Bins {
     this.framesInBin = overview.frames_in_bin;
     this.durationS = overview.duration_s;
     this.beginNs = overview.begin_t_ns;
+    this.axis = overview.time_axis;
     this.serials = overview.serials;
     this.provisional = Boolean(overview.provisional); // it is not sealed yet
     this.behind = Boolean(overview.behind); // there are more frames than these

@@ -6,6 +6,7 @@ import { byId, el, localTime, number, setText } from "../common/text.js";
 import { Beside } from "./beside.js";
 import { alignments } from "./align.js";
 import { drawReport } from "./report.js";
+import { clockOn, stancesOn } from "./time_axis.js";
 
 const SESSIONS_MOST = 50; // older ones by their link
 const SAME = ["grf", "cop-x", "cop-y", "angle"];
@@ -98,7 +99,9 @@ export class Compare {
     const { plots } = this.page;
     this.ways = alignments(
       { beginNs: plots.whole.beginNs, durationS: this.page.durationS, stances: plots.stances, marks: plots.marks, offset: this.offset },
-      { beginNs: beside.answer.begin_t_ns, durationS: beside.durationS, stances: stances ?? [], events: events?.items ?? [], clock },
+      { beginNs: beside.answer.begin_t_ns, durationS: beside.durationS,
+        stances: stancesOn(beside.answer.time_axis, stances ?? []), events: events?.items ?? [],
+        clock: clockOn(beside.answer.time_axis, other.parts, clock) },
     );
     this.align.replaceChildren(...this.ways.map((way) => el("option", { value: way.key, text: way.says })));
     byId("align-choice").hidden = false;

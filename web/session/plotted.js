@@ -5,6 +5,7 @@ import { mayPress } from "../common/login.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, setText } from "../common/text.js";
 import { offsetAt } from "./clock.js";
+import { axisWords, clockOn, stancesOn } from "./time_axis.js";
 import { Downloads } from "./downloads.js";
 import { listen } from "./gestures.js";
 import { drawLegend } from "./legend.js";
@@ -88,13 +89,15 @@ export class Plotted {
   /** What may be missing holds no plot up. */
   async loadBeside(whole, sealed) {
     const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return null; };
-    const [array, stances, events, clock] = await Promise.all([
+    const [array, stances, events, summary] = await Promise.all([
       api.arrayOf(this.session.id).catch(none),
       whole.estimated && sealed ? api.listStances(this.session.id).catch(none) : null,
       api.listEvents(this.session.id).catch(none), api.clockOf(this.session.id).catch(none),
     ]);
     if (array) this.replay.dress(array);
-    this.plots.stances = placed(stances ?? [], whole.beginNs);
+    const clock = clockOn(whole.axis, this.session.parts, summary);
+    setText(byId("axis-says"), axisWords(whole.axis));
+    this.plots.stances = placed(stancesOn(whole.axis, stances ?? []), whole.beginNs);
     this.stances.show(this.plots.stances);
     quietly(() => this.showOverlay());
     const offset = (tNs, ofServer) => (clock && offsetAt(clock, tNs, ofServer));

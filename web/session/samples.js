@@ -21,7 +21,7 @@ const RAW = ["seq", "frame_status", "status"];
 /**
  * The columns of CSV as numbers; what is not known is NaN.
  * @param {string} csv
- * @returns {{tNs: bigint[], columns: Record<string, Float64Array>}}
+ * @returns {Record<string, Float64Array>}
  */
 export function columnsOf(csv) {
   const lines = csv.split("\n");
@@ -29,14 +29,11 @@ export function columnsOf(csv) {
   const names = lines[0].trim().split(",").map((name) => name.replaceAll('"', ""));
   const rows = lines.length - 1;
   const values = names.map(() => new Float64Array(rows));
-  const time = names.indexOf("t_ns");
-  const tNs = [];
   for (let row = 0; row < rows; row++) {
     const fields = lines[row + 1].trim().split(",");
-    tNs.push(BigInt(fields[time])); // a number has not its last digits
     for (let i = 0; i < names.length; i++) values[i][row] = fields[i] === "" ? NaN : Number(fields[i]);
   }
-  return { tNs, columns: Object.fromEntries(names.map((name, i) => [name, values[i]])) };
+  return Object.fromEntries(names.map((name, i) => [name, values[i]]));
 }
 
 /** The frame of a row, in the words of a live message. @returns {Frame} */
@@ -76,11 +73,10 @@ export class Samples {
     this.whole = whole;
     this.tell = tell;
     this.tiles = whole.serials.length;
-    this.names = ["t_ns", ...(whole.estimated ? [...BY_FRAME, ...BY_TILE] : RAW)];
+    this.names = ["time_s", ...(whole.estimated ? [...BY_FRAME, ...BY_TILE] : RAW)];
     const values = whole.estimated ? BY_TILE.length * this.tiles + BY_FRAME.length : this.tiles + 2;
     this.sliceS = Math.round(1e3 * Math.min(SLICE_MOST_S, Math.max(SLICE_LEAST_S, VALUES_IN_SLICE / (values * rateHz)))) * 1e-3;
     this.slices = new Map(); // by number: what came, or the promise of it
-    this.beginNs = null;
     this.notBeforeMs = 0; // after a refusal
   }
 
@@ -172,12 +168,10 @@ export class Samples {
   }
 
   async ask(number) {
-    this.beginNs ??= api.samples(this.id, { columns: "t_ns", end_s: 1e-9 }).then((csv) => columnsOf(csv).tNs[0]);
-    const begin = await this.beginNs.catch((error) => { this.beginNs = null; throw error; });
-    const { tNs, columns } = columnsOf(await api.samples(this.id, {
+    const columns = columnsOf(await api.samples(this.id, {
       columns: this.names.join(","), start_s: number * this.sliceS, end_s: (number + 1) * this.sliceS,
     }));
-    return { timeS: Float64Array.from(tNs, (t) => Number(t - begin) * 1e-9), columns };
+    return { timeS: columns.time_s, columns };
   }
 
   /**

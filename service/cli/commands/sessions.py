@@ -36,6 +36,7 @@ from storage.formats.written.registry import SEVERAL
 from storage.sessions.beside import EVENTS_NAME
 
 if TYPE_CHECKING:
+    from storage.formats.export import ClockName
     from storage.sessions.choice import Choice
 
 SERVER = "http://127.0.0.1:8000"
@@ -46,6 +47,10 @@ _LONG = {"ledger", "events", "clock", "calibration", "scene_content", "asked"}
 ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
 ColumnsOption = Annotated[
     str | None, typer.Option(help="Names with commas between: t_ns,grf_n,force_n_0.")
+]
+
+ClockOption = Annotated[
+    str, typer.Option(help="node, or server: adds t_server_ns and t_server_uncertainty_ns.")
 ]
 
 
@@ -142,6 +147,7 @@ def pull_command(
     end_s: EndOption = None,
     columns: ColumnsOption = None,
     to: FormatOption = "parquet",
+    clock: ClockOption = "node",
     as_json: JsonOption = False,
     *,
     options: FormatOptions,
@@ -160,15 +166,16 @@ def pull_command(
 
     if (session is None) == (take is None):
         raise UsageError("what is to be pulled", expected="the id of a session, or --take")
+    own_clock = _clock_named(clock)
     chosen = format_named(to) if take is None else together_named(to)
     part = Slice(start_s, end_s, _names(columns))
     with foottile.connect(server or SERVER) as source, progress(f"pulling {session or take}"):
         if session is None:
             pulled = pull_take(source, str(take), out, part, chosen, options)
-        elif part.is_all and chosen is PARQUET and not options.set_names:
+        elif part.is_all and chosen is PARQUET and not options.set_names and own_clock == "node":
             pulled = pull(source, session, out)
         else:
-            pulled = pull_made(source, session, out, part, chosen, options)
+            pulled = pull_made(source, session, out, part, chosen, options, own_clock)
     if as_json:
         print_json(pulled)
     elif "resumed_bytes" not in pulled:
@@ -200,9 +207,7 @@ def export_command(
     start_s: StartOption = None,
     end_s: EndOption = None,
     columns: ColumnsOption = None,
-    clock: Annotated[
-        str, typer.Option(help="node, or server: adds t_server_ns and t_server_uncertainty_ns.")
-    ] = "node",
+    clock: ClockOption = "node",
     marks: Annotated[
         bool | None,
         typer.Option(
@@ -237,19 +242,17 @@ def export_command(
     """
     from service.offline.archive.places import is_remote
     from service.offline.export import ExportOptions, export_session, export_together
-    from storage.formats.export import CLOCKS
     from storage.formats.slice import Slice
     from storage.formats.written.registry import format_named
 
-    if clock not in CLOCKS:
-        raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
+    own_clock = _clock_named(clock)
     if take is not None:
         if sessions:
             raise UsageError("--take and sessions are two ways to name them", remedy="Name one")
         sessions, together = _of_take(take, data), True
     part = Slice(start_s, end_s, _names(columns))
     wanted = ExportOptions(
-        format_named(to).name, part, "server" if together else clock, marks, options
+        format_named(to).name, part, "server" if together else own_clock, marks, options
     )
     if together and (manifest is not None or is_remote(out)):
         raise UsageError(
@@ -280,8 +283,24 @@ def export_command(
     say(f"{path}: {done.size_bytes} bytes")
     for mark in done.left_out:
         remark(f"mark {mark.event.label!r} is not in it: {mark.left_out}")
+    for text in done.remarks:
+        remark(text)
     if done.lacks_marks:
         remark(f"without marks: there is no {EVENTS_NAME} beside {sources[0].name}")
+
+
+def _clock_named(clock: str) -> ClockName:
+    """Return the clock of an option.
+
+    Raises:
+        UsageError: there is no such clock.
+    """
+    from storage.formats.export import CLOCKS
+
+    for name in CLOCKS:
+        if name == clock:
+            return name
+    raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
 
 
 def _names(columns: str | None) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from storage.sessions.file import SessionWriter
 from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.frame_order import in_order
 from storage.sessions.reader import SessionReader
+from storage.sessions.time_axis import TIME_AXIS_NOTE
 
 _OF_THE_WHOLE = frozenset({"session", "ledger"})
 """Notes of a session that its part cannot keep: it has other frames."""
@@ -76,10 +77,15 @@ def estimate_session(
         )
     with SessionReader(source, only_slices=not part.is_all) as session:
         what = prepared(session, request, remark)
-        notes, stretch = session.notes, Stretch()
+        notes, stretch = dict(session.notes), Stretch()
+        if session.axis.is_shifted:  # the clock table may not lie beside what is written
+            notes[TIME_AXIS_NOTE] = session.axis.as_dicts()
         if not part.is_all:
             options, stretch = _of_part(session, what.info, what.options, part)
-            notes, what = _notes_of_part(session, part, stretch), replace(what, options=options)
+            notes, what = (
+                _notes_of_part(session, notes, part, stretch),
+                replace(what, options=options),
+            )
         stream = EstimateStream(what.info, what.options)
         judged = _Judged(what) if is_judged else None
         ordered = in_order(session.batches(*what.kept, groups=stretch.groups), where=str(source))
@@ -164,11 +170,15 @@ def _of_part(
         ordered = in_order(session.batches(), where=str(session.path))
         tares = (stream.find_tare(ordered),)
     stretch = stretch_of(session, part, stream.plan_of(tares[0]))
-    return replace(options, tare_s=None, tares=since(tares, stretch.from_ns)), stretch
+    if not stretch.axis.is_shifted:  # tares are by the node's date
+        tares = since(tares, stretch.from_ns)
+    return replace(options, tare_s=None, tares=tares), stretch
 
 
-def _notes_of_part(session: SessionReader, part: Slice, stretch: Stretch) -> dict[str, object]:
+def _notes_of_part(
+    session: SessionReader, notes: Mapping[str, object], part: Slice, stretch: Stretch
+) -> dict[str, object]:
     """The session's, without what is true only of all of it."""
-    notes = {name: said for name, said in session.notes.items() if name not in _OF_THE_WHOLE}
+    notes = {name: said for name, said in notes.items() if name not in _OF_THE_WHOLE}
     seconds = {"start_s": part.start_s, "end_s": part.end_s, "warm_up_s": stretch.warm_up_s}
     return {**notes, "part_of": {**session.identity, **seconds}}

@@ -21,6 +21,7 @@ from service.estimation.tare.tare import Tare
 from service.sessions.pipeline import Extra
 from storage.formats.slice import Slice
 from storage.sessions.reader import SessionReader
+from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 Piece = tuple[FrameBatch, Extra]
 _SETTLE_NS = 1_000_000_000
@@ -32,11 +33,12 @@ class Stretch:
     """Which frames are read, and which are given; by default all.
 
     Attributes:
-        from_ns: `t_ns` from which models run; None: from the first frame.
+        from_ns: instant of the time axis from which models run; None: from the first frame.
         begin_ns: of the first frame that is given; None: the session's.
         end_ns: behind the last one; None: to the end.
         until_ns: behind the last one that is needed for its look-ahead.
         groups: row groups that are read; None: all.
+        axis: the session's time axis.
     """
 
     from_ns: int | None = None
@@ -44,6 +46,7 @@ class Stretch:
     end_ns: int | None = None
     until_ns: int | None = None
     groups: tuple[int, ...] | None = None
+    axis: TimeAxis = NODE_AXIS
 
     @property
     def warm_up_s(self) -> float | None:
@@ -54,24 +57,26 @@ class Stretch:
 
     def needed(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
         """Of the frames that the row groups have, those that models run over."""
-        return _within(pieces, self.from_ns, self.until_ns)
+        return self._within(pieces, self.from_ns, self.until_ns)
 
     def given(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
         """Of those the frames that are given."""
-        return _within(pieces, self.begin_ns, self.end_ns)
+        return self._within(pieces, self.begin_ns, self.end_ns)
 
-
-def _within(pieces: Iterable[Piece], begin_ns: int | None, end_ns: int | None) -> Iterator[Piece]:
-    for frames, columns in pieces:
-        inside = np.ones(len(frames), dtype=np.bool_)
-        if begin_ns is not None:
-            inside &= frames.t_ns >= begin_ns
-        if end_ns is not None:
-            inside &= frames.t_ns < end_ns
-        if inside.all():
-            yield frames, columns
-        elif inside.any():
-            yield frames.select(inside), {name: v[inside] for name, v in columns.items()}
+    def _within(
+        self, pieces: Iterable[Piece], begin_ns: int | None, end_ns: int | None
+    ) -> Iterator[Piece]:
+        for frames, columns in pieces:
+            at_ns = self.axis.at(frames.t_ns, columns.get("part"))
+            inside = np.ones(len(frames), dtype=np.bool_)
+            if begin_ns is not None:
+                inside &= at_ns >= begin_ns
+            if end_ns is not None:
+                inside &= at_ns < end_ns
+            if inside.all():
+                yield frames, columns
+            elif inside.any():
+                yield frames.select(inside), {name: v[inside] for name, v in columns.items()}
 
 
 def stretch_of(session: SessionReader, part: Slice, plan: EstimationPlan) -> Stretch:
@@ -98,7 +103,7 @@ def stretch_of(session: SessionReader, part: Slice, plan: EstimationPlan) -> Str
         from_ns = None
     until_ns = None if end_ns is None else end_ns + plan.lag_ns + _SETTLE_NS
     groups = tuple(session.groups_within(from_ns, until_ns))
-    return Stretch(from_ns, begin_ns, end_ns, until_ns, groups)
+    return Stretch(from_ns, begin_ns, end_ns, until_ns, groups, session.axis)
 
 
 def since(tares: Sequence[Tare], from_ns: int | None) -> tuple[Tare, ...]:

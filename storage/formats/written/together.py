@@ -27,12 +27,12 @@ def instants_of(export: Export, columns: Mapping[str, Array]) -> Times:
 
     Args:
         export: whose frames they are.
-        columns: `t_ns`, and `t_server_ns` if the server's clock was asked for.
+        columns: `t_ns`, `part` if it has parts, `t_server_ns` if the server's clock was asked for.
 
     Raises:
         UsageError: it was, and of some frames the server's time is not known.
     """
-    t_ns: Times = columns["t_ns" if export.clock is None else "t_server_ns"]
+    t_ns: Times = export.at_ns(columns) if export.clock is None else columns["t_server_ns"]
     unknown = int((t_ns == NO_INSTANT).sum())
     if unknown:
         raise UsageError(

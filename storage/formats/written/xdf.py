@@ -171,7 +171,7 @@ class _Session:
                     stream, header = self._opened(name + of_part, "Force", columns, format_)
                     self._parts[part].append(stream)
                     content += header
-        at_s = flat["t_ns"] * 1e-9
+        at_s = self._export.at_ns(flat) * 1e-9
         if len(at_s):
             content += self._offsets(part, flat)
             for stream in self._parts[part]:
@@ -197,7 +197,7 @@ class _Session:
         if "t_server_ns" not in flat:
             return b""
         known = np.flatnonzero(flat["t_server_ns"] != NO_INSTANT)
-        t_ns, t_server_ns = flat["t_ns"][known], flat["t_server_ns"][known]
+        t_ns, t_server_ns = self._export.at_ns(flat)[known], flat["t_server_ns"][known]
         if not len(t_ns):
             return b""
         begin_ns = self._next_offset_ns.get(part, int(t_ns[0]))

@@ -144,7 +144,8 @@ def _marks(session: Session, query: DataQuery, server: Server) -> Marks:
         {name: getattr(frames, name) for name in TIMES} | {"part": columns["part"]}
         for frames, columns in SessionFrames(sources).raw()
     )
-    return place(session.events, times, sources.clock_table(), query.slice)
+    axis = sources.time_axis()
+    return place(session.events, times, sources.clock_table(), query.slice, axis=axis)
 
 
 def _chunks(session: Session, query: DataQuery, server: Server, marks: Marks | None) -> Chunks:

@@ -22,6 +22,7 @@ from storage.formats.slice import Slice
 from storage.formats.written.arrow import ARROW
 from storage.schema import Array
 from storage.sessions.folder import Session
+from storage.sessions.time_axis import Basis
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
@@ -44,6 +45,17 @@ class OverviewQuery(SecondsQuery):
     )
 
 
+class PartShift(BaseModel):
+    """Where a part of the session is on its time axis."""
+
+    part: int
+    shift_ns: int = Field(description="To be added to `t_ns` of its frames.")
+    by: Basis = Field(
+        description="How that is known: `node`: the node's date was right; `server`: by the "
+        "server's clock; `joined`: not at all, the part begins where the one before it ends."
+    )
+
+
 class OverviewView(BaseModel):
     """Bins of consecutive frames (docs/api.md); what is not known is null."""
 
@@ -51,6 +63,9 @@ class OverviewView(BaseModel):
     begin_t_ns: int = Field(description="t_ns of the first frame of the session.")
     duration_s: float = Field(description="From the first frame to the last.")
     frames_in_bin: int = Field(description="1: each bin is a frame.")
+    time_axis: list[PartShift] = Field(
+        description="Of each part, one at least; all 0 unless the node's date was set between two."
+    )
     serials: list[str] = Field(description="Of the tiles, in the order of the columns.")
     provisional: bool = Field(
         description="It is not sealed yet: frames may still come between these, and tares follow."
@@ -155,6 +170,7 @@ def _written(
         "begin_t_ns": seen.begin_ns,
         "duration_s": (seen.end_ns - seen.begin_ns) * 1e-9,
         "frames_in_bin": seen.frames_in_bin,
+        "time_axis": seen.axis.as_dicts(),
         "serials": serials,
         **said,
     }

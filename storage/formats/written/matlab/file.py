@@ -104,7 +104,8 @@ def _values(export: Export, column: Column) -> Array:
 def _t_ns(export: Export) -> dict[str, Array]:
     """Instants of its frames, by each clock that was asked for."""
     limit = min(FRAMES_MAX, _VALUES_MAX // max(len(export.info.tiles), 1))
-    asked = ["t_ns"] if export.clock is None else ["t_ns", "t_server_ns"]
+    asked = ["t_ns", *(["part"] if "part" in export.content.names else [])]
+    asked += [] if export.clock is None else ["t_server_ns"]
     return export.whole(asked, frames_max=limit)
 
 

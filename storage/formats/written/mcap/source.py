@@ -83,7 +83,7 @@ def frames_of(export: Export, columns: list[str]) -> Iterator[Frames]:
     Raises:
         UsageError: as for `Export.pieces`; the server's time of a frame is not known.
     """
-    asked = [*columns, "t_ns"]
+    asked = [*columns, "t_ns", *(["part"] if "part" in export.content.names else [])]
     asked += [column.name for column in SERVER_TIME] if export.clock is not None else []
     asked += ["event"] if export.marks is not None else []
     last_shown = -1
