@@ -10,11 +10,8 @@ WORKDIR /src
 COPY requirements.lock ./
 # Every download is compared with its hash here; what follows takes nothing from anywhere else.
 RUN pip download --no-cache-dir --require-hashes -r requirements.lock -d /wheels
-COPY pyproject.toml README.md ./
-COPY devices devices
-COPY storage storage
-COPY service service
-COPY web web
+# .dockerignore names what there is to copy.
+COPY . .
 ARG EXTRAS=server,emulation
 RUN pip install --no-index --find-links /wheels hatchling \
     && pip wheel --no-deps --no-build-isolation -w /dist . \

@@ -50,7 +50,7 @@ from devices.words import printable
 
 Extra = Literal["server", "client", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
 
-_OURS = ("devices", "storage", "service", "foottile")
+OUR_PACKAGES = ("devices", "storage", "service", "foottile")
 
 
 @contextmanager
@@ -69,7 +69,7 @@ def needs_extra(extra: Extra, what: str, *, remedy: str = "") -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        if package in _OURS:  # a mistake of ours, which no package mends
+        if package in OUR_PACKAGES:  # a mistake of ours, which no package mends
             raise
         raise MissingExtraError(
             f"{what} needs {package}, which is not installed",
