@@ -1,45 +1,32 @@
 // REST calls: problem+json, and nothing the page does not need. Who we are is in a cookie: login.js.
 
 import { askToLogIn } from "./login.js";
+import { parseAnswer, PATIENCE_S, Refusal, sendRequest } from "./request.js";
+
+export { Refusal };
 
 const PREFIX = "/api/v1";
-
-/** A refusal by the server; `message` is its `detail`, which says what to do. */
-export class Refusal extends Error {
-  constructor(message, status) {
-    super(message);
-    this.status = status;
-  }
-}
-
 const JSON_TYPE = "application/json";
 
 /**
  * Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. `stop` takes it back;
  * with `said` it is refused (412) if what is changed is not that any more.
+ * @param {string} method
+ * @param {string} path
+ * @param {{body?: object | Blob, stop?: AbortSignal | null, type?: string, said?: string | null, patienceS?: number}} [how]
  */
-export async function call(method, path, body, stop = null, type = JSON_TYPE, said = null, patienceS = 10) {
+export async function call(method, path, { body, stop = null, type = JSON_TYPE, said = null, patienceS = PATIENCE_S } = {}) {
   const headers = { Accept: type };
   if (said !== null) headers["If-Match"] = `"${said}"`;
   if (body !== undefined) headers["Content-Type"] = JSON_TYPE;
-  let response;
-  try {
-    response = await fetch(PREFIX + path, {
-      method, headers, cache: "no-store",
-      body: body === undefined || body instanceof Blob ? body : JSON.stringify(body),
-      signal: AbortSignal.any([...(stop ? [stop] : []), AbortSignal.timeout(patienceS * 1e3)]),
-    });
-  } catch (error) {
-    const slow = error instanceof DOMException && error.name === "TimeoutError";
-    throw new Refusal(slow ? `The server did not answer within ${patienceS} s.` : "The server cannot be reached.", 0);
-  }
-  const read = () => (response.ok && type !== JSON_TYPE ? response.text() : response.json());
-  const [answer, isWhole] = response.status === 204 ? [null, true] : await read().then((all) => [all, true], () => [null, false]);
-  if (response.ok && !isWhole) throw new Refusal("The server's answer broke off.", 0);
+  const options = { method, headers, body: body === undefined || body instanceof Blob ? body : JSON.stringify(body) };
+  let { response, text } = await sendRequest(PREFIX + path, options, { patienceS, stop });
+  if (response.status === 401 && await askToLogIn()) ({ response, text } = await sendRequest(PREFIX + path, options, { patienceS, stop }));
+  if (response.status === 204) return null;
+  if (response.ok && type !== JSON_TYPE) return text;
+  const answer = parseAnswer(response, text);
   if (response.ok) return answer;
-  const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
-  if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop, type, said, patienceS);
-  throw new Refusal(String(detail), response.status);
+  throw new Refusal(String(answer?.detail || answer?.title || `The server refused (${response.status}).`), response.status);
 }
 
 const id = encodeURIComponent;
@@ -47,34 +34,34 @@ const id = encodeURIComponent;
 const asked = (query) => new URLSearchParams(Object.entries(query).map(([name, value]) => [name, String(value)]));
 export const recent = (node, seconds, before, tiles) =>
   call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
-export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, {});
+export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, { body: {} });
 export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
 /** @type {(node: string) => Promise<NodeCalibration>} */
 export const calibrationOf = (node) => call("GET", `/nodes/${id(node)}/calibration`);
 /** @type {(node: string, calibration: string, said: string) => Promise<NodeCalibration>} */
 export const assignCalibration = (node, calibration, said) =>
-  call("PUT", `/nodes/${id(node)}/calibration`, { id: calibration }, null, JSON_TYPE, said);
+  call("PUT", `/nodes/${id(node)}/calibration`, { body: { id: calibration }, said });
 /** @type {(node: string, said: string) => Promise<NodeCalibration>} */
-export const takeBackCalibration = (node, said) => call("DELETE", `/nodes/${id(node)}/calibration`, undefined, null, JSON_TYPE, said);
+export const takeBackCalibration = (node, said) => call("DELETE", `/nodes/${id(node)}/calibration`, { said });
 /** @type {() => Promise<{items: Kept[]}>} */
 export const listCalibrations = () => call("GET", "/calibrations");
 /** As it is: its hashes are of its very digits. @type {(file: Blob) => Promise<Kept>} */
-export const uploadCalibration = (file) => call("POST", "/calibrations", file);
+export const uploadCalibration = (file) => call("POST", "/calibrations", { body: file });
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
 /** @type {(node: string, name: string) => Promise<Session>} */
-export const startSession = (node, name) => call("POST", "/sessions", { node, name });
+export const startSession = (node, name) => call("POST", "/sessions", { body: { node, name } });
 /** @type {(session: string) => Promise<Session>} */
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
 /** @type {(session: string, event: object) => Promise<Mark>} */
-export const markEvent = (session, event) => call("POST", `/sessions/${id(session)}/events`, event);
+export const markEvent = (session, event) => call("POST", `/sessions/${id(session)}/events`, { body: event });
 /** @type {(name: string) => Promise<Take>} */
-export const startTake = (name) => call("POST", "/takes", { name });
+export const startTake = (name) => call("POST", "/takes", { body: { name } });
 /** @type {(take: string) => Promise<Take>} */
 export const getTake = (take) => call("GET", `/takes/${id(take)}`);
 /** @type {(take: string) => Promise<Take>} */
 export const stopTake = (take) => call("POST", `/takes/${id(take)}/stop`);
 /** @type {(take: string, event: object) => Promise<Take>} */
-export const markTake = (take, event) => call("POST", `/takes/${id(take)}/events`, event);
+export const markTake = (take, event) => call("POST", `/takes/${id(take)}/events`, { body: event });
 /** @type {(session: string) => Promise<Session>} */
 export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
 /** @type {(session: string) => Promise<{items: Mark[]}>} */
@@ -84,29 +71,29 @@ export const stancesOverlay = (session) => call("GET", `/sessions/${id(session)}
 export const listComparisons = (session) => call("GET", `/sessions/${id(session)}/comparisons`);
 export const getComparison = (session, name) => call("GET", `/sessions/${id(session)}/comparisons/${id(name)}`);
 export const comparisonSeries = (session, name, query, stop) =>
-  call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${asked(query)}`, undefined, stop);
+  call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${asked(query)}`, { stop });
 export const newestSessions = (limit) => call("GET", `/sessions?limit=${limit}`);
 /** @type {(session: string) => Promise<Dressed>} */
 export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`);
 export const ledgerOf = (session) => call("GET", `/sessions/${id(session)}/ledger`);
 /** Every file of it is read: of a long one that takes its time. @type {(session: string) => Promise<Verified>} */
-export const verified = (session) => call("GET", `/sessions/${id(session)}/verification`, undefined, null, JSON_TYPE, null, 300);
+export const verified = (session) => call("GET", `/sessions/${id(session)}/verification`, { patienceS: 300 });
 /** @type {(session: string) => Promise<Clock>} */
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
 /** @type {(session: string, query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} */
 export const overview = (session, query, stop) =>
-  call("GET", `/sessions/${id(session)}/overview?${asked(query)}`, undefined, stop);
+  call("GET", `/sessions/${id(session)}/overview?${asked(query)}`, { stop });
 /** Some seconds of a session's frames, as CSV. */
 export const samples = (session, query) =>
-  call("GET", `/sessions/${id(session)}/data?${asked({ format: "csv", marks: "false", ...query })}`, undefined, null, "text/csv");
+  call("GET", `/sessions/${id(session)}/data?${asked({ format: "csv", marks: "false", ...query })}`, { type: "text/csv" });
 /** @type {(session: string, changes: object, said?: string | null) => Promise<Session>} */
 export const changeSession = (session, changes, said = null) =>
-  call("PATCH", `/sessions/${id(session)}`, changes, null, JSON_TYPE, said);
+  call("PATCH", `/sessions/${id(session)}`, { body: changes, said });
 /** @type {(session: string, mark: string, changes: object, said: string) => Promise<Mark>} */
 export const changeMark = (session, mark, changes, said) =>
-  call("PATCH", `/sessions/${id(session)}/events/${id(mark)}`, changes, null, JSON_TYPE, said);
+  call("PATCH", `/sessions/${id(session)}/events/${id(mark)}`, { body: changes, said });
 export const removeMark = (session, mark, said) =>
-  call("DELETE", `/sessions/${id(session)}/events/${id(mark)}`, undefined, null, JSON_TYPE, said);
+  call("DELETE", `/sessions/${id(session)}/events/${id(mark)}`, { said });
 /** @type {(session: string) => Promise<Session>} */
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);

@@ -1,5 +1,6 @@
 // Getting in: a ticket or a token in the address, or a token typed in, becomes a cookie that no script can read.
 
+import { parseAnswer, Refusal, sendRequest } from "./request.js";
 import { el } from "./text.js";
 
 const PATH = "/api/v1/login";
@@ -9,6 +10,8 @@ const ASKED = `Anyone may watch; to tare, record or change something you have to
 const PRIVATE = `This server is private: to look you have to log in, too. ${WHERE}`;
 const ENDED = `Your login has ended: the server was started again, or 12 hours are over. ${WHERE}`;
 const VIEWER = `You came with a viewer's ticket: you may look, and not tare, record or change anything. ${WHERE}`;
+const NOT_KEPT = "The server let this browser in, and the browser did not keep that: it blocks cookies of this address. "
+  + "Allow them in its settings, or leave its private window; then load this page again.";
 const WRONG = `That is not this server's token. ${WHERE}`;
 
 /** What the server said last of who we are; null: it has not been reached. */
@@ -33,7 +36,7 @@ export async function enter() {
   fields.delete("token");
   const rest = fields.toString();
   history.replaceState(null, "", location.pathname + location.search + (rest ? `#${rest}` : ""));
-  const answer = await ask("POST", ticket === null ? {} : { ticket }, token);
+  const answer = await logIn(ticket === null ? {} : { ticket }, token);
   if (answer.ok) return;
   refused = answer.detail;
   await look();
@@ -67,14 +70,14 @@ export function askToLogIn() {
 
 async function dialogUntilIn() {
   if (!refused) await look(); // it may have ended since
-  let why = refused ? `${refused}.` : state?.ended ? ENDED : state?.may === "look" ? VIEWER : keptOut() ? PRIVATE : ASKED;
+  let why = refused ? asSentence(refused) : state?.ended ? ENDED : state?.may === "look" ? VIEWER : keptOut() ? PRIVATE : ASKED;
   refused = "";
   for (;;) {
     const token = await typed(why);
     if (!token) return false;
-    const answer = await ask("POST", {}, token);
+    const answer = await logIn({}, token);
     if (answer.ok) return true;
-    why = answer.status === 401 ? WRONG : answer.detail;
+    why = answer.status === 401 ? WRONG : asSentence(answer.detail);
   }
 }
 
@@ -96,6 +99,17 @@ function typed(why) {
   });
 }
 
+/** @param {string} text */
+const asSentence = (text) => (/[.!?]$/.test(text) ? text : `${text}.`);
+
+/** Log in, and check that the browser sends the cookie back. */
+async function logIn(body, token) {
+  const answer = await ask("POST", body, token);
+  if (!answer.ok) return answer;
+  const now = await ask("GET");
+  return now.ok && state.may === null ? { ok: false, status: 0, detail: NOT_KEPT } : now;
+}
+
 /** Ask for, or change, who we are; resolves to what came of it. */
 async function ask(method, body, token = null) {
   const headers = { Accept: "application/json" };
@@ -103,10 +117,12 @@ async function ask(method, body, token = null) {
   if (token) headers.Authorization = `Bearer ${token}`;
   let response, answer;
   try {
-    response = await fetch(PATH, { method, headers, cache: "no-store", body: body && JSON.stringify(body), signal: AbortSignal.timeout(10_000) });
-    answer = await response.json();
-  } catch {
-    return { ok: false, status: 0, detail: "The server cannot be reached" };
+    let text;
+    ({ response, text } = await sendRequest(PATH, { method, headers, body: body && JSON.stringify(body) }));
+    answer = parseAnswer(response, text);
+  } catch (error) {
+    if (!(error instanceof Refusal)) throw error;
+    return { ok: false, status: error.status, detail: error.message };
   }
   if (!response.ok) return { ok: false, status: response.status, detail: String(answer?.detail ?? "The server refused") };
   state = answer;

@@ -1,6 +1,6 @@
 // Results and refusals of what the user did: short, announced politely, few at a time.
 
-import { Refusal } from "./api.js";
+import { Refusal } from "./request.js";
 import { byId, el } from "./text.js";
 
 const GOOD_FOR_MS = 4000;
@@ -26,12 +26,13 @@ export function notice(text, { bad = false, undo = null } = {}) {
   if (!bad) setTimeout(() => item.remove(), undo ? UNDO_FOR_MS : GOOD_FOR_MS);
 }
 
+/** Show a refusal. Any other error is a fault of this page: thrown on, to guard.js. @param {unknown} error */
+export function showRefusal(error) {
+  if (!(error instanceof Refusal)) throw error;
+  notice(error.message, { bad: true });
+}
+
 /** Do something; a refusal is told, not thrown. */
 export async function quietly(doing) {
-  try {
-    await doing();
-  } catch (error) {
-    if (!(error instanceof Refusal)) throw error;
-    notice(error.message, { bad: true });
-  }
+  await Promise.resolve().then(doing).catch(showRefusal);
 }

@@ -2,7 +2,7 @@
 
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
-import { notice } from "../common/notices.js";
+import { notice, showRefusal } from "../common/notices.js";
 import { byId, duration, el, isInside, localTime, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
@@ -73,8 +73,7 @@ export class Actions {
     try {
       await this[name](this.state.node);
     } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      notice(error.message, { bad: true });
+      showRefusal(error);
     } finally {
       this.busy.delete(name);
       button.removeAttribute("aria-busy");
@@ -186,8 +185,7 @@ export class Actions {
       try {
         await this.stop(null, session.id);
       } catch (error) {
-        if (!(error instanceof api.Refusal)) throw error;
-        notice(error.message, { bad: true });
+        showRefusal(error);
         stop.disabled = false;
       }
     });

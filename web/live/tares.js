@@ -1,7 +1,7 @@
 // The history of a node's tares: when, why, and whether it was undone. Loaded when it is opened.
 
 import * as api from "../common/api.js";
-import { notice } from "../common/notices.js";
+import { showRefusal } from "../common/notices.js";
 import { byId, el, localTime, number, setText } from "../common/text.js";
 
 const SHOWN = 20;
@@ -29,8 +29,7 @@ export class Tares {
       byId("tares").replaceChildren(...items.slice(0, SHOWN).map((tare) => row(tare, items)));
       setText(byId("tares-legend"), legend(items, drift));
     } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      notice(error.message, { bad: true });
+      showRefusal(error);
     }
   }
 }

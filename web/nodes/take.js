@@ -2,7 +2,7 @@
 
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
-import { notice } from "../common/notices.js";
+import { notice, showRefusal } from "../common/notices.js";
 import { byId, duration, isInside, localTime, setData, setText } from "../common/text.js";
 import { Marks } from "../live/marks.js";
 
@@ -71,8 +71,7 @@ export class Takes {
     try {
       await this.does[id]();
     } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      notice(error.message, { bad: true });
+      showRefusal(error);
     } finally {
       this.busy.delete(id);
       button.removeAttribute("aria-busy");

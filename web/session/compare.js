@@ -1,7 +1,8 @@
 // Chooses what is drawn beside a session: a reference it was compared with, or another session.
 
 import * as api from "../common/api.js";
-import { notice, quietly } from "../common/notices.js";
+import { notice, quietly, showRefusal } from "../common/notices.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, el, localTime, number, setText } from "../common/text.js";
 import { Beside } from "./beside.js";
 import { alignments } from "./align.js";
@@ -35,8 +36,7 @@ export class Compare {
   }
 
   async begin() {
-    const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return { items: [] }; };
-    const sessions = await api.newestSessions(SESSIONS_MOST).catch(none);
+    const sessions = await unlessRefused(api.newestSessions(SESSIONS_MOST), { items: [] });
     const others = sessions.items.filter((one) => one.id !== this.session.id && one.state === "sealed" && one.sha256);
     const asked = new URLSearchParams(location.search);
     const wanted = asked.has("against") ? `against:${asked.get("against")}` : asked.has("with") ? `with:${asked.get("with")}` : "";
@@ -86,9 +86,8 @@ export class Compare {
   /** Another session: moved as is chosen. */
   async with(id, align) {
     const wanted = this.wanted;
-    const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return null; };
     const [other, stances, events, clock] = await Promise.all([
-      api.getSession(id), api.listStances(id).catch(none), api.listEvents(id).catch(none), api.clockOf(id).catch(none),
+      api.getSession(id), unlessRefused(api.listStances(id)), unlessRefused(api.listEvents(id)), unlessRefused(api.clockOf(id)),
     ]);
     const columns = Object.fromEntries(SAME.map((key) => [key, [`${STEMS[key]}_min`, `${STEMS[key]}_max`]]));
     const beside = this.beside(other.name || other.id, columns, (query, stop) => api.overview(id, query, stop));
@@ -113,7 +112,7 @@ export class Compare {
   beside(name, columns, ask) {
     return new Beside({
       name, columns: { ...columns }, ask, onChange: () => this.page.redraw(),
-      onError: (error) => notice(error.message, { bad: true }),
+      onError: showRefusal,
     });
   }
 

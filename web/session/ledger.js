@@ -67,8 +67,13 @@ export class LedgerCard {
 
   async load() {
     if (!this.card.open) return;
-    const ledger = await api.ledgerOf(this.session.id).catch((error) => error);
-    const lines = ledger instanceof Error ? [ledger.message] : ledgerInWords(ledger, this.session);
+    let lines;
+    try {
+      lines = ledgerInWords(await api.ledgerOf(this.session.id), this.session);
+    } catch (error) {
+      if (!(error instanceof api.Refusal)) throw error;
+      lines = [error.message];
+    }
     byId("ledger").replaceChildren(...lines.map((text) => el("li", { text })));
   }
 

@@ -1,7 +1,8 @@
 // Marks of a session on its time axis: listed to go to, set at the cursor, renamed, moved and removed.
 
 import * as api from "../common/api.js";
-import { notice, quietly } from "../common/notices.js";
+import { notice, quietly, showRefusal } from "../common/notices.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, el, setText } from "../common/text.js";
 import { timeWords } from "./overlay.js";
 
@@ -80,9 +81,8 @@ export class Marks {
     try {
       await doing();
     } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error;
-      notice(error.message, { bad: true });
-      const events = await api.listEvents(this.id).catch(() => null);
+      showRefusal(error);
+      const events = await unlessRefused(api.listEvents(this.id));
       if (events) this.show(events.items, this.beginNs, this.offset);
     }
   }

@@ -5,6 +5,7 @@ import { edit } from "../common/dialogs.js";
 import { helpWithKeys } from "../common/help.js";
 import { enter } from "../common/login.js";
 import { notice, quietly } from "../common/notices.js";
+import { unlessRefused } from "../common/request.js";
 import { inSunlight } from "../common/sunlight.js";
 import { byId, setText } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
@@ -41,7 +42,7 @@ async function look() {
     say(session.state === "recording" ? "Being recorded" : "Not sealed yet", [WHY[session.state] ?? session.problem ?? "", plainState(session)[1]].join(" ").trim());
     byId("message").dataset.small = "true";
     // Before its first frames there is nothing to plot.
-    await plotted.load(session).catch((error) => { if (!(error instanceof api.Refusal)) throw error; });
+    await unlessRefused(plotted.load(session));
     if (plotted.plots.whole?.behind) setText(byId("message-text"), `${byId("message-text").textContent} Not all of it is shown yet: the server is estimating the rest.`);
     document.body.dataset.state = session.state;
     setTimeout(look, AGAIN_MS);

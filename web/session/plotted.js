@@ -2,7 +2,8 @@
 
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
-import { notice, quietly } from "../common/notices.js";
+import { quietly, showRefusal } from "../common/notices.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, setText } from "../common/text.js";
 import { offsetAt } from "./clock.js";
 import { axisWords, clockOn, stancesOn } from "./time_axis.js";
@@ -38,10 +39,10 @@ export class Plotted {
       changed: () => { this.plots.marks = this.marks.placed; this.draw(); },
     });
     this.loader = new Loader(
-      (query, stop) => api.overview(session.id, query, stop), (bins) => this.take(bins), (error) => notice(error.message, { bad: true }));
+      (query, stop) => api.overview(session.id, query, stop), (bins) => this.take(bins), showRefusal);
     this.replay = new Replay({
       at: () => this.cursorS ?? this.view.from, go: (timeS) => this.cursorTo(timeS),
-      changed: () => this.draw(), failed: (error) => notice(error.message, { bad: true }),
+      changed: () => this.draw(), failed: showRefusal,
     });
     this.downloads = new Downloads();
     this.cursorS = null;
@@ -88,11 +89,10 @@ export class Plotted {
 
   /** What may be missing holds no plot up. */
   async loadBeside(whole, sealed) {
-    const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return null; };
     const [array, stances, events, summary] = await Promise.all([
-      api.arrayOf(this.session.id).catch(none),
-      whole.estimated && sealed ? api.listStances(this.session.id).catch(none) : null,
-      api.listEvents(this.session.id).catch(none), api.clockOf(this.session.id).catch(none),
+      unlessRefused(api.arrayOf(this.session.id)),
+      whole.estimated && sealed ? unlessRefused(api.listStances(this.session.id)) : null,
+      unlessRefused(api.listEvents(this.session.id)), unlessRefused(api.clockOf(this.session.id)),
     ]);
     if (array) this.replay.dress(array);
     const clock = clockOn(whole.axis, this.session.parts, summary);
@@ -109,8 +109,7 @@ export class Plotted {
 
   /** What may be drawn beside it: its modules come when somebody asks, or a reference is there already. */
   async showCompare(offset) {
-    const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return { items: [] }; };
-    const references = (await api.listComparisons(this.session.id).catch(none)).items;
+    const references = (await unlessRefused(api.listComparisons(this.session.id), { items: [] })).items;
     const open = async () => {
       byId("compare").hidden = true;
       const { Compare } = await import("./compare.js");

@@ -89,13 +89,15 @@ export class Replay {
   walk(by, jump) {
     if (!this.samples) return;
     if (this.playing.going) this.playing.stop();
-    this.walking = this.walking.then(async () => {
+    const step = this.walking.then(async () => {
       const { samples } = this;
       const fromS = this.on.at();
       if (!jump) return this.on.go(await samples.step(fromS, by));
       const toS = Math.min(samples.whole.durationS, Math.max(0, fromS + by * JUMP_S));
       return this.on.go(await samples.step(toS, 0));
-    }).catch(this.on.failed);
+    });
+    step.catch(this.on.failed);
+    this.walking = step.catch(() => {}); // the next key has its step all the same
   }
 
   draw() {
