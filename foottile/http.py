@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from foottile.environment import check_token, read_token
 from foottile.errors import FootTileError, NoAnswerError, UsageError, refused
 from foottile.local_server import find_local_server
 
@@ -33,8 +33,8 @@ class Http:
     """
 
     def __init__(self, url: str, token: str | None, timeout_s: float) -> None:
-        token = token or os.environ.get("FOOTTILE_TOKEN")
-        if not token and (local := find_local_server(url)) is not None:
+        token = check_token(token, "the token") if token else read_token()
+        if token is None and (local := find_local_server(url)) is not None:
             url, token = local.url, local.token
         self.url = url.rstrip("/")
         self.headers = {"Authorization": f"Bearer {token}"} if token else {}

@@ -6,27 +6,24 @@ the TOML file named with --config, else from here.
 
 from __future__ import annotations
 
+import json
+import tomllib
 from pathlib import Path
 from typing import Annotated
 
 from platformdirs import user_data_path
-from pydantic import Field, ValidationError
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    SettingsConfigDict,
-    TomlConfigSettingsSource,
-)
+from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from devices.errors import UsageError
-from devices.inputs import TEXT_BYTES_MAX, check_file
+from devices.inputs import read_text
+from foottile.environment import read_variable
 from service.api.doors import Bounds
 
 
-class Settings(Bounds, BaseSettings):
+class Settings(Bounds):
     """What a server is told; the bounds of connections are in `service.api.doors`."""
 
-    model_config = SettingsConfigDict(env_prefix="FOOTTILE_", extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0: on every one."""
@@ -34,7 +31,7 @@ class Settings(Bounds, BaseSettings):
     """TCP port; 0: any that is free."""
     data: Path = Field(default_factory=lambda: user_data_path("foottile"))
     """Folder for sessions, journals and what is known of nodes."""
-    token: Annotated[str, Field(min_length=8)] | None = None
+    token: Annotated[str, Field(pattern=r"^[!-~]{8,200}$")] | None = None
     """Asked for on every change of state; made and kept in the data folder if none is given."""
     private: bool = False
     """Is a login, or the token, asked for to look, too?"""
@@ -44,6 +41,23 @@ class Settings(Bounds, BaseSettings):
     exact: bool = False
     """Are estimates in recorded sessions as computed, and not rounded?"""
 
+    @field_validator("data", mode="before")
+    @classmethod
+    def _refuse_empty_path(cls, given: object) -> object:
+        if given == "":  # as a path it would be the working folder
+            raise ValueError("it is empty; expected a folder")
+        return given
+
+    @field_validator("allow_host", mode="before")
+    @classmethod
+    def _split_names(cls, given: object) -> object:
+        """Split what a variable or a file has in one text: names with commas between, or JSON."""
+        if not isinstance(given, str):
+            return given
+        if given.startswith("["):
+            return json.loads(given)
+        return tuple(name for name in given.replace(",", " ").split() if name)
+
 
 def load_settings(config: Path | None, **given: object) -> Settings:
     """Settings from everywhere; `given` are those of the command line that are not None.
@@ -51,23 +65,30 @@ def load_settings(config: Path | None, **given: object) -> Settings:
     Raises:
         UsageError: the file is not readable, a name is unknown, or a value is wrong.
     """
-    if config is not None:
-        try:
-            check_file(config, bytes_max=TEXT_BYTES_MAX)
-        except (OSError, ValueError) as error:
-            raise UsageError(f"no settings file {str(config)!r}: {error}") from error
-
-    where = "" if config is None else str(config)
+    from_file = {} if config is None else _read_file(config)
+    variables = {name: f"FOOTTILE_{name.upper()}" for name in Settings.model_fields}
+    read = {name: read_variable(variable) for name, variable in variables.items()}
+    from_environment = {name: value for name, value in read.items() if value is not None}
     chosen = {name: value for name, value in given.items() if value is not None}
     try:
-        from_file = TomlConfigSettingsSource(Settings, toml_file=config)()
-        return Settings(**{**from_file, **EnvSettingsSource(Settings)(), **chosen})
+        return Settings.model_validate({**from_file, **from_environment, **chosen})
     except ValidationError as error:
         complaint = error.errors()[0]
         name = ".".join(str(part) for part in complaint["loc"])
-        raise UsageError(
-            f"setting {name!r}: {complaint['msg']}",
-            where=where,
-        ) from error
-    except ValueError as error:  # not TOML
-        raise UsageError(f"settings are not readable: {error}", where=where) from error
+        top = str(complaint["loc"][0])
+        where = "" if config is None else str(config)
+        if top in chosen:
+            where = ""
+        elif top in from_environment:
+            where = variables[top]
+        raise UsageError(f"setting {name!r}: {complaint['msg']}", where=where) from error
+
+
+def _read_file(config: Path) -> dict[str, object]:
+    try:
+        # Editors of Windows put a byte-order mark in front.
+        return tomllib.loads(read_text(config).removeprefix("\ufeff"))
+    except OSError as error:
+        raise UsageError(f"no settings file {str(config)!r}: {error}") from error
+    except ValueError as error:  # neither TOML nor UTF-8
+        raise UsageError(f"settings are not readable: {error}", where=str(config)) from error

@@ -27,6 +27,7 @@ from devices.errors import UsageError
 from devices.scene.file import Scene, load_scene
 from devices.scene.hardware import EMULATED
 from devices.words import printable
+from foottile.environment import read_variable
 from service.plain_json import json_text
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ class _Output(_Screen):
 
 def _width() -> int | None:
     # A pipe or a file has no edge at which a line or a cell would have to be broken.
-    return None if sys.stdout.isatty() or "COLUMNS" in os.environ else 500
+    return None if sys.stdout.isatty() or read_variable("COLUMNS") else 500
 
 
 # Data goes to stdout; progress and remarks to stderr, progress only on a terminal.

@@ -76,6 +76,7 @@ def demo_command(
 async def _demo(
     host: str, port: int, data: Path, seconds: float | None, node_arguments: list[str]
 ) -> None:
+    from foottile.environment import read_token
     from service.api.address import listen, published, token_for, urls_of
     from service.api.logins import Logins
     from storage.private import keep_private
@@ -83,7 +84,7 @@ async def _demo(
     stop = stop_on_signals()
     keep_private(data)
     with listen(host, port) as listening, ExitStack() as stack:
-        given = os.environ.get("FOOTTILE_TOKEN")
+        given = read_token()
         token = token_for(given, data)
         stack.enter_context(published(listening, token))
         logins = Logins(token)

@@ -74,6 +74,7 @@ def node_command(
     """
     from platformdirs import user_state_path
 
+    from foottile.environment import read_token
     from service.node.dial import ingest_url
     from service.node.options import NodeOptions
     from service.rig.options import RigOptions
@@ -111,7 +112,7 @@ def node_command(
                 record=record,
                 calibration=calibration,
                 calibration_problem=problem,
-                token=os.environ.get("FOOTTILE_TOKEN"),
+                token=read_token(),
             )
         )
     )

@@ -22,6 +22,7 @@ import pyarrow.fs as fs
 
 from devices.errors import FileFormatError, StorageError, UsageError, needs_extra
 from devices.words import printable
+from foottile.environment import read_variable
 from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID
 
@@ -209,7 +210,7 @@ def _local() -> fs.FileSystem:
 @cache
 def _s3() -> fs.FileSystem:
     """Of credentials, region and endpoint that the environment says, as other programs know it."""
-    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
+    endpoint = read_variable("AWS_ENDPOINT_URL_S3") or read_variable("AWS_ENDPOINT_URL")
     library: Any = fs  # its stubs are of an older one
     filesystem: fs.FileSystem = library.S3FileSystem(
         endpoint_override=endpoint,

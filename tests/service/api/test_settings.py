@@ -1,0 +1,72 @@
+"""Settings as they come from the environment and from files."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from devices.errors import UsageError
+from service.api.settings import Settings, load_settings
+
+
+@pytest.fixture(autouse=True)
+def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in Settings.model_fields:
+        monkeypatch.delenv(f"FOOTTILE_{name.upper()}", raising=False)
+
+
+@pytest.mark.parametrize("name", [name.upper() for name in Settings.model_fields])
+def test_an_empty_variable_counts_as_not_set(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = load_settings(None)
+    for empty in ("", "\r", '""'):
+        monkeypatch.setenv(f"FOOTTILE_{name}", empty)
+        assert load_settings(None) == usual
+
+
+def test_values_of_an_env_file_of_another_system_are_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("FOOTTILE_TOKEN", '"0123456789abcdef"\r')
+    monkeypatch.setenv("FOOTTILE_PORT", "8123\r")
+    monkeypatch.setenv("FOOTTILE_PRIVATE", "true\r")
+    monkeypatch.setenv("FOOTTILE_DATA", "'/srv/foot tile'")
+    settings = load_settings(None)
+    assert settings.token == "0123456789abcdef"  # noqa: S105  # of this test
+    assert (settings.port, settings.private) == (8123, True)
+    assert settings.data == Path("/srv/foot tile")
+
+
+def test_the_port_that_kubernetes_sets_is_ignored(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("FOOTTILE_PORT", "tcp://10.0.0.1:8000")
+    with caplog.at_level(logging.WARNING, "foottile.environment"):
+        assert load_settings(None).port == 8000
+    assert "Kubernetes" in caplog.text
+
+
+@pytest.mark.parametrize("value", ["robot.local,lab", "robot.local lab", '["robot.local", "lab"]'])
+def test_several_names_fit_into_one_variable(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FOOTTILE_ALLOW_HOST", value)
+    assert load_settings(None).allow_host == ("robot.local", "lab")
+
+
+def test_a_wrong_value_is_said_with_the_variable_that_has_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("FOOTTILE_PORT", "eight")
+    with pytest.raises(UsageError, match="FOOTTILE_PORT"):
+        load_settings(None)
+
+
+def test_a_file_may_have_a_byte_order_mark_and_no_empty_folder(tmp_path: Path) -> None:
+    config = tmp_path / "foottile.toml"
+    config.write_bytes(b"\xef\xbb\xbfport = 8001\r\nallow_host = ['robot.local']\r\n")
+    settings = load_settings(config)
+    assert (settings.port, settings.allow_host) == (8001, ("robot.local",))
+    for text in ('data = ""', "port = ", "prot = 1", "data = '\xff'"):
+        config.write_bytes(text.encode("latin-1"))
+        with pytest.raises(UsageError, match=r"foottile\.toml"):
+            load_settings(config)
