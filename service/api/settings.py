@@ -48,7 +48,7 @@ class Settings(Bounds):
             raise ValueError("it is empty; expected a folder")
         return given
 
-    @field_validator("allow_host", mode="before")
+    @field_validator("allow_host", "trusted_proxy", mode="before")
     @classmethod
     def _split_names(cls, given: object) -> object:
         """Split what a variable or a file has in one text: names with commas between, or JSON."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -57,6 +58,10 @@ def main() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # started with it closed: whoever does wants to hear nothing
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  # as long as it runs
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper):
+            # A letter that the terminal's encoding lacks must not end a command.
+            stream.reconfigure(errors="backslashreplace")
     give_back_freed()
     # So that what is half-written is cleaned up when the machine is shut down, too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))

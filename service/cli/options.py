@@ -137,8 +137,20 @@ def progress(message: str) -> Iterator[Callable[[str], None]]:
     if not stderr.is_terminal:
         yield remark
         return
-    with stderr.status(escape(printable(message))) as status:
+    # The usual spinner is of Braille, which not every terminal's encoding has.
+    spinner = "dots" if is_shown("⠋") else "line"
+    with stderr.status(escape(printable(message)), spinner=spinner) as status:
         yield lambda text: status.update(escape(printable(text)))
+
+
+def is_shown(text: str) -> bool:
+    """Return whether the encodings of both streams have all characters of a text."""
+    try:
+        for stream in (sys.stdout, sys.stderr):
+            text.encode(stream.encoding or "ascii")
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def say(message: str) -> None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import sys
 from io import StringIO
 from urllib.parse import urlsplit
 
-from service.cli.options import remark, say
+from service.cli.options import is_shown, remark, say
 
 _BORDER = 2
 _BLACK_ON_WHITE = "\x1b[38;5;231;48;5;16m"
 """Light blocks on a dark ground, whatever colours the terminal has: few phones read it inverted."""
+_WHITE_ON_WHITE = "\x1b[38;5;231;48;5;231m"
 _USUAL = "\x1b[0m"
 
 
@@ -21,12 +24,21 @@ def reaches_others(url: str) -> bool:
     return not is_loopback(urlsplit(url).hostname or "")
 
 
-def qr_lines(text: str) -> list[str]:
-    """A QR code in half blocks, two rows a line, the light modules drawn."""
+def qr_lines(text: str, *, is_ascii: bool = False) -> list[str]:
+    """Return a QR code as lines of text in which the light modules are drawn.
+
+    Args:
+        text: its content.
+        is_ascii: draw `##` for a module, and not half blocks, two rows a line.
+    """
     import segno
 
+    code = segno.make(text, error="l", micro=False)
+    if is_ascii:
+        rows = code.matrix_iter(border=_BORDER)
+        return ["".join("  " if is_dark else "##" for is_dark in row) for row in rows]
     drawn = StringIO()
-    segno.make(text, error="l", micro=False).terminal(drawn, border=_BORDER, compact=True)
+    code.terminal(drawn, border=_BORDER, compact=True)
     return drawn.getvalue().splitlines()
 
 
@@ -34,8 +46,14 @@ def show_code(address: str, *, viewer: bool = False) -> None:
     """Show the code of an address that has a ticket; on a terminal only, which no log is."""
     if not sys.stdout.isatty():
         return
-    for line in qr_lines(address):
-        sys.stdout.write(f"{_BLACK_ON_WHITE}{line}{_USUAL}\n")
+    lines = qr_lines(address, is_ascii=not is_shown("█▀▄"))
+    columns = shutil.get_terminal_size().columns
+    if len(lines[0]) > columns:
+        remark(f"the QR code needs {len(lines[0])} columns, and this terminal has {columns}")
+        return
+    for line in lines:
+        solid = re.sub("#+", rf"{_WHITE_ON_WHITE}\g<0>{_BLACK_ON_WHITE}", line)
+        sys.stdout.write(f"{_BLACK_ON_WHITE}{solid}{_USUAL}\n")
     sys.stdout.flush()
     may = "look" if viewer else "tare, record and change"
     remark(f"for a phone: it may {may}; good once, for five minutes; more with `foottile ticket`")

@@ -34,6 +34,16 @@ def test_a_code_is_drawn_with_light_blocks_module_by_module() -> None:
     assert {light for row in rows[:border] for light in row} == {1}  # readers need a margin
 
 
+def test_a_code_of_ascii_has_the_same_modules() -> None:
+    text = f"{AWAY}/#ticket=0123456789abcdefABCDEF"
+    drawn = qr_lines(text, is_ascii=True)
+    assert all(line.isascii() for line in drawn)
+    rows = [[line[at : at + 2] == "##" for at in range(0, len(line), 2)] for line in drawn]
+    dark = [list(row) for row in segno.make(text, error="l", micro=False).matrix]
+    assert [[not light for light in row[2:-2]] for row in rows[2:-2]] == dark
+    assert all(all(row) for row in (*rows[:2], *rows[-2:]))
+
+
 def announced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], url: str, **how: bool
 ) -> tuple[str, Logins]:
