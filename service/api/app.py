@@ -16,6 +16,7 @@ from devices.errors import FootTileError
 from service.api import problems
 from service.api.described import DOCS_FILES, say_who_may, swagger_folder
 from service.api.guard import Guard
+from service.api.head import HeadFromGet
 from service.api.logins import Logins
 from service.api.page import PageFiles
 from service.api.routes import access, calibrations, formats, health, index, login, nodes
@@ -162,6 +163,7 @@ def make_app(
         return await swagger.get_response(name, request.scope)
 
     app.mount("/static", page, name="static")
+    app.add_middleware(HeadFromGet)
     app.add_middleware(Guard, hosts=tuple(hosts), logins=logins)
     return app
 

@@ -59,8 +59,15 @@ _OPEN = re.compile(
 )
 """What also a private server shows everybody: pages and files without data, how to get in, and for
 those who watch over its process whether it works."""
-_HOST = re.compile(r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)\])(?::[0-9]{1,5})?")
-"""As browsers write it: a name or an address, and a port; no user, no path."""
+_HOST = re.compile(
+    r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)(?P<zone>%[A-Za-z0-9._~%-]{1,40})?\])"
+    r"(?::[0-9]{1,5})?"
+)
+"""As browsers write it: a name or an address, and a port; no user, no path.
+
+A link-local address may have a zone, the name of an interface behind `%` or `%25` (RFC 6874): some
+clients send it, and to which interface it leads is decided before it comes here.
+"""
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 _DEFAULT_HEADERS = {
     "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
@@ -151,10 +158,10 @@ class Guard:
             return True
         try:
             # A foreign DNS can point a name here, but not an address.
-            ipaddress.ip_address(name)
+            address = ipaddress.ip_address(name)
         except ValueError:
             return False
-        return True
+        return found["zone"] is None or address.is_link_local
 
 
 def _most(scope: Scope) -> int:

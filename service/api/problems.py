@@ -120,8 +120,10 @@ def _methods_of(request: Request) -> list[str]:
         for route in routes
         if route.matches({**request.scope, "method": method})[0] is Match.FULL
     }
-    # What is under a mount is files.
-    return sorted((found or {"GET", "HEAD"}) | {"OPTIONS"})
+    found = found or {"GET"}  # what is under a mount is files
+    if "GET" in found:
+        found.add("HEAD")  # see service.api.head
+    return sorted(found | {"OPTIONS"})
 
 
 async def _on_bug(request: Request, error: Exception) -> JSONResponse:

@@ -11,6 +11,7 @@ import asyncio
 import errno
 import logging
 import socket
+import struct
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -18,7 +19,7 @@ from http import HTTPStatus
 from typing import Any
 
 import uvicorn
-from starlette.types import Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 from starlette.websockets import WebSocket as StarletteWebSocket
 from starlette.websockets import WebSocketDisconnect
 from uvicorn._types import ASGIReceiveEvent
@@ -132,8 +133,13 @@ class Http(HttpToolsProtocol):
         client = self.config.forwarded_client(_address(self.client), named)
         if not is_websocket and not self.config.doors.admit(self.transport, client):
             self.app = refuse
+        app = self.app
+        without_chunks = WithoutChunks(app, self.transport)
+        if self.parser.get_http_version() == "1.0":
+            self.app = without_chunks
         before: RequestResponseCycle | None = self.cycle  # None before the first one
         super().on_headers_complete()
+        without_chunks.cycle, self.app = self.cycle, app
         if self.cycle is not before:
             self._asked.append(self.cycle)
             self._expect_more()
@@ -216,6 +222,56 @@ class Http(HttpToolsProtocol):
         for cycle in self._asked:
             cycle.disconnected = True
             cycle.message_event.set()
+
+
+class WithoutChunks:
+    """The application for one request of HTTP/1.0, which has no chunks.
+
+    uvicorn sends them all the same. Here a body whose length is not known is sent as it is, and
+    ends where the connection ends. One that breaks off resets the connection, else nobody could
+    tell it from a whole one.
+
+    Args:
+        app: what answers.
+        transport: the connection.
+    """
+
+    cycle: RequestResponseCycle
+    """Of this request; set before it is answered."""
+
+    def __init__(self, app: Any, transport: asyncio.Transport) -> None:
+        self._app = app
+        self._transport = transport
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer it."""
+        is_unframed = False
+
+        async def send_unframed(message: Message) -> None:
+            nonlocal is_unframed
+            if message["type"] == "http.response.start":
+                names = {name.lower() for name, _ in message.get("headers", ())}
+                is_unframed = b"content-length" not in names
+                if is_unframed:
+                    self.cycle.chunked_encoding = False
+            elif is_unframed:
+                self.cycle.expected_content_length = len(message.get("body", b""))
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_unframed)
+        except BaseException:
+            if is_unframed:
+                reset(self._transport)
+            raise
+
+
+def reset(transport: asyncio.Transport) -> None:
+    """Close a connection so that its other end sees an error, and not an end."""
+    connection = transport.get_extra_info("socket")
+    if connection is not None:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    transport.abort()
 
 
 class WebSocket(WebSocketsSansIOProtocol):

@@ -343,12 +343,13 @@ def test_no_get_changes_anything(running: Running, node: FakeNode) -> None:
 @pytest.mark.parametrize(
     ("path", "allowed"),
     [
-        ("/sessions", {"GET", "POST"}),
-        ("/sessions/20200101T000000Z-000000", {"GET", "PATCH", "DELETE"}),
-        ("/sessions/20200101T000000Z-000000/events", {"GET", "POST"}),
+        ("/sessions", {"GET", "HEAD", "POST"}),
+        ("/sessions/20200101T000000Z-000000", {"GET", "HEAD", "PATCH", "DELETE"}),
+        ("/sessions/20200101T000000Z-000000/events", {"GET", "HEAD", "POST"}),
         ("/sessions/20200101T000000Z-000000/data", {"GET", "HEAD"}),
-        ("/trash", {"GET", "DELETE"}),
-        ("/health", {"GET"}),
+        ("/sessions/20200101T000000Z-000000/stop", {"POST"}),
+        ("/trash", {"GET", "HEAD", "DELETE"}),
+        ("/health", {"GET", "HEAD"}),
     ],
 )
 def test_what_is_allowed_is_all_of_it(running: Running, path: str, allowed: set[str]) -> None:

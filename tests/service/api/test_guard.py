@@ -30,7 +30,14 @@ STRANGE_HOSTS = (
         "::1",
         "[::1]x",
     ),
-    *("[localhost]", "[fe80::1%25eth0]", "0x7f.1", "localhost,evil.example"),
+    *("[localhost]", "0x7f.1", "localhost,evil.example", "localhost%25eth0", "127.0.0.1%eth0"),
+    *(
+        "[fe80::1%]",
+        "[fe80::1%25 x]",
+        "[fe80::1%eth0/x]",
+        "[fe80::1%25eth0",
+        "[2001:db8::1%25eth0]",
+    ),
 )
 
 
@@ -60,6 +67,9 @@ def test_localhost_and_addresses_pass(running: Running) -> None:
         "192.168.4.1:8000",
         "[::1]",
         "[fe80::1]:8",
+        "[fe80::1%25eth0]:8",
+        "[fe80::1%eth0]",
+        "[FE80::1%25br-lan.2]:8000",
     ):
         answer = running.http.get("/health", headers={"Host": host})
         assert answer.status_code == 200, host

@@ -35,7 +35,6 @@ _YEAR_S = 31_536_000
 MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
 
 
-@router.head("/{session_id}/data", include_in_schema=False)
 @router.get(
     "/{session_id}/data",
     operation_id="getData",
@@ -130,7 +129,7 @@ async def _made(
     if query.has_marks:
         marks = await run_in_threadpool(_marks, session, query, server)
         headers |= said_of_marks([marks])
-    return await made(_chunks(session, query, server, marks), query, session.id, request, headers)
+    return await made(_chunks(session, query, server, marks), query, session.id, headers)
 
 
 def _marks(session: Session, query: DataQuery, server: Server) -> Marks:

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import AsyncIterator, Generator
 
 import pyarrow as pa
-from fastapi import Request, Response
+from fastapi import Response
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
@@ -56,16 +56,13 @@ def said_of_marks(marks: list[Marks]) -> dict[str, str]:
     return {"Foottile-Marks": f"placed={total - left_out}, left-out={left_out}"}
 
 
-async def made(
-    chunks: Chunks, query: MadeQuery, stem: str, request: Request, headers: dict[str, str]
-) -> Response:
+async def made(chunks: Chunks, query: MadeQuery, stem: str, headers: dict[str, str]) -> Response:
     """An answer of chunks, which are closed whoever goes away.
 
     Args:
         chunks: the file.
         query: what was asked for.
         stem: the file's name without its ending.
-        request: HEAD, or GET.
         headers: that it has besides.
     """
     # The first chunk now: what is wrong with the query is then an answer, not a broken download.
@@ -73,12 +70,6 @@ async def made(
     if first is None:
         raise UsageError("the session has no frames")
     headers["Content-Disposition"] = f'attachment; filename="{stem}.{query.to.ending}"'
-    if request.method == "HEAD":
-        await run_in_threadpool(chunks.close)
-        answer = Response(headers=headers, media_type=query.to.media_type)
-        del answer.headers["content-length"]  # it is not known before it is made
-        return answer
-
     return StreamingResponse(sent(chunks, first), headers=headers, media_type=query.to.media_type)
 
 

@@ -23,7 +23,6 @@ from storage.sessions.folder import Session
 router = APIRouter(prefix="/takes", tags=["data"])
 
 
-@router.head("/{take_id}/data", include_in_schema=False)
 @router.get(
     "/{take_id}/data",
     operation_id="getTakeData",
@@ -75,7 +74,7 @@ async def take_data(
         marks = [await run_in_threadpool(_marks, each, query, server) for each in sessions]
         headers |= said_of_marks(marks)
     chunks = _chunks(sessions, query, server, marks)
-    return await made(chunks, query, f"take-{take_id}", request, headers)
+    return await made(chunks, query, f"take-{take_id}", headers)
 
 
 def _marks(session: Session, query: TakeDataQuery, server: Server) -> Marks:
