@@ -1,0 +1,191 @@
+"""A server behind a real nginx on its own machine: bare, and as docs/security.md has it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import socket
+import ssl
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import httpx
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from service.api.doors import Bounds
+from service.api.logins import Right
+from service.link import INGEST_PATH, LIVE_PATH
+from tests.service.fake_node import NodeOf
+from tests.service.running import Running, ServeWith, assert_refused
+from tests.tokens import SHARED_BEARER
+from tests.waiting import PATIENCE_S, until
+
+ROOT = Path(__file__).resolve().parents[3]
+NGINX = shutil.which("nginx", path="/usr/sbin:/usr/bin:/sbin:/bin")
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(NGINX is None, reason="no nginx; on Debian: sudo apt-get install nginx"),
+]
+Proxy = Callable[..., int]
+BARE = "server { listen 127.0.0.1:{listen}; location / { proxy_pass http://127.0.0.1:{port}; } }"
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        port: int = found.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def nginx(tmp_path: Path) -> Iterator[Proxy]:
+    """Starts nginx with these servers in its configuration, once it answers at a port."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(servers: str, port: int) -> int:
+        folder = tmp_path / "nginx"
+        folder.mkdir()
+        temporary = "".join(
+            f"{kind}_temp_path {folder / kind};\n"
+            for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+        )
+        file = folder / "nginx.conf"
+        file.write_text(
+            f"daemon off; master_process off; pid {folder / 'pid'}; error_log stderr;\n"
+            f"events {{}}\nhttp {{ access_log off;\n{temporary}{servers}\n}}\n"
+        )
+        assert NGINX is not None
+        started.append(subprocess.Popen([NGINX, "-e", "stderr", "-p", folder, "-c", file]))
+        until(lambda: answers(port))
+        return port
+
+    yield start
+    for process in started:
+        process.terminate()
+        process.wait(PATIENCE_S)
+
+
+def answers(port: int) -> bool:
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
+        return True
+    return False
+
+
+def documented(folder: Path, *, listen: int, port: int) -> str:
+    """The configuration of docs/security.md, with this test's ports and certificate."""
+    text = (ROOT / "docs" / "security.md").read_text("utf-8")
+    (found,) = re.findall(r"```nginx\n(.*?)```", text, re.DOTALL)
+    for old, new in (
+        ("listen 443 ssl;", f"listen 127.0.0.1:{listen} ssl;"),
+        ("http://127.0.0.1:8000", f"http://127.0.0.1:{port}"),
+        ("/etc/ssl/foottile.pem", str(folder / "foottile.pem")),
+        ("/etc/ssl/foottile.key", str(folder / "foottile.key")),
+    ):
+        assert found.count(old) == 1, old
+        found = found.replace(old, new)
+    return str(found)
+
+
+@pytest.fixture
+def bare(running: Running, nginx: Proxy) -> str:
+    """Address of a bare `proxy_pass` to the server."""
+    port = free_port()
+    servers = BARE.replace("{listen}", str(port)).replace("{port}", str(running.port))
+    return f"http://127.0.0.1:{nginx(servers, port)}"
+
+
+def test_through_a_bare_proxy_nobody_changes_anything_without_the_token(
+    running: Running, bare: str
+) -> None:
+    with httpx.Client(base_url=f"{bare}/api/v1", trust_env=False) as anybody:
+        assert_refused(anybody.delete("/trash"), 401, "token", "foottile ticket")
+        assert anybody.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
+        assert anybody.post("/tickets", json={}).status_code == 401
+        assert anybody.get("/sessions").status_code == 200
+        # A page's change names the proxy's own address, which the proxy does not pass on.
+        headers = SHARED_BEARER | {"Origin": bare}
+        assert_refused(anybody.delete("/trash", headers=headers), 403, "Host header")
+        assert anybody.delete("/trash", headers=SHARED_BEARER).status_code == 200
+    assert running.http.get("/trash").json()["items"] == []
+
+
+@pytest.fixture
+def tls(tmp_path: Path) -> ssl.SSLContext:
+    """Trusts the certificate that is made for the proxy."""
+    certificate = tmp_path / "foottile.pem"
+    words = ("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    named = ("-subj", "/CN=foottile", "-addext", "subjectAltName=IP:127.0.0.1", "-days", "2")
+    files = ("-keyout", tmp_path / "foottile.key", "-out", certificate)
+    subprocess.run(["openssl", *words, *named, *files], check=True, capture_output=True)
+    return ssl.create_default_context(cafile=certificate)
+
+
+@pytest.fixture
+def behind(serve_with: ServeWith) -> Running:
+    """A server that trusts the proxy on its own machine, as the document has it started."""
+    return serve_with(bounds=Bounds.model_validate({"trusted_proxy": ["127.0.0.1"]}))
+
+
+@pytest.fixture
+def site(behind: Running, nginx: Proxy, tls: ssl.SSLContext, tmp_path: Path) -> str:
+    """Address of the documented proxy."""
+    port = free_port()
+    return f"https://127.0.0.1:{nginx(documented(tmp_path, listen=port, port=behind.port), port)}"
+
+
+def test_as_documented_people_log_in_record_watch_and_download(
+    behind: Running, site: str, tls: ssl.SSLContext, node_of: NodeOf
+) -> None:
+    node = node_of(behind)
+    node.connect()
+    node.tared()
+    ticket = behind.call(lambda: behind.logins.tickets.new(Right.PRESS))
+    with httpx.Client(base_url=f"{site}/api/v1", verify=tls, trust_env=False) as anybody:
+        assert_refused(anybody.delete("/trash"), 401, "token")
+        anybody.headers["Origin"] = site
+        answer = anybody.post("/login", json={"ticket": ticket})
+        assert answer.status_code == 200, answer.text
+        assert "Secure" in answer.headers["set-cookie"]
+        begun = anybody.post("/sessions", json={"node": "bench", "name": "through the proxy"})
+        assert begun.status_code == 201, begun.text
+        recording = behind.session(begun.json()["id"])
+        node.deliver(50)
+        assert anybody.post(f"{recording.url}/stop").status_code == 200
+        node.send(10, now=True)
+        recording.sealed()
+        downloaded = anybody.get(f"{recording.url}/data", params={"format": "parquet"})
+        assert downloaded.content[:4] == b"PAR1"
+        assert_refused(
+            anybody.delete("/trash", headers={"Origin": site.replace("https", "http")}),
+            *(403, "another site"),
+        )
+    address = site.replace("https", "wss")
+    with connect(address + LIVE_PATH, ssl=tls, origin=site, proxy=None) as live:  # type: ignore[arg-type]  # a NewType of str
+        assert "hello" in live.recv(timeout=PATIENCE_S)
+    with (
+        pytest.raises(InvalidStatus) as refused,
+        connect(address + INGEST_PATH, ssl=tls, proxy=None),
+    ):
+        pass
+    assert refused.value.response.status_code == 401
+
+
+def test_as_documented_a_client_cannot_choose_its_own_address(
+    serve_with: ServeWith, nginx: Proxy, tls: ssl.SSLContext, tmp_path: Path
+) -> None:
+    one = {"max_connections_per_address": 1, "trusted_proxy": ["127.0.0.1"]}
+    running, port = serve_with(bounds=Bounds.model_validate(one)), free_port()
+    nginx(documented(tmp_path, listen=port, port=running.port), port)
+    address = f"wss://127.0.0.1:{port}{LIVE_PATH}"
+    with connect(address, ssl=tls, proxy=None) as live:
+        assert "hello" in live.recv(timeout=PATIENCE_S)
+        answer = httpx.get(
+            f"https://127.0.0.1:{port}/api/v1/health",
+            headers={"X-Forwarded-For": "192.0.2.9"},
+            verify=tls,
+            trust_env=False,
+        )
+        assert answer.status_code == 503
