@@ -29,5 +29,6 @@ USER foottile
 VOLUME /data
 EXPOSE 8000
 STOPSIGNAL SIGTERM
-# Without FOOTTILE_TOKEN it makes a token, which is not in the log: docker exec NAME cat /data/token
+# Without FOOTTILE_TOKEN it makes a token, which is not in the log. A link that logs a browser in, once:
+# docker exec NAME foottile ticket
 CMD ["foottile", "serve", "--host", "0.0.0.0", "--data", "/data"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import secrets
 import shutil
 import subprocess
 import sys
@@ -23,6 +25,8 @@ LOOK_S = 11.0  # until the trace is full
 
 SESSION_S = 20.0
 """How long the session lasts of whose page there is a picture."""
+TOKEN = os.environ.setdefault("FOOTTILE_TOKEN", secrets.token_urlsafe(18))
+"""Of demo, node and requests here, which have it from the environment."""
 
 
 @contextmanager
@@ -36,7 +40,7 @@ def demo(*options: str) -> Iterator[str]:
         )
         try:
             assert running.stdout is not None
-            url = running.stdout.readline().split()[-1]
+            url = running.stdout.readline().split()[-1].partition("#")[0]
             while not any(node["tare"] for node in httpx.get(f"{url}api/v1/nodes").json()["items"]):
                 time.sleep(0.2)
             yield url
@@ -45,6 +49,11 @@ def demo(*options: str) -> Iterator[str]:
             running.wait(30)
             if running.stdout is not None:
                 running.stdout.close()
+
+
+def api_of(url: str) -> httpx.Client:
+    """A client of the demo's API, with its token."""
+    return httpx.Client(base_url=f"{url}api/v1", headers={"Authorization": f"Bearer {TOKEN}"})
 
 
 def live(browser: Browser) -> None:
@@ -63,7 +72,7 @@ def live(browser: Browser) -> None:
 
 def session(browser: Browser) -> None:
     """The page of a session of a walking foot: two of its stances."""
-    with demo("--scene", "poppy") as url, httpx.Client(base_url=f"{url}api/v1") as http:
+    with demo("--scene", "poppy") as url, api_of(url) as http:
         body = {
             "node": http.get("/nodes").json()["items"][0]["node"],
             "name": "stones, third trial",
@@ -105,7 +114,7 @@ def session(browser: Browser) -> None:
 
 def nodes(browser: Browser) -> None:
     """All nodes at once: two feet, both recorded."""
-    with demo("--scene", "rolling") as url, httpx.Client(base_url=f"{url}api/v1") as http:
+    with demo("--scene", "rolling") as url, api_of(url) as http:
         other = subprocess.Popen(
             [*COMMAND, "node", "--scene=standing", "--name=right", f"--server={url}"]
         )

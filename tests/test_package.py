@@ -203,7 +203,8 @@ def container_commands(folder: Path) -> list[list[str]]:
     printer.chmod(0o755)
     node = subprocess.run(
         ["sh", str(ROOT / "scripts" / "container-node")],
-        env={"PATH": f"{folder}{os.pathsep}{os.environ['PATH']}"},
+        # `python` of the image has the package.
+        env={"PATH": os.pathsep.join((str(folder), sysconfig.get_path("scripts"), "/usr/bin:/bin"))},
         check=True,
         capture_output=True,
         text=True,

@@ -20,7 +20,8 @@ from devices.frames import FrameBatch
 from service.api.address import listen, urls_of
 from service.api.app import make_app
 from service.api.doors import Bounds
-from service.api.logins import Logins
+from service.api.logins import Logins, Right
+from service.api.routes.login import with_ticket
 from service.api.serve import serving
 from service.link import SUBPROTOCOL
 from service.server.server import Server
@@ -122,6 +123,11 @@ class Running:
             return function()
 
         return asyncio.run_coroutine_threadsafe(run(), self._loop).result(10.0)
+
+    def link(self) -> str:
+        """An address of the live page that logs a browser in, once."""
+        ticket = self.call(lambda: self.logins.tickets.new(Right.PRESS))
+        return with_ticket(self.url, ticket)
 
     def socket(self, path: str, *, small: bool = False, **options: Any) -> ClientConnection:
         """A websocket to the server."""

@@ -50,7 +50,7 @@ def test_what_stands_on_the_foot_is_watched_recorded_marked_looked_at_and_downlo
     scripted: Scripted, firefox: Firefox
 ) -> None:
     with Play(scripted.node, 5.0) as play:
-        firefox.open(scripted.url)
+        firefox.open(scripted.running.link())
         firefox.wait("document.body.dataset.live === 'true'")
         firefox.wait("Math.abs(Number(document.getElementById('grf').dataset.value) - 10) < 0.01")
         firefox.wait("document.querySelectorAll('#bars [data-value]').length === 2")
@@ -97,7 +97,7 @@ def test_what_stands_on_the_foot_is_watched_recorded_marked_looked_at_and_downlo
 def test_on_a_phone_nothing_is_wider_than_the_screen(scripted: Scripted, firefox: Firefox) -> None:
     session = scripted.recorded("walk")
     with Play(scripted.node, 5.0):
-        firefox.open(scripted.url, 390, 844)
+        firefox.open(scripted.running.link(), 390, 844)
         firefox.wait("document.body.dataset.live === 'true'")
         firefox.wait("document.documentElement.scrollWidth <= innerWidth")
         firefox.keys("?")

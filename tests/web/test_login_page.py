@@ -62,6 +62,21 @@ def test_a_phone_that_opens_a_ticket_may_record_and_a_second_one_may_not(
         expect(second.locator("#login")).to_be_hidden()
 
 
+def test_a_link_that_is_opened_twice_in_one_browser_says_nothing_while_its_login_lasts(
+    script: Script, open_page: OpenPage
+) -> None:
+    server = script(token=TOKEN)
+    for link in (server.running.link(), f"{server.url}/#token={TOKEN}"):
+        page = open_page(link)
+        expect(page.locator("body")).to_have_attribute("data-may", "press")
+        again = page.context.new_page()
+        again.goto(link)
+        expect(again.locator("body")).to_have_attribute("data-may", "press")
+        expect(again.locator("#login")).to_be_hidden()
+        expect(again.locator("#token-dialog")).to_have_count(0)
+        assert again.url == f"{server.url}/"
+
+
 def test_a_viewer_is_offered_nothing_and_the_server_refuses_it(
     script: Script, open_page: OpenPage
 ) -> None:

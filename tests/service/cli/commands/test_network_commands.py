@@ -20,6 +20,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
+import foottile
 from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S
 
@@ -40,9 +41,13 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]
 
 @dataclass
 class Demo:
-    url: str
+    link: str
     data: Path
     process: subprocess.Popen[str]
+
+    @property
+    def url(self) -> str:
+        return self.link.partition("/#")[0]
 
     def get(self, path: str) -> httpx.Response:
         return httpx.get(f"{self.url}/api/v1{path}", headers=SHARED_BEARER, trust_env=False)
@@ -73,8 +78,8 @@ def start_demo(folder: Path, *options: str, tared: bool = True) -> Demo:
             [*COMMAND, *arguments, *options], stdout=subprocess.PIPE, stderr=stderr, text=True
         )
     assert process.stdout is not None
-    url = process.stdout.readline().split()[-1].partition("/#ticket=")[0]
-    demo = Demo(url, folder / "data", process)
+    link = process.stdout.readline().split()[-1]
+    demo = Demo(link, folder / "data", process)
     end = time.monotonic() + 30
     while tared and not any(node["tare"] for node in demo.get("/nodes").json()["items"]):
         assert time.monotonic() < end, (folder / "stderr.txt").read_text()
@@ -248,6 +253,24 @@ def test_a_second_node_of_the_same_name_is_told_why_it_is_not_let_in(
     node.stderr.close()
     assert "--name" in said
     assert demo.get("/nodes/demo").json()["connected"]
+
+
+def test_a_demo_prints_one_link_that_logs_a_browser_in_and_commands_need_no_token(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FOOTTILE_TOKEN")
+    demo = start_demo(tmp_path, "--host=0.0.0.0", tared=False)
+    login = f"http://127.0.0.1:{demo.url.rsplit(':', 1)[1]}/api/v1/login"
+    ticket = {"ticket": demo.link.partition("/#ticket=")[2]}
+    answers = [httpx.post(login, json=ticket, trust_env=False) for _ in range(2)]
+    assert [answer.status_code for answer in answers] == [200, 401]
+    assert answers[0].json()["may"] == "press"
+    with foottile.connect(login.removesuffix("/api/v1/login")) as server:
+        assert server.ticket()["may"] == "press"
+    demo.process.send_signal(signal.SIGINT)
+    assert ended(demo.process) == 0
+    said = (tmp_path / "stderr.txt").read_text()
+    assert (demo.data / "token").read_text().strip() not in said + demo.link
 
 
 @pytest.mark.real_time
