@@ -48,6 +48,10 @@ class ServoSource(Protocol):
     def stale_after_ns(self) -> int:
         """Age from which a position is older than it should be."""
 
+    @property
+    def is_turn_known(self) -> bool:
+        """Are the whole turns known of the position that `latest` gave last?"""
+
 
 class FrameRow(NamedTuple):
     """One frame as it is taken: a row of the columns of `FrameBatch`."""
@@ -182,6 +186,8 @@ class Acquisition:
             if reading is not None:
                 servo_counts, age_ns = reading[0], t_mono_ns - reading[1]
                 servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
+                if not self._servo.is_turn_known:
+                    frame_status |= FrameStatus.SERVO_TURN_UNKNOWN
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
         # Positional, and unpacked by the keeper: this runs for every frame.

@@ -16,7 +16,8 @@
      |    +-- SpiSetupError                    no such SPI device, no permission
      |    +-- AdcSilentError                   no converter drives the line
      +-- ServoError
-     |    +-- ServoSetupError                  no such serial port
+     |    +-- ServoSetupError                  another servo or another firmware than the scene's
+     |    |    +-- ServoLostError              its serial port is not there, or may not be used
      |    +-- ServoTimeoutError (TimeoutError) a servo did not answer in time
      |    +-- ServoPacketError  (ValueError)   bytes that are no valid packet
      |    +-- ServoStatusError                 the servo answered with an error number
@@ -195,7 +196,11 @@ class ServoError(FootTileError):
 
 
 class ServoSetupError(ServoError):
-    """The servo's serial port cannot be opened."""
+    """The servo cannot be used as the scene says: another model, firmware or baud rate."""
+
+
+class ServoLostError(ServoSetupError):
+    """The servo's serial port is not there, failed, or may not be used now."""
 
 
 class ServoTimeoutError(ServoError, TimeoutError):

@@ -66,6 +66,8 @@ class FrameStatus(IntFlag):
     """Taken before a load trace begins: the foot is unloaded."""
     NEW_ARRAY_INFO = 16
     """The array was identified again before this frame."""
+    SERVO_TURN_UNKNOWN = 32
+    """The servo restarted or its count leapt: the position may be off by whole turns."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ class FrameBatch(Arrays):
         padc: uint16[n, tiles], raw 10-bit pressure counts; `NOT_READ` where not read.
         tadc: uint16[n, tiles], raw 10-bit temperature counts; `NOT_READ` where not read.
         sample_offset_us: int32[n, tiles], each tile's sample instant minus `t_ns`.
-        servo_counts: int32[n], newest position; `NO_SERVO_COUNTS` without servo.
+        servo_counts: int32[n], newest position, continued over whole turns (see
+            `devices.chips.dynamixel.turns`); `NO_SERVO_COUNTS` without servo.
         servo_age_us: int32[n], its age at `t_ns`; `NO_SERVO_AGE` without servo.
         status: uint8[n, tiles], `TileStatus` bits.
         frame_status: uint8[n], `FrameStatus` bits.

@@ -86,7 +86,9 @@ FRAMES = (
         "1 no_answer, 2 stale, 4 retried, 8 implausible, 16 over_range, 32 not_converted",
     ),
     _frame(
-        "frame_status", "bits", "1 overrun, 2 servo_stale, 4 bus_fault, 8 lead, 16 new_array_info"
+        "frame_status",
+        "bits",
+        "1 overrun, 2 servo_stale, 4 bus_fault, 8 lead, 16 new_array_info, 32 servo_turn_unknown",
     ),
     _frame("reference_force_n", "N", "force of the calibration rig's sensor"),
 )

@@ -13,9 +13,10 @@ from typing import Protocol
 
 import serial
 
-from devices.errors import ServoSetupError
+from devices.errors import ServoLostError, ServoSetupError
 
 SYSFS = Path("/sys/bus/usb-serial/devices")
+BY_ID = Path("/dev/serial/by-id")
 LATENCY_MS = 1
 """What the timer should say."""
 
@@ -42,14 +43,16 @@ def open_line(port: str, baudrate: int, timeout_s: float) -> SerialPort:
     """Open a serial port for this program alone; a read waits `timeout_s` seconds at most.
 
     Raises:
-        ServoSetupError: there is no such port, it may not be used, or another program uses it.
+        ServoLostError: there is no such port, it may not be used, or another program uses it.
+        ServoSetupError: it cannot run at this baud rate.
     """
     try:
         line = serial.Serial(
             port, baudrate, timeout=timeout_s, write_timeout=timeout_s, exclusive=True
         )
     except (*PORT_ERRORS, ValueError) as error:
-        raise ServoSetupError(
+        kind = ServoSetupError if isinstance(error, ValueError) else ServoLostError
+        raise kind(
             f"the serial port cannot be opened ({error})",
             where=port,
             remedy="Check that the device exists, that this user is in the group dialout, that no "
@@ -59,6 +62,20 @@ def open_line(port: str, baudrate: int, timeout_s: float) -> SerialPort:
     with contextlib.suppress(ValueError):
         line.set_low_latency_mode(True)
     return line
+
+
+def stable_path(port: str, folder: Path = BY_ID) -> str:
+    """Return the path by which the adapter at `port` is found again after it was plugged in anew.
+
+    The kernel numbers adapters as they come, so /dev/ttyUSB0 may be /dev/ttyUSB1 afterwards, or
+    another adapter. udev's links in `folder` are named after the adapter; without one it is `port`.
+    """
+    device = Path(port).resolve()
+    try:
+        links = sorted(link for link in folder.iterdir() if link.resolve() == device)
+    except OSError:
+        return port
+    return str(links[0]) if links else port
 
 
 def latency_timer_ms(port: str, sysfs: Path = SYSFS) -> int | None:

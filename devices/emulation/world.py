@@ -200,6 +200,8 @@ class World:
             model=servo.model,
             protocol=servo.protocol,
             baudrate=servo.baudrate,
+            unplugged=self._faults.of("servo_unplugged"),
+            unpowered=self._faults.of("servo_restart"),
         ) as emulated:
             yield emulated
 

@@ -171,7 +171,8 @@ BusFault = Literal[
     "nack_storm",
     "bit_errors",
 ]
-FaultKind = Literal[TileFault, MuxFault, BusFault]
+ServoFault = Literal["servo_unplugged", "servo_restart"]
+FaultKind = Literal[TileFault, MuxFault, BusFault, ServoFault]
 
 LEAK_S = 2.0
 """How long a punctured dome takes to even out, unless a scene says otherwise."""
@@ -180,7 +181,7 @@ RATE = 0.01
 """How often a fault strikes that comes by chance, unless a scene says otherwise."""
 
 BUS = "bus"
-"""Target of a fault that is no tile's and no multiplexer's."""
+"""Target of a fault that is no tile's and no multiplexer's: of the bus, or of the servo."""
 
 
 class FaultScene(Section):

@@ -14,14 +14,21 @@ from collections import Counter
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Self, get_args
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from devices.errors import SceneError
 from devices.facts import MODELS_MAX, RATE_HZ_MIN, Label
 from devices.inputs import read_text
-from devices.scene.emulated import EmulationScene, FaultScene, GroundScene, MudGround, NoGround
+from devices.scene.emulated import (
+    EmulationScene,
+    FaultScene,
+    GroundScene,
+    MudGround,
+    NoGround,
+    ServoFault,
+)
 from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
 from devices.scene.quantities import Name, NotNegative, Section
 
@@ -78,6 +85,8 @@ class Scene(Section):
                 )
             if fault.mux is not None and fault.mux not in {tile.mux for tile in self.tile}:
                 raise ValueError(f"a fault names mux 0x{fault.mux:02x}, and no tile is behind it")
+            if fault.kind in get_args(ServoFault) and self.servo is None:
+                raise ValueError(f"{fault.kind} is a fault of the servo, and there is no [servo]")
         return self
 
 

@@ -238,7 +238,7 @@ def _polled_servo(world: World, scene: ServoScene, now_ns: int, stack: ExitStack
     line_clock = VirtualClock(now_ns)
     emulated = stack.enter_context(world.servo(scene, line_clock))
     servo = open_servo(
-        emulated.port,
+        lambda: emulated.port,
         baudrate=scene.baudrate,
         clock=line_clock,
         servo_id=scene.id,

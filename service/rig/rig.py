@@ -199,6 +199,8 @@ class Rig:
         found = self._ready.array.troubles()
         if self._reference is not None and self._reference.trouble:
             found["reference"] = self._reference.trouble
+        if self._servo_source is not None and self._servo_source.trouble:
+            found["servo"] = f"servo: {self._servo_source.trouble}"
         return found
 
     def counts(self) -> dict[str, dict[str, int]]:
@@ -252,9 +254,10 @@ class Rig:
             sys.stderr.write(f"foottile: {error}\n")
 
     def _servo(self, scene: ServoScene, world: World | None, stack: ExitStack) -> ServoReader:
-        port = scene.port
+        port: str | Callable[[], str] = scene.port
         if port == EMULATED and world is not None:
-            port = stack.enter_context(world.servo(scene, self._line_clock)).port
+            emulated = stack.enter_context(world.servo(scene, self._line_clock))
+            port = lambda: emulated.port  # noqa: E731
         servo = open_servo(
             port,
             baudrate=scene.baudrate,
@@ -262,6 +265,7 @@ class Rig:
             servo_id=scene.id,
             model=scene.model,
             protocol=scene.protocol,
+            waits=True,
         )
         stack.callback(servo.close)
         self.remarks += servo.remarks

@@ -25,6 +25,10 @@ class FaultyServo(EmulatedServo):
         self._late_s = 0.0
         super().__init__(position, clock, **options)
 
+    def write_table(self, address: int, data: bytes) -> None:
+        """Set registers, as with the maker's own tool."""
+        self._firmware.table[address : address + len(data)] = data
+
     def silent(self) -> contextlib.AbstractContextManager[None]:
         """Answer nothing, as without power or with the plug pulled; but its state survives."""
         return self._with("_is_silent", True)

@@ -197,6 +197,7 @@ class Servo:
         self.reading = reading
         self.asked_ns: list[int] = []
         self.stale_after_ns = 30_000_000
+        self.is_turn_known = True
 
     def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
         self.asked_ns.append(t_mono_ns)
@@ -234,6 +235,17 @@ def test_the_newest_position_goes_with_a_frame_and_ages() -> None:
     assert stale.tolist() == (age_ns > 30_000_000).tolist()
     assert stale.any()
     assert not stale.all()
+
+
+def test_a_position_whose_turn_is_not_known_says_so() -> None:
+    servo = Servo((2048, 0))
+    one = with_servo(make_scene(array=TYPICAL, emulation=LIVELY), servo)
+    servo.is_turn_known = False
+    batch = one.take(3)
+    assert (batch.servo_counts == 2048).all(), "counts are kept as they were read"
+    assert ((batch.frame_status & FrameStatus.SERVO_TURN_UNKNOWN) != 0).all()
+    servo.is_turn_known = True
+    assert ((one.take(3).frame_status & FrameStatus.SERVO_TURN_UNKNOWN) == 0).all()
 
 
 def test_a_servo_that_died_an_hour_ago_does_not_stop_the_stream() -> None:

@@ -75,6 +75,7 @@ def test_the_status_bits_are_those_of_the_design() -> None:
         "BUS_FAULT": 4,
         "LEAD": 8,
         "NEW_ARRAY_INFO": 16,
+        "SERVO_TURN_UNKNOWN": 32,
     }
 
 

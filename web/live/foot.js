@@ -150,7 +150,8 @@ export class Foot {
     const angle = frame?.angle_rad ?? null;
     const stale = Boolean((frame?.frame_status ?? 0) & FRAME.SERVO_STALE);
     const degrees = angle === null ? "no angle" : `${angle > 0 ? "+" : ""}${number((angle * 180) / Math.PI)}°`;
-    setText(label, stale ? `${degrees} servo stale` : degrees);
+    const turnless = Boolean((frame?.frame_status ?? 0) & FRAME.SERVO_TURN_UNKNOWN);
+    setText(label, stale ? `${degrees} servo stale` : turnless ? `${degrees} servo turn unknown` : degrees);
     setData(label, "stale", String(stale));
     setData(label, "known", String(angle !== null));
   }

@@ -68,6 +68,7 @@ const FRAME_WORDS = [
   [FRAME.BUS_FAULT, "the bus failed"],
   [FRAME.OVERRUN, "frames before it not taken"],
   [FRAME.SERVO_STALE, "servo's angle is old"],
+  [FRAME.SERVO_TURN_UNKNOWN, "servo's turn is not known"],
   [FRAME.LEAD, "unloaded lead-in"],
   [FRAME.NEW_ARRAY_INFO, "the array was looked for again"],
 ];

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 
 from devices.chips.dynamixel.packets import DynamixelProtocol
 from devices.chips.dynamixel.protocol1 import PROTOCOL_1
@@ -15,6 +16,26 @@ from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 
 COUNTS_PER_TURN = 4096
 """Of every MX servo (hardware.md 5)."""
+
+
+class CountRange(Enum):
+    """How far a servo's count goes, which its mode of operation decides."""
+
+    ONE_TURN = "one turn"
+    """Position control (joint mode): the joint stays within the turn that the encoder measures."""
+    MANY_TURNS = "many turns"
+    """The count goes on beyond a turn, from where the servo was switched on."""
+    WRAPPED = "wrapped"
+    """Wheel mode of Protocol 1.0: the joint goes on, the count stays within a turn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """A place in a control table."""
+
+    address: int
+    size: int
+    """Bytes to ask for: not two in 1.0, see `devices.chips.dynamixel.protocol1`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +50,44 @@ class Firmware:
     """Bytes of the present position: little-endian, signed, beyond one turn in multi-turn mode."""
     asked_bytes: int
     """How many are read from there: in 1.0 one more, see `devices.chips.dynamixel.protocol1`."""
+    tick: Register
+    """Realtime Tick: its first two bytes are milliseconds since it was switched on."""
+    mode: Register
+    """Operating Mode; in 1.0 the limits of the angle, CW and CCW, which decide the mode."""
+
+    def count_range(self, mode: bytes) -> CountRange:
+        """Return how far the count goes in the mode that the register says."""
+        if self.protocol.version == 2:
+            return CountRange.ONE_TURN if mode[0] == _POSITION_CONTROL else CountRange.MANY_TURNS
+        limits = mode[:4]
+        if limits == _WHEEL:
+            return CountRange.WRAPPED
+        return CountRange.MANY_TURNS if limits == _MULTI_TURN else CountRange.ONE_TURN
+
+
+_POSITION_CONTROL = 3  # of Operating Mode (e-manual mx-64-2.md)
+_WHEEL, _MULTI_TURN = bytes(4), b"\xff\x0f\xff\x0f"  # both limits 0, both 4095 (mx-64.md)
 
 
 FIRMWARES = {
-    1: Firmware(PROTOCOL_1, {"MX-28": 29, "MX-64": 310}, 36, position_bytes=2, asked_bytes=3),
-    2: Firmware(PROTOCOL_2, {"MX-28": 30, "MX-64": 311}, 132, position_bytes=4, asked_bytes=4),
+    1: Firmware(
+        PROTOCOL_1,
+        {"MX-28": 29, "MX-64": 310},
+        36,
+        position_bytes=2,
+        asked_bytes=3,
+        tick=Register(50, 3),
+        mode=Register(6, 4),
+    ),
+    2: Firmware(
+        PROTOCOL_2,
+        {"MX-28": 30, "MX-64": 311},
+        132,
+        position_bytes=4,
+        asked_bytes=4,
+        tick=Register(120, 2),
+        mode=Register(11, 1),
+    ),
 }
 """By the protocol that they speak."""
 

@@ -6,15 +6,26 @@ here, so that no mistake in a measurement can move a robot.
 
 from __future__ import annotations
 
+import contextlib
 import errno
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from devices.buses.serial_line import PORT_ERRORS, SerialPort, latency_remark, open_line
-from devices.chips.dynamixel.models import FIRMWARES, known_model
+from devices.buses.serial_line import (
+    PORT_ERRORS,
+    SerialPort,
+    latency_remark,
+    open_line,
+    stable_path,
+)
+from devices.chips.dynamixel.models import FIRMWARES, CountRange, Register, known_model
 from devices.chips.dynamixel.packets import PacketDecoder, Status, wire_time_ns
+from devices.chips.dynamixel.reading import PositionReading
+from devices.chips.dynamixel.uptime import UptimeWatch
 from devices.clock import Clock
 from devices.errors import (
     ServoError,
+    ServoLostError,
     ServoPacketError,
     ServoSetupError,
     ServoStatusError,
@@ -24,20 +35,10 @@ from devices.errors import (
 # Far more than a status (15 bytes at most here): it bounds a line that never stops chattering.
 _MAX_BYTES_PER_ANSWER = 256
 
-
-@dataclass(frozen=True, slots=True)
-class PositionReading:
-    """A position and when it was true: at `t_mono_ns`, give or take `half_width_ns`."""
-
-    counts: int
-    """Signed; 4096 to the turn, beyond one turn in multi-turn mode."""
-    t_mono_ns: int
-    """Nanoseconds of the clock, midway between end of request and first byte of the answer."""
-    half_width_ns: int
-    done_ns: int
-    """When the answer was complete, nanoseconds of the clock."""
-    alert: bool = False
-    """The servo reports a hardware error; the position is valid all the same."""
+REOPEN_NS = 1_000_000_000
+"""From one attempt to open a port that is away to the next."""
+UPTIME_NS = 1_000_000_000
+"""Between two looks at the servo's uptime while it answers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,23 +60,43 @@ class _Answer:
 class Dynamixel:
     """One servo. Not thread-safe: one thread owns a port.
 
-    `timeout_s`, in seconds, should be the port's own: it is the longest that one read of it waits.
-    `protocol` is 1 or 2.
+    Args:
+        port: its serial port; None: `reopen` has to open it first.
+        clock: virtual or real.
+        servo_id: its id.
+        baudrate: of its line.
+        timeout_s: in seconds, should be the port's own: the longest that one read of it waits.
+        protocol: 1 or 2.
+        model: "MX-28" or "MX-64", to check when the port was opened again.
+        reopen: opens the port again after it failed, once a second. A servo that can be reopened is
+            also watched for restarts; None: neither.
     """
 
     def __init__(
         self,
-        port: SerialPort,
+        port: SerialPort | None,
         clock: Clock,
         *,
         servo_id: int,
         baudrate: int,
         timeout_s: float,
         protocol: int = 2,
+        model: str = "",
+        reopen: Callable[[], SerialPort] | None = None,
     ) -> None:
         self.remarks: tuple[str, ...] = ()
         """What is wrong with this servo, but does not stop the frames."""
         self._port = port
+        self._model = model
+        self._reopen = reopen
+        self._reopen_due_ns = clock.now_ns()
+        self._lost: ServoSetupError | None = None
+        self._uptime = UptimeWatch() if reopen is not None else None
+        self._uptime_ns = clock.now_ns()
+        self._count_range: CountRange | None = None
+        self._answered_ns = clock.now_ns()
+        self._was_silent = True
+        self._restarted = False
         self._clock = clock
         self._id = servo_id
         self._baudrate = baudrate
@@ -137,48 +158,128 @@ class Dynamixel:
         The servo samples it somewhere between the last bit of the request and the first of the
         answer (hardware.md 5.2); a slow adapter delays the answer and so widens the interval.
         """
-        answer = self._exchange(self._position_request, n_data=self._firmware.asked_bytes)
+        try:
+            self._ensure_port()
+            if self._was_silent:
+                self.look_at_uptime()
+            answer = self._exchange(self._position_request, n_data=self._firmware.asked_bytes)
+            if answer.done_ns - self._uptime_ns >= UPTIME_NS:
+                self.look_at_uptime()
+        except ServoError:
+            self._was_silent = True
+            raise
+        self._was_silent, self._answered_ns = False, answer.done_ns
         earliest_ns = answer.asked_ns + wire_time_ns(len(self._position_request), self._baudrate)
         latest_ns = answer.done_ns - wire_time_ns(len(answer.status.packet.wire), self._baudrate)
         position = answer.status.data[: self._firmware.position_bytes]
+        restarted, self._restarted = self._restarted, False
         return PositionReading(
             counts=int.from_bytes(position, "little", signed=True),
             t_mono_ns=(earliest_ns + latest_ns) // 2,
             half_width_ns=max(0, latest_ns - earliest_ns + 1) // 2,
             done_ns=answer.done_ns,
             alert=answer.status.alert,
+            restarted=restarted,
+            count_range=self._count_range or CountRange.MANY_TURNS,
         )
+
+    def look_at_uptime(self) -> None:
+        """Note whether the servo restarted since the last look; after a silence its mode, too.
+
+        Raises:
+            ServoError: as for `identify`.
+        """
+        if self._uptime is None:
+            return
+        if self._was_silent or self._count_range is None:
+            mode = self._read_register(self._firmware.mode)
+            self._count_range = None if mode is None else self._firmware.count_range(mode)
+        data = self._read_register(self._firmware.tick)
+        now_ns = self._clock.now_ns()
+        tick = None if data is None else int.from_bytes(data[:2], "little")
+        silent_ns = now_ns - self._answered_ns if self._was_silent else 0
+        self._restarted |= self._uptime.has_restarted(tick, now_ns, silent_ns=silent_ns)
+        self._uptime_ns = self._answered_ns = now_ns
+        self._was_silent = False
+
+    def _read_register(self, register: Register) -> bytes | None:
+        """Read a register; None if the servo says that it has none there."""
+        request = self._protocol.read_request(self._id, register.address, register.size)
+        try:
+            return self._exchange(request, n_data=register.size).status.data
+        except ServoStatusError:
+            return None
 
     def close(self) -> None:
         """Close the port."""
-        self._port.close()
+        if self._port is not None:
+            self._port.close()
+
+    def _ensure_port(self) -> None:
+        """Open a port that is away, at most once a second, and check which servo is there.
+
+        Raises:
+            ServoSetupError: it is still away, or another servo answers.
+        """
+        if self._port is not None or self._reopen is None:
+            return
+        now_ns = self._clock.now_ns()
+        if now_ns < self._reopen_due_ns and self._lost is not None:
+            raise self._lost
+        self._reopen_due_ns = now_ns + REOPEN_NS
+        try:
+            self._port = self._reopen()
+            with contextlib.suppress(ServoTimeoutError, ServoPacketError, ServoStatusError):
+                self.check_model(self._model)
+        except ServoSetupError as error:
+            self._let_go()
+            self._lost = error
+            raise
+        self._lost = None
+
+    def _let_go(self) -> None:
+        """Close a port that failed; while it is open it keeps its number occupied."""
+        if self._port is not None and self._reopen is not None:
+            with contextlib.suppress(*PORT_ERRORS):
+                self._port.close()
+            self._port = None
 
     def _exchange(self, request: bytes, n_data: int) -> _Answer:
         """The answer to `request` with `n_data` bytes."""
+        port = self._port
+        if port is None:
+            raise self._port_failed("it is not open")
         try:
             # Packets carry no number: a late answer to an older request would pass for this one's.
-            self._port.reset_input_buffer()
+            port.reset_input_buffer()
             asked_ns = self._clock.now_ns()
-            sent = self._port.write(request)
+            sent = port.write(request)
             if sent is not None and sent != len(request):
                 raise OSError(errno.EIO, f"{sent} of {len(request)} bytes sent")
-            status, done_ns = self._await_status(request, asked_ns + self._timeout_ns)
+            status, done_ns = self._await_status(port, request, asked_ns + self._timeout_ns)
         except ServoError:  # a ServoTimeoutError is an OSError too
             raise
         except PORT_ERRORS as error:
-            raise ServoSetupError(
-                f"the serial port failed ({error})",
-                where=self._where,
-                remedy="Check the adapter's plug, and that nothing else uses the port",
-            ) from error
+            self._let_go()
+            self._lost = self._port_failed(str(error))
+            raise self._lost from error
         self._check(status, n_data)
         return _Answer(status, asked_ns, done_ns)
 
-    def _await_status(self, request: bytes, deadline_ns: int) -> tuple[Status, int]:
+    def _port_failed(self, why: str) -> ServoLostError:
+        return ServoLostError(
+            f"the serial port failed ({why})",
+            where=self._where,
+            remedy="Check the adapter's plug, and that nothing else uses the port",
+        )
+
+    def _await_status(
+        self, port: SerialPort, request: bytes, deadline_ns: int
+    ) -> tuple[Status, int]:
         decoder = PacketDecoder(self._protocol)
         n_bytes = 0
         while n_bytes < _MAX_BYTES_PER_ANSWER:
-            data = self._port.read(min(decoder.missing, _MAX_BYTES_PER_ANSWER - n_bytes))
+            data = port.read(min(decoder.missing, _MAX_BYTES_PER_ANSWER - n_bytes))
             done_ns = self._clock.now_ns()
             if not data or done_ns > deadline_ns:
                 # The port has waited in real time; a virtual clock has yet to.
@@ -217,7 +318,7 @@ class Dynamixel:
 
 
 def open_servo(
-    port: str,
+    port: str | Callable[[], str],
     *,
     baudrate: int,
     clock: Clock,
@@ -225,20 +326,49 @@ def open_servo(
     timeout_s: float = 0.1,
     model: str = "MX-64",
     protocol: int = 2,
+    waits: bool = False,
 ) -> Dynamixel:
-    """Open the servo at `port`: /dev/ttyUSB0 and the like, or an emulated servo's `port`.
+    """Open the servo at `port`: /dev/ttyUSB0 and the like.
 
     It is asked who it is. One that does not answer is opened all the same, for it may yet come to
-    life: that, and a slow adapter, are among the `remarks` of what is returned.
+    life: that, and a slow adapter, are among the `remarks` of what is returned. A port that fails
+    later is opened again by its path, or by udev's link to the adapter that it led to.
 
     The default `timeout_s`, in seconds, is ample for the slowest case: 9600 baud (30 ms), the
     longest return delay (0.5 ms) and an FTDI's default latency timer (16 ms).
 
+    Args:
+        port: its path, or what gives it at each attempt: an emulated servo's.
+        baudrate: of its line.
+        clock: virtual or real.
+        servo_id: its id.
+        timeout_s: how long an answer is waited for.
+        model: "MX-28" or "MX-64".
+        protocol: 1 or 2.
+        waits: a port that is not there yet is a remark, and is opened as soon as it is there.
+
     Raises:
-        ServoSetupError: there is no such port, it may not be used, or another program uses it; or
-            another model or firmware answers than `model` and `protocol`.
+        ServoLostError: there is no such port, it may not be used, or another program uses it.
+        ServoSetupError: another model or firmware answers than `model` and `protocol`.
     """
-    line = open_line(port, baudrate, timeout_s)
+    path = port if isinstance(port, str) else port()
+
+    def reopen() -> SerialPort:
+        nonlocal path
+        if not isinstance(port, str):
+            path = port()
+        line = open_line(path, baudrate, timeout_s)
+        path = stable_path(path)
+        return line
+
+    remarks: list[str] = []
+    line: SerialPort | None = None
+    try:
+        line = reopen()
+    except ServoLostError as error:
+        if not waits:
+            raise
+        remarks.append(f"the servo is not there yet: {error}")
     servo = Dynamixel(
         line,
         clock,
@@ -246,14 +376,19 @@ def open_servo(
         baudrate=baudrate,
         timeout_s=timeout_s,
         protocol=protocol,
+        model=model,
+        reopen=reopen,
     )
-    slow, silent = latency_remark(port), None
-    try:
-        servo.check_model(model)
-    except ServoSetupError:
-        servo.close()
-        raise
-    except ServoError as error:
-        silent = str(error)
-    servo.remarks = tuple(remark for remark in (slow, silent) if remark is not None)
+    if line is not None:
+        if slow := latency_remark(path):
+            remarks.append(slow)
+        try:
+            servo.check_model(model)
+            servo.look_at_uptime()
+        except ServoSetupError:
+            servo.close()
+            raise
+        except ServoError as error:
+            remarks.append(str(error))
+    servo.remarks = tuple(remarks)
     return servo

@@ -13,9 +13,11 @@ from collections import deque
 from types import TracebackType
 from typing import Self
 
-from devices.chips.dynamixel.reader import Dynamixel, PositionReading
+from devices.chips.dynamixel.reader import Dynamixel
+from devices.chips.dynamixel.reading import PositionReading
+from devices.chips.dynamixel.turns import TurnCounter
 from devices.clock import Clock
-from devices.errors import ServoError
+from devices.errors import ServoError, ServoSetupError
 
 _RECENT = 16
 """Readings kept for a frame that takes long: 64 tiles take 16 ms, a quick servo 1 ms."""
@@ -27,9 +29,44 @@ class _PacedServo:
     def __init__(self, servo: Dynamixel, clock: Clock, *, rate_hz: float) -> None:
         self.failures = 0
         """Readings that failed: silence, garbage, or an error status."""
+        self.is_turn_known = True
+        """Are the whole turns known of the position that `latest` gave last?"""
         self._servo = servo
         self._clock = clock
         self._period_ns = round(1e9 / rate_hz)
+        self._turns = TurnCounter()
+        self._failure = ""
+        self._newest_is_turn_known = True
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the servo now, in words; empty if nothing is."""
+        if self._failure:
+            return self._failure
+        if self._newest_is_turn_known:
+            return ""
+        return (
+            "the servo restarted, or its count leapt, and which turn it counts from is not known: "
+            "there is no angle. Bring the joint into the turn of zero_counts, and start the node "
+            "again"
+        )
+
+    def _read_position(self) -> PositionReading | None:
+        """Read the servo once; None if it failed, which `trouble` explains."""
+        try:
+            reading = self._turns.follow(self._servo.read_position())
+        except ServoError as error:
+            self.failures += 1
+            self._failure = str(error)
+            if isinstance(error, ServoSetupError):
+                self._forget()
+            return None
+        self._failure, self._newest_is_turn_known = "", reading.is_turn_known
+        return reading
+
+    def _forget(self) -> None:
+        """Drop what was read before the servo went away: its age tells nothing of it."""
+        raise NotImplementedError
 
     @property
     def stale_after_ns(self) -> int:
@@ -53,14 +90,20 @@ class PolledServo(_PacedServo):
         """Newest position known at `t_mono_ns` with its sample instant; None before the first."""
         while self._due_ns <= t_mono_ns:
             self._clock.sleep_until_ns(self._due_ns)
-            try:
-                self._on_the_way.append(self._servo.read_position())
-            except ServoError:
-                self.failures += 1
+            reading = self._read_position()
+            if reading is not None:
+                self._on_the_way.append(reading)
             self._due_ns = max(self._due_ns + self._period_ns, self._clock.now_ns())
         while self._on_the_way and self._on_the_way[0].done_ns <= t_mono_ns:
             self._newest = self._on_the_way.popleft()
-        return None if self._newest is None else (self._newest.counts, self._newest.t_mono_ns)
+        if self._newest is None:
+            return None
+        self.is_turn_known = self._newest.is_turn_known
+        return self._newest.counts, self._newest.t_mono_ns
+
+    def _forget(self) -> None:
+        self._newest = None
+        self._on_the_way.clear()
 
 
 class ServoReader(_PacedServo):
@@ -85,6 +128,7 @@ class ServoReader(_PacedServo):
         if not recent:
             return None
         reading = next((r for r in recent if r.t_mono_ns <= t_mono_ns), recent[-1])
+        self.is_turn_known = reading.is_turn_known
         return reading.counts, min(reading.t_mono_ns, t_mono_ns)
 
     def __enter__(self) -> Self:
@@ -100,14 +144,17 @@ class ServoReader(_PacedServo):
         self._stop.set()
         self._thread.join()
 
+    def _forget(self) -> None:
+        self._recent = ()
+
     def _read(self) -> None:
         due_ns = self._clock.now_ns()
         while not self._stop.is_set():
-            try:
+            reading = self._read_position()
+            if reading is not None:
                 # Replaced as a whole, newest first: a reader sees the old or the new ones.
-                self._recent = (self._servo.read_position(), *self._recent[: _RECENT - 1])
-            except ServoError:
-                self.failures += 1
+                self._recent = (reading, *self._recent[: _RECENT - 1])
+            else:
                 # A port that has gone fails at once: do not spin on it.
                 self._stop.wait(self._period_ns * 1e-9)
             due_ns = max(due_ns + self._period_ns, self._clock.now_ns())

@@ -13,15 +13,18 @@ import contextlib
 import os
 import pty
 import select
+import tempfile
 import termios
 import threading
 import tty
 from collections.abc import Callable
+from pathlib import Path
 from typing import Self
 
 from devices.chips.dynamixel.packets import Packet, PacketDecoder, wire_time_ns
 from devices.clock import Clock
 from devices.emulation.chips.dynamixel_firmware import EMULATED_FIRMWARES
+from devices.emulation.faults import Fault
 
 # A rate as the pseudo-terminal keeps it.
 _SPEEDS = {
@@ -39,7 +42,8 @@ class EmulatedServo:
     """One servo alone on its line, powered from construction until `close`.
 
     `position` maps nanoseconds of the clock to signed counts; it is called on the servo's thread.
-    `protocol` is 1 or 2. `return_delay_us` is in microseconds, 0 to 508 in steps of 2.
+    `protocol` is 1 or 2. `return_delay_us` is in microseconds, 0 to 508 in steps of 2. While
+    `unplugged`, its USB adapter is away; while `unpowered`, it is silent, and then it restarts.
 
     Raises:
         UsageError: no MX servo runs at `baudrate`, or none (below 4.5 M) that termios can name.
@@ -56,7 +60,10 @@ class EmulatedServo:
         baudrate: int = 1_000_000,
         return_delay_us: int = 500,
         status_return_level: int = 2,
+        unplugged: Fault | None = None,
+        unpowered: Fault | None = None,
     ) -> None:
+        self._is_closed = False
         self._clock = clock
         self._baudrate = baudrate
         self._firmware = EMULATED_FIRMWARES[protocol](
@@ -68,30 +75,59 @@ class EmulatedServo:
             status_return_level=status_return_level,
         )
         self._speed = _SPEEDS[baudrate]
-        self._resources = contextlib.ExitStack()
-        self._power_up()
+        self._unplugged = unplugged if unplugged is not None else Fault()
+        self._unpowered = unpowered if unpowered is not None else Fault()
+        self._seen_ns = clock.now_ns()
+        self._is_hung_up = False
+        self._folder = tempfile.TemporaryDirectory(prefix="foottile-servo-")
+        self._link = Path(self._folder.name, "ttyUSB0")
+        self._plug_in()
 
-    def _power_up(self) -> None:
+    @property
+    def port(self) -> str:
+        """What to open: a path that leads to the pseudo-terminal while the adapter is plugged in.
+
+        An adapter that is back is plugged in by this: ask for it before each attempt to open it.
+        """
+        if self._is_hung_up and not self._unplugged(self._clock.now_ns()):
+            self._end_thread()
+            self._plug_in()
+        return str(self._link)
+
+    def _plug_in(self) -> None:
         # The slave's end stays open here too: else the line hangs up whenever a reader closes it.
         self._line, self._slave = pty.openpty()
         tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        """What to open: the path of the pseudo-terminal."""
+        self._link.symlink_to(os.ttyname(self._slave))
         # A servo does not wait for a listener; what is not read is lost.
         os.set_blocking(self._line, False)
-        self._wake, wake_writer = os.pipe()
+        self._wake, self._wake_writer = os.pipe()
+        self._is_hung_up = False
         # A daemon only so that a forgotten `close` does not keep the interpreter from ending.
-        thread = threading.Thread(target=self._serve, name=f"servo at {self.port}", daemon=True)
-        thread.start()
-        # Unwound from the last to the first: closing the writer wakes and ends the thread.
-        for descriptor in (self._line, self._slave, self._wake):
-            self._resources.callback(os.close, descriptor)
-        self._resources.callback(thread.join)
-        self._resources.callback(os.close, wake_writer)
+        self._thread = threading.Thread(target=self._serve, name="emulated servo", daemon=True)
+        self._thread.start()
+
+    def _hang_up(self) -> None:
+        """The adapter is pulled: its open file fails, and its path is not there."""
+        self._link.unlink()
+        self._is_hung_up = True
+        for descriptor in (self._line, self._slave):
+            os.close(descriptor)
+
+    def _end_thread(self) -> None:
+        os.close(self._wake_writer)
+        self._thread.join()
+        os.close(self._wake)
 
     def close(self) -> None:
         """Power off: end the thread and hang up. Closing twice does no harm."""
-        self._resources.close()
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self._end_thread()
+        if not self._is_hung_up:
+            self._hang_up()
+        self._folder.cleanup()
 
     def __enter__(self) -> Self:
         return self
@@ -109,6 +145,14 @@ class EmulatedServo:
                 return
             data = os.read(self._line, 4096)
             received_ns = self._clock.now_ns()
+            since_ns, self._seen_ns = self._seen_ns, received_ns
+            if self._unplugged.struck(since_ns, received_ns):
+                self._hang_up()
+                return
+            if self._unpowered.struck(since_ns, received_ns):
+                self._firmware.restart(received_ns)
+            if self._unpowered(received_ns):
+                continue
             # The one thing of a wire that a pseudo-terminal keeps is the rate it was opened with.
             # At any other than its own a servo hears noise.
             if termios.tcgetattr(self._slave)[5] != self._speed:

@@ -17,15 +17,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from devices.chips.dynamixel.models import FIRMWARES
+from devices.chips.dynamixel.models import COUNTS_PER_TURN, FIRMWARES
 from devices.chips.dynamixel.packets import BROADCAST_ID, Instruction, Packet
 from devices.chips.dynamixel.protocol1 import Error
 from devices.chips.dynamixel.protocol2 import ALERT
+from devices.chips.dynamixel.uptime import TICKS
 from devices.errors import UsageError
 
 FIRMWARE_VERSION = 42
 MULTI_TURN_COUNTS = 28_672
 """Seven turns: in Protocol 1.0 a servo goes no further either way (hardware.md 5)."""
+
+_ON_BEFORE_NS = 5_000_000_000
+"""How long before its first answer it was switched on."""
 
 _ANSWERED_FROM: dict[int, int] = {Instruction.PING: 0, Instruction.READ: 1}
 _INSTRUCTION_ERROR, _CRC_ERROR, _DATA_RANGE_ERROR, _DATA_LENGTH_ERROR = 2, 3, 4, 5
@@ -63,6 +67,8 @@ class EmulatedFirmware(ABC):
     version: ClassVar[int]
     _layout: ClassVar[_Layout]
     _baud_codes: ClassVar[Mapping[int, int]]
+    _mode_at_factory: ClassVar[bytes]
+    """Position control, within one turn."""
     _answered_from: ClassVar[Mapping[int, int]] = _ANSWERED_FROM
     """Status return level from which an instruction is answered; every other needs level 2."""
 
@@ -86,7 +92,9 @@ class EmulatedFirmware(ABC):
         self.alerts = Error(0)
         """Error bits of every answer in 1.0; in 2.0 they are in its table."""
         self._position = position
-        self._position_address = firmware.position_address
+        self._register = firmware
+        self._uncounted = 0
+        self._powered_ns: int | None = None
         layout = self._layout
         self.table = bytearray(layout.size)
         struct.pack_into("<H", self.table, 0, firmware.model_numbers[model])
@@ -97,6 +105,8 @@ class EmulatedFirmware(ABC):
         self.table[layout.status_return_level] = status_return_level
         if layout.protocol_type is not None:
             self.table[layout.protocol_type] = self.version
+        mode = firmware.mode
+        self.table[mode.address : mode.address + mode.size] = self._mode_at_factory
 
     @property
     def return_delay_ns(self) -> int:
@@ -112,6 +122,11 @@ class EmulatedFirmware(ABC):
             called = packet.instruction == Instruction.PING or self._is_called_by(packet)
             return packet.intact and called
         return packet.servo_id == self._id and not self._is_an_answer(packet)
+
+    def restart(self, t_ns: int) -> None:
+        """Count milliseconds from `t_ns` on, and the turns anew: its supply came back."""
+        self._powered_ns = t_ns
+        self._uncounted = self._position(t_ns) // COUNTS_PER_TURN * COUNTS_PER_TURN
 
     @abstractmethod
     def answer(self, packet: Packet, t_ns: int) -> bytes:
@@ -129,14 +144,24 @@ class EmulatedFirmware(ABC):
     def _id(self) -> int:
         return self.table[self._layout.servo_id]
 
-    def _store_position(self, position: bytes) -> None:
-        self.table[self._position_address : self._position_address + len(position)] = position
+    def _counts(self, t_ns: int) -> int:
+        return self._position(t_ns) - self._uncounted
+
+    def _store(self, counts: int, t_ns: int) -> None:
+        """Write the position and the Realtime Tick into the table."""
+        if self._powered_ns is None:
+            self._powered_ns = t_ns - _ON_BEFORE_NS
+        tick = (t_ns - self._powered_ns) // 1_000_000 % TICKS
+        struct.pack_into("<H", self.table, self._register.tick.address, tick)
+        size, address = self._register.position_bytes, self._register.position_address
+        self.table[address : address + size] = counts.to_bytes(size, "little", signed=True)
 
 
 class _Firmware1(EmulatedFirmware):
     """The factory's, Protocol 1.0. Its table ends behind Goal Acceleration."""
 
     version = 1
+    _mode_at_factory = struct.pack("<HH", 0, COUNTS_PER_TURN - 1)  # joint mode
     _layout = _Layout(
         size=74, firmware=2, servo_id=3, baud=4, return_delay=5, status_return_level=16
     )
@@ -165,8 +190,10 @@ class _Firmware1(EmulatedFirmware):
         address, length = packet.parameters
         if length == 0 or address + length > len(self.table):
             return Error.RANGE, b""
-        counts = max(-MULTI_TURN_COUNTS, min(self._position(t_ns), MULTI_TURN_COUNTS))
-        self._store_position(counts.to_bytes(2, "little", signed=True))
+        counts = max(-MULTI_TURN_COUNTS, min(self._counts(t_ns), MULTI_TURN_COUNTS))
+        if self.table[6:10] == bytes(4):  # both limits 0: wheel mode
+            counts = self._position(t_ns) % COUNTS_PER_TURN
+        self._store(counts, t_ns)
         return Error(0), bytes(self.table[address : address + length])
 
 
@@ -174,6 +201,7 @@ class _Firmware2(EmulatedFirmware):
     """Protocol 2.0, called MX(2.0). Its table ends behind Indirect Data 56 (SDK mx_64.model)."""
 
     version = 2
+    _mode_at_factory = b"\x03"
     _layout = _Layout(
         size=662,
         firmware=6,
@@ -226,7 +254,7 @@ class _Firmware2(EmulatedFirmware):
             return _DATA_LENGTH_ERROR, b""
         if address + length > len(self.table):
             return _DATA_RANGE_ERROR, b""
-        self._store_position(self._position(t_ns).to_bytes(4, "little", signed=True))
+        self._store(self._counts(t_ns), t_ns)
         return 0, bytes(self.table[address : address + length])
 
 

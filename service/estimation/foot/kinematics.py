@@ -17,14 +17,14 @@ from service.estimation.records import Records, record_type
 
 _AGE_UNIT_NS = 1000
 """Ages are cut to microseconds: two frames may date one reading this far apart."""
-_STALE = int(FrameStatus.SERVO_STALE)
+_UNKNOWN = int(FrameStatus.SERVO_STALE | FrameStatus.SERVO_TURN_UNKNOWN)
 
 READING = record_type(
     [
         ("t_ns", np.int64),  # instant of the frame
         ("sampled_ns", np.int64),  # of its reading; without meaning where there is no age
         ("counts", np.int64),
-        ("known", np.int64),  # is there one, and it is not stale?
+        ("known", np.int64),  # is there one, not stale, and its turn is known?
         ("dated", np.int64),  # and is its age known?
         ("begins", np.int64),  # is it another than that of the frame before, or none?
         ("joins", np.int64),  # is it the reading next after that of the frame before?
@@ -59,7 +59,7 @@ def carry(
     """
     now, before = readings[i], readings[max(i - 1, 0)]
     now.t_ns, now.sampled_ns, now.counts = t_ns, t_ns - age_us * _AGE_UNIT_NS, counts
-    now.known = 1 if counts != NO_SERVO_COUNTS and (frame_status & _STALE) == 0 else 0
+    now.known = 1 if counts != NO_SERVO_COUNTS and (frame_status & _UNKNOWN) == 0 else 0
     now.dated = 1 if now.known == 1 and age_us >= 0 else 0
     unbroken = i > 0 and now.dated == 1 and before.dated == 1 and not broken
     later_ns, moved = now.sampled_ns - before.sampled_ns, abs(counts - before.counts)

@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 
 from devices.errors import SceneError
-from devices.scene.emulated import FaultKind
+from devices.scene.emulated import FaultKind, ServoFault
 from devices.scene.file import load_scene, parse_scene
 from tests.devices.scene.texts import refused, scene, tile
 
@@ -180,8 +180,11 @@ def test_every_fault_names_what_fails_and_nothing_else(kind: str) -> None:
     bus = "sda_low sda_high scl_low adapter_timeout adapter_unplugged nack_storm bit_errors"
     belongs_to = {
         **dict.fromkeys(("brown_out", "mux_reset"), "mux"),
-        **dict.fromkeys(bus.split(), "bus"),
+        **dict.fromkeys((*bus.split(), *get_args(ServoFault)), "bus"),
     }.get(kind, "tile")
+    if kind in get_args(ServoFault):
+        assert "there is no [servo]" in refused(sections=line)
+        line = "[servo]\n" + line
     for target, key in targets.items():
         if target == belongs_to:
             fault = scene(sections=line + key).fault[0]

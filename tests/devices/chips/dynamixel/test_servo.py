@@ -6,17 +6,29 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.chips.dynamixel.reader import PositionReading, open_servo
+from devices.chips.dynamixel.reader import open_servo
+from devices.chips.dynamixel.reading import PositionReading
 from devices.chips.dynamixel.servo import PolledServo, ServoReader
 from devices.clock import SystemClock, VirtualClock
 from devices.emulation.chips.dynamixel import EmulatedServo
-from devices.errors import ServoError, ServoPacketError, ServoStatusError, ServoTimeoutError
+from devices.emulation.faults import Fault
+from devices.errors import (
+    ServoError,
+    ServoLostError,
+    ServoPacketError,
+    ServoStatusError,
+    ServoTimeoutError,
+)
+from tests.builders.servo import FaultyServo
+from tests.devices.chips.dynamixel.lines import both_protocols
+from tests.waiting import until
 
 MS = 1_000_000
 ANSWER_NS = 600_000
@@ -168,7 +180,140 @@ def test_a_servo_of_another_id_is_counted_as_failing() -> None:
         )
 
 
+# A servo that goes away, and one that restarts
+
+MULTI_TURN = {1: (6, b"\xff\x0f\xff\x0f"), 2: (11, b"\x04")}
+"""Register and value that make a servo count turns (e-manual mx-64.md, mx-64-2.md)."""
+
+
+@contextlib.contextmanager
+def faulty(
+    position: Callable[[int], int],
+    *,
+    protocol: int = 2,
+    unplugged: Fault | None = None,
+    unpowered: Fault | None = None,
+    mode: tuple[int, bytes] | None = None,
+) -> Iterator[PolledServo]:
+    clock = VirtualClock(1_000 * MS)
+    for fault in (unplugged, unpowered):
+        if fault is not None:
+            fault.begin(clock.now_ns())
+    with FaultyServo(
+        position, clock, protocol=protocol, unplugged=unplugged, unpowered=unpowered
+    ) as servo:
+        servo.write_table(*(mode or MULTI_TURN[protocol]))
+        driver = open_servo(
+            lambda: servo.port, baudrate=1_000_000, clock=clock, timeout_s=0.02, protocol=protocol
+        )
+        with contextlib.closing(driver):
+            yield PolledServo(driver, clock, rate_hz=100.0)
+
+
+def seen_each_100_ms(source: PolledServo, end_s: float) -> dict[int, int | None]:
+    """Position at each tenth of a second after the beginning; None where it is not known."""
+    found: dict[int, int | None] = {}
+    for tenth in range(1, round(10 * end_s)):
+        t_ns = (1_000 + 100 * tenth) * MS
+        position = source.latest(t_ns)
+        fresh = position is not None and t_ns - position[1] <= source.stale_after_ns
+        found[tenth] = position[0] if position and fresh and source.is_turn_known else None
+    return found
+
+
+@both_protocols
+@pytest.mark.parametrize("away_s", [0.05, 0.7, 3.0])
+def test_an_adapter_that_was_unplugged_is_opened_again_and_the_turn_is_kept(
+    protocol: int, away_s: float
+) -> None:
+    with faulty(
+        lambda _: 9000, protocol=protocol, unplugged=Fault([(1.0, 1.0 + away_s)])
+    ) as source:
+        assert set(seen_each_100_ms(source, 1.0).values()) == {9000}
+        assert source.latest(2_050 * MS) is None, "what was read before tells nothing now"
+        assert "serial port" in source.trouble
+        seen = seen_each_100_ms(source, 8.0)
+        assert seen[79] == 9000
+        assert source.trouble == ""
+
+
+@both_protocols
+def test_a_restart_beyond_its_turn_leaves_no_angle_and_is_said(protocol: int) -> None:
+    with faulty(lambda _: 9000, protocol=protocol, unpowered=Fault([(1.0, 1.5)])) as source:
+        seen = seen_each_100_ms(source, 4.0)
+        assert {seen[tenth] for tenth in range(1, 10)} == {9000}
+        assert {seen[tenth] for tenth in range(11, 40)} == {None}
+        assert source.latest(5_000 * MS) is not None, "the count is kept as it was read"
+        assert source.latest(5_000 * MS) == (9000 % 4096, pytest.approx(5_000 * MS, abs=11 * MS))
+        assert "turn" in source.trouble
+
+
+@both_protocols
+def test_a_restart_of_a_joint_that_stays_in_its_turn_costs_the_silence_only(protocol: int) -> None:
+    mode = {1: (6, b"\x00\x00\xff\x0f"), 2: (11, b"\x03")}[protocol]
+    with faulty(
+        lambda _: 3000, protocol=protocol, unpowered=Fault([(1.0, 1.5)]), mode=mode
+    ) as source:
+        seen = seen_each_100_ms(source, 4.0)
+    assert {seen[tenth] for tenth in range(11, 15)} == {None}
+    assert {seen[tenth] for tenth in range(17, 40)} == {3000}
+
+
+def test_a_wheel_in_protocol_1_goes_on_beyond_its_turn() -> None:
+    def position(t_ns: int) -> int:
+        return (t_ns - 1_000 * MS) // (MS // 2)  # half a turn a second
+
+    with faulty(position, protocol=1, mode=(6, bytes(4))) as source:
+        seen = seen_each_100_ms(source, 6.0)
+    assert seen[59] == pytest.approx(2 * 5_900, abs=40)
+
+
+def test_another_servo_in_its_place_is_not_read() -> None:
+    clock = VirtualClock(1_000 * MS)
+    with (
+        FaultyServo(lambda _: 5, clock) as right,
+        FaultyServo(lambda _: 7, clock, model="MX-28") as wrong,
+    ):
+        here = [right.port]
+        driver = open_servo(lambda: here[0], baudrate=1_000_000, clock=clock, timeout_s=0.02)
+        with contextlib.closing(driver):
+            source = PolledServo(driver, clock, rate_hz=100.0)
+            assert source.latest(1_050 * MS) is not None
+            here[0] = wrong.port
+            right.close()
+            assert source.latest(4_000 * MS) is None
+            assert "MX-28" in source.trouble
+
+
+def test_a_port_that_is_not_there_yet_is_waited_for_if_that_is_asked(tmp_path: Path) -> None:
+    clock, path = VirtualClock(1_000 * MS), tmp_path / "ttyUSB0"
+    with pytest.raises(ServoLostError):
+        open_servo(str(path), baudrate=1_000_000, clock=clock)
+    driver = open_servo(str(path), baudrate=1_000_000, clock=clock, timeout_s=0.02, waits=True)
+    assert "not there yet" in driver.remarks[0]
+    source = PolledServo(driver, clock, rate_hz=100.0)
+    assert source.latest(1_500 * MS) is None
+    with FaultyServo(lambda _: 77, clock) as servo:
+        path.symlink_to(servo.port)
+        with contextlib.closing(driver):
+            assert (source.latest(2_600 * MS) or (None,))[0] == 77
+
+
 # On a real clock
+
+
+def test_a_thread_opens_a_port_again_that_hung_up() -> None:
+    clock = SystemClock()
+    pulled = Fault()
+    with FaultyServo(lambda _: 11, clock, unplugged=pulled) as servo:
+        driver = open_servo(lambda: servo.port, baudrate=1_000_000, clock=clock)
+        with contextlib.closing(driver), ServoReader(driver, clock, rate_hz=200.0) as source:
+            until(lambda: source.latest(clock.now_ns()))
+            with pulled.injected():
+                until(lambda: source.latest(clock.now_ns()) is None)
+                assert "serial port" in source.trouble
+            until(lambda: source.latest(clock.now_ns()))
+            until(lambda: source.trouble == "")
 
 
 def soon(true: Callable[[], bool]) -> bool:

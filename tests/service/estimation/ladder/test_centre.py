@@ -223,9 +223,10 @@ def test_unknown_travel_leaves_the_angle_and_no_ground_frame() -> None:
     [
         {"servo_counts": [NO_SERVO_COUNTS] * 12},
         {"servo_counts": [2048] * 12, "frame_status": [FrameStatus.SERVO_STALE] * 12},
+        {"servo_counts": [2048] * 12, "frame_status": [FrameStatus.SERVO_TURN_UNKNOWN] * 12},
     ],
 )
-def test_a_servo_that_is_silent_or_stale_gives_nan_and_the_foot_goes_on(
+def test_a_servo_whose_position_or_turn_is_not_known_gives_nan_and_the_foot_goes_on(
     columns: dict[str, list[int]],
 ) -> None:
     e = estimate(

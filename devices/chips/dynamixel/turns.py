@@ -1,0 +1,68 @@
+"""Whole turns of a servo's count: continued where the next reading tells them, else not known.
+
+A servo counts turns in memory. When it is switched on or rebooted, and when its torque is switched
+on in position control, the count begins anew within one turn (e-manual, Present Position). In
+1.0's wheel mode the count always stays within one turn. So a count may leap by whole turns while
+the joint stands still, and each turn is 2 pi of angle.
+
+Between two readings a joint moves no farther than its greatest speed allows. If that is less than
+half a turn, the turn follows from it; if it is more, it is not known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from devices.chips.dynamixel.models import COUNTS_PER_TURN, CountRange
+from devices.chips.dynamixel.reading import PositionReading
+from devices.frames import NO_SERVO_COUNTS
+
+SPEED_MAX_COUNTS_PER_S = 3 * COUNTS_PER_TURN
+"""Twice the no-load speed of an MX-64 at its highest voltage, 78 rev/min: a load may drive it."""
+SLACK_COUNTS = 64
+"""Noise of the encoder, and of the instants."""
+_COUNTS_END = 2**31  # the column of a frame holds no more
+
+
+class TurnCounter:
+    """Follows the readings of one servo."""
+
+    def __init__(self) -> None:
+        self._last: PositionReading | None = None
+        self._turns: int | None = 0
+        self._has_left_turn = False
+
+    def follow(self, reading: PositionReading) -> PositionReading:
+        """Return the next reading with its count continued, or with `is_turn_known` false."""
+        last, self._last = self._last, reading
+        if last is not None:
+            self._turns = self._turns_after(last, reading)
+        counts = reading.counts + COUNTS_PER_TURN * (self._turns or 0)
+        if self._turns is None or not NO_SERVO_COUNTS < counts < _COUNTS_END:
+            return replace(reading, is_turn_known=False)
+        self._has_left_turn |= self._turns != 0
+        return replace(reading, counts=counts)
+
+    def _turns_after(self, last: PositionReading, reading: PositionReading) -> int | None:
+        turns = self._turns
+        if turns is None:
+            if self._has_left_turn or not (_stays_in_turn(last) and _stays_in_turn(reading)):
+                return None
+            turns = 0
+        moved = reading.counts - last.counts
+        elapsed_s = (reading.t_mono_ns - last.t_mono_ns) * 1e-9
+        reach = SLACK_COUNTS + SPEED_MAX_COUNTS_PER_S * elapsed_s
+        is_ambiguous = 2 * reach >= COUNTS_PER_TURN
+        has_wrapped = is_ambiguous and reading.count_range is CountRange.WRAPPED
+        if not reading.restarted and not has_wrapped and abs(moved) <= reach:
+            return turns
+        added = round(-moved / COUNTS_PER_TURN)
+        if is_ambiguous or abs(moved + added * COUNTS_PER_TURN) > reach:
+            return None
+        return turns + added
+
+
+def _stays_in_turn(reading: PositionReading) -> bool:
+    """Return whether the joint is held within the turn that its encoder measures."""
+    is_in_turn = 0 <= reading.counts < COUNTS_PER_TURN
+    return reading.count_range is CountRange.ONE_TURN and is_in_turn
