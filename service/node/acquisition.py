@@ -1,6 +1,7 @@
 """Acquisition in a process of its own, so that nothing else on the node disturbs its pace.
 
 The child opens the array, takes frames and encodes them; a thread of it sends them through a pipe.
+On hardware it may have to wait for the array: the parent gets `Waiting` each time it was not there.
 The parent gets `Started`, then `Batch` after `Batch`, and `Started` again when the array
 has become another one, with which a new stream begins; a `Failed` ends it. The child ends when it
 is told to, or when the pipe breaks because its parent died.
@@ -8,6 +9,7 @@ is told to, or when the pipe breaks because its parent died.
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import queue
 import signal
@@ -18,7 +20,15 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 
-from devices.errors import FootTileError
+from devices.errors import (
+    BusMisuseError,
+    BusSetupError,
+    FootTileError,
+    I2cError,
+    SpiError,
+    SpiSetupError,
+    TileSetupError,
+)
 from devices.frames import ArrayInfo, FrameBatch
 from devices.realtime import spare_what_is_loaded
 from service.node.notices import Notices
@@ -32,6 +42,9 @@ _WAITING_MAX = 4096
 as a gap in `seq`."""
 _END_S = 5.0
 """How long a process that is told to end has before it is killed."""
+OPEN_AGAIN_S = 1.0
+"""Between two attempts to open an array that is not there."""
+_ABSENT = {errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EBUSY}
 _LOOK_EVERY_NS = 500_000_000
 """Interval at which the array is asked for its health, in the stream's own time."""
 
@@ -43,6 +56,13 @@ class Started:
     info: ArrayInfo
     remarks: tuple[str, ...] = ()
     """What a user should hear about it."""
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """The array could not be opened; it is asked for again."""
+
+    problem: str
 
 
 @dataclass(frozen=True)
@@ -76,7 +96,7 @@ class Failed:
     error: BaseException | None
 
 
-Message = Started | Batch | Failed
+Message = Waiting | Started | Batch | Failed
 _Item = tuple[FrameBatch, int, tuple[str, ...], Health]
 
 
@@ -163,7 +183,9 @@ def _streamed(
 ) -> FootTileError | None:
     """Take frames until told to stop; why it ended before that, if it did."""
     try:
-        rig = Rig(options, stack)
+        rig = _open_rig(options, connection, stop, stack)
+        if rig is None:
+            return None
         spare_what_is_loaded()
         while not stop.is_set():  # a replaced part begins a new stream
             _stream(rig, connection, stop)
@@ -178,6 +200,41 @@ def _streamed(
             remedy="This is a bug. Start the node again: a new stream begins, sessions go on in it",
         )
     return None
+
+
+def _open_rig(
+    options: RigOptions, connection: Connection, stop: threading.Event, stack: ExitStack
+) -> Rig | None:
+    """Open the array, again and again while it may yet come; None if told to stop before.
+
+    A node that starts with its robot starts before the sensors have their supply. Emulated tiles do
+    not come by being waited for: the time of their faults begins with the first frame.
+
+    Raises:
+        FootTileError: it cannot be opened, and waiting does not help.
+    """
+    while True:
+        attempt, waits = ExitStack(), False
+        try:
+            return Rig(options, attempt)
+        except (I2cError, SpiError, TileSetupError) as error:
+            waits = not options.emulated and _may_pass(error)
+            if not waits:
+                raise
+            attempt.close()
+            connection.send(Waiting(str(error)))
+        finally:
+            if not waits:  # what failed for good is closed after it was reported
+                stack.enter_context(attempt)
+        if stop.wait(OPEN_AGAIN_S):
+            return None
+
+
+def _may_pass(error: FootTileError) -> bool:
+    """Return whether hardware that is not there now may come without a change of the set-up."""
+    if isinstance(error, (BusSetupError, SpiSetupError)):
+        return getattr(error.__cause__, "errno", None) in _ABSENT
+    return not isinstance(error, BusMisuseError)
 
 
 def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:

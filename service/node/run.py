@@ -12,7 +12,15 @@ from typing import Any
 
 from devices.errors import FootTileError
 from service.link import Status, Wanted
-from service.node.acquisition import AcquisitionProcess, Batch, Failed, Health, Message, Started
+from service.node.acquisition import (
+    AcquisitionProcess,
+    Batch,
+    Failed,
+    Health,
+    Message,
+    Started,
+    Waiting,
+)
 from service.node.connection import hello_of
 from service.node.options import NodeOptions
 from service.node.publisher import Publisher
@@ -122,7 +130,7 @@ class RunningNode:
         stopping = asyncio.create_task(stop.wait())
         tasks: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._watch())]
         try:
-            started = await _started(self._messages, stopping)
+            started = await self._await_array(stopping)
             if started is None:
                 return Outcome()
             stopping.add_done_callback(lambda _: self._acquisition.stop())
@@ -136,7 +144,7 @@ class RunningNode:
                 if isinstance(message, Started):
                     self._report("the tiles have a new description: a new stream begins")
                     await self._begin(message)
-                elif self._present is not None:
+                elif isinstance(message, Batch) and self._present is not None:
                     self._take(self._present, message)
             if self._present is not None:
                 self._present.end()
@@ -154,6 +162,27 @@ class RunningNode:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _await_array(self, stopping: asyncio.Task[bool]) -> Started | None:
+        """Wait until the array is open; return None if the node is stopped before."""
+        told = ""
+        while True:
+            message = asyncio.create_task(self._messages.get())
+            await asyncio.wait({message, stopping}, return_when=asyncio.FIRST_COMPLETED)
+            if not message.done():
+                message.cancel()
+                return None
+            match message.result():
+                case Started() as started:
+                    return started
+                case Waiting(problem):
+                    if problem != told:
+                        self._report(f"waits for the array, and asks again each second: {problem}")
+                    told = problem
+                case Failed(error) if error is not None:
+                    raise error
+                case _:
+                    return None
 
     def _tell_failure(self, task: asyncio.Task[None]) -> None:
         """A publisher that ended by itself ends the node, which would else go on in silence."""
@@ -286,24 +315,6 @@ class RunningNode:
             recorded=recorded,
             is_lossy=is_lossy,
         )
-
-
-async def _started(
-    messages: asyncio.Queue[Message], stopping: asyncio.Task[bool]
-) -> Started | None:
-    """The array, once it is open; None if the node is stopped before."""
-    first = asyncio.create_task(messages.get())
-    await asyncio.wait({first, stopping}, return_when=asyncio.FIRST_COMPLETED)
-    if not first.done():
-        first.cancel()
-        return None
-    match first.result():
-        case Started() as started:
-            return started
-        case Failed(error) if error is not None:
-            raise error
-        case _:
-            return None
 
 
 def _hand_over(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import signal
+import subprocess
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,10 +15,20 @@ from typing import Any
 import pytest
 
 import service.node.acquisition
-from devices.errors import FootTileError
+from devices.errors import (
+    BusFaultError,
+    BusMisuseError,
+    BusSetupError,
+    FootTileError,
+    NoAcknowledgeError,
+    SceneError,
+    ServoSetupError,
+    TileSetupError,
+)
 from devices.scene.file import load_scene
+from service.node.acquisition import Waiting
 from service.rig.options import RigOptions
-from tests.builders.scenes import ONE_TILE_FILE
+from tests.builders.scenes import ONE_TILE_FILE, make_scene
 from tests.service.process import Process, Start, acquisition_of
 from tests.service.running import Running
 from tests.waiting import until
@@ -103,6 +115,94 @@ def test_a_bug_in_acquisition_is_said_before_anything_is_closed_that_may_hang(
     assert "ValueError: dome pressure was asked for too late" in str(failed.error)
     assert said_when_closed == [1]
     assert "Traceback" in capfd.readouterr().err, "whoever mends it needs to know where"
+
+
+def refusal(number: int) -> BusSetupError:
+    """As `open_bus` raises it."""
+    error = BusSetupError("the bus cannot be used", where="/dev/i2c-9", errno=number)
+    error.__cause__ = OSError(number, os.strerror(number))
+    return error
+
+
+NOT_YET = [
+    TileSetupError("tile A17 does not answer"),
+    NoAcknowledgeError("no acknowledge"),
+    BusFaultError("the bus failed"),
+    refusal(errno.ENOENT),
+    refusal(errno.ENODEV),
+    refusal(errno.EBUSY),
+]
+NEVER = [
+    BusMisuseError("the adapter refused the transfer"),
+    refusal(errno.EACCES),
+    refusal(errno.ENOTTY),
+    ServoSetupError("an MX-28 answers"),
+    SceneError("schedule"),
+]
+
+
+def opened_after(
+    errors: list[FootTileError], monkeypatch: pytest.MonkeyPatch, bus: str = "/dev/i2c-9"
+) -> tuple[list[Any], list[str]]:
+    """What the parent got while the array could not be opened at first, and what was closed."""
+    connection, coming, closed = _Tells(), iter(errors), list[str]()
+
+    def rig(options: RigOptions, stack: ExitStack) -> str:
+        attempt = f"attempt {len(connection.got)}"
+        stack.callback(lambda: closed.append(attempt))
+        if (error := next(coming, None)) is not None:
+            raise error
+        return attempt
+
+    def streams(rig: str, connection: Any, stop: threading.Event) -> None:
+        connection.send((rig, list(closed)))
+        stop.set()
+
+    monkeypatch.setattr(service.node.acquisition, "Rig", rig)
+    monkeypatch.setattr(service.node.acquisition, "_stream", streams)
+    monkeypatch.setattr(service.node.acquisition, "OPEN_AGAIN_S", 0.0)
+    monkeypatch.setattr(service.node.acquisition, "_await_stop", lambda *_: None)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    scene = make_scene(array={"bus": bus})
+    service.node.acquisition._run(RigOptions(scene, "leg"), connection)  # type: ignore[arg-type]
+    return connection.got, closed
+
+
+def test_an_array_that_is_not_there_yet_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    got, closed = opened_after([*NOT_YET], monkeypatch)
+    n = len(NOT_YET)
+    assert got[:n] == [Waiting(str(error)) for error in NOT_YET]
+    # What an attempt opened is closed before the next; what is used, at the end.
+    assert got[n] == (f"attempt {n}", [f"attempt {i}" for i in range(n)])
+    assert got[n + 1].error is None
+    assert closed[-1] == f"attempt {n}"
+
+
+@pytest.mark.parametrize("error", NEVER, ids=lambda error: f"{type(error).__name__} {error}")
+def test_what_waiting_does_not_help_ends_the_node(
+    error: FootTileError, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (failed,), _ = opened_after([error], monkeypatch)
+    assert failed.error is error
+
+
+def test_emulated_tiles_are_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    (failed,), _ = opened_after([NOT_YET[0]], monkeypatch, bus="emulated")
+    assert failed.error is NOT_YET[0]
+
+
+def test_a_node_waits_for_its_bus_says_so_once_and_stops_when_told(
+    foottile: Start, tmp_path: Path
+) -> None:
+    path = tmp_path / "one.toml"
+    path.write_text(ONE_TILE_FILE + f'\n[array]\nbus = "{tmp_path}/i2c-9"\n')
+    process = foottile("node", "--scene", path, "--record", "first")
+    process.said("waits for the array, and asks again each second")
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.process.wait(2.5)
+    assert sum("ENOENT" in line for line in process.err) == 1
+    process.process.send_signal(signal.SIGTERM)
+    assert process.ended(20.0) == 0, process.err
 
 
 def test_a_parent_that_has_died_is_no_bug(monkeypatch: pytest.MonkeyPatch) -> None:
