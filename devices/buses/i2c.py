@@ -72,7 +72,10 @@ class _Smbus(SMBus):
         Raises:
             OSError: the kernel's; EREMOTEIO after fewer messages than asked.
         """
-        data = i2c_rdwr_ioctl_data.create(*i2c_msgs)
+        if self.fd is None:
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        # Its annotation is of one argument that is a sequence.
+        data = i2c_rdwr_ioctl_data.create(*i2c_msgs)  # type: ignore[arg-type]
         done = fcntl.ioctl(self.fd, I2C_RDWR, data)
         if done != len(i2c_msgs):
             what = f"{done} of {len(i2c_msgs)} messages transferred"

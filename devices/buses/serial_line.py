@@ -21,6 +21,8 @@ LATENCY_MS = 1
 """What the timer should say."""
 
 PORT_ERRORS = (OSError, termios.error)
+NOT_SENT = serial.SerialTimeoutException
+"""A request was not sent in time, perhaps because this machine was busy; the port is there."""
 
 
 class SerialPort(Protocol):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from devices.buses.serial_line import latency_remark, latency_timer_ms
+from devices.buses.holders import holders_of
+from devices.buses.serial_line import latency_remark, latency_timer_ms, stable_path
 from devices.chips.dynamixel.probe import BAUDRATES, FoundServo, probe
 from devices.clock import Clock
+from devices.errors import ServoSetupError
 from devices.scene.hardware import ServoScene
 
 TIMEOUTS_S = (0.05, 0.25)
@@ -38,17 +40,19 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
         port: its serial port.
         clock: a real one.
         wanted: what the scene says of it; None: the one with id 1.
-
-    Raises:
-        ServoSetupError: the port cannot be opened.
     """
     servo_id = wanted.id if wanted is not None else 1
     rates = dict.fromkeys((*((wanted.baudrate,) if wanted is not None else ()), *BAUDRATES))
     found: tuple[FoundServo, ...] = ()
-    for timeout_s in TIMEOUTS_S:
-        found = found or tuple(
-            probe(port, clock, servo_ids=[servo_id], baudrates=rates, timeout_s=timeout_s)
-        )
+    try:
+        for timeout_s in TIMEOUTS_S:
+            found = found or tuple(
+                probe(port, clock, servo_ids=[servo_id], baudrates=rates, timeout_s=timeout_s)
+            )
+    except ServoSetupError as error:
+        holders = ", ".join(holders_of(port))
+        held = f" It is open in {holders}." if holders else ""
+        return ServoDiagnosis((), None, is_well=False, verdict=f"{error}.{held}")
     said = [
         f"{servo.model or f'model {servo.model_number}'}, protocol {servo.protocol}, "
         f"{servo.baudrate} baud, id {servo.servo_id}."
@@ -67,6 +71,8 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
         )
     if remark := latency_remark(port):
         wrong.append(remark)
+    if (lasting := stable_path(port)) != port:
+        said.append(f"Name it {lasting} in the scene: {port} may be another adapter's next time.")
     return ServoDiagnosis(found, latency_timer_ms(port), not wrong, " ".join((*said, *wrong)))
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from devices.buses.serial_line import (
+    NOT_SENT,
     PORT_ERRORS,
     SerialPort,
     latency_remark,
@@ -259,6 +260,8 @@ class Dynamixel:
             status, done_ns = self._await_status(port, request, asked_ns + self._timeout_ns)
         except ServoError:  # a ServoTimeoutError is an OSError too
             raise
+        except NOT_SENT as error:
+            raise self._timed_out(0) from error
         except PORT_ERRORS as error:
             self._let_go()
             self._lost = self._port_failed(str(error))

@@ -133,7 +133,7 @@ def plug_another(wires: Wires, tile: int) -> None:
     """Another part, of other coefficients, that reads the very same counts."""
     silicon = wires.tiles[tile]._silicon
     wires.tiles[tile]._silicon = type(silicon)(FORUM_CHIP, silicon.conversion_ns, silicon.sense)
-    wires.tiles[tile]._power_up()
+    wires.tiles[tile].lose_supply()
 
 
 @every_schedule

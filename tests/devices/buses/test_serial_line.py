@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from devices.buses.serial_line import latency_remark, latency_timer_ms
+from devices.buses.serial_line import latency_remark, latency_timer_ms, stable_path
 
 
 def adapter(sysfs: Path, content: str) -> None:
@@ -55,3 +55,20 @@ def test_a_slow_timer_is_remarked_on_with_the_remedy(tmp_path: Path) -> None:
 def test_a_quick_timer_is_not(tmp_path: Path, timer: str) -> None:
     adapter(tmp_path, timer)
     assert latency_remark("/dev/ttyUSB7", tmp_path) is None
+
+
+def test_the_name_that_lasts_is_udevs_link_to_the_adapter(tmp_path: Path) -> None:
+    device, other, by_id = tmp_path / "ttyUSB0", tmp_path / "ttyUSB1", tmp_path / "by-id"
+    by_id.mkdir()
+    for file in (device, other):
+        file.touch()
+    (by_id / "usb-another").symlink_to(other)
+    assert stable_path(str(device), by_id) == str(device)
+    link = by_id / "usb-FTDI_adapter-port0"
+    link.symlink_to(device)
+    assert stable_path(str(device), by_id) == str(link)
+    assert stable_path(str(link), by_id) == str(link)
+
+
+def test_without_udev_a_port_keeps_its_own_name(tmp_path: Path) -> None:
+    assert stable_path("/dev/ttyUSB0", tmp_path / "by-id") == "/dev/ttyUSB0"

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from pathlib import Path
+
 import pytest
 
+from devices.buses.serial_line import open_line
 from devices.clock import VirtualClock
 from devices.scene.file import load_scene
 from service.offline import servo_doctor
@@ -33,3 +38,21 @@ def test_who_never_answers_is_not_found_however_patient_one_is(
         diagnosis = diagnose_servo(servo.port, VirtualClock(), None)
     assert not diagnosis.is_well
     assert "No servo answers as id 1" in diagnosis.verdict
+
+
+def test_a_port_that_is_not_there_is_a_finding_and_no_failure_of_the_doctor(tmp_path: Path) -> None:
+    diagnosis = diagnose_servo(str(tmp_path / "ttyUSB0"), VirtualClock(), None)
+    assert not diagnosis.is_well
+    assert diagnosis.found == ()
+    assert "No such file" in diagnosis.verdict
+    assert "group dialout" in diagnosis.verdict
+
+
+def test_who_holds_a_busy_port_is_named() -> None:
+    with (
+        FaultyServo(lambda _: 0, VirtualClock()) as servo,
+        contextlib.closing(open_line(servo.port, 57_600, 0.02)),
+    ):
+        diagnosis = diagnose_servo(servo.port, VirtualClock(), None)
+    assert not diagnosis.is_well
+    assert f"(process {os.getpid()})" in diagnosis.verdict

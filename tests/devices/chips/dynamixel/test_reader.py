@@ -6,6 +6,7 @@ import contextlib
 import pickle
 
 import pytest
+import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -51,6 +52,18 @@ class ScriptedPort:
 
     def close(self) -> None:
         pass
+
+
+class LatePort(ScriptedPort):
+    """A port that reports that it could not send in time, as on a machine that was busy."""
+
+    def write(self, data: bytes, /) -> int:
+        raise serial.SerialTimeoutException("Write timeout")
+
+
+def test_a_request_that_was_not_sent_in_time_is_a_silence_and_no_lost_port() -> None:
+    with pytest.raises(ServoTimeoutError):
+        servo_on(LatePort(b"")).read_position()
 
 
 class ShortPort(ScriptedPort):

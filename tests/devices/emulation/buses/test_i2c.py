@@ -316,6 +316,9 @@ class Port:
     def stop(self, t_ns: int) -> None:
         self.heard.append("stop")
 
+    def lose_supply(self) -> None:
+        pass
+
     def connected(self) -> Iterable[Port]:
         return ()
 

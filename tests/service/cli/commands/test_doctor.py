@@ -148,6 +148,13 @@ def test_a_servo_that_is_not_what_the_scene_says_is_said(
     assert "The scene says MX-28, protocol 2" in found["verdict"]
 
 
+def test_a_servo_whose_port_is_not_there_does_not_hide_the_tiles(run: Run) -> None:
+    found = run("doctor", "--scene", "rolling", "--servo", "/dev/ttyUSB99", "--json").printed(3)
+    assert found["scl_hz"] is not None
+    assert found["servo"]["is_well"] is False
+    assert "No such file" in found["servo"]["verdict"]
+
+
 def test_a_wait_that_the_scene_fixes_is_the_one_that_counts(doctor: Doctor) -> None:
     text = scene_text("standing").replace("[array]", "[array]\nwait_ms = 3.0")
     found = json.loads(doctor(text).out)

@@ -1,0 +1,23 @@
+"""Which programs have a device open, for an error that says it is busy."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+PROC = Path("/proc")
+
+
+def holders_of(path: str, proc: Path = PROC) -> tuple[str, ...]:
+    """Return the programs that have the file at `path` open, as "NAME (process N)".
+
+    Only those that this user may look at: a service's own processes, or all for root.
+    """
+    device = Path(path).resolve()
+    found = []
+    for process in sorted(proc.glob("[0-9]*"), key=lambda process: int(process.name)):
+        with suppress(OSError):  # it ended, or is another user's
+            if any(link.resolve() == device for link in (process / "fd").iterdir()):
+                name = (process / "comm").read_text().strip()
+                found.append(f"{name} (process {process.name})")
+    return tuple(found)
