@@ -222,6 +222,7 @@ function tick() {
   setText(byId("node-name"), node?.node ?? "");
   byId("status").hidden = !node;
   byId("emulated").hidden = !node?.emulated;
+  document.body.dataset.emulated = String(Boolean(node?.emulated));
   const nowMs = performance.now();
   // The chosen node may not be known yet: the banner still says that the server is not there.
   status.draw(node ?? { node: "?", tiles: [] }, state.heard, nowMs, state.serverNowMs());

@@ -364,9 +364,10 @@ NodeOf = Callable[..., FakeNode]
 class Play:
     """A node that streams in real time until it is told to stop."""
 
-    def __init__(self, node: FakeNode, force_n: float = 0.0) -> None:
+    def __init__(self, node: FakeNode, force_n: float = 0.0, *, alive: bool = False) -> None:
         self.node = node
         self.force_n = force_n
+        self.alive = alive
         self.problem: BaseException | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="play")
@@ -386,6 +387,6 @@ class Play:
             while not self._stop.wait(0.02):
                 due = (time.monotonic_ns() - self.node.next_t_mono_ns) // PERIOD_NS
                 if due > 0:
-                    self.node.send(int(due), self.force_n)
+                    self.node.send(int(due), self.force_n, alive=self.alive)
         except ConnectionClosed as end:
             self.problem = end

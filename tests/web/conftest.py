@@ -37,6 +37,8 @@ CHROMIUM = next(
 CHROMIUM_OPTIONS = [
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    # This machine by an address that is no secure context, as a server in a network is.
+    "--host-resolver-rules=MAP 192.0.2.1 127.0.0.1",
 ]
 
 expect.set_options(timeout=1e3 * PATIENCE_S)
@@ -126,11 +128,13 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
-    """Opens the page at a size; fails the test if the page complains in its console."""
+    """Opens the page at a size, a script of the test first; fails if its console complains."""
     complaints: list[str] = []
     contexts = []
 
-    def open_(url: str, width: int = 1366, height: int = 768, **options: Any) -> Page:
+    def open_(
+        url: str, width: int = 1366, height: int = 768, first: str = "", **options: Any
+    ) -> Page:
         context = browser.new_context(
             viewport={"width": width, "height": height}, accept_downloads=True, **options
         )
@@ -138,6 +142,8 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
         log_in(context, url)
         page = context.new_page()
         page.set_default_timeout(1e3 * PATIENCE_S)
+        if first:
+            page.add_init_script(first)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on(
             "console",

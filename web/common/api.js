@@ -13,7 +13,7 @@ const JSON_TYPE = "application/json";
  * with `said` it is refused (412) if what is changed is not that any more.
  * @param {string} method
  * @param {string} path
- * @param {{body?: object | Blob, stop?: AbortSignal | null, type?: string, said?: string | null, patienceS?: number}} [how]
+ * @param {{body?: any, stop?: AbortSignal | null, type?: string, said?: string | null, patienceS?: number}} [how]
  */
 export async function call(method, path, { body, stop = null, type = JSON_TYPE, said = null, patienceS = PATIENCE_S } = {}) {
   const headers = { Accept: type };

@@ -117,7 +117,7 @@ export class TileTraces {
     for (const run of runs(points, (point) => of(point, "max_"))) {
       context.beginPath();
       run.forEach((point) => context.lineTo(x(point.timeS), y(of(point, "max_"))));
-      run.toReversed().forEach((point) => context.lineTo(x(point.timeS), y(of(point, "min_"))));
+      [...run].reverse().forEach((point) => context.lineTo(x(point.timeS), y(of(point, "min_"))));
       context.fill();
     }
     context.strokeStyle = colours.fill;

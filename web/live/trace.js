@@ -126,7 +126,7 @@ export class Trace {
     for (const run of runs(points, (point) => point.high)) {
       context.beginPath();
       run.forEach((point) => context.lineTo(x(point.timeS), y(point.high)));
-      run.toReversed().forEach((point) => context.lineTo(x(point.timeS), y(point.low)));
+      [...run].reverse().forEach((point) => context.lineTo(x(point.timeS), y(point.low)));
       context.fill();
       if (run.length === 1) context.fillRect(x(run[0].timeS) - 1, y(run[0].high), 2, Math.max(1, y(run[0].low) - y(run[0].high)));
     }

@@ -147,6 +147,6 @@ export class Compare {
     const [kind, ...rest] = (this.wanted ?? "").split(":");
     if (kind) fields.set(kind, rest.join(":"));
     if (kind === "with" && this.align.value && !byId("align-choice").hidden) fields.set("align", this.align.value);
-    history.replaceState(null, "", location.pathname + (fields.size ? `?${fields}` : ""));
+    history.replaceState(null, "", location.pathname + (String(fields) && `?${fields}`));
   }
 }

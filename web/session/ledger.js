@@ -80,8 +80,8 @@ export class LedgerCard {
   /** The server reads all of its files again. */
   async verify() {
     const [button, box] = [byId("verify", HTMLButtonElement), byId("verified")];
-    if (button.ariaBusy) return;
-    button.ariaBusy = "true";
+    if (button.hasAttribute("aria-busy")) return;
+    button.setAttribute("aria-busy", "true");
     box.replaceChildren(el("p", { text: `Reading ${frames(this.session.frames)} …` }));
     try {
       const { whole, says, details } = verifiedInWords(await api.verified(this.session.id), this.session, new Date());
@@ -90,7 +90,7 @@ export class LedgerCard {
       if (!(error instanceof api.Refusal)) throw error;
       box.replaceChildren(el("p", { text: `Not checked: ${error.message}` }));
     } finally {
-      button.ariaBusy = null;
+      button.removeAttribute("aria-busy");
     }
   }
 }

@@ -34,6 +34,8 @@ export class Plots {
     this.heat = null; // least and greatest of its colours
     this.flags = []; // of marks, where they were drawn
     this.panels = [];
+    /** @type {Record<string, string> | null} */
+    this.colours = null;
     this.drawn = []; // where each panel is, and its scale
     whenColoursChange(() => { this.colours = null; this.changed(); });
     this.changed = () => {};

@@ -29,6 +29,8 @@ export class Plotted {
   /** @param {Session} session */
   constructor(session) {
     this.session = session;
+    /** @type {import("./view.js").View | null} */
+    this.view = null;
     this.plots = new Plots();
     this.plots.changed = () => this.draw();
     this.readout = new Readout();

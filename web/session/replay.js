@@ -54,6 +54,7 @@ export class Replay {
       this.shown = null;
     }
     byId("replay").hidden = false;
+    setData(byId("stage"), "replay", "true");
     for (const part of ["replay-foot", "bars-card"]) byId(part).hidden = !whole.estimated;
     this.sayLag();
   }

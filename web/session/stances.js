@@ -70,6 +70,7 @@ export class Stances {
     this.body.replaceChildren();
     this.current = -1;
     for (const id of ["stances-card", "stance-line"]) byId(id).hidden = !stances.length;
+    setData(byId("plots-card"), "stances", String(stances.length > 0)); // for the style: :has() is newer than our browsers
     byId("stances-legend").textContent = `${stances.length} in all`;
     this.add();
   }
@@ -119,7 +120,7 @@ export class Stances {
   }
 
   say(stance, isPlaying) {
-    this.says.ariaLive = isPlaying ? "off" : "polite"; // at four times the speed nobody can listen
+    this.says.setAttribute("aria-live", isPlaying ? "off" : "polite"); // at four times the speed nobody can listen
     const many = this.stances.length.toLocaleString("en-GB");
     setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : many === "1" ? "1 stance" : `Step through ${many} stances`);
     setText(byId("stance-figures"), stance ? figuresInWords(stance) : "");

@@ -53,5 +53,5 @@ export function toLink(view, durationS, search = "") {
     fields.set("from", text(view.from));
     fields.set("to", text(view.to));
   }
-  return fields.size ? `?${fields}` : "";
+  return String(fields) && `?${fields}`;
 }
