@@ -41,6 +41,7 @@ from devices.errors import FileFormatError, LinkError
 from devices.facts import Count, Facts, Label, OffsetNs, Seq, Text, TMonoNs, TNs
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
+from service.private_paths import without_folders
 from service.scene_content import SceneContent
 from storage.intervals import NO_END
 
@@ -343,5 +344,6 @@ def checked(message: bytes) -> bytes:
 
 def close_reason(text: str) -> str:
     """A reason as a close frame and a log can carry it: 123 bytes (RFC 6455 5.5) in one line."""
+    text = without_folders(text)
     plain = "".join(char if char.isprintable() else "?" for char in text[:_REASON_BYTES_MAX])
     return plain.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")

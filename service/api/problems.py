@@ -24,6 +24,7 @@ from devices.errors import (
     UnknownError,
     UsageError,
 )
+from service.private_paths import without_folders
 
 log = logging.getLogger("foottile.api")
 
@@ -66,7 +67,7 @@ def problem(
         "type": "about:blank",
         "title": HTTPStatus(status).phrase,
         "status": status,
-        "detail": detail,
+        "detail": without_folders(detail),
         "instance": path[:200],
     }
     return JSONResponse(content, status, dict(headers or {}), MEDIA_TYPE)

@@ -12,6 +12,7 @@ from typing import Any
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
+from service.private_paths import register_folder
 from service.server.book import SessionBook, Trash, destroy
 from service.server.calibrations import CalibrationBook
 from service.server.data_folder import DataFolder
@@ -87,6 +88,7 @@ class Server:
 
     def __init__(self, data: Path, *, exact: bool = False) -> None:
         self.data = data
+        register_folder(data)
         self.folder = DataFolder(data)
         self.id = self.folder.id
         """Name of this data folder: a node keeps what this server needs apart from others."""

@@ -14,6 +14,7 @@ from devices.facts import check_new_name
 from service.api.routes.access import FULL, ServerState, has_it, problems, tag_of
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
+from service.private_paths import ShownText
 from service.server.book import expect
 from service.server.calibrations import Kept
 from service.server.fits import SESSIONS_MAX, Fit
@@ -99,9 +100,9 @@ class FitView(View):
     state: Literal["running", "done", "failed", "cancelled"]
     started_t_ns: int = Field(description="Server's UTC.")
     ended_t_ns: int | None
-    said: list[str] = Field(description="What was found so far, a line a tile.")
+    said: list[ShownText] = Field(description="What was found so far, a line a tile.")
     calibration_id: str | None = Field(description="What came of it, once it is done.")
-    problem: str | None = Field(description="Why it failed.")
+    problem: ShownText | None = Field(description="Why it failed.")
 
     @classmethod
     def of(cls, fit: Fit) -> FitView:
@@ -138,7 +139,7 @@ class NodeCalibrationView(View):
     )
     assigned_t_ns: int | None = Field(description="When that was, server's UTC.")
     calibration: CalibrationView | None = Field(description="What is in use; null: none.")
-    problem: str | None = Field(description="Why none is.")
+    problem: ShownText | None = Field(description="Why none is.")
     own_id: str | None = Field(description="Of the one that the node says itself.")
 
     @classmethod

@@ -7,6 +7,7 @@ from pydantic import Field
 
 from service.api.routes.access import ServerState, problems
 from service.link import SUBPROTOCOL
+from service.private_paths import ShownText
 from service.server.screens.views import View
 from service.version import SOFTWARE
 
@@ -17,7 +18,7 @@ class Health(View):
     """The process answers."""
 
     status: str = Field(examples=["ok"])
-    problems: list[str] = Field(
+    problems: list[ShownText] = Field(
         description="What was found damaged in the data folder when the server was started, and "
         "what became of it, in words. The rest is served."
     )

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from devices.frames import ArrayInfo, ServoInfo
 from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
 from service.estimation.warm import WARMING, is_warming
+from service.private_paths import ShownText
 from service.server.book import mark_of, said_of
 from service.server.estimates.ranges import Ranges
 from service.server.estimates.tare_keeper import AutoTare
@@ -168,9 +169,9 @@ class NodeView(View):
     calibration_source: CalibrationSource = Field(
         description="Who says which: the node itself, or the server, where one was assigned."
     )
-    calibration_problem: str | None = Field(description="Why there is no calibration.")
+    calibration_problem: ShownText | None = Field(description="Why there is no calibration.")
     tare: TareView | None = Field(description="The tare in force.")
-    tare_problem: str | None = Field(
+    tare_problem: ShownText | None = Field(
         description="Why there is none, or why the one in force is not this stream's own."
     )
     tare_warnings: list[str] = Field(
@@ -182,7 +183,7 @@ class NodeView(View):
         "was undone, and nobody has tared since; off: the scene says `auto_tare = false`."
     )
     drift: DriftView
-    storage_problem: str | None = Field(description="Why frames are not being kept.")
+    storage_problem: ShownText | None = Field(description="Why frames are not being kept.")
     clock: ClockView | None = Field(description="Null: not measured yet.")
     clock_set: bool = Field(description="Whether anything had set the node's date.")
     rate_hz: float | None = Field(description="Frames a second over the last second.")
@@ -298,7 +299,7 @@ class SessionView(View):
         description="Who said which calibration: the node, or the server, where one was assigned."
     )
     absolute_scale: Literal["measured", "assumed"] | None
-    problem: str | None = Field(description="What a person should know of it.")
+    problem: ShownText | None = Field(description="What a person should know of it.")
     said: str = Field(
         description="Hash of name, subject, notes and tags; as `If-Match` it has a change refused "
         "(412) if somebody else was quicker."

@@ -13,6 +13,7 @@ from devices.frames import ArrayInfo, ServoInfo
 from service.api.routes.access import ServerState, problems
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
+from service.private_paths import ShownText
 from service.server.estimates.ranges import Ranges
 from service.server.screens.views import CalibrationView, TileView, View, scale_of, tiles_of
 from service.server.server import Server
@@ -33,7 +34,7 @@ class ArrayView(View):
         description="Look-ahead of the estimates: for so long after a frame its estimate still "
         "takes notice of what was read; null: there are none."
     )
-    estimates_problem: str | None = Field(description="Why there are no estimates.")
+    estimates_problem: ShownText | None = Field(description="Why there are no estimates.")
 
 
 @router.get(

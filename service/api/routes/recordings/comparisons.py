@@ -15,6 +15,7 @@ from starlette.concurrency import run_in_threadpool
 from devices.errors import FileFormatError, StateError, UnknownError, UsageError
 from service.api.encoding import numbers_as_json
 from service.api.routes.access import SecondsQuery, ServerState, problems
+from service.private_paths import ShownText
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX
 from storage.formats.slice import Slice
@@ -43,7 +44,7 @@ class ComparisonView(BaseModel):
     """One comparison in the list."""
 
     name: str = Field(description="Of its reference.")
-    problem: str | None = Field(description="Why it cannot be read; null: it can.")
+    problem: ShownText | None = Field(description="Why it cannot be read; null: it can.")
     is_of_these_frames: bool | None = Field(
         description="False: the session's frames were others then; null: it does not say."
     )

@@ -22,6 +22,7 @@ from service.api.routes.access import (
     stored_table,
     tag_of,
 )
+from service.private_paths import ShownText
 from service.server.screens.views import EventView, Page, SessionView
 from storage.formats.written.parquet import PARQUET
 from storage.sessions.beside import EVENTS_NAME
@@ -57,7 +58,7 @@ class _Body(BaseModel):
 class SessionPage(Page[SessionView]):
     """A page of sessions."""
 
-    unreadable: dict[str, str] = Field(
+    unreadable: dict[str, ShownText] = Field(
         default={},
         description="By id, sessions whose files are damaged, and what is wrong with them. No "
         "frames are dropped meanwhile; `foottile verify` says more.",

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from service.api.routes.access import IdempotencyKey, ServerState, asked_with, problems
 from service.api.routes.recordings import sessions as one
+from service.private_paths import ShownText
 from service.server.screens.views import SessionView, View
 from service.server.server import Server
 from service.server.takes import Take
@@ -35,7 +36,7 @@ class TakeView(View):
 
     id: str = Field(examples=["1a2b3c4d5e6f"])
     sessions: list[SessionView] = Field(description="Where it was done; of a take, all it has.")
-    failed: dict[str, str] = Field(
+    failed: dict[str, ShownText] = Field(
         description="By node, why it was not done there. The others do not wait for that.",
         examples=[{"left": "node 'left' is not sending. Record when it is connected"}],
     )

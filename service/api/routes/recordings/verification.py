@@ -11,6 +11,7 @@ from pydantic import Field
 
 from devices.errors import FileFormatError, StateError, UnknownError
 from service.api.routes.access import ServerState, problems
+from service.private_paths import ShownText
 from storage.sessions.folder import Ledger
 from storage.verify.session import verify_session
 
@@ -24,7 +25,7 @@ class VerificationView(Ledger):
     """What `foottile verify --json` says: the ledger, and what was found."""
 
     id: str | None
-    problems: list[str] = Field(description="What is wrong; none: it is whole.")
+    problems: list[ShownText] = Field(description="What is wrong; none: it is whole.")
     sha256: str | None = Field(
         description="Of the file of frames as it is now; null: there is none."
     )

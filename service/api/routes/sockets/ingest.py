@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from devices.errors import FileFormatError, LinkError, StorageError
+from devices.words import printable
 from service.api.protocols import send
 from service.link import (
     MESSAGE_BYTES_MAX,
@@ -264,7 +265,7 @@ def _protocol_of(message: str | bytes) -> int | None:
 
 async def _close(socket: WebSocket, end: HangUp) -> None:
     reason = close_reason(end.reason)
-    log.warning("link closed: %s", reason)
+    log.warning("link closed: %s", printable(end.reason))  # with paths as they are here
     if socket.application_state is not WebSocketState.DISCONNECTED:
         with suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(end.code, reason)

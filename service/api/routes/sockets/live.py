@@ -14,6 +14,7 @@ from service.api.protocols import OUTLET, send
 from service.api.protocols import WebSocket as Connection
 from service.api.routes.sockets.live_frames import LiveFrames
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
+from service.private_paths import without_folders
 from service.server.index import age_of
 from service.server.screens.fan_out import RATES_HZ, framed
 from service.server.screens.picture import dumps
@@ -101,7 +102,7 @@ def _hello(server: Server, node: str | None) -> dict[str, object]:
         "protocol": PROTOCOL,
         "software": SOFTWARE,
         "t_ns": utc_ns(),
-        "problems": server.problems,
+        "problems": [without_folders(text) for text in server.problems],
         "nodes": [
             view
             for known in server.nodes
