@@ -64,6 +64,10 @@ class NodeRecording:
         """Unreadable sessions: it is not known which frames they need, so all frames are kept."""
         for session_id, error in self._unreadable.items():
             report(f"session {session_id} is left out: {error}")
+        for stray in self._folder.strays():
+            report(f"session folder {stray.name} is left out: {stray.error}")
+            if stray.may_need_frames:
+                self._unreadable[stray.name] = stray.error
         self._left_over = [s for s in found if s.state != "sealed" and s.node == node]
         self._need()
 

@@ -9,10 +9,11 @@ import hashlib
 import logging
 import shutil
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from devices.errors import ChangedError, StateError, StorageError, UnknownError, UsageError
+from devices.words import printable
 from service.server.index import Age, SessionIndex
 from service.server_clock import utc_ns
 from service.sessions.restore import restore
@@ -26,6 +27,7 @@ from storage.sessions.folder import (
     Event,
     Session,
     SessionFolder,
+    StraySession,
 )
 from storage.sessions.reader import SessionReader
 
@@ -53,6 +55,13 @@ def load_or_restore(folder: SessionFolder) -> tuple[list[Session], dict[str, str
     return found, left
 
 
+def told_strays(strays: Iterable[StraySession]) -> dict[str, str]:
+    """Warn of sessions whose folders were renamed or copied; return what is wrong, by folder."""
+    for stray in strays:
+        log.warning("session folder %s is left out: %s", printable(stray.name), stray.error)
+    return {printable(stray.name): str(stray.error) for stray in strays}
+
+
 class Trash:
     """The sessions in the trash.
 
@@ -65,6 +74,9 @@ class Trash:
         for doomed in folder.glob(DOOMED_PREFIX + "*"):
             shutil.rmtree(doomed, ignore_errors=True)
         found, unreadable = load_or_restore(self.folder)
+        self.has_unreadable = bool(unreadable)
+        """Is it not known which frames one of them needs?"""
+        unreadable |= told_strays(self.folder.strays())
         self.problems = [f"in the trash, {text}" for text in _in_words(unreadable)]
         """Sessions that cannot be read, and why."""
         self._sessions = SessionIndex(found)
@@ -147,10 +159,13 @@ class SessionBook:
         self.changed = changed
         found, self.unreadable = load_or_restore(folder)
         """By id why these cannot be read; their files are as they were."""
+        strays = folder.strays()
+        self.has_unreadable = bool(self.unreadable) or any(each.may_need_frames for each in strays)
+        """Is a session unreadable? Then it is not known which frames it needs."""
+        self.has_unreadable |= trash.has_unreadable
+        self.unreadable |= told_strays(strays)
         self.problems = _in_words(self.unreadable) + trash.problems
         """The same in words, with those in the trash."""
-        self.has_unreadable = bool(self.problems)
-        """Is a session unreadable? Then it is not known which frames it needs."""
         self._sessions = SessionIndex(found)
         self._files = CheckedFiles()
 

@@ -125,6 +125,8 @@ def recover(
             recovery.problems.append(str(error))
         else:
             recovery.restored.append(session_id)
+    strays = [*sessions.strays(), *SessionFolder(data / "trash").strays()]
+    recovery.problems += [str(stray.error) for stray in strays]
     for session in known:
         if session.state == "sealed":
             if _mend_events(session, sessions.path(session.id)):

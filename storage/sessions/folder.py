@@ -11,6 +11,7 @@ import secrets
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +26,7 @@ from devices.errors import (
 )
 from storage.checked_json import read_checked, write_checked
 from storage.clock.log import ClockOffset
-from storage.durable import make_folder, storage_errors, sync_folder
+from storage.durable import ASIDE, make_folder, storage_errors, sync_folder
 
 FRAMES_NAME = "frames.parquet"
 DOOMED_PREFIX = ".deleted-"
@@ -175,6 +176,21 @@ def new_session_id(now: datetime) -> str:
     return f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
 
 
+@dataclass(frozen=True)
+class StraySession:
+    """A session whose folder was renamed or copied, so that it has another name than its id.
+
+    Attributes:
+        name: of the folder.
+        error: what is wrong, and what to do.
+        may_need_frames: is it not sealed, so that it is still to be made of frames?
+    """
+
+    name: str
+    error: FileFormatError
+    may_need_frames: bool
+
+
 class SessionFolder:
     """All sessions of a data folder."""
 
@@ -219,11 +235,14 @@ class SessionFolder:
         """
         path = self.path(session_id) / "session.json"
         try:
-            return Session.model_validate_json(read_checked(path).text)
+            session = Session.model_validate_json(read_checked(path).text)
         except FileNotFoundError as error:
             raise UnknownError(f"no session {session_id!r}") from error
         except ValidationError as error:
             raise FileFormatError(f"not a session: {error}", where=str(path)) from error
+        if session.id != session_id:
+            raise self._stray(path.parent, session.id)
+        return session
 
     def load_all(self) -> tuple[list[Session], dict[str, FootTileError]]:
         """All sessions, newest first, and errors by id for those that cannot be read."""
@@ -234,6 +253,51 @@ class SessionFolder:
             except FootTileError as error:
                 unreadable[session_id] = error
         return found, unreadable
+
+    def strays(self) -> list[StraySession]:
+        """Find sessions in folders that have no session's name; they are left where they are."""
+        found: list[StraySession] = []
+        if not self._folder.is_dir():
+            return found
+        for path in sorted(self._folder.iterdir()):
+            is_named = SESSION_ID.fullmatch(path.name) or path.name.startswith(".")
+            if is_named or ASIDE in path.name or not path.is_dir():
+                continue
+            try:
+                session = Session.model_validate_json(read_checked(path / "session.json").text)
+            except FileNotFoundError:
+                if (path / FRAMES_NAME).is_file():
+                    found.append(StraySession(path.name, self._stray(path, None), True))
+            except (FootTileError, ValidationError):
+                found.append(StraySession(path.name, self._stray(path, None), True))
+            else:
+                is_copy = (self._folder / session.id).is_dir()
+                needs_frames = session.state != "sealed" and not is_copy
+                error = self._stray(path, session.id)
+                found.append(StraySession(path.name, error, needs_frames))
+        return found
+
+    def _stray(self, path: Path, session_id: str | None) -> FileFormatError:
+        if session_id is None:
+            return FileFormatError(
+                "its folder was renamed, and its session.json cannot be read",
+                where=str(path),
+                expected="a folder that has the session's id as its name",
+                remedy="Rename it to the id, as 20200131T235959Z-0123ab",
+            )
+        if (self._folder / session_id).is_dir() and path.name != session_id:
+            return FileFormatError(
+                f"it is a copy of session {session_id}, which is here, too",
+                where=str(path),
+                expected="each session once",
+                remedy="Move the copy elsewhere",
+            )
+        return FileFormatError(
+            f"it is session {session_id}, whose folder was renamed",
+            where=str(path),
+            expected=f"a folder of the name {session_id}",
+            remedy=f"Rename it to {session_id}",
+        )
 
     def move(self, session_id: str, to: SessionFolder) -> None:
         """Move a session's folder to those of `to`: it is in one place or the other, never both.

@@ -20,7 +20,7 @@ from storage.journal.segment import SUFFIX
 from storage.journal.segment_format import INDEX_SUFFIX
 from storage.journal.stream_notes import NOTES_FILE
 from storage.sessions.claims import SESSION_NAME
-from storage.sessions.folder import FRAMES_NAME, SESSION_ID
+from storage.sessions.folder import FRAMES_NAME, SESSION_ID, SessionFolder
 from storage.verify.exported import ExportReport, verify_export
 from storage.verify.journal import StreamReport, verify_stream
 from storage.verify.others import Others, check_json, verify_others
@@ -140,6 +140,13 @@ def verify_folder(path: Path) -> FolderReport:
                     if session.id not in (None, folder.name):
                         session.problems.append(f"it lies in the folder of {folder.name}")
                     report.sessions.append(session)
+        for stray in SessionFolder(data / place).strays():
+            folder = data / place / stray.name
+            proven.add(folder)
+            with _told(report, folder, data):
+                session = verify_session(folder, data=data, streams=known)
+                session.problems.append(f"{place}/{stray.name}: {stray.error.what}")
+                report.sessions.append(session)
     others = verify_others(data, proven)
     report.problems += others.problems
     report.unproven, report.set_aside = others.unproven, others.set_aside

@@ -345,9 +345,12 @@ def _in_folder(data: Path, choice: Choice) -> list[Mapping[str, Any]]:
 
     if not data.is_dir():
         raise UsageError(f"no data folder {str(data)!r}")
-    sessions, unreadable = SessionFolder(data / "sessions").load_all()
+    folder = SessionFolder(data / "sessions")
+    sessions, unreadable = folder.load_all()
     for session_id, error in unreadable.items():
         remark(f"session {session_id} is left out: {error}")
+    for stray in folder.strays():
+        remark(f"session folder {stray.name} is left out: {stray.error}")
 
     def complete(session: Session) -> Completeness:
         return False if session.ledger is None else session.ledger.completeness
