@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import stat
 from errno import EFBIG, EINVAL
@@ -24,14 +25,43 @@ def check_file(path: Path, *, bytes_max: int | None = None) -> None:
         raise OSError(EFBIG, f"{found.st_size} bytes, where {bytes_max} are the most", str(path))
 
 
+def read_bytes(path: Path, *, bytes_max: int) -> bytes:
+    """Read all of a file.
+
+    Raises:
+        OSError: as for `check_file`, or it cannot be read.
+    """
+    check_file(path, bytes_max=bytes_max)
+    # It may have become another one since: a pipe is not waited for, and no more is read than fits.
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        return file.read(bytes_max)
+
+
 def read_text(path: Path, *, bytes_max: int = TEXT_BYTES_MAX) -> str:
-    """All of a text file in UTF-8.
+    """Read all of a text file, as editors save it (`decode_text`).
 
     Raises:
         OSError: as for `check_file`, or it cannot be read.
         UnicodeDecodeError: it is no text.
     """
-    check_file(path, bytes_max=bytes_max)
-    # It may have become another one since: a pipe is not waited for, and no more is read than fits.
-    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
-        return file.read(bytes_max).decode("utf-8")
+    return decode_text(read_bytes(path, bytes_max=bytes_max))
+
+
+def decode_text(content: bytes) -> str:
+    """Return a text in UTF-8, or in the Unicode that its byte order mark states.
+
+    Editors and shells of Windows write that mark, which is no part of the text.
+
+    Raises:
+        UnicodeDecodeError: it is no text.
+    """
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16")
+    head = content[:1000]
+    if b"\0" in head:  # UTF-16 without a mark: every other byte of plain text is zero
+        even, odd = head[::2].count(0), head[1::2].count(0)
+        if odd > 9 * even and 4 * odd > len(head):
+            return content.decode("utf-16-le")
+        if even > 9 * odd and 4 * even > len(head):
+            return content.decode("utf-16-be")
+    return content.decode("utf-8-sig")

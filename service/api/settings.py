@@ -86,8 +86,7 @@ def load_settings(config: Path | None, **given: object) -> Settings:
 
 def _read_file(config: Path) -> dict[str, object]:
     try:
-        # Editors of Windows put a byte-order mark in front.
-        return tomllib.loads(read_text(config).removeprefix("\ufeff"))
+        return tomllib.loads(read_text(config))
     except OSError as error:
         raise UsageError(f"no settings file {str(config)!r}: {error}") from error
     except ValueError as error:  # neither TOML nor UTF-8

@@ -27,9 +27,9 @@ from service.offline.compare.plausible import (
 from service.offline.compare.signals import Signal
 from service.offline.compare.trials import Mark, trials_of
 from storage.formats.reference import ReferenceData, Stated, read_reference
-from storage.formats.reference_tables import is_session
 from storage.formats.sealed import marks_of
 from storage.formats.slice import Slice
+from storage.formats.tables.session import is_session
 from storage.schema import NO_INSTANT
 from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.reader import SessionReader

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from devices.errors import CalibrationError, DamagedFileError
+from devices.inputs import decode_text
 from service.estimation.calibration import EDITED, Calibration
 from storage.checked_json import checked, with_check, write_checked
 
@@ -15,6 +17,8 @@ def calibration_of(content: bytes, *, where: str) -> Calibration:
     Raises:
         CalibrationError: it is not one, or not what its hashes are of.
     """
+    with suppress(UnicodeDecodeError):  # with which `checked` finds damage
+        content = decode_text(content).encode()  # as an editor may have saved it
     try:
         text = checked(content, where=where).text
     except DamagedFileError as error:

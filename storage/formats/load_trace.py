@@ -1,8 +1,9 @@
-"""Reads a recorded load from CSV or Parquet, and refuses what cannot be one.
+"""Recorded loads, from any table of forces; what cannot be a load is refused.
 
 Columns, whatever their case: `time_s`, and either `fz_n, cop_x_m, cop_y_m` or one force per tile,
 `cell1_n, cell2_n, ...`; optionally `angle_rad`. Others are ignored. A session of ours, sealed or
-exported, has `t_ns` instead, and is translated (`storage.formats.session_load`).
+exported, has `t_ns` instead, and is translated (`storage.formats.session_load`); force platforms
+and OpenSim's ground reactions are read as references are.
 """
 
 from __future__ import annotations
@@ -12,18 +13,15 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
 
+from devices.arrays import Floats
 from devices.emulation.ground.load_trace import LoadTrace
-from devices.errors import DamagedFileError, LoadTraceError
-from devices.inputs import check_file
-from storage.file_hash import check_hash, file_hashes
-from storage.formats.session_load import SESSION_COLUMN, as_load, is_session
+from devices.errors import FileFormatError, LoadTraceError, UsageError
+from storage.formats.reference import Stated, as_reference
+from storage.formats.session_load import SESSION_COLUMN, as_load
+from storage.formats.tables.registry import read_table
+from storage.formats.tables.table import INSTANTS, OURS, Column, Table
 
-CSV_BYTES_MAX = 256 << 20
 NUMBERS_MAX = 20_000_000
 """Rows times columns: an hour of eight cells at 500 rows a second, and 160 MB in memory."""
 
@@ -46,7 +44,7 @@ def read_load_trace(path: Path) -> LoadTrace:
     where = str(path)
     columns, names = _read(path)
 
-    def numbers(name: str, *, may_be_empty: bool = False) -> npt.NDArray[np.float64]:
+    def numbers(name: str, *, may_be_empty: bool = False) -> Floats:
         return _numbers(columns, names, name, where, may_be_empty=may_be_empty)
 
     time_s = numbers("time_s")
@@ -102,87 +100,70 @@ def read_load_trace(path: Path) -> LoadTrace:
     )
 
 
-Columns = dict[str, "pa.ChunkedArray[pa.Scalar[pa.DataType]]"]
+def _is_needed(name: str) -> bool:
+    name = name.lower()
+    return bool(_COLUMN.fullmatch(name) or SESSION_COLUMN.fullmatch(name)) or name in OURS
 
 
-def _read(path: Path) -> tuple[Columns, list[str]]:
-    """The columns of a trace, and the names of all that the file has, in lower case."""
-    where = str(path)
+def _read(path: Path) -> tuple[dict[str, Column], list[str]]:
+    """Return the columns of a trace by name in lower case, and the names of all in the file."""
     try:
-        is_parquet = path.suffix.lower() == ".parquet"
-        check_file(path, bytes_max=None if is_parquet else CSV_BYTES_MAX)
-        if is_parquet:
-            with pyarrow.parquet.ParquetFile(path, page_checksum_verification=True) as file:
-                check_hash(file_hashes(path), file.schema_arrow.metadata or {}, where=where)
-                names, rows = file.schema_arrow.names, file.metadata.num_rows
-                wanted = _wanted(names, where)
-                _check_size(rows, len(wanted), where)
-                table = file.read(columns=wanted)
-        else:
-            with pyarrow.csv.open_csv(path) as file:
-                names = file.schema.names
-            wanted = _wanted(names, where)
-            convert = pyarrow.csv.ConvertOptions(include_columns=wanted)
-            table = pyarrow.csv.read_csv(path, convert_options=convert)
-            _check_size(len(table), len(wanted), where)
-    except DamagedFileError as error:
-        raise LoadTraceError(error.what, where=where, remedy=error.remedy) from error
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        table = read_table(path, _is_needed, NUMBERS_MAX)
+        names = [name.lower() for name in table.names if name]
+        columns = _lower(table)
+        if INSTANTS in columns:
+            columns = as_load(columns, table.schema, where=table.where)
+        elif "grf_n" in columns and "fz_n" not in columns and "cell1_n" not in columns:
+            columns = _of_reference(table)
+    except (FileFormatError, UsageError) as error:
         raise LoadTraceError(
-            f"cannot be read: {error}",
-            where=where,
-            expected="a CSV file in UTF-8 with a header line, or a Parquet file",
+            error.what, where=error.where, expected=error.expected, remedy=error.remedy
         ) from error
-    columns: Columns = dict(zip([name.lower() for name in wanted], table.columns, strict=True))
-    known = [name.lower() for name in names]
-    if is_session(known):
-        columns = as_load(columns, table.schema, where=where)
-    return columns, [*known, *columns]
-
-
-def _wanted(names: list[str], where: str) -> list[str]:
-    """Those that are read."""
-    known = [name.lower() for name in names]
-    pattern = SESSION_COLUMN if is_session(known) else _COLUMN
-    wanted = [name for name in names if pattern.fullmatch(name.lower())]
-    lower = [name.lower() for name in wanted]
-    if twice := sorted({name for name in lower if lower.count(name) > 1}):
-        raise LoadTraceError(
-            f"column {', '.join(twice)} is there twice, whatever its case", where=where
-        )
-    if not wanted:
+    if not any(_COLUMN.fullmatch(name) for name in columns):
         raise LoadTraceError(
             f"no load in its columns ({', '.join(names)[:200]})",
-            where=where,
-            expected=_other_unit(known, "time_s") or "time_s, and fz_n or cell1_n, cell2_n, ...",
+            where=table.where,
+            expected=_other_unit(names, "time_s") or "time_s, and fz_n or cell1_n, cell2_n, ...",
         )
-    return wanted
+    return columns, list(dict.fromkeys([*names, *columns]))
 
 
-def _check_size(rows: int, columns: int, where: str) -> None:
-    if rows * columns > NUMBERS_MAX:
+def _of_reference(table: Table) -> dict[str, Column]:
+    found = as_reference(table, Stated())
+    if len(found.time_s) < len(table.columns["time_s"]):
         raise LoadTraceError(
-            f"{rows} rows of {columns} columns are too many to be held in memory",
-            where=where,
-            expected=f"up to {NUMBERS_MAX} numbers",
-            remedy="Cut out the part that is to be pressed",
+            f"{len(table.columns['time_s']) - len(found.time_s)} samples have no force",
+            where=table.where,
+            expected="a force in each",
+            remedy="Cut them out, or fill them from their neighbours on purpose",
         )
+    columns: dict[str, Column] = {"time_s": found.time_s, "fz_n": found.grf_n}
+    if found.cop_m is not None:
+        columns |= {"cop_x_m": found.cop_m[:, 0], "cop_y_m": found.cop_m[:, 1]}
+    return columns
+
+
+def _lower(table: Table) -> dict[str, Column]:
+    columns: dict[str, Column] = {}
+    for name, column in table.columns.items():
+        if name.lower() in columns and columns[name.lower()] is not column:
+            raise FileFormatError(
+                f"column {name.lower()} is there twice, whatever its case", where=table.where
+            )
+        columns[name.lower()] = column
+    return columns
 
 
 def _numbers(
-    columns: Columns, names: list[str], name: str, where: str, *, may_be_empty: bool
-) -> npt.NDArray[np.float64]:
+    columns: dict[str, Column], names: list[str], name: str, where: str, *, may_be_empty: bool
+) -> Floats:
     if name not in columns:
         raise LoadTraceError(
             f"column {name} is missing (it has {', '.join(names)})",
             where=where,
             expected=_other_unit(names, name) or name,
         )
-    column = columns[name]
-    try:
-        values = column.cast(pa.float64()).to_numpy().astype(np.float64)
-    except pa.ArrowException as error:
-        raise LoadTraceError(f"column {name} is not numeric: {error}", where=where) from error
+    values = columns[name].astype(np.float64)
     bad = ~(np.abs(values) < NUMBER_MAX)  # NaN too
     if may_be_empty:
         bad &= ~np.isnan(values)

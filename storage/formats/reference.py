@@ -1,8 +1,9 @@
-"""What a reference has measured, from whatever file it is in; units and sign are never guessed.
+"""Force and centre of pressure of a reference, whatever its file; units are never guessed.
 
-A file's own columns are told by a mapping to `time_s`, `grf_n`, `cop_x_m` and `cop_y_m`. A column
-that has our name says its unit and sign by that; of any other both have to be stated. What cannot
-be a measurement is refused here; what is odd, and what was left out, is said in `notes`.
+A file's own columns are mapped to `time_s`, `grf_n`, `cop_x_m` and `cop_y_m`. A column that has our
+name has its unit and sign by that; of any other the file states them, or the user. The sign of a
+force platform follows from the load that it bears. What cannot be a measurement is refused here;
+what is odd, and what was left out, stands in `notes`.
 """
 
 from __future__ import annotations
@@ -15,15 +16,9 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
-from storage.formats.force_platform import read_force_platforms
-from storage.formats.pressure_plate import read_pressure_plate
-from storage.formats.reference_tables import (
-    Table,
-    read_csv,
-    read_opensim,
-    read_parquet,
-    read_session,
-)
+from storage.formats.tables.registry import read_table
+from storage.formats.tables.session import read_session
+from storage.formats.tables.table import OURS, Table
 
 QUANTITIES = ("time_s", "grf_n", "cop_x_m", "cop_y_m")
 FACTORS: Mapping[str, Mapping[str, float]] = {
@@ -40,6 +35,13 @@ NUMBER_MAX = 1e9
 TIME_MAX_S = 1e11
 """Unix time is far below that in seconds, and beyond it in any other unit."""
 GAP_STEPS = 3.5
+PEAK_S = 0.02
+LOADED_SIGMA = 12.0
+"""A plate is loaded clearly if its force goes over so many sigma of its noise."""
+SIGN_RATIO = 3.0
+"""Peaks of both signs within this factor do not tell which of them is the load."""
+BEARS = 0.05
+"""Of its greatest force: below that a plate's centre of pressure is noise over noise."""
 TURNED = 2.0
 """A force that goes so many times further below zero than above it is negative under load."""
 
@@ -98,13 +100,25 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
     Raises:
         FileFormatError: unreadable, empty, a column is missing, times do not rise, or no sample has
             a force.
-        UsageError: a unit or the sign is neither stated nor said by the file.
-        MissingExtraError: it is a C3D file, and what reads it is not installed.
+        UsageError: a unit or the sign is neither stated nor given by the file, or a stated one
+            differs from the file's.
     """
-    table = _table(path, stated)
+    named = {name.removeprefix("-") for name in stated.columns.values()}
+    table = read_session(path, named) or read_table(
+        path, lambda name: name in named or name.lower() in OURS
+    )
+    return as_reference(table, stated)
+
+
+def as_reference(table: Table, stated: Stated) -> ReferenceData:
+    """Return the force and centre of pressure that a table holds, in SI units.
+
+    Raises:
+        FileFormatError, UsageError: as for `read_reference`.
+    """
     where = table.where
     time_s = _column(table, stated, "time_s")
-    grf_n = _column(table, stated, "grf_n") * _sign(table, stated)
+    grf_n, sign_note = _with_sign(table, stated, _column(table, stated, "grf_n"), time_s)
     cop = [
         _column(table, stated, name)
         for name in ("cop_x_m", "cop_y_m")
@@ -116,10 +130,14 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
             where=where,
             remedy="Map cop_x_m and cop_y_m, or neither",
         )
+    notes = [*table.notes, *sign_note]
+    timed = ~np.isnan(time_s)
+    if not timed.all():
+        notes.append(f"{int((~timed).sum())} of {len(timed)} samples have no time: left out")
+        time_s, grf_n, cop = time_s[timed], grf_n[timed], [column[timed] for column in cop]
     if len(time_s) < 2:
         raise FileFormatError(f"{len(time_s)} samples", where=where, expected="at least two")
     _check_time(time_s, where)
-    notes = list(table.notes)
     if abs(time_s[0]) >= NUMBER_MAX:
         notes.append(
             f"the reference's time begins at {time_s[0]:.3f} s, as Unix time does: the lag is to "
@@ -139,60 +157,58 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
             f"{int(gaps.sum())} gaps, the longest of {steps_s.max():.3f} s: nothing is compared in "
             "them"
         )
+    cop_m = np.stack(cop, axis=1)[known] if cop else None
+    if cop_m is not None:
+        notes += _drop_far_cop(cop_m, grf_n[known], where)
     return ReferenceData(
         where=where,
         time_s=time_s[known],
         grf_n=grf_n[known],
-        cop_m=np.stack(cop, axis=1)[known] if cop else None,
+        cop_m=cop_m,
         epoch_ns=table.epoch_ns,
         notes=tuple(notes),
     )
 
 
-def _table(path: Path, stated: Stated) -> Table:
-    named = {name.removeprefix("-") for name in stated.columns.values()}
-    match path.suffix.lower():
-        case ".parquet":
-            session = read_session(path, named)
-            return session if session is not None else read_parquet(path, named)
-        case ".mot" | ".sto":
-            return read_opensim(path, named)
-        case ".csv" | ".txt" | ".tsv":
-            return read_csv(path, named)
-        case ".npz":
-            return read_pressure_plate(path)
-        case ".c3d":
-            return read_force_platforms(path)
-    raise FileFormatError(
-        f"a reference with the ending {path.suffix!r} cannot be read",
-        where=str(path),
-        expected=".csv, .parquet (also a session), .c3d, .mot, .sto, or .npz of a pressure plate",
-    )
-
-
 def _column(table: Table, stated: Stated, name: str) -> Floats:
-    """A quantity in SI units; infinite and monstrous numbers are errors, NaN is not."""
+    """Return a quantity in SI units, with NaN where a cell is empty.
+
+    Raises:
+        FileFormatError: there is no such column, or a time or force is larger than any can be.
+        UsageError: its unit is not stated, or is stated otherwise than by the file.
+    """
     given = stated.columns.get(name, name)
     turned, theirs = given.startswith("-"), given.removeprefix("-")
     if theirs not in table.columns:
         raise FileFormatError(
-            f"no column {theirs!r} for {name} (it has {', '.join(table.names)[:200]})",
+            f"no column {theirs!r} for {name} (it has "
+            f"{', '.join(filter(None, table.names))[:200]})",
             where=table.where,
             expected=table.form,
             remedy=f"Name it: --map {name}=COLUMN",
         )
     quantity = name.partition("_")[0]
-    unit = stated.units.get(quantity)
-    if unit is None and name != "time_s" and theirs not in table.si:
+    factors = FACTORS[quantity]
+    unit, of_file = stated.units.get(quantity), table.units.get(theirs)
+    if of_file is not None and of_file not in factors:
+        of_file = None
+    if unit is not None and of_file is not None and unit != of_file:
+        raise UsageError(
+            f"the file states that column {theirs!r} is in {of_file}, not in {unit}",
+            where=table.where,
+            remedy=f"Leave out --units {quantity}={unit}; if the file is wrong, rename its column",
+        )
+    unit = of_file or unit or ("s" if quantity == "time" else None)
+    if unit is None:
         raise UsageError(
             f"the unit of column {theirs!r} is not stated",
             where=table.where,
-            remedy=f"Add --units {quantity}={'|'.join(FACTORS[quantity])}",
+            remedy=f"Add --units {quantity}={'|'.join(factors)}",
         )
-    values = table.columns[theirs] * (FACTORS[quantity][unit] if unit is not None else 1.0)
-    greatest = TIME_MAX_S if quantity == "time" else NUMBER_MAX
-    bad = np.flatnonzero(np.abs(values) >= greatest)
-    if len(bad):
+    values = np.asarray(table.columns[theirs] * factors[unit], dtype=np.float64)
+    # A centre of pressure may be anywhere while nothing bears: `_drop_far_cop`.
+    greatest = {"time": TIME_MAX_S, "grf": NUMBER_MAX}.get(quantity)
+    if greatest is not None and len(bad := np.flatnonzero(np.abs(values) >= greatest)):
         raise FileFormatError(
             f"column {theirs!r} is {values[bad[0]]:g} at sample {bad[0] + 1}",
             where=table.where,
@@ -202,22 +218,88 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
     return -values if turned else values
 
 
-def _sign(table: Table, stated: Stated) -> float:
+def _with_sign(
+    table: Table, stated: Stated, grf_n: Floats, time_s: Floats
+) -> tuple[Floats, tuple[str, ...]]:
+    """Return a force that is positive under load, and a note of how that was found."""
+    name = stated.columns.get("grf_n", "grf_n")
     if stated.sign is not None:
-        return SIGNS[stated.sign]
-    if stated.columns.get("grf_n", "grf_n") in table.si:
-        return 1.0
+        return SIGNS[stated.sign] * grf_n, ()
+    if name.removeprefix("-") in table.positive:
+        return grf_n, ()
+    if name in table.plates:
+        return _positive_under_load(grf_n, time_s, table.where)
+    if name.removeprefix("-") in table.plates:  # turned by the user
+        return grf_n, ()
     raise UsageError(
-        f"the sign of column {stated.columns.get('grf_n', 'grf_n')!r} is not stated",
+        f"the sign of column {name!r} is not stated",
         where=table.where,
         remedy="Add --sign + if it is positive under load, --sign - if it is negative",
     )
 
 
+def _positive_under_load(
+    grf_n: Floats, time_s: Floats, where: str
+) -> tuple[Floats, tuple[str, ...]]:
+    """Return the force of a plate, positive under load: a plate bears load, and lifts nobody.
+
+    A peak is what is reached for `PEAK_S` altogether, so that a spike is none.
+
+    Raises:
+        UsageError: the load does not tell.
+    """
+    known = np.sort(grf_n[np.isfinite(grf_n)])
+    if len(known) < 2:
+        return grf_n, ()
+    step_s = float(np.median(np.diff(time_s)))
+    held = min(len(known) - 1, max(1, round(PEAK_S / step_s)) if step_s > 0.0 else 1)
+    low_n, high_n = min(0.0, float(known[held - 1])), max(0.0, float(known[-held]))
+    small_n, great_n = sorted((-low_n, high_n))
+    middle_n = float(np.median(known))
+    # Third differences are of noise: a load changes little in three samples.
+    third_n = np.diff(grf_n[np.isfinite(grf_n)], 3)
+    noise_n = 1.4826 * float(np.median(np.abs(third_n))) / np.sqrt(20.0) if len(third_n) else 0.0
+    is_loaded = float(known[-held] - known[held - 1]) > LOADED_SIGMA * noise_n
+    if not is_loaded or great_n < SIGN_RATIO * small_n or great_n == 0.0:
+        raise UsageError(
+            "the load does not tell the sign of the force: it goes from "
+            f"{known[0]:.4g} to {known[-1]:.4g} N, and is {middle_n:.4g} N at its median",
+            where=where,
+            expected="a plate that was loaded clearly",
+            remedy="Add --sign + if it is positive under load, --sign - if it is negative",
+        )
+    if high_n > -low_n:
+        note = "the file holds the load on the plate, positive along the plate's z axis (--sign +)"
+    else:
+        note = (
+            "the file holds the reaction on the foot, negative along the plate's z axis (--sign -)"
+        )
+    return (grf_n if high_n > -low_n else -grf_n), (note,)
+
+
+def _drop_far_cop(cop_m: Floats, grf_n: Floats, where: str) -> list[str]:
+    """Set a centre of pressure to NaN that is nowhere, while the plate bears next to nothing.
+
+    Raises:
+        FileFormatError: it is nowhere under load.
+    """
+    far = ~(np.abs(cop_m) < NUMBER_MAX).all(axis=1) & ~np.isnan(cop_m).any(axis=1)
+    if not far.any():
+        return []
+    bears = far & (grf_n > BEARS * np.max(grf_n))
+    if bears.any():
+        sample = int(np.flatnonzero(bears)[0])
+        raise FileFormatError(
+            f"the centre of pressure is {np.abs(cop_m[sample]).max():g} m away at sample "
+            f"{sample + 1}, under {grf_n[sample]:.4g} N",
+            where=where,
+            expected=f"numbers below {NUMBER_MAX:g}",
+        )
+    cop_m[far] = np.nan
+    return [f"in {int(far.sum())} samples without load there is no centre of pressure: left out"]
+
+
 def _check_time(time_s: Floats, where: str) -> None:
-    if not np.isfinite(time_s).all():
-        sample = int(np.flatnonzero(~np.isfinite(time_s))[0])
-        raise FileFormatError(f"no time at sample {sample + 1}", where=where)
     falls = np.flatnonzero(np.diff(time_s) <= 0.0)
     if len(falls):
         i = int(falls[0])

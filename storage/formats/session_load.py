@@ -10,16 +10,14 @@ for the reader of the trace to refuse.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Mapping
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from devices.errors import FileFormatError, LoadTraceError
+from storage.formats.tables.table import INSTANTS, Column
 from storage.schema import array_info
-
-Columns = dict[str, "pa.ChunkedArray[pa.Scalar[pa.DataType]]"]
 
 SESSION_COLUMN = re.compile(
     r"t_ns|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)",
@@ -29,23 +27,20 @@ SESSION_COLUMN = re.compile(
 _TOTAL = ("grf_n", "cop_x_m", "cop_y_m")
 
 
-def is_session(names: Iterable[str]) -> bool:
-    """Are these a session's columns, and no load trace's?"""
-    return "t_ns" in names
-
-
-def as_load(columns: Columns, schema: pa.Schema, *, where: str) -> Columns:
-    """`time_s` and `cell1_n, ...` or `fz_n, cop_x_m, cop_y_m`, with `angle_rad` if it is known.
+def as_load(
+    columns: Mapping[str, Column], schema: pa.Schema | None, *, where: str
+) -> dict[str, Column]:
+    """Return `time_s` and `cell1_n, ...` or `fz_n, cop_x_m, cop_y_m`, and `angle_rad` if known.
 
     Args:
         columns: of a session; those that `SESSION_COLUMN` names.
-        schema: of its file, which may describe the array.
+        schema: of its Parquet file, which may describe the array; None of text.
         where: for errors.
 
     Raises:
         LoadTraceError: it has no load in its columns, or `t_ns` are no instants.
     """
-    found: Columns = {}
+    found: dict[str, Column] = {}
     for stem in ("true_", ""):
         if cells := _cells(columns, schema, stem, where=where):
             found = {f"cell{i + 1}_n": column for i, column in enumerate(cells)}
@@ -62,25 +57,25 @@ def as_load(columns: Columns, schema: pa.Schema, *, where: str) -> Columns:
             remedy="Estimate it first, with `foottile estimate`",
         )
     for name in ("true_angle_rad", "angle_rad"):
-        if name in columns and columns[name].null_count < len(columns[name]):
+        if name in columns and not np.isnan(columns[name]).all():
             found["angle_rad"] = columns[name]
             break
-    if not pa.types.is_integer(columns["t_ns"].type) or columns["t_ns"].null_count:
+    t_ns = columns[INSTANTS]
+    if t_ns.dtype.kind != "i":
         raise LoadTraceError("t_ns are no instants", where=where, expected="nanoseconds")
-    t_ns = columns["t_ns"].to_numpy()
-    found["time_s"] = pa.chunked_array([(t_ns - t_ns[:1]) * 1e-9])
+    found["time_s"] = np.asarray((t_ns - t_ns[:1]) * 1e-9, dtype=np.float64)
     # Where nothing presses there is no centre of pressure, and none is needed.
     needed = [column for name, column in found.items() if not name.startswith("cop_")]
-    rows = np.flatnonzero(~np.any([pc.is_null(c, nan_is_null=True) for c in needed], axis=0))
+    rows = np.flatnonzero(~np.any([np.isnan(column) for column in needed], axis=0))
     if not len(rows):
         raise LoadTraceError("no row of it has a load", where=where)
     begin, end = int(rows[0]), int(rows[-1]) + 1
-    return {name: column.slice(begin, end - begin) for name, column in found.items()}
+    return {name: column[begin:end] for name, column in found.items()}
 
 
 def _cells(
-    columns: Columns, schema: pa.Schema, stem: str, *, where: str
-) -> list[pa.ChunkedArray[pa.Scalar[pa.DataType]]]:
+    columns: Mapping[str, Column], schema: pa.Schema | None, stem: str, *, where: str
+) -> list[Column]:
     """Forces of the tiles that bear load, in their order."""
     numbers = sorted(
         int(match[1]) for name in columns if (match := re.fullmatch(rf"{stem}force_n_(\d+)", name))
@@ -95,14 +90,16 @@ def _cells(
     cells = []
     for i in numbers:
         estimated = columns.get(f"force_n_{i}")
-        is_empty = estimated is not None and estimated.null_count == len(estimated)
+        is_empty = estimated is not None and bool(np.isnan(estimated).all())
         if not (is_empty if bare is None else i in bare):
             cells.append(columns[f"{stem}force_n_{i}"])
     return cells
 
 
-def _bare(schema: pa.Schema) -> set[int] | None:
+def _bare(schema: pa.Schema | None) -> set[int] | None:
     """Numbers of the bare tiles; None if the file does not describe the array, as CSV."""
+    if schema is None:
+        return None
     try:
         tiles = array_info(schema, where="").tiles
     except FileFormatError:

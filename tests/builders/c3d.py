@@ -22,6 +22,8 @@ def c3d_bytes(
     *,
     point_hz: float = 100.0,
     samples_a_frame: int = 10,
+    is_integer: bool = False,
+    frames_in_header: int | None = None,
 ) -> bytes:
     """A file with one point and these analog samples.
 
@@ -31,6 +33,8 @@ def c3d_bytes(
         analog: (n, channels), n being a multiple of `samples_a_frame`.
         point_hz: frames a second.
         samples_a_frame: analog samples in each.
+        is_integer: samples are stored as integers of 16 bits, which they have to be.
+        frames_in_header: as the header counts them; None: rightly.
     """
     parameters = _section(groups)
     frames = len(analog) // samples_a_frame
@@ -38,12 +42,17 @@ def c3d_bytes(
     channels = analog.shape[1]
     head = struct.pack(
         "<BB5HfHHf",
-        *(2, 0x50, 1, channels * samples_a_frame, 1, frames, 0),
-        *(-1.0, begin, samples_a_frame, point_hz),
+        *(2, 0x50, 1, channels * samples_a_frame, 1),
+        *((frames if frames_in_header is None else frames_in_header), 0),
+        *(1.0 if is_integer else -1.0, begin, samples_a_frame, point_hz),
     )
     rows = analog.reshape(frames, samples_a_frame * channels)
     points = np.zeros((frames, 4))
-    data = np.concatenate([points, rows], axis=1).astype("<f4").tobytes()
+    stored = np.concatenate([points, rows], axis=1)
+    if is_integer:
+        data = stored.astype(np.int64).astype("<u2").tobytes()
+    else:
+        data = stored.astype("<f4").tobytes()
     return _padded(head) + parameters + _padded(data)
 
 
@@ -106,7 +115,7 @@ def _value(value: Any) -> tuple[int, Sequence[int], bytes]:
         return -1, (width, len(value)), "".join(text.ljust(width) for text in value).encode()
     array = np.asarray(value)
     if array.dtype.kind == "i":
-        return 2, array.shape[::-1], array.astype("<i2").tobytes()
+        return 2, array.shape[::-1], array.astype("<u2").tobytes()
     return 4, array.shape[::-1], array.astype("<f4").tobytes()
 
 

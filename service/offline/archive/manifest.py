@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
+import re
 from collections.abc import Collection, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import TextIO
 
@@ -11,12 +14,20 @@ from devices.errors import FileFormatError, UsageError
 from devices.inputs import check_file
 from service.offline.archive.places import absolute, is_remote
 
+_HEAD_LINES = 20
+"""The names stand in one of the first so many lines."""
+_STATED = re.compile(r"(?i)sep=(.)")
+"""Excel's line that states the delimiter."""
+_PIECE = 1 << 20
 _LINE_MAX = 1 << 16
 """A longer line is none of a table: no file is read into memory for it."""
 
 
 def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
-    """Rows by the names of their columns; paths of sessions are relative to the manifest.
+    """Yield rows by the names of their columns; paths of sessions are relative to the manifest.
+
+    Cells are parted by commas, semicolons or tabs, as spreadsheets save them; empty rows, and
+    columns without name and content, are left out.
 
     Args:
         path: the file.
@@ -28,16 +39,26 @@ def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
     """
     try:
         check_file(path)
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            columns = next(csv.reader(_lines(file)), [])
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        encoding = _encoding(path)
+        with path.open(encoding=encoding, newline="") as file:
+            head = list(islice(_lines(file), _HEAD_LINES))
+    except (OSError, UnicodeError, csv.Error) as error:
         raise UsageError(f"--manifest {str(path)!r} cannot be read: {error}") from error
+    if any("\0" in line for line in head):
+        raise UsageError(f"--manifest {str(path)!r} is no text")
+    at = next((i for i, line in enumerate(head) if line.strip(" ,;\t\r\n")), 0)
+    stated = _STATED.fullmatch(head[at].strip()) if head else None
+    delimiters = stated[1] if stated else ",;\t"
+    names = "".join(head[at + bool(stated) :][:1])
+    found = {one: _cells(next(csv.reader([names], delimiter=one), [])) for one in delimiters}
+    delimiter = max(found, key=lambda one: ("session" in found[one], len(found[one])))
+    columns = found[delimiter]
     if "session" not in columns or set(columns) - set(known) or len(set(columns)) < len(columns):
         raise UsageError(
             f"--manifest {str(path)!r} has the columns {', '.join(columns)[:200] or 'of nothing'}",
             expected=f"session, and of {', '.join(sorted(known))} those that differ by row",
         )
-    return _rows(path, columns)
+    return _rows(path, columns, encoding, delimiter, at + bool(stated))
 
 
 def resolved(path: Path, named: str) -> str:
@@ -45,22 +66,52 @@ def resolved(path: Path, named: str) -> str:
     return named if is_remote(named) else absolute(str(path.parent / named))
 
 
-def _rows(path: Path, columns: list[str]) -> Iterator[dict[str, str]]:
-    with path.open(encoding="utf-8-sig", newline="") as file:
+def _rows(
+    path: Path, columns: list[str], encoding: str, delimiter: str, begin: int
+) -> Iterator[dict[str, str]]:
+    """Yield the rows below the names, which stand in line `begin`, from 0."""
+    with path.open(encoding=encoding, newline="") as file:
         try:
-            for number, cells in enumerate(csv.reader(_lines(file)), start=1):
-                if number == 1 or not cells:
+            lines = islice(_lines(file), begin, None)
+            for number, row in enumerate(csv.reader(lines, delimiter=delimiter), start=begin + 1):
+                cells = _cells(row)
+                if number == begin + 1 or not cells:
                     continue
-                row = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
-                if len(cells) != len(columns) or not row["session"]:
+                cells += [""] * (min(len(row), len(columns)) - len(cells))
+                named = dict(zip(columns, cells, strict=False))
+                if len(cells) != len(columns) or not named["session"]:
                     raise FileFormatError(
                         f"row {number} has {len(cells)} cells",
                         where=str(path),
                         expected=f"{len(columns)}, with a session",
                     )
-                yield {**row, "session": resolved(path, row["session"])}
-        except (UnicodeDecodeError, csv.Error) as error:
+                yield {**named, "session": resolved(path, named["session"])}
+        except (UnicodeError, csv.Error) as error:
             raise FileFormatError(f"cannot be read: {error}", where=str(path)) from error
+
+
+def _cells(row: list[str]) -> list[str]:
+    """Return the cells of a row, without those that are empty at its end."""
+    cells = [cell.strip() for cell in row]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _encoding(path: Path) -> str:
+    """Return the encoding that a spreadsheet has saved a text in."""
+    check = codecs.getincrementaldecoder("utf-8")()
+    with path.open("rb") as file:
+        if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+            return "utf-16"
+        file.seek(0)
+        try:
+            while piece := file.read(_PIECE):
+                check.decode(piece)
+            check.decode(b"", final=True)
+        except UnicodeDecodeError:
+            return "cp1252"
+    return "utf-8-sig"
 
 
 def _lines(file: TextIO) -> Iterator[str]:

@@ -43,7 +43,8 @@ def check_time_unit(ours: Signal, reference: Signal) -> None:
                 f"the reference is {np.ptp(reference.t_s):.4g} s long, {times:.0f} times the "
                 f"session, with a sample every {reference.step_s:.3g} s",
                 expected="about as long as the session",
-                remedy=f"Its time may be in {unit}: add --units time={unit}",
+                remedy=f"Its time may be in {unit}: add --units time={unit}, and rename its column "
+                "if that is called time_s",
             )
 
 

@@ -1,10 +1,10 @@
 """C3D: the foot as a force platform of type 2, in its own frame, written by ezc3d.
 
 The laboratory's axes are those of the foot frame, in mm. The platform's own z points down, as the
-C3D manual wants it (FORCE_PLATFORM), so its y is the foot's turned; its channels are what the foot
-does to it: Fz is the GRF, Mx and My are the GRF times the centre of pressure, so that a reader
-comes to both again. While the foot is known to bear nothing they are 0, and there is no centre of
-pressure; where something is not known, it is NaN.
+C3D manual wants it (FORCE_PLATFORM), so its y is the foot's turned. Its channels are the reaction
+on the foot, as Vicon, Qualisys and most others write it, and as readers expect it: Fz is the GRF
+less than zero, Mx and My are Fz times the centre of pressure. While the foot is known to bear
+nothing they are 0, and there is no centre of pressure; where something is not known, it is NaN.
 
 Integers have to be integers: ezc3d makes floats of a list of them, and then does not read the file.
 """
@@ -43,9 +43,9 @@ MARGIN_MM = 10.0
 _WRENCH = {
     "Fx": ("N", "not measured, 0"),
     "Fy": ("N", "not measured, 0"),
-    "Fz": ("N", "GRF, down on the platform; 0 without contact"),
-    "Mx": ("Nmm", "GRF times COP, at the platform's centre; NaN where no COP is stated"),
-    "My": ("Nmm", "GRF times COP, at the platform's centre; NaN where no COP is stated"),
+    "Fz": ("N", "GRF on the foot, negative: z points down; 0 without contact"),
+    "Mx": ("Nmm", "Fz times COP, at the platform's centre; NaN where no COP is stated"),
+    "My": ("Nmm", "Fz times COP, at the platform's centre; NaN where no COP is stated"),
     "Mz": ("Nmm", "not measured, 0"),
 }
 _UNCERTAINTY = "t_server_uncertainty_s"
@@ -242,8 +242,8 @@ def _platform(export: Export) -> tuple[Floats, Floats]:
 
 
 def _wrench(found: Reaction, centre_m: Floats) -> Iterator[Floats]:
-    """What the foot does to the platform, in the platform's axes: N and N mm, (n,) each."""
-    fz_n = found.grf_n
+    """Yield the reaction on the foot in the platform's axes: N and N mm, (n,) each."""
+    fz_n = 0.0 - found.grf_n
     fz = found.steady.between(fz_n)
     nothing = np.where(np.isnan(fz), np.nan, 0.0)
     yield from (nothing, nothing, fz)

@@ -201,8 +201,7 @@ def test_a_folder_is_refused(tmp_path: Path, suffix: str) -> None:
         bytes(range(256)) * 4,
         b"PAR1 and then nothing",
         "time_s,fz_n,cop_x_m,cop_y_m\n0,1,0,0\n1,1,0\n",  # a short line
-        "time_s,fz_n,cop_x_m,cop_y_m,n\xe9\n0,1,0,0,1\n1,1,0,0,1\n".encode("latin-1"),
-        "time_s,fz_n,cop_x_m,cop_y_m\n0,1,0,0\n1,1,0,0\n".encode("utf-16"),
+        "0,1,0,0\n1,1,0,0\n",  # numbers without names
     ],
 )
 def test_a_file_that_is_no_table_is_refused(read: Read, content: str | bytes) -> None:
@@ -212,7 +211,7 @@ def test_a_file_that_is_no_table_is_refused(read: Read, content: str | bytes) ->
 def test_a_csv_that_is_called_parquet_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "trace.parquet"
     path.write_text(GOOD)
-    with pytest.raises(LoadTraceError, match=r"trace\.parquet.*expected a CSV file"):
+    with pytest.raises(LoadTraceError, match=r"trace\.parquet.*expected a Parquet file"):
         read_load_trace(path)
 
 

@@ -116,7 +116,7 @@ HEAD = "Time,Fz,COPx,COPy\n"
         (HEAD + "0,1,1,1\n", "1 samples"),
         (HEAD + "0,5,1,1\n0,6,1,1\n", "time is repeated"),
         (HEAD + "0,5,1,1\n2,6,1,1\n1,6,1,1\n", "time runs back: 2 s, then 1 s, at sample 3"),
-        (HEAD + ",5,1,1\n1,6,1,1\n", "no time at sample 1"),
+        (HEAD + ",5,1,1\n1,6,1,1\n", "1 samples"),
         (HEAD + "0,,1,1\n1,,1,1\n", "no sample has a force"),
         (HEAD + "0,0,1,1\n1,0,1,1\n", "0 N throughout"),
         (HEAD + "0,0,1,1\n1,-30,1,1\n2,-20,1,1\n", "negative under load"),

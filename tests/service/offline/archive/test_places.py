@@ -81,6 +81,34 @@ def test_a_manifest_names_sessions_relative_to_itself(tmp_path: Path) -> None:
     assert rows[1]["reference"] == "r.csv"
 
 
+PLAIN = "session,reference,units\r\na/Größe,r.csv,\r\nb,s.csv,grf=N\r\n"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        PLAIN.encode(),
+        PLAIN.encode("utf-8-sig"),
+        PLAIN.encode("cp1252"),
+        PLAIN.replace(",", "\t").encode("utf-16"),
+        PLAIN.replace(",", ";").encode("cp1252"),
+        (PLAIN + ",,\r\n ,,\r\n").encode(),
+        PLAIN.replace("\r\n", ",,\r\n").encode(),
+        ("sep=;\r\n" + PLAIN.replace(",", ";") + ";;\r\n").encode("utf-8-sig"),
+        (",,\r\n" + PLAIN).encode(),
+        PLAIN.replace(",", " , ").encode(),
+    ],
+)
+def test_a_manifest_is_read_as_spreadsheets_save_it(tmp_path: Path, content: bytes) -> None:
+    manifest = tmp_path / "list.csv"
+    manifest.write_bytes(content)
+    rows = list(rows_in(manifest, {"session", "reference", "units"}))
+    assert rows == [
+        {"session": str(tmp_path / "a" / "Größe"), "reference": "r.csv", "units": ""},
+        {"session": str(tmp_path / "b"), "reference": "s.csv", "units": "grf=N"},
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [

@@ -137,7 +137,7 @@ def of_opensim(content: bytes) -> dict[str, Seen]:
 def of_c3d(content: bytes) -> dict[str, Seen]:
     read, found = C3dFile(content), {}
     for number, said in enumerate(said_in("c3d", content), 1):
-        grf_n = read.channel(f"Fz{number}")
+        grf_n = -read.channel(f"Fz{number}")
         bound_s = np.nanmax(read.channel(f"{number}:t_server_uncertainty_s"))
         found[said["node"]] = Seen(np.arange(len(grf_n)) / RATE_HZ, grf_n, 1e9 * bound_s)
     return found

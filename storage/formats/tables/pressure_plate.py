@@ -16,21 +16,20 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from devices.inputs import check_file
-from storage.formats.reference_tables import NUMBERS_MAX, Table
+from storage.formats.tables.table import IsNeeded, Table, make_table
 
 _CELLS = {"force_n": 1.0, "pressure_kpa": 1e3}
 """What a cell reads, in newtons or in pascals."""
-_BYTES_MAX = 8 * NUMBERS_MAX
 
 
-def read_pressure_plate(path: Path) -> Table:
+def read_pressure_plate(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
     """Force and centre of pressure of every frame; NaN where a cell is, or nothing bears.
 
     Raises:
         FileFormatError: unreadable, too large, or arrays are missing or do not fit one another.
     """
     where = str(path)
-    arrays = _arrays(path)
+    arrays = _arrays(path, 8 * numbers_max)
     named = [name for name in _CELLS if name in arrays]
     if len(named) != 1:
         raise FileFormatError(
@@ -68,20 +67,21 @@ def read_pressure_plate(path: Path) -> Table:
         "cop_y_m": along_y / divisor_n,
     }
     notes = (f"a plate of {cells.shape[1]} by {cells.shape[2]} cells, added up",)
-    return Table(where, tuple(columns), columns, frozenset(columns), notes=notes)
+    needed = {name: column for name, column in columns.items() if is_needed(name)}
+    return make_table(where, columns, needed, notes=notes)
 
 
-def _arrays(path: Path) -> dict[str, Floats]:
+def _arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
     where = str(path)
     try:
         check_file(path)
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if size > _BYTES_MAX:
+        if size > bytes_max:
             raise FileFormatError(
                 f"{size} bytes are too many to be held in memory",
                 where=where,
-                expected=f"up to {_BYTES_MAX}",
+                expected=f"up to {bytes_max}",
             )
         with np.load(path, allow_pickle=False) as file:
             return {name: np.asarray(file[name], dtype=np.float64) for name in file.files}

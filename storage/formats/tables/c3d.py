@@ -1,0 +1,262 @@
+"""C3D files: their parameters, and their analog samples as physical numbers.
+
+After the C3D user guide (Motion Lab Systems). Numbers are those of Intel, DEC or SGI processors.
+Counts that are meant to be without a sign (frames, samples, offsets) are read so. Nothing is
+believed that the size of the file does not bear out.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Floats
+from devices.errors import FileFormatError
+from devices.inputs import read_bytes
+from storage.formats.tables.table import TEXT_BYTES_MAX
+
+FORM = "a whole C3D file"
+BLOCK = 512
+KEY = 0x50
+INTEL, DEC, SGI = 84, 85, 86
+Value = npt.NDArray[Any] | list[str]
+Parameters = Mapping[str, Mapping[str, Value]]
+Raw = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class C3dFile:
+    """A file, whose samples are made numbers when they are asked for.
+
+    Attributes:
+        where: path of the file.
+        parameters: by group and name; the first dimension is that which changes fastest.
+        rate_hz: of analog samples.
+        samples_a_frame: analog samples in a frame of points.
+        channels: how many channels there are.
+        raw: (samples, channels), as stored.
+    """
+
+    where: str
+    parameters: Parameters
+    rate_hz: float
+    samples_a_frame: int
+    channels: int
+    raw: Raw
+
+    def texts(self, group: str, name: str) -> list[str]:
+        """Return a parameter of texts; empty if there is none."""
+        value = self.parameters.get(group, {}).get(name)
+        return value if isinstance(value, list) else []
+
+    def numbers(self, group: str, name: str) -> Raw:
+        """Return a parameter of numbers; empty if there is none."""
+        value = self.parameters.get(group, {}).get(name)
+        return np.empty(0) if value is None or isinstance(value, list) else value
+
+    def of_channels(self, name: str) -> list[str]:
+        """Return texts of ANALOG, one a channel; those beyond 255 stand in NAME2 and so on."""
+        more = (f"{name}{number}" for number in range(2, 2 + self.channels // 255))
+        return [text for one in (name, *more) for text in self.texts("ANALOG", one)]
+
+    def samples(self, channels: Sequence[int]) -> Floats:
+        """Return the samples of some channels, (len(channels), n), in the unit of each.
+
+        Raises:
+            FileFormatError: the file states no scale for one of them.
+        """
+        is_unsigned = "".join(self.texts("ANALOG", "FORMAT")).strip().upper() == "UNSIGNED"
+        scale, offset = self._of_channels("SCALE"), self._of_channels("OFFSET")
+        general = float(np.ravel(self.numbers("ANALOG", "GEN_SCALE"))[:1].sum() or 1.0)
+        at = list(channels)
+        if max(at) >= min(len(scale), len(offset)):
+            raise FileFormatError(
+                f"ANALOG states {len(scale)} scales and {len(offset)} offsets",
+                where=self.where,
+                expected=f"one of each for each of {self.channels} channels",
+            )
+        raw = self.raw[:, at].T
+        if is_unsigned:
+            offset = offset % 65536
+            raw = raw.view(np.uint16) if raw.dtype.itemsize == 2 else raw
+        return np.asarray((raw - offset[at, None]) * (scale[at, None] * general), dtype=np.float64)
+
+    def _of_channels(self, name: str) -> Floats:
+        more = (f"{name}{number}" for number in range(2, 2 + self.channels // 255))
+        parts = [np.ravel(self.numbers("ANALOG", one)) for one in (name, *more)]
+        return np.concatenate(parts).astype(np.float64)
+
+
+def read_c3d(path: Path) -> C3dFile:
+    """Read a C3D file.
+
+    Raises:
+        FileFormatError: it cannot be read, is no C3D file, or ends before its samples do.
+    """
+    where = str(path)
+    try:
+        content = read_bytes(path, bytes_max=TEXT_BYTES_MAX)
+        return _parse(content, where)
+    except OSError as error:
+        raise FileFormatError(f"cannot be read: {error}", where=where, expected=FORM) from error
+    except FileFormatError:
+        raise
+    except (struct.error, IndexError, ValueError, TypeError, OverflowError) as error:
+        raise FileFormatError(
+            f"its header and its parameters contradict each other: {error}",
+            where=where,
+            expected=FORM,
+        ) from error
+
+
+def _parse(content: bytes, where: str) -> C3dFile:
+    if len(content) < BLOCK or content[1] != KEY:
+        raise FileFormatError("it is no C3D file", where=where, expected=FORM)
+    begin = BLOCK * (content[0] - 1)
+    processor = content[begin + 3] if 0 < begin < len(content) - 3 else 0
+    if processor not in (INTEL, DEC, SGI):
+        raise FileFormatError(
+            f"its parameters are of processor {processor}",
+            where=where,
+            expected=f"{INTEL} (Intel), {DEC} (DEC) or {SGI} (SGI)",
+        )
+    order = ">" if processor == SGI else "<"
+    parameters = _parameters(content, begin + 4, order, is_dec=processor == DEC)
+    points, measures, first, last = struct.unpack_from(f"{order}4H", content, 2)
+    data_block, samples_a_frame = struct.unpack_from(f"{order}2H", content, 16)
+    scale, frame_hz = (
+        float(_floats(content[at : at + 4], order, is_dec=processor == DEC)[0]) for at in (12, 20)
+    )
+    analog, point = parameters.get("ANALOG", {}), parameters.get("POINT", {})
+    channels = _count(analog.get("USED"))
+    if channels and measures % channels == 0:
+        samples_a_frame = measures // channels
+    elif measures:
+        raise FileFormatError(
+            f"a frame has {measures} analog samples of {channels} channels",
+            where=where,
+            expected="the same number of each channel (ANALOG:USED)",
+        )
+    scale = _number(point.get("SCALE")) or scale
+    kind = np.dtype(f"{order}f4" if scale < 0.0 else f"{order}i2")
+    width = 4 * points + measures
+    data = content[BLOCK * (data_block - 1) :] if data_block else b""
+    frames = _frames(parameters, last - first + 1, len(data), width * kind.itemsize, where)
+    values = data[: frames * width * kind.itemsize]
+    if processor == DEC and scale < 0.0:
+        stored: Raw = _floats(values, order, is_dec=True)
+    else:
+        stored = np.frombuffer(values, kind)
+    samples = stored.reshape(frames, width)[:, 4 * points :] if width else np.empty((frames, 0))
+    rate_hz = _number(analog.get("RATE")) or frame_hz * samples_a_frame
+    return C3dFile(
+        where,
+        parameters,
+        rate_hz,
+        max(1, samples_a_frame),
+        channels,
+        samples.reshape(-1, channels) if channels else np.empty((0, 0)),
+    )
+
+
+def _frames(parameters: Parameters, stated: int, size: int, width: int, where: str) -> int:
+    """Return how many frames of `width` bytes there are.
+
+    The header counts 65535 at most; longer files state more in one of several parameters.
+    """
+    if width == 0:
+        return 0
+    point, trial = parameters.get("POINT", {}), parameters.get("TRIAL", {})
+    counts = {stated % 65536, *(int(_count(point.get(name))) for name in ("FRAMES", "LONG_FRAMES"))}
+    ends = [_words(trial.get(f"ACTUAL_{name}_FIELD")) for name in ("START", "END")]
+    if all(ends):
+        counts.add(ends[1] - ends[0] + 1)
+    there = size // width
+    held = [count for count in counts if 0 < count <= there]
+    if not held:
+        raise FileFormatError(
+            f"it ends after {there} frames of {max(counts)}", where=where, expected=FORM
+        )
+    # A count of 65535 may stand for more.
+    return there if max(held) == 65535 else max(held)
+
+
+def _count(value: Value | None) -> int:
+    """Return a count, which is stored without a sign if as an integer."""
+    number = _number(value)
+    return int(number) % 65536 if -32768 <= number < 0 else max(0, int(number))
+
+
+def _words(value: Value | None) -> int:
+    """Return a number of two words of 16 bits without a sign, the lower one first."""
+    if value is None or isinstance(value, list) or np.size(value) == 0:
+        return 0
+    words = [int(word) % 65536 for word in np.ravel(value)[:2]]
+    return words[0] + 65536 * (words[1] if len(words) > 1 else 0)
+
+
+def _number(value: Value | None) -> float:
+    """Return the first number of a parameter; 0 if there is none."""
+    if value is None or isinstance(value, list) or np.size(value) == 0:
+        return 0.0
+    number = float(np.ravel(value)[0])
+    return number if np.isfinite(number) else 0.0
+
+
+def _parameters(
+    content: bytes, at: int, order: str, *, is_dec: bool
+) -> dict[str, dict[str, Value]]:
+    """Return all parameters by group and name; groups may be named behind their parameters."""
+    names: dict[int, str] = {}
+    found: list[tuple[int, str, Value]] = []
+    while at + 2 <= len(content):
+        length, group = struct.unpack_from("bb", content, at)
+        length = abs(length)  # below zero: locked
+        if length == 0 or group == 0:
+            break
+        name = content[at + 2 : at + 2 + length].decode("latin-1").strip().upper()
+        at += 2 + length
+        (further,) = struct.unpack_from(f"{order}H", content, at)
+        if group < 0:
+            names[-group] = name
+        else:
+            found.append((group, name, _value(content, at + 2, order, is_dec=is_dec)))
+        if further == 0:
+            break
+        at += further
+    by_group: dict[str, dict[str, Value]] = {}
+    for group, name, value in found:
+        by_group.setdefault(names.get(group, ""), {})[name] = value
+    return by_group
+
+
+def _value(content: bytes, at: int, order: str, *, is_dec: bool) -> Value:
+    kind, dimensions = struct.unpack_from("bB", content, at)
+    shape = tuple(content[at + 2 : at + 2 + dimensions])
+    at += 2 + dimensions
+    count = int(np.prod(shape, dtype=np.int64))
+    data = content[at : at + count * abs(kind)]
+    if kind == -1:
+        width = shape[0] if shape else 1
+        text = data.decode("latin-1")
+        # A text of no dimension is one letter.
+        return [text[i : i + width].rstrip(" \0") for i in range(0, len(text), max(1, width))]
+    if kind == 4:
+        numbers = _floats(data, order, is_dec=is_dec)
+    else:
+        numbers = np.frombuffer(data, np.dtype(f"{order}i{kind}"))
+    return np.asarray(numbers).reshape(shape, order="F")
+
+
+def _floats(content: bytes, order: str, *, is_dec: bool) -> Raw:
+    """Return numbers of single precision; those of DEC have halves swapped, and are fourfold."""
+    if not is_dec:
+        return np.frombuffer(content, np.dtype(f"{order}f4"))
+    words = np.frombuffer(content, "<u2").reshape(-1, 2)[:, ::-1]
+    return np.ascontiguousarray(words).view("<f4").ravel() / np.float32(4.0)

@@ -1,0 +1,84 @@
+"""OpenSim's `.mot` and `.sto`: a header to the line `endheader`, a line of names, lines of numbers.
+
+Times are seconds, forces newtons, positions metres, and y points up. Cells of three numbers
+(`DataType=Vec3`) become three columns: `ground_force_v` becomes `ground_force_vx` and so on.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from devices.errors import FileFormatError
+from storage.formats.tables.table import IsNeeded, Table, make_table, needed_names
+from storage.formats.tables.text import (
+    BLANKS,
+    Layout,
+    parse_columns,
+    read_table_text,
+    split_cells,
+)
+
+FORM = "a header to the line endheader, a line of names, lines of numbers"
+_END = re.compile(r"^[ \t]*endheader[ \t]*$", re.IGNORECASE | re.MULTILINE)
+_VECTOR = re.compile(r"[^,]*,[^,]*,[^,]*")
+_UNITS = ((re.compile(r"_v[xyz]?(_\d+)?$"), "N"), (re.compile(r"_p[xyz]?(_\d+)?$"), "m"))
+
+
+def read_opensim(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
+    """Read a `.mot` or `.sto` file.
+
+    Raises:
+        FileFormatError: it cannot be read, has no header or no names, or numbers do not fit them.
+    """
+    where = str(path)
+    text = read_table_text(path)
+    end = _END.search(text)
+    if end is None:
+        raise FileFormatError("there is no line endheader", where=where, expected=FORM)
+    head, _, rows = text[end.end() :].lstrip().partition("\n")
+    rows = rows.strip("\n")
+    line = rows.partition("\n")[0]
+    delimiter = "\t" if "\t" in head and "\t" in line else BLANKS
+    names, first = split_cells(head, delimiter), split_cells(line, delimiter)
+    if len(first) > 1 and all(map(_VECTOR.fullmatch, first[1:])):
+        rows = rows.replace(",", delimiter)
+        first = split_cells(rows.partition("\n")[0], delimiter)
+        vectors = (name if name.endswith(("_v", "_p", "_m")) else f"{name}_" for name in names[1:])
+        names = [*names[:1], *(f"{name}{axis}" for name in vectors for axis in "xyz")]
+    if len(names) < 2 or (first and len(first) != len(names)):
+        raise FileFormatError(
+            f"{len(names)} names stand over {len(first)} columns of numbers",
+            where=where,
+            expected=FORM,
+        )
+    times = {name for name in names if name.lower() == "time"}
+    alone = _names_of_one_force(names)
+    wanted = set(alone.values()) if is_needed("grf_n") and "grf_n" not in names else set()
+    needed = needed_names(names, lambda name: name in wanted | times or is_needed(name), where)
+    width = line.count("\t") + 1 if delimiter == "\t" else 0
+    padded = (*names, *[""] * (width - len(names)))
+    columns = parse_columns(rows, Layout(padded, delimiter, 0, {}), needed, numbers_max, where)
+    for ours, name in alone.items():
+        if name in wanted:  # z points to the right, y of the foot to the left
+            columns[ours] = -columns[name] if ours == "cop_y_m" else columns[name]
+    for name in times:
+        columns["time_s"] = columns[name]
+    units = {name: unit for name in names for ending, unit in _UNITS if ending.search(name)}
+    table = make_table(where, names, columns, units=units | dict.fromkeys(times, "s"), form=FORM)
+    forces = {name for name, unit in units.items() if unit == "N"}
+    return replace(table, positive=table.positive | forces)
+
+
+def _names_of_one_force(names: Sequence[str]) -> dict[str, str]:
+    """Return the columns of the only force of a file by our names; empty: there are several."""
+    forces = [name for name in names if name.endswith("_vy")]
+    if len(forces) != 1:
+        return {}
+    stem = forces[0].removesuffix("_vy")
+    found = {"grf_n": forces[0]}
+    if {f"{stem}_px", f"{stem}_pz"} <= set(names):
+        found |= {"cop_x_m": f"{stem}_px", "cop_y_m": f"{stem}_pz"}
+    return found

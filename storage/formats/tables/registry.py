@@ -1,0 +1,56 @@
+"""All formats of tables; a new one is a line here, and its module."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from devices.errors import FileFormatError
+from storage.formats.tables.force_platform import read_force_platforms
+from storage.formats.tables.opensim import read_opensim
+from storage.formats.tables.parquet import read_parquet
+from storage.formats.tables.pressure_plate import read_pressure_plate
+from storage.formats.tables.table import NUMBERS_MAX, IsNeeded, Table
+from storage.formats.tables.text import read_text_table
+
+
+@dataclass(frozen=True)
+class TableFormat:
+    """A format of tables.
+
+    Attributes:
+        endings: of its files, in lower case.
+        read: reads the needed columns of a file, up to so many numbers.
+    """
+
+    endings: tuple[str, ...]
+    read: Callable[[Path, IsNeeded, int], Table]
+
+
+TEXT = TableFormat((".csv", ".txt", ".tsv"), read_text_table)
+FORMATS = (
+    TEXT,
+    TableFormat((".parquet",), read_parquet),
+    TableFormat((".c3d",), read_force_platforms),
+    TableFormat((".mot", ".sto"), read_opensim),
+    TableFormat((".npz",), read_pressure_plate),
+)
+
+
+def read_table(path: Path, is_needed: IsNeeded, numbers_max: int = NUMBERS_MAX) -> Table:
+    """Read the needed columns of a file; its ending tells the format, and any other is text.
+
+    Raises:
+        FileFormatError: the file cannot be read.
+    """
+    ending = path.suffix.lower()
+    chosen = next((one for one in FORMATS if ending in one.endings), TEXT)
+    try:
+        return chosen.read(path, is_needed, numbers_max)
+    except MemoryError as error:
+        raise FileFormatError(
+            "there is not enough memory to read it",
+            where=str(path),
+            remedy="Lift the limit (ulimit -v), or cut out the part that is needed",
+        ) from error

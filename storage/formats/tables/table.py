@@ -1,0 +1,130 @@
+"""Columns of numbers of a file of any format, with what the file states of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from devices.errors import FileFormatError
+
+Column = npt.NDArray[np.float64] | npt.NDArray[np.int64]
+"""(n,), float64 with NaN in empty cells; int64 for instants in nanoseconds."""
+IsNeeded = Callable[[str], bool]
+"""Tells by a column's name whether its numbers are needed; others are not read."""
+
+TEXT_BYTES_MAX = 256 << 20
+NUMBERS_MAX = 50_000_000
+"""Rows times columns that are read: 400 MB in memory."""
+OURS: Mapping[str, str] = {"time_s": "s", "grf_n": "N", "fz_n": "N", "cop_x_m": "m", "cop_y_m": "m"}
+"""Names that state the unit and the sign of their column, in any case, with the unit."""
+INSTANTS = "t_ns"
+"""Name of a session's column of instants, whose numbers need all 64 bits."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of a file, in the units of the file.
+
+    Attributes:
+        where: path of the file.
+        names: names of all columns of the file.
+        columns: the needed columns by name.
+        units: unit of each column whose unit the file states.
+        positive: names of the forces that the file states to be positive under load.
+        plates: names of the forces of plates, whose sign follows from the load that they bear.
+        epoch_ns: UTC of time zero; None if the file does not state it.
+        notes: remarks for the user.
+        form: form that was expected of the file, for errors; empty if files differ in nothing.
+        schema: Arrow's schema of a Parquet file.
+    """
+
+    where: str
+    names: tuple[str, ...]
+    columns: Mapping[str, Column]
+    units: Mapping[str, str] = field(default_factory=dict)
+    positive: frozenset[str] = frozenset()
+    plates: frozenset[str] = frozenset()
+    epoch_ns: int | None = None
+    notes: tuple[str, ...] = ()
+    form: str = ""
+    schema: pa.Schema | None = None
+
+
+def make_table(
+    where: str,
+    names: Iterable[str],
+    columns: Mapping[str, Column],
+    *,
+    units: Mapping[str, str] | None = None,
+    notes: tuple[str, ...] = (),
+    form: str = "",
+    schema: pa.Schema | None = None,
+) -> Table:
+    """Return a table in which columns with one of our names have that name and its unit.
+
+    `fz_n` is `grf_n` as well, if the file has no `grf_n`.
+
+    Raises:
+        FileFormatError: two names differ in their case only.
+    """
+    found = dict(columns)
+    for name in columns:
+        if name.lower() in OURS and name.lower() != name:
+            if name.lower() in found:
+                raise repeated_name([name.lower()], where)
+            found[name.lower()] = columns[name]
+    if "fz_n" in found and "grf_n" not in found:
+        found["grf_n"] = found["fz_n"]
+    ours = {name: unit for name, unit in OURS.items() if name in found}
+    cased = {name: OURS[name.lower()] for name in columns if name.lower() in OURS}
+    forces = {name for name, unit in (cased | ours).items() if unit == "N"}
+    return Table(
+        where,
+        tuple(names),
+        found,
+        {**(units or {}), **cased, **ours},
+        frozenset(forces),
+        notes=notes,
+        form=form,
+        schema=schema,
+    )
+
+
+def needed_names(names: Collection[str], is_needed: IsNeeded, where: str) -> list[str]:
+    """Return the names of the columns to read.
+
+    Raises:
+        FileFormatError: one of them stands for two columns.
+    """
+    needed = [name for name in names if name and is_needed(name)]
+    if twice := sorted({name for name in needed if needed.count(name) > 1}):
+        raise repeated_name(twice, where)
+    return needed
+
+
+def repeated_name(names: Collection[str], where: str) -> FileFormatError:
+    """Return the error for names that stand for two columns each."""
+    return FileFormatError(
+        f"column {', '.join(names)} is there twice",
+        where=where,
+        expected="a name of its own for each column, whatever its case",
+    )
+
+
+def check_size(rows: int, columns: int, numbers_max: int, where: str) -> None:
+    """Refuse a table that is too large for memory.
+
+    Raises:
+        FileFormatError: it has more than `numbers_max` numbers.
+    """
+    if rows * columns > numbers_max:
+        raise FileFormatError(
+            f"{rows} rows of {columns} columns are too many to be held in memory",
+            where=where,
+            expected=f"up to {numbers_max} numbers",
+            remedy="Cut out the part that is needed",
+        )

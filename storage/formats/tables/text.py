@@ -1,0 +1,343 @@
+"""Text files of columns, as measuring programs and spreadsheets save them.
+
+The names stand in a line above the numbers. Above it there may be blank lines, comments, a title,
+or Excel's `sep=`; below it a line of units. Cells stand between commas, semicolons, tabs or blanks,
+with a decimal point or a decimal comma. The text is UTF-8, UTF-16, or else Windows-1252.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+
+from devices.arrays import Floats
+from devices.errors import FileFormatError
+from devices.inputs import decode_text, read_bytes
+from storage.formats.tables.table import (
+    INSTANTS,
+    TEXT_BYTES_MAX,
+    Column,
+    IsNeeded,
+    Table,
+    check_size,
+    make_table,
+    needed_names,
+)
+
+FORM = (
+    "a text with a line of names above lines of numbers, parted by commas, semicolons or tabs; or "
+    "a file that ends in .parquet, .c3d, .mot, .sto or .npz"
+)
+HEAD_LINES = 200
+"""The line of names is one of the first so many."""
+HEAD_CHARACTERS = 1 << 20
+COMMENT = re.compile(r"^\s*(#|%|//)+\s*")
+"""Beginning of a line that is a comment."""
+BLANKS = " "
+"""Delimiter of columns that any number of blanks parts."""
+DELIMITERS = ("\t", ";", ",", BLANKS)
+KNOWN_UNITS = frozenset(
+    (
+        *("s", "sec", "ms", "us", "µs", "ns", "hz"),
+        *("n", "kn", "mn", "kg", "g", "v", "mv"),
+        *("m", "cm", "mm", "nm", "nmm", "n.m", "n.mm", "n*m", "n*mm", "n·m", "n·mm"),
+        *("deg", "rad", "°", "pa", "kpa", "psi", "%"),
+    )
+)
+NO_NUMBER = (
+    r"(?i)^[+-]?nan(\((ind|snan)\))?\d*$|^[+-]?1\.?#(ind|qnan|snan)0*$|^#?n/?a!?$|^null$|^none$|^$"
+)
+"""Cells without a number: empty, or NaN as programs of Windows, C, Python and R write it."""
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
+_IN_BRACKETS = re.compile(r"[\[(]\s*([^\[\]()\s]+)\s*[\])]$")
+_GROUPED = r"^[+-]?[1-9]\d{0,2},\d{3}$"
+"""A cell whose comma may be a decimal comma, or part thousands."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the columns of a text stand.
+
+    Attributes:
+        names: of the columns; empty for a column without a name.
+        delimiter: between cells; `BLANKS` for any number of blanks.
+        line: index of the first line of numbers.
+        units: as the file states them, by name.
+        score: numbers less other cells in the first line of numbers.
+    """
+
+    names: tuple[str, ...]
+    delimiter: str
+    line: int
+    units: Mapping[str, str]
+    score: int = 0
+
+
+def read_text_table(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
+    """Read a text file of columns.
+
+    Raises:
+        FileFormatError: it cannot be read, is too large, has no line of names above numbers, or a
+            cell of a needed column is no number.
+    """
+    where = str(path)
+    text = read_table_text(path)
+    layout = find_layout(text, where)
+    needed = needed_names(layout.names, is_needed, where)
+    columns = parse_columns(text, layout, needed, numbers_max, where)
+    return make_table(where, layout.names, columns, units=layout.units, form=FORM)
+
+
+def read_table_text(path: Path) -> str:
+    r"""Read a text in the encoding that it has, with `\n` at the end of each line.
+
+    Raises:
+        FileFormatError: it cannot be read, or is too large.
+    """
+    try:
+        content = read_bytes(path, bytes_max=TEXT_BYTES_MAX)
+    except OSError as error:
+        raise FileFormatError(f"cannot be read: {error}", where=str(path), expected=FORM) from error
+    try:
+        text = decode_text(content)
+    except UnicodeDecodeError:
+        # Names and titles of older programs; numbers are the same in every such encoding.
+        text = content.decode("cp1252", errors="replace")
+    if "\0" in text[:HEAD_CHARACTERS]:
+        raise FileFormatError("cannot be read: it is no text", where=str(path), expected=FORM)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def find_layout(text: str, where: str) -> Layout:
+    """Find the line of names, and how columns are parted.
+
+    Raises:
+        FileFormatError: no line of names stands above numbers.
+    """
+    lines = list(islice(_lines(text[:HEAD_CHARACTERS]), HEAD_LINES))
+    first = next((line for line in lines if line.strip()), "")
+    stated = re.fullmatch(r"(?i)\"?sep=(.)\"?", first)
+    found = [
+        layout
+        for delimiter in ([stated[1]] if stated else DELIMITERS)
+        if (layout := _layout(lines, delimiter)) is not None
+    ]
+    if not found:
+        raise FileFormatError(
+            "no line of names stands above lines of numbers"
+            if first
+            else "cannot be read: it is empty",
+            where=where,
+            expected=FORM,
+        )
+    return max(found, key=lambda layout: layout.score)
+
+
+def parse_columns(
+    text: str, layout: Layout, needed: Sequence[str], numbers_max: int, where: str
+) -> dict[str, Column]:
+    """Return the numbers of the needed columns, without empty lines at the end.
+
+    Raises:
+        FileFormatError: a line has more or fewer cells than the first, a cell is no number, or
+            there are too many numbers.
+    """
+    body = _body(text, layout)
+    check_size(body.count("\n"), len(needed), numbers_max, where)
+    if not body or not needed:
+        return {name: np.empty(0) for name in needed}
+    source: Any = pa.BufferReader(body.encode())  # its stubs know no buffers
+    indices = [str(layout.names.index(name)) for name in needed]
+    try:
+        table = pyarrow.csv.read_csv(
+            source,
+            read_options=pyarrow.csv.ReadOptions(
+                column_names=[str(i) for i in range(len(layout.names))]
+            ),
+            parse_options=pyarrow.csv.ParseOptions(
+                delimiter=layout.delimiter, newlines_in_values=True
+            ),
+            convert_options=pyarrow.csv.ConvertOptions(
+                include_columns=indices,
+                column_types=dict.fromkeys(indices, pa.string()),
+                strings_can_be_null=False,
+            ),
+        )
+    except pa.ArrowException as error:
+        raise FileFormatError(f"cannot be read: {error}", where=where, expected=FORM) from error
+    cells = {
+        name: pc.utf8_trim_whitespace(table[index]).combine_chunks()
+        for name, index in zip(needed, indices, strict=True)
+    }
+    has_comma = _has_decimal_comma(list(cells.values()), where)
+    columns = {
+        name: _numbers(column, name, where, has_comma=has_comma) for name, column in cells.items()
+    }
+    filled = np.flatnonzero(np.any([~np.isnan(column) for column in columns.values()], axis=0))
+    count = int(filled[-1]) + 1 if len(filled) else 0
+    return {name: column[:count] for name, column in columns.items()}
+
+
+def _lines(text: str) -> Iterator[str]:
+    begin = 0
+    while begin < len(text):
+        end = text.find("\n", begin)
+        end = len(text) if end < 0 else end
+        yield text[begin:end]
+        begin = end + 1
+
+
+def _layout(lines: Sequence[str], delimiter: str) -> Layout | None:
+    """Return the layout of a text whose cells this delimiter parts; None: it parts none.
+
+    Of several lines that may be the names the one with most numbers below is taken: lines above it
+    state single values, such as a rate.
+    """
+    rows = [(number, split_cells(line, delimiter)) for number, line in enumerate(lines)]
+    rows = [(number, cells) for number, cells in rows if any(cells)]
+    comments = {number for number, _ in rows if COMMENT.match(lines[number])}
+    found: list[Layout] = []
+    for i, (number, cells) in enumerate(rows):
+        is_comment = number in comments
+        names = split_cells(COMMENT.sub("", lines[number]), delimiter) if is_comment else cells
+        if len(names) < 2 or any(map(_is_number, names)):
+            continue
+        below = [row for row in rows[i + 1 :] if row[0] not in comments]
+        units = below.pop(0)[1] if below and _are_units(below[0][1]) else []
+        if not below and len(rows) == i + 1 + bool(units) and not is_comment:
+            found.append(_layout_of(names, units, delimiter, len(lines), []))
+        elif below and (len(below[0][1]) == len(names) or not (is_comment or delimiter == BLANKS)):
+            first, numbers = below[0]
+            if len(numbers) <= len(names) and any(map(_is_number, numbers)):
+                width = len(_split(lines[first], delimiter))
+                padded = [*names, *[""] * (width - len(names))]
+                found.append(_layout_of(padded, units, delimiter, first, numbers))
+    return max(found, key=lambda layout: layout.score, default=None)
+
+
+def _layout_of(
+    names: Sequence[str], units: Sequence[str], delimiter: str, line: int, numbers: Sequence[str]
+) -> Layout:
+    stated = {name: match[1] for name in names if (match := _IN_BRACKETS.search(name))}
+    stated |= {
+        name: unit.strip("[]() ") for name, unit in zip(names, units, strict=False) if name and unit
+    }
+    count = sum(map(_is_number, numbers))
+    others = sum(map(bool, numbers)) - count
+    return Layout(tuple(names), delimiter, line, stated, count - others)
+
+
+def _split(line: str, delimiter: str) -> list[str]:
+    if delimiter == BLANKS:
+        return line.split()
+    try:
+        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    except csv.Error:  # a cell of more than 128 kB
+        return []
+
+
+def split_cells(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line, without those that are empty at its end."""
+    cells = [" ".join(cell.split()) for cell in _split(line, delimiter)]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _is_number(cell: str) -> bool:
+    return _NUMBER.fullmatch(cell) is not None
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    units = [cell.strip("[]() ").lower() for cell in cells if cell]
+    known = sum(unit in KNOWN_UNITS for unit in units)
+    return known > 0 and 2 * known >= len(units) and not any(map(_is_number, units))
+
+
+def _body(text: str, layout: Layout) -> str:
+    """Return the lines of numbers, without comments."""
+    begin = 0
+    for _ in range(layout.line):
+        begin = text.find("\n", begin) + 1
+        if begin == 0:
+            return ""
+    body = text[begin:].rstrip(" \n\x1a\x00")
+    if not body:
+        return ""
+    if layout.delimiter == BLANKS:
+        body = "\n".join(" ".join(line.split()) for line in body.split("\n"))
+    if any(mark in body for mark in ("#", "%", "//")):
+        body = "\n".join(line for line in body.split("\n") if not COMMENT.match(line))
+    return body + "\n"
+
+
+def _has_decimal_comma(columns: Sequence[pa.Array[Any]], where: str) -> bool:
+    """Tell whether numbers have a decimal comma.
+
+    Raises:
+        FileFormatError: some have a comma and some a point, or commas may part thousands.
+    """
+    commas = [pc.filter(cells, pc.match_substring(cells, ",")) for cells in columns]
+    first = next((cells[0].as_py() for cells in commas if len(cells)), None)
+    if first is None:
+        return False
+    expected = "a decimal point, or a decimal comma, in all numbers, and nothing between thousands"
+    number = r"^[+-]?\d*\.\d*([eE][+-]?\d+)?$"
+    for cells in columns:
+        if pc.any(pc.match_substring_regex(cells, number)).as_py():
+            raise FileFormatError(
+                f"some numbers have a decimal point, and {first!r} has a comma",
+                where=where,
+                expected=expected,
+            )
+    if all(
+        pc.all(pc.match_substring_regex(cells, _GROUPED)).as_py() is not False for cells in commas
+    ):
+        raise FileFormatError(
+            f"{first!r} may have a decimal comma, or a comma between thousands",
+            where=where,
+            expected=expected,
+        )
+    return True
+
+
+def _numbers(cells: pa.Array[Any], name: str, where: str, *, has_comma: bool) -> Column:
+    cells = pc.if_else(pc.match_substring_regex(cells, NO_NUMBER), None, cells)
+    if name.lower() == INSTANTS and not cells.null_count:
+        try:
+            return np.asarray(cells.cast(pa.int64()).to_numpy(), dtype=np.int64)
+        except pa.ArrowException:
+            pass  # no instants, which the reader of the table finds
+    plain = pc.replace_substring(cells, ",", ".") if has_comma else cells
+    try:
+        return as_floats(plain.cast(pa.float64()))
+    except pa.ArrowException as error:
+        at, text = next((i, c) for i, c in enumerate(cells.to_pylist()) if c and not _is_float(c))
+        raise FileFormatError(
+            f"column {name} is not numeric: {text[:40]!r} in row {at + 1} of its numbers",
+            where=where,
+            expected=FORM,
+        ) from error
+
+
+def as_floats(column: pa.Array[Any]) -> Floats:
+    """Return Arrow's numbers with NaN for null."""
+    return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
+
+
+def _is_float(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,170 @@
+"""Text files of columns in every form that spreadsheets and measuring programs save."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError
+from storage.formats.load_trace import read_load_trace
+from storage.formats.reference import Stated, read_reference
+from storage.formats.tables.registry import read_table
+from storage.formats.tables.table import Table
+
+PLAIN = "Time,Fz\n0.00,0.5\n0.01,-12.25\n0.02,1e3\n"
+FORMS: dict[str, Callable[[str], str | bytes]] = {
+    "as it is": str,
+    "lines end as on Windows": lambda text: text.replace("\n", "\r\n"),
+    "lines end as on an old Mac": lambda text: text.replace("\n", "\r"),
+    "a byte order mark": lambda text: text.encode("utf-8-sig"),
+    "quoted names": lambda text: text.replace("Time,Fz", '"Time","Fz"').encode("utf-8-sig"),
+    "quoted cells": lambda text: "".join(
+        ",".join(f'"{cell}"' for cell in line.split(",")) + "\n" for line in text.splitlines()
+    ),
+    "UTF-16 as Excel saves it": lambda text: text.replace(",", "\t").encode("utf-16"),
+    "UTF-16 without a mark": lambda text: text.encode("utf-16-le"),
+    "UTF-16 of big endians": lambda text: text.encode("utf-16-be"),
+    "a title in Latin-1": lambda text: ("Vorwärts, Nr. 1\n" + text).encode("latin-1"),
+    "semicolons": lambda text: text.replace(",", ";"),
+    "tabs": lambda text: text.replace(",", "\t"),
+    "blanks": lambda text: text.replace(",", "    "),
+    "decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
+    "decimal commas in quotes": lambda text: "".join(
+        ",".join(f'"{cell}"' for cell in line.replace(",", ";").replace(".", ",").split(";")) + "\n"
+        for line in text.splitlines()
+    ),
+    "a space after each comma": lambda text: text.replace(",", ", "),
+    "empty columns at the end": lambda text: text.replace("\n", ",,\n"),
+    "a comma at the end of numbers": lambda text: PLAIN[:8] + text[8:].replace("\n", ",\n"),
+    "empty columns above numbers only": lambda text: text.replace("Fz\n", "Fz,,\n"),
+    "empty lines at the end": lambda text: text + ",\n,\n\n",
+    "a blank line above the names": lambda text: "\n" + text,
+    "an empty line of Excel above the names": lambda text: ",\n" + text,
+    "a blank line below the names": lambda text: text.replace("Fz\n", "Fz\n\n"),
+    "Excel's line of the delimiter": lambda text: "sep=,\n" + text,
+    "Excel's line of another delimiter": lambda text: "sep=|\n" + text.replace(",", "|"),
+    "comments above": lambda text: "# plate 1\n% 2 columns, of 3\n" + text,
+    "comments between": lambda text: text.replace("0.01", "# turned\n0.01"),
+    "names in a comment": lambda text: "# plate 1\n# " + text,
+    "a title": lambda text: "Plate 1 of 2\nMonday\n" + text,
+    "facts above": lambda text: "Rate (Hz),1000\nSamples,3\n\n" + text,
+    "a line of units": lambda text: text.replace("Fz\n", "Fz\n(s),[N]\n"),
+}
+
+
+def table_of(folder: Path, content: str | bytes, name: str = "plate.csv") -> Table:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_table(path, lambda name: True)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_same_numbers_are_read_whatever_the_form(tmp_path: Path, form: str) -> None:
+    found = table_of(tmp_path, FORMS[form](PLAIN))
+    assert [name for name in found.names if name] == ["Time", "Fz"]
+    np.testing.assert_array_equal(found.columns["Time"], [0.0, 0.01, 0.02])
+    np.testing.assert_array_equal(found.columns["Fz"], [0.5, -12.25, 1000.0])
+
+
+CELLS = st.one_of(st.none(), st.floats(-1e6, 1e6).map(lambda x: round(x, 5)))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=1, max_size=8),
+    delimiter=st.sampled_from(",;\t"),
+    encoding=st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "cp1252"]),
+    end=st.sampled_from(["\n", "\r\n"]),
+    has_comma=st.booleans(),
+    blank=st.sampled_from(["", " "]),
+)
+def test_numbers_and_empty_cells_survive_any_dialect(
+    tmp_path_factory: pytest.TempPathFactory,
+    rows: list[tuple[float | None, ...]],
+    delimiter: str,
+    encoding: str,
+    end: str,
+    has_comma: bool,
+    blank: str,
+) -> None:
+    # The first column is always known, as time is; and no number looks like grouped thousands.
+    rows = [(i + 0.5, *row[1:]) for i, row in enumerate(rows)]
+    has_comma = has_comma and delimiter != ","
+    cells = [["" if x is None else repr(x) for x in row] for row in rows]
+    if has_comma:
+        cells = [[cell.replace(".", ",") for cell in row] for row in cells]
+    lines = [["Größe", "F z", "x (mm)"], *cells]
+    text = end.join((delimiter + blank).join(line) for line in lines) + end
+    found = table_of(tmp_path_factory.mktemp("text"), text.encode(encoding))
+    assert found.names == ("Größe", "F z", "x (mm)")
+    for i, name in enumerate(found.names):
+        expected = [np.nan if row[i] is None else row[i] for row in rows]
+        np.testing.assert_array_equal(found.columns[name], expected)
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        *("", "NaN", "nan", "-nan", "-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND", "-1.#IND00"),
+        *("N/A", "#N/A", "NA", "null", "None"),
+    ],
+)
+def test_what_programs_write_for_no_number_is_none(tmp_path: Path, cell: str) -> None:
+    found = table_of(tmp_path, PLAIN.replace("-12.25", cell))
+    np.testing.assert_array_equal(found.columns["Fz"], [0.5, np.nan, 1000.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "it is empty"),
+        ("0.0,1.0\n0.1,2.0\n", "no line of names"),
+        (PLAIN.replace("1e3", "much"), "column Fz is not numeric: 'much' in row 3"),
+        (PLAIN + "0.03\n", "cannot be read"),
+        (PLAIN + "0.03,1,2\n", "cannot be read"),
+        ("t;Fz\n0.0;1,5\n", "have a decimal point, and '1,5' has a comma"),
+        ("t;Fz\n0;1,000\n1;1,500\n", "or a comma between thousands"),
+        ('t,Fz\n0.5,"1,000.5"\n', "has a comma"),
+    ],
+)
+def test_a_text_that_may_be_read_in_two_ways_is_not_guessed_at(
+    tmp_path: Path, text: str, says: str
+) -> None:
+    with pytest.raises(FileFormatError) as caught:
+        table_of(tmp_path, text)
+    assert says in str(caught.value)
+
+
+def test_units_are_read_from_brackets_and_from_a_line_of_units(tmp_path: Path) -> None:
+    named = table_of(tmp_path, "t [ms],F (kN)\n0,1\n5,2\n")
+    assert named.units == {"t [ms]": "ms", "F (kN)": "kN"}
+    below = table_of(tmp_path, "t,F,k\nms,kN,\n0,1,3\n5,2,3\n")
+    assert below.units == {"t": "ms", "F": "kN"}
+
+
+def test_a_unit_that_the_file_states_is_applied_once_and_not_contradicted(tmp_path: Path) -> None:
+    path = tmp_path / "plate.csv"
+    path.write_text("t (ms),F (kN)\n0,0\n5,0.5\n")
+    columns = {"time_s": "t (ms)", "grf_n": "F (kN)"}
+    for units in ({}, {"grf": "kN"}, {"grf": "kN", "time": "ms"}):
+        found = read_reference(path, Stated(columns, units, "+"))
+        np.testing.assert_allclose(found.time_s, [0.0, 0.005])
+        np.testing.assert_allclose(found.grf_n, [0.0, 500.0])
+    with pytest.raises(ValueError, match=r"in kN, not in N.*Leave out --units grf=N"):
+        read_reference(path, Stated(columns, {"grf": "N"}, "+"))
+
+
+def test_a_load_is_read_by_the_same_reader(tmp_path: Path) -> None:
+    path = tmp_path / "load.txt"
+    path.write_bytes(
+        "time_s;Fz_N;COP_x_m;cop_y_m;\n0,0;1,5;;;\n0,5;2,5;0,1;-0,2;\n".encode("utf-16")
+    )
+    found = read_load_trace(path)
+    assert found.fz_n is not None
+    assert found.fz_n.tolist() == [1.5, 2.5]
+    np.testing.assert_array_equal(found.cop_m, [[np.nan, np.nan], [0.1, -0.2]])
