@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.special import fdtri
 
-from devices.arrays import Bools, Floats, Ints
+from devices.arrays import Floats, Ints
 from devices.errors import ComparisonError
 from service.offline.compare.blocks import (
     Estimate,
@@ -36,6 +36,10 @@ WIDTHS_S = (0.04, 0.01)
 """Windows before the last one, which is as narrow as samples allow."""
 WIDTH_STEPS = 2.0
 """The last window, in steps of the slower signal: narrower ones would tell sample from sample."""
+STEPS_A_WIDTH = 32.0
+"""A window has no more steps than that in its width, however fast one of the signals is."""
+DRIFT_MAX = 0.01
+"""No clock of a reference is further off than by a hundredth: what lies beyond cannot overlap."""
 CORRELATION_MIN = 0.5
 """Signals that resemble each other less at their best lag are not of the same load."""
 RIVAL_FROM = 0.8
@@ -176,10 +180,7 @@ def _check_varies(signal: Signal, whose: str) -> None:
 def _check_alike(
     peaks: Peaks, ours: Signal, reference: Signal, lag_range_s: tuple[float, float] | None
 ) -> None:
-    turned = likely_lags(ours, Signal(reference.t_s, -reference.force_n), lag_range_s)
-    if turned is not None and turned.best.correlation > max(
-        CORRELATION_MIN, peaks.best.correlation
-    ):
+    if peaks.opposite > max(CORRELATION_MIN, peaks.best.correlation):
         raise _wrong_sign(_elsewhere(ours, reference, lag_range_s))
     if peaks.best.correlation >= CORRELATION_MIN:
         return
@@ -254,13 +255,18 @@ def _fit(ours: Signal, reference: Signal, peak: Peak, coarse_s: float) -> _Fit:
     fit: _Fit | None = None
     for width_s in (*(width for width in WIDTHS_S if width > last_s), last_s, last_s):
         margin_s = max(width_s, coarse_s)
-        step_s = min(0.5 * width_s, ours.step_s, reference.step_s)
+        # A signal that is much faster than the other one need not be resampled at all its samples.
+        step_s = max(min(ours.step_s, reference.step_s), width_s / STEPS_A_WIDTH)
+        step_s = min(0.5 * width_s, step_s)
+        begin_s, end_s = (float(ours.t_s[i] + lag_s) for i in (0, -1))
+        room_s = 10.0 * (width_s + margin_s) + DRIFT_MAX * (end_s - begin_s)
+        within_s = (begin_s - room_s, end_s + room_s)
         own = smooth(ours, width_s, step_s)
-        theirs = smooth(reference, width_s, step_s, margin_s)
+        theirs = smooth(reference, width_s, step_s, margin_s, within_s)
         every = max(1, round(width_s / step_s))
         t_s, samples = own.t_s[::every], np.arange(len(own.t_s[::every]))
         to_s = t_s + lag_s + (drift * (t_s - fit.at_s) if fit is not None else 0.0)
-        used = own.known[::every] & _known_at(theirs, to_s)
+        used = own.known[::every] & theirs.known_at(to_s)
         if used.sum() < 10 * (_SCALE + 1):
             raise ComparisonError(
                 f"reference and session overlap in {used.sum() * width_s:.2f} s without a gap",
@@ -317,12 +323,6 @@ def _noise_n(residual: Floats, own_n: Floats) -> float:
 
 def _deviation(values: Floats) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
-
-
-def _known_at(signal: Even, t_s: Floats) -> Bools:
-    at = np.rint((t_s - signal.begin_s) / signal.step_s).astype(np.int64)
-    inside = (at >= 0) & (at < len(signal.known))
-    return np.asarray(inside & signal.known[np.clip(at, 0, len(signal.known) - 1)])
 
 
 def _is_worse(other: _Fit, best: _Fit) -> bool:

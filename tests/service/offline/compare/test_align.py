@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -216,3 +218,39 @@ def test_a_reference_with_its_sign_turned_is_named_as_that() -> None:
     ours, reference = walk(14)
     with pytest.raises(ComparisonError, match="sign is turned"):
         align(ours, Signal(reference.t_s, -reference.force_n))
+
+
+def apart(signal: Signal, at_s: float, by_s: float) -> Signal:
+    """Return a signal whose samples from an instant on are so much later."""
+    return Signal(signal.t_s + by_s * (signal.t_s >= at_s), signal.force_n)
+
+
+@pytest.mark.parametrize("by_s", [3.0, 86_400.0, 1e9])
+@pytest.mark.parametrize("at", ["first", "last", "middle"])
+def test_a_wrong_stamp_or_a_long_pause_costs_no_memory_and_no_truth(at: str, by_s: float) -> None:
+    ours, reference = walk(4, 12.0, lag_s=0.5)
+    clean = align(ours, reference)
+    if at == "middle":  # both have paused, and nobody presses meanwhile
+        ours, reference = apart(ours, 6.1, by_s), apart(reference, 6.6, by_s)
+    else:
+        at_s = reference.t_s[1 if at == "first" else -1]
+        reference = apart(reference, at_s, by_s)
+    tracemalloc.start()
+    found = align(ours, reference)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 100e6
+    shift_s = by_s if at == "first" else 0.0
+    assert found.lag_s.value - shift_s == pytest.approx(clean.lag_s.value, abs=5e-4)
+    assert found.scale.value == pytest.approx(clean.scale.value, abs=5e-3)
+
+
+def test_every_second_of_a_day_with_pauses_is_found() -> None:
+    # Stretches of two seconds with an hour between them: more pauses than islands.
+    ours, reference = walk(7, 40.0, lag_s=-2.5)
+    for number in range(1, 20):
+        at_s = 2.0 * number + 3600.0 * (number - 1)
+        ours, reference = apart(ours, at_s, 3600.0), apart(reference, at_s - 2.5, 3600.0)
+    found = align(ours, reference)
+    assert found.lag_s.value == pytest.approx(-2.5, abs=1e-3)
+    assert found.scale.value == pytest.approx(1.0, abs=0.02)
