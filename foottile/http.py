@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from foottile.address import decode_zone
 from foottile.environment import check_token, read_token
 from foottile.errors import FootTileError, NoAnswerError, UsageError, refused
 from foottile.local_server import find_local_server
@@ -36,7 +37,7 @@ class Http:
         token = check_token(token, "the token") if token else read_token()
         if token is None and (local := find_local_server(url)) is not None:
             url, token = local.url, local.token
-        self.url = url.rstrip("/")
+        self.url = decode_zone(url.rstrip("/"))
         self.headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
             self._client = httpx.Client(

@@ -24,7 +24,7 @@ from tests.waiting import PATIENCE_S
 ROOT = Path(__file__).resolve().parents[1]
 BLOCKER = """
 import sys
-absent = ["fastapi", "httptools", "httpx", "starlette", "uvicorn"]
+absent = ["fastapi", "httptools", "httpx", "psutil", "starlette", "uvicorn"]
 absent += ["matplotlib", "uvloop"]
 if not any("spawn_main" in word for word in sys.orig_argv):
     absent += ["numba", "scipy"]  # which an emulated foot needs, where a robot has a real one

@@ -204,7 +204,9 @@ def container_commands(folder: Path) -> list[list[str]]:
     node = subprocess.run(
         ["sh", str(ROOT / "scripts" / "container-node")],
         # `python` of the image has the package.
-        env={"PATH": os.pathsep.join((str(folder), sysconfig.get_path("scripts"), "/usr/bin:/bin"))},
+        env={
+            "PATH": f"{folder}{os.pathsep}{sysconfig.get_path('scripts')}{os.pathsep}/usr/bin:/bin"
+        },
         check=True,
         capture_output=True,
         text=True,

@@ -5,6 +5,8 @@ Nothing here needs what the server itself is made of, which takes long to import
 
 from __future__ import annotations
 
+import errno
+import ipaddress
 import logging
 import re
 import secrets
@@ -12,9 +14,10 @@ import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
-from devices.errors import DamagedFileError, LinkError
+from devices.errors import DamagedFileError, LinkError, UsageError
 from foottile.local_server import LocalServer, is_loopback, publish_local_server
 from storage.durable import put_aside, read_whole, storage_errors, write_whole
 
@@ -31,40 +34,122 @@ no time-out of ours sees how much of a download has arrived."""
 def listen(host: str, port: int) -> socket.socket:
     """A listening socket; port 0 is any that is free.
 
+    Of a name with several addresses it is the first that can be listened on, IPv4 first.
+
     Raises:
         LinkError: the port is in use, or the address is not this machine's.
     """
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        listening = socket.socket(family, kind, protocol)
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError) as error:
-        raise LinkError(f"cannot listen on {host}: {error}") from error
+        raise LinkError(
+            f"cannot listen on {host}: {error}",
+            remedy="Name an address of this machine with --host, or 0.0.0.0 for all of them",
+        ) from error
+    problem: OSError | None = None
+    for family, kind, protocol, _, address in sorted(found, key=lambda each: each[0]):
+        try:
+            return _listening(family, kind, protocol, address)
+        except OSError as error:
+            problem = problem or error
+    assert problem is not None  # noqa: S101  # getaddrinfo returns an address or raises
+    raise LinkError(
+        f"cannot listen on {host} port {port}: {problem.strerror}",
+        remedy=_REMEDIES.get(
+            problem.errno or 0, "Stop what uses the port, or choose another one with --port"
+        ),
+    ) from problem
+
+
+_REMEDIES = {
+    errno.EADDRNOTAVAIL: "Name an address of this machine with --host, or 0.0.0.0 for all of them",
+    errno.EACCES: "Choose a port from 1024 on with --port",
+    errno.EINVAL: "A link-local address needs its zone, the name of an interface: fe80::1%eth0",
+}
+
+
+def _listening(family: int, kind: int, protocol: int, address: Any) -> socket.socket:
+    listening = socket.socket(family, kind, protocol)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if address[0] == "::":  # IPv4, too, whatever the system's usual is
+            listening.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # those that come to it inherit this
             listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
-        if family == socket.AF_INET6:  # `::` is every address, whatever the machine's default
-            listening.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         listening.bind(address)
         listening.listen(_BACKLOG)
-    except OSError as error:
+    except BaseException:
         listening.close()
-        raise LinkError(
-            f"cannot listen on {host} port {port}: {error.strerror}",
-            remedy="Stop what uses the port, or choose another one with --port",
-        ) from error
+        raise
     return listening
 
 
-def urls_of(listening: socket.socket, host: str) -> list[str]:
-    """Addresses under which it is reached, from other machines first if they can."""
-    port = listening.getsockname()[1]
+def is_everywhere(host: str) -> bool:
+    """Return whether a server on this address listens on all interfaces."""
+    return host in ("0.0.0.0", "::", "")  # noqa: S104  # compared only
+
+
+def urls_of(listening: socket.socket, host: str, advertised: str | None = None) -> list[str]:
+    """Return the addresses under which a server is reached, the most useful to others first.
+
+    Args:
+        listening: its socket.
+        host: what it was told to listen on.
+        advertised: an address or a name to show instead of those found, as of `--advertise`.
+
+    Raises:
+        UsageError: `advertised` is no address.
+    """
+    bound, port = listening.getsockname()[:2]
     names = [host]
-    if host in ("0.0.0.0", "::", ""):  # noqa: S104  # compared only
-        names = [*_own_addresses(), "127.0.0.1"]
-    return [f"http://[{n}]:{port}" if ":" in n else f"http://{n}:{port}" for n in names]
+    if is_everywhere(host):
+        from service.api.interfaces import list_addresses
+
+        found = [] if advertised else list_addresses(has_ipv6=listening.family == socket.AF_INET6)
+        names = [*found, "127.0.0.1"]
+    elif host == "localhost":  # another program may listen on its other address
+        names = [bound]
+    first = [] if advertised is None else [advertised_url(advertised, port)]
+    return list(dict.fromkeys([*first, *(_url(name, port) for name in names)]))
+
+
+def advertised_url(advertised: str, port: int) -> str:
+    """Return the address that `--advertise` names: HOST, HOST:PORT, or all of it.
+
+    Raises:
+        UsageError: it is none.
+    """
+    text = advertised.strip().rstrip("/")
+    if "://" not in text:
+        text = _url(text, None) if text.count(":") > 1 and text[0] != "[" else f"http://{text}"
+        text += "" if re.search(r":\d+$", text.rpartition("]")[2]) else f":{port}"
+    try:
+        parts = urlsplit(text)
+        name, scheme = parts.hostname or "", parts.scheme
+        has_more = bool(parts.path or parts.query or parts.fragment or parts.username)
+        is_right = scheme in ("http", "https") and parts.port != 0 and not has_more
+        is_right &= "[" in parts.netloc or _HOST_NAME.fullmatch(name) is not None or _is_ip(name)
+    except ValueError:
+        is_right = False
+    if not is_right:
+        raise UsageError(
+            f"--advertise {advertised!r} is no address",
+            expected="HOST, HOST:PORT, or https://HOST of a reverse proxy",
+        )
+    return text
+
+
+def _url(name: str, port: int | None) -> str:
+    host = f"[{name.replace('%', '%25')}]" if ":" in name else name
+    return f"http://{host}" + ("" if port is None else f":{port}")
+
+
+def _is_ip(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 def own_names() -> tuple[str, ...]:
@@ -81,17 +166,6 @@ def own_names() -> tuple[str, ...]:
 
 
 _HOST_NAME = re.compile(r"(?!\d+$)[a-z0-9](?:[a-z0-9-]{0,62}[a-z0-9])?(?:\.[a-z0-9-]{1,63}){0,8}")
-
-
-def _own_addresses() -> list[str]:
-    """This machine's address towards other networks, if it is in one."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            # Nothing is sent: connecting a datagram socket only chooses the way out.
-            probe.connect(("192.0.2.1", 9))
-        except OSError:
-            return []
-        return [name for name in (probe.getsockname()[0],) if not is_loopback(name)]
 
 
 def token_for(given: str | None, data: Path) -> str:

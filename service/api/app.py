@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from http import HTTPStatus
 from pathlib import Path
@@ -54,7 +54,7 @@ def make_app(
     *,
     logins: Logins,
     hosts: Iterable[str] = (),
-    urls: Sequence[str] = (),
+    find_urls: Callable[[], Sequence[str]] = tuple,
 ) -> FastAPI:
     """Build the application.
 
@@ -62,7 +62,8 @@ def make_app(
         server: the state it serves.
         logins: token, tickets and cookies: asked for on every change of state and on ingest.
         hosts: names under which it is reached, in addition to addresses and localhost.
-        urls: its addresses, as they are said to people; the first one is shown to phones.
+        find_urls: returns its addresses, which change with the networks that the machine joins; the
+            first one is for phones.
     """
 
     @asynccontextmanager
@@ -86,7 +87,7 @@ def make_app(
     )
     app.state.server = server
     app.state.logins = logins
-    app.state.urls = tuple(urls)
+    app.state.find_urls = find_urls
     problems.install(app)
     api = APIRouter(
         prefix=API,

@@ -38,6 +38,8 @@ class Settings(Bounds):
     allow_host: tuple[str, ...] = ()
     """Names under which the server is reached, in addition to its addresses and this machine's own
     names."""
+    advertise: str | None = None
+    """Address or name that is shown to people, as that of a reverse proxy; None: those found."""
     exact: bool = False
     """Are estimates in recorded sessions as computed, and not rounded?"""
 

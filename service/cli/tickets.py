@@ -17,11 +17,37 @@ _WHITE_ON_WHITE = "\x1b[38;5;231;48;5;231m"
 _USUAL = "\x1b[0m"
 
 
+def host_of(url: str) -> str:
+    """Return the name or the address of a server, without port and brackets."""
+    return urlsplit(url).hostname or ""
+
+
 def reaches_others(url: str) -> bool:
     """Is this an address that a phone could open?"""
     from foottile.local_server import is_loopback
 
-    return not is_loopback(urlsplit(url).hostname or "")
+    return not is_loopback(host_of(url))
+
+
+def remark_reach(urls: list[str], host: str) -> None:
+    """Remark what keeps others from a server's addresses.
+
+    Args:
+        urls: its addresses.
+        host: what it was told to listen on.
+    """
+    from service.api.address import is_everywhere
+
+    if is_everywhere(host) and not any(reaches_others(url) for url in urls):
+        remark(
+            "this machine is in no network, so no phone reaches it: start a hotspot or join a "
+            "network; `foottile ticket` then shows its address"
+        )
+    if any("%25" in url for url in urls):
+        remark(
+            "an address with %25 is for a node or a Python program at the same cable: behind it "
+            "stands this machine's name of the interface; write there the other machine's"
+        )
 
 
 def qr_lines(text: str, *, is_ascii: bool = False) -> list[str]:
@@ -66,4 +92,7 @@ def say_ticket(urls: list[str], *, viewer: bool) -> None:
     if reaches_others(urls[0]):
         show_code(urls[0], viewer=viewer)
     else:
-        remark("a phone does not reach this address: start the server with --host 0.0.0.0")
+        remark(
+            "a phone does not reach this address: start the server with --host 0.0.0.0; if that is "
+            "done, its machine is in no network: start a hotspot or join one, and ask again"
+        )

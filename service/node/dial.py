@@ -16,6 +16,7 @@ from urllib.parse import urlsplit, urlunsplit
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from devices.errors import UsageError
+from foottile.address import decode_zone
 from service.link import INGEST_PATH, Close
 
 EVERY_S = 0.5
@@ -34,7 +35,7 @@ def ingest_url(server: str) -> str:
     """
     expected = "one such as http://192.168.4.1:8000"
     try:
-        parts = urlsplit(server)
+        parts = urlsplit(decode_zone(server))
         known = parts.hostname is not None and parts.port != 0
     except ValueError as error:
         raise UsageError(f"{server!r} is no server address", expected=expected) from error

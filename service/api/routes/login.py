@@ -127,7 +127,7 @@ async def log_out(request: Request, response: Response, logins: LoginsState) -> 
 async def give_ticket(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
     """Good once, for five minutes. It takes the token itself; a login is not enough."""
     ticket = logins.tickets.new(_RIGHTS[body.may])
-    urls = request.app.state.urls or (str(request.base_url).rstrip("/"),)
+    urls = request.app.state.find_urls() or (str(request.base_url).rstrip("/"),)
     return TicketView(
         ticket=ticket,
         may=body.may,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,7 @@ from service.cli.options import (
     stop_on_signals,
     with_foot_options,
 )
+from service.cli.tickets import host_of, remark_reach
 
 if TYPE_CHECKING:
     import socket
@@ -43,6 +45,14 @@ def demo_command(
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
+    advertise: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST",
+            help="Address or name to show to people, as behind a reverse proxy or in a container; "
+            "default: those of all interfaces.",
+        ),
+    ] = None,
     data: Annotated[
         Path | None, typer.Option(help="Folder for sessions; default: one for demos.")
     ] = None,
@@ -70,11 +80,16 @@ def demo_command(
     arguments = [f"--scene={scene}", *options.as_arguments()]
     folder = data if data is not None else user_data_path("foottile") / "demo"
     arguments.append(f"--journal={folder / 'node'}")
-    uvloop.run(_demo(host, port, folder, seconds, arguments))
+    uvloop.run(_demo(host, port, advertise, folder, seconds, arguments))
 
 
 async def _demo(
-    host: str, port: int, data: Path, seconds: float | None, node_arguments: list[str]
+    host: str,
+    port: int,
+    advertise: str | None,
+    data: Path,
+    seconds: float | None,
+    node_arguments: list[str],
 ) -> None:
     from foottile.environment import read_token
     from service.api.address import listen, published, token_for, urls_of
@@ -88,12 +103,14 @@ async def _demo(
         token = token_for(given, data)
         stack.enter_context(published(listening, token))
         logins = Logins(token)
-        urls = urls_of(listening, host)
+        find_urls = partial(urls_of, listening, host, advertise)
+        urls = find_urls()
         # First: while the server is imported and prepared, the tiles are found and measured.
         node = await _start_node(urls[-1], token, node_arguments)
         try:
-            async with _server(listening, data, logins, urls) as server:
+            async with _server(listening, data, logins, find_urls) as server:
                 announce(urls, data, logins, is_kept=not given, is_demo=True)
+                remark_reach(urls, host)
                 remark(f"what was recorded: foottile sessions --server {urls[-1]}")
                 ended = asyncio.create_task(node.wait())
                 stopped = asyncio.create_task(stop.wait())
@@ -116,16 +133,19 @@ async def _demo(
 
 @asynccontextmanager
 async def _server(
-    listening: socket.socket, data: Path, logins: Logins, urls: list[str]
+    listening: socket.socket, data: Path, logins: Logins, find_urls: Callable[[], list[str]]
 ) -> AsyncIterator[Server]:
     """A server that answers, while the block runs."""
     from devices.realtime import spare_what_is_loaded
+    from service.api.address import own_names
     from service.api.app import make_app
     from service.api.serve import serving
     from service.server.server import Server
 
     server = Server(data)
-    async with serving(make_app(server, logins=logins, urls=urls), listening):
+    hosts = (*own_names(), host_of(find_urls()[0]))
+    app = make_app(server, hosts=hosts, logins=logins, find_urls=find_urls)
+    async with serving(app, listening):
         spare_what_is_loaded()
         yield server
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +12,7 @@ import typer
 
 from devices.errors import needs_extra
 from service.cli.options import remark, say, stop_on_signals
-from service.cli.tickets import reaches_others, show_code
+from service.cli.tickets import host_of, reaches_others, remark_reach, show_code
 
 if TYPE_CHECKING:
     from service.api.logins import Logins
@@ -34,6 +35,14 @@ def serve_command(
         list[str] | None,
         typer.Option(
             help="Further name under which the server is reached; may be given several times."
+        ),
+    ] = None,
+    advertise: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST",
+            help="Address or name to show to people, as behind a reverse proxy or in a container; "
+            "default: those of all interfaces.",
         ),
     ] = None,
     private: Annotated[
@@ -88,6 +97,7 @@ def serve_command(
         port=port,
         data=data,
         allow_host=tuple(allow_host or ()) or None,
+        advertise=advertise,
         private=private,
         exact=exact,
         trusted_proxy=tuple(trusted_proxy or ()) or None,
@@ -118,13 +128,15 @@ async def _serve(settings: Settings) -> None:
         server = Server(settings.data, exact=settings.exact)
         token = token_for(settings.token, settings.data)
         logins = Logins(token, is_private=settings.private)
-        urls = urls_of(listening, settings.host)
-        hosts = (*settings.allow_host, *own_names())
-        app = make_app(server, logins=logins, hosts=hosts, urls=urls)
+        find_urls = partial(urls_of, listening, settings.host, settings.advertise)
+        urls = find_urls()
+        hosts = (*settings.allow_host, *own_names(), host_of(urls[0]))
+        app = make_app(server, logins=logins, hosts=hosts, find_urls=find_urls)
         with published(listening, token):
             async with serving(app, listening, settings):
                 spare_what_is_loaded()
                 announce(urls, settings.data, logins, is_kept=not settings.token)
+                remark_reach(urls, settings.host)
                 await stop.wait()
 
 

@@ -347,7 +347,10 @@ def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     log = tmp_path.with_name("log")
     with log.open("w") as stderr:
         serve = subprocess.Popen(
-            [*COMMAND, "serve", f"--host={host}", "--port", "0", "--data", str(tmp_path)],
+            [
+                *(*COMMAND, "serve", f"--host={host}", "--port", "0", "--data", str(tmp_path)),
+                *("--advertise", "robot.example"),
+            ],
             stdout=subprocess.PIPE,
             stderr=stderr,
             text=True,
@@ -355,6 +358,7 @@ def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     assert serve.stdout is not None
     line = serve.stdout.readline()
     url = line.split()[-1].rstrip("/")
+    assert url.startswith("http://robot.example:")
     url = f"http://127.0.0.1:{url.rsplit(':', 1)[1]}"
     assert (tmp_path / "token").stat().st_mode & 0o077 == 0
     token = (tmp_path / "token").read_text().strip()
@@ -365,6 +369,8 @@ def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     assert (refused.status_code, allowed.status_code) == (401, 404)
     by_name = httpx.get(f"{url}/api/v1/nodes", headers={"Host": "evil.example"}, trust_env=False)
     assert by_name.status_code == 403
+    by_name = httpx.get(f"{url}/api/v1/nodes", headers={"Host": "robot.example"}, trust_env=False)
+    assert by_name.status_code == 200
     found = run("ticket", "--server", url)
     assert "/#ticket=" in found.stdout, found.stderr
     serve.terminate()
