@@ -16,6 +16,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import os
+
     from foottile.data import Data as Data
     from foottile.errors import ConflictError as ConflictError
     from foottile.errors import DamagedError as DamagedError
@@ -54,7 +56,13 @@ _PLACES = {
 __all__ = sorted([*_PLACES, "connect", "connect_async"])  # noqa: PLE0605  # names of the table above
 
 
-def connect(url: str, token: str | None = None, *, timeout_s: float = 10.0) -> Server:
+def connect(
+    url: str,
+    token: str | None = None,
+    *,
+    timeout_s: float = 10.0,
+    ca: str | os.PathLike[str] | None = None,
+) -> Server:
     """A server; use it as a context manager, or `close` it. Nothing is asked yet.
 
     Args:
@@ -62,20 +70,28 @@ def connect(url: str, token: str | None = None, *, timeout_s: float = 10.0) -> S
         token: its token; None: FOOTTILE_TOKEN, else that of a server which this user runs on this
             machine. To read, none is needed unless the server is private.
         timeout_s: how long an answer may keep one waiting.
+        ca: file or folder of CA certificates in PEM, beside those that this machine trusts, as
+            those of a laboratory.
 
     Raises:
-        UsageError: that is no address.
+        UsageError: that is no address, token or certificate.
     """
     from foottile.server import Server
 
-    return Server(url, token, timeout_s=timeout_s)
+    return Server(url, token, timeout_s=timeout_s, ca=ca)
 
 
-def connect_async(url: str, token: str | None = None, *, timeout_s: float = 10.0) -> AsyncServer:
+def connect_async(
+    url: str,
+    token: str | None = None,
+    *,
+    timeout_s: float = 10.0,
+    ca: str | os.PathLike[str] | None = None,
+) -> AsyncServer:
     """The same for asyncio; arguments and errors as of `connect`."""
     from foottile.with_asyncio import AsyncServer
 
-    return AsyncServer(url, token, timeout_s=timeout_s)
+    return AsyncServer(url, token, timeout_s=timeout_s, ca=ca)
 
 
 def __getattr__(name: str) -> Any:

@@ -14,6 +14,7 @@ from websockets.sync.client import ClientConnection, connect
 from foottile.closing import Closing
 from foottile.errors import FootTileError
 from foottile.live_state import LiveState
+from foottile.websocket import Connection
 
 
 class Live(LiveState, Closing):
@@ -78,7 +79,9 @@ class Live(LiveState, Closing):
     def _connected(self) -> ClientConnection:
         while self._socket is None:
             try:
-                connection = connect(self._protocol.address(), **self._options())
+                connection = connect(
+                    self._protocol.address(), create_connection=Connection, **self._options()
+                )
                 self._socket = self._closing.enter_context(connection)
             except (OSError, InvalidHandshake, EOFError) as error:
                 time.sleep(self._failed_s(error))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import warnings
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from http import HTTPStatus
 from typing import Any, Literal, get_args
 from urllib.parse import urlencode
 
@@ -20,6 +21,8 @@ from foottile.errors import (
     UsageError,
     refused,
 )
+from foottile.foreign import explain_foreign
+from foottile.tls import explain_tls
 
 Policy = Literal["lossless", "drop_oldest", "latest"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
@@ -28,7 +31,6 @@ MESSAGE_BYTES_MAX = 1 << 24
 _POLICY, _NO_STREAM, _UNREADABLE = 1008, 4011, 4012
 _LOSSES_MAX = 1000
 _AGAIN_S = (0.1, 5.0)
-_TRY_LATER = 503
 
 
 @dataclass(frozen=True)
@@ -156,15 +158,21 @@ class LiveProtocol:
             self._boot_id, self._next_seq = None, 0  # all that there is of the present one
             self._lose(loss)
 
-    def refused(self, status: int, body: bytes | bytearray) -> FootTileError | None:
+    def refused(self, status: int, headers: Mapping[str, str], body: bytes) -> FootTileError | None:
         """The server has answered with HTTP; None: it may be asked again.
 
         Args:
             status: of the answer.
+            headers: of the answer, their names in small letters.
             body: its content.
         """
-        if status == _TRY_LATER and self._has_begun:
+        foreign = explain_foreign(self._asked.url, status, headers)
+        if foreign is None and status == HTTPStatus.OK:  # it has not understood
+            foreign = explain_foreign(self._asked.url, status, headers, expected="a websocket")
+        if self._has_begun and (foreign is not None or status == HTTPStatus.SERVICE_UNAVAILABLE):
             return None
+        if foreign is not None:
+            return NoAnswerError(f"{self._asked.url}: {foreign}", status=status)
         try:
             content: Any = json.loads(body)
         except ValueError:
@@ -183,7 +191,8 @@ class LiveProtocol:
             NoAnswerError: it is not to be tried again.
         """
         if not self._has_begun or (give_up_s is not None and silent_s > give_up_s):
-            raise NoAnswerError(f"{self._asked.url}: no answer: {error}") from error
+            what = explain_tls(error) or f"no answer: {error}"
+            raise NoAnswerError(f"{self._asked.url}: {what}") from error
         self._failures += 1
         least, most = _AGAIN_S
         return float(min(most, least * 2 ** min(self._failures - 1, 10)))

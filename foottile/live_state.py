@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 
+from foottile.http import Http
 from foottile.live_protocol import MESSAGE_BYTES_MAX, Asked, LiveProtocol, Loss
+from foottile.websocket import UpgradeRefused
 
 _NO_CLOSE_FRAME = 1006
 
@@ -19,13 +21,13 @@ class LiveState:
     def __init__(
         self,
         asked: Asked,
-        headers: Mapping[str, str],
+        http: Http,
         *,
         on_loss: Callable[[Loss], None] | None = None,
         give_up_s: float | None = None,
     ) -> None:
         self._protocol = LiveProtocol(asked, on_loss)
-        self._headers = dict(headers)
+        self._http = http
         self._give_up_s = give_up_s
         self._heard_s = time.monotonic()
         self._is_over = False
@@ -43,7 +45,8 @@ class LiveState:
     def _options(self) -> dict[str, Any]:
         """How a connection is made."""
         return {
-            "additional_headers": self._headers,
+            "additional_headers": self._http.headers,
+            "ssl": self._http.context,
             "compression": None,
             "max_size": MESSAGE_BYTES_MAX,
             "close_timeout": 1.0,
@@ -70,9 +73,8 @@ class LiveState:
         Raises:
             FootTileError: it is not to be tried again.
         """
-        if isinstance(error, InvalidStatus):
-            answer = error.response
-            problem = self._protocol.refused(answer.status_code, answer.body)
+        if isinstance(error, UpgradeRefused):
+            problem = self._protocol.refused(error.status, error.headers, error.body)
             if problem is not None:
                 raise problem from error
         return self._again_s(error)

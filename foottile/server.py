@@ -26,8 +26,15 @@ class Server(Closing):
     Every method raises a `FootTileError` if there is no answer, or one that is a problem.
     """
 
-    def __init__(self, url: str, token: str | None = None, *, timeout_s: float = 10.0) -> None:
-        self.http = Http(url, token, timeout_s)
+    def __init__(
+        self,
+        url: str,
+        token: str | None = None,
+        *,
+        timeout_s: float = 10.0,
+        ca: str | os.PathLike[str] | None = None,
+    ) -> None:
+        self.http = Http(url, token, timeout_s, ca)
         """Asks it what has no method here: `server.http.get("/calibrations")`."""
 
     def close(self) -> None:
@@ -46,7 +53,7 @@ class Server(Closing):
 
     def nodes(self) -> list[dict[str, Any]]:
         """All nodes that it knows, as the API describes them: `node`, `connected`, `tiles`, ..."""
-        items: list[dict[str, Any]] = self.http.get("/nodes")["items"]
+        items: list[dict[str, Any]] = self.http.get("/nodes", has="items")["items"]
         return items
 
     def node(self, name: str) -> dict[str, Any]:
@@ -86,7 +93,7 @@ class Server(Closing):
             "limit": _PAGE,
         }
         while True:
-            page = self.http.get("/sessions", query)
+            page = self.http.get("/sessions", query, has="next_cursor")
             for facts in page["items"]:
                 yield Session(self.http, facts)
             if page["next_cursor"] is None:
@@ -95,7 +102,9 @@ class Server(Closing):
 
     def session(self, session_id: str) -> Session:
         """One session."""
-        return Session(self.http, self.http.get(f"/sessions/{quote(session_id, safe='')}"))
+        return Session(
+            self.http, self.http.get(f"/sessions/{quote(session_id, safe='')}", has="id")
+        )
 
     def download_take(
         self,
@@ -154,7 +163,8 @@ class Server(Closing):
 
     def tares(self, node: str) -> list[dict[str, Any]]:
         """The tares of a node, the newest first."""
-        items: list[dict[str, Any]] = self.http.get(f"/nodes/{quote(node, safe='')}/tares")["items"]
+        path = f"/nodes/{quote(node, safe='')}/tares"
+        items: list[dict[str, Any]] = self.http.get(path, has="items")["items"]
         return items
 
     def ticket(self, *, may: str = "press") -> dict[str, Any]:
@@ -187,7 +197,7 @@ class Server(Closing):
                 once it has answered.
         """
         asked = Asked.of(self.http.url, node, columns, policy, boot_id, from_seq)
-        return Live(asked, self.headers, on_loss=on_loss, give_up_s=give_up_s)
+        return Live(asked, self.http, on_loss=on_loss, give_up_s=give_up_s)
 
 
 def _all_of(given: str | Sequence[str] | None) -> list[str]:

@@ -151,7 +151,9 @@ class Session:
         Raises:
             FootTileError: no answer, or it is gone.
         """
-        return [Mark.of(each) for each in self._http.get(f"{self._path}/events")["items"]]
+        return [
+            Mark.of(each) for each in self._http.get(f"{self._path}/events", has="items")["items"]
+        ]
 
     def mark(self, label: str, *, t_ns: int | None = None) -> Mark:
         """Mark this moment, or another one of the server's UTC; sent twice, it is marked once.

@@ -22,6 +22,7 @@ from foottile.live_protocol import Asked, Loss, Policy
 from foottile.live_state import LiveState
 from foottile.server import Server
 from foottile.sessions import Mark, Session
+from foottile.websocket import AsyncConnection
 
 T = TypeVar("T")
 
@@ -128,8 +129,8 @@ class AsyncSession:
 class AsyncServer(AsyncClosing):
     """One server, as `Server`; made by `foottile.connect_async`."""
 
-    def __init__(self, url: str, token: str | None = None, *, timeout_s: float = 10.0) -> None:
-        self._server = Server(url, token, timeout_s=timeout_s)
+    def __init__(self, url: str, token: str | None = None, **how: Any) -> None:
+        self._server = Server(url, token, **how)
 
     async def close(self) -> None:
         """As `Server.close`."""
@@ -181,8 +182,7 @@ class AsyncServer(AsyncClosing):
     ) -> AsyncLive:
         """As `Server.live`: `async for batch in server.live("left")`."""
         asked = Asked.of(self._server.url, node, columns, policy, boot_id, from_seq)
-        headers = self._server.headers
-        return AsyncLive(asked, headers, on_loss=on_loss, give_up_s=give_up_s)
+        return AsyncLive(asked, self._server.http, on_loss=on_loss, give_up_s=give_up_s)
 
 
 class AsyncLive(LiveState, AsyncClosing):
@@ -224,7 +224,9 @@ class AsyncLive(LiveState, AsyncClosing):
     async def _connected(self) -> ClientConnection:
         while self._socket is None:
             try:
-                self._socket = await connect(self._protocol.address(), **self._options())
+                self._socket = await connect(
+                    self._protocol.address(), create_connection=AsyncConnection, **self._options()
+                )
             except (OSError, InvalidHandshake, EOFError) as error:
                 await asyncio.sleep(self._failed_s(error))
         return self._socket

@@ -43,6 +43,13 @@ ExactOption = Annotated[
     bool,
     typer.Option("--exact", help="Keep estimates as computed: do not round off their noise."),
 ]
+CaOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="CA certificates in PEM that an https server's may be of, beside the machine's own.",
+    ),
+]
 StartOption = Annotated[
     float | None, typer.Option(help="From so many seconds after the first frame.")
 ]

@@ -11,12 +11,16 @@ from __future__ import annotations
 import asyncio
 import random
 import socket
+from http import HTTPStatus
 from urllib.parse import urlsplit, urlunsplit
 
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 
 from devices.errors import UsageError
 from foottile.address import decode_zone
+from foottile.foreign import explain_foreign
+from foottile.tls import explain_tls
+from foottile.websocket import UpgradeRefused
 from service.link import INGEST_PATH, Close
 
 EVERY_S = 0.5
@@ -111,7 +115,6 @@ BACK_OFF_S = (0.1, 0.5)
 """Between attempts at a server that cannot be reached: the picture is back within a second."""
 REFUSED_BACK_OFF_S = (0.2, 5.0)
 """Between attempts at a server that answered and refused."""
-_UNAUTHORISED = 401
 
 
 class BackOff:
@@ -146,22 +149,28 @@ def _is_refusal(error: BaseException) -> bool:
         # A server that is going down will be back; what was damaged on its way is sent again.
         soon = (Close.RESTART, Close.MALFORMED)
         return error.rcvd is not None and error.rcvd.code not in soon
-    return isinstance(error, InvalidStatus)
+    return isinstance(error, UpgradeRefused)
 
 
-def reason_of(error: Exception) -> str:
-    """Why there is no connection, in words."""
+def reason_of(error: Exception, url: str = "") -> str:
+    """Why there is no connection to an address, in words."""
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         return error.rcvd.reason or f"closed with code {error.rcvd.code}"
-    if isinstance(error, InvalidStatus) and error.response.status_code == _UNAUTHORISED:
-        is_wrong = b"is not the server's token" in (error.response.body or b"")
+    if isinstance(error, UpgradeRefused):
+        return _reason_of_refusal(error, url)
+    return explain_tls(error) or str(error) or type(error).__name__
+
+
+def _reason_of_refusal(error: UpgradeRefused, url: str) -> str:
+    foreign = explain_foreign(url, error.status, error.headers)
+    if foreign is not None:
+        return foreign
+    if error.status == HTTPStatus.UNAUTHORIZED:
+        is_wrong = b"is not the server's token" in error.body
         what = (
             "FOOTTILE_TOKEN is not the server's token" if is_wrong else "the server wants its token"
         )
         return (
             f"{what}: set FOOTTILE_TOKEN to the one that `foottile serve` shows or keeps in a file"
         )
-    if isinstance(error, InvalidStatus):
-        said = error.response.body.decode(errors="replace")[:300] if error.response.body else ""
-        return f"HTTP {error.response.status_code} {said}".strip()
-    return str(error) or type(error).__name__
+    return f"HTTP {error.status} {error.body.decode(errors='replace')[:300]}".strip()

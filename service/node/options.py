@@ -21,6 +21,7 @@ class NodeOptions:
         calibration: of its tiles, for the server to estimate with.
         calibration_problem: why there is no calibration.
         token: of the server; None: that of a server which this user runs on this machine.
+        ca: file or folder of CA certificates, beside those that the machine trusts.
     """
 
     rig: RigOptions
@@ -30,3 +31,4 @@ class NodeOptions:
     calibration: Calibration | None = None
     calibration_problem: str | None = None
     token: str | None = None
+    ca: Path | None = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import socket as sockets
 from collections.abc import Callable
+from pathlib import Path
 
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
@@ -16,6 +17,8 @@ from websockets.frames import CloseCode
 
 from devices.errors import LinkError
 from foottile.local_server import find_local_server
+from foottile.tls import make_context
+from foottile.websocket import AsyncConnection
 from service.link import MESSAGE_BYTES_MAX, SILENCE_S, SUBPROTOCOL, Hello, Welcome, say
 from service.node.connection import Connection, parse
 from service.node.dial import BackOff, dial, ingest_url, reason_of
@@ -29,14 +32,22 @@ class Publisher:
         server: http(s) or ws(s) address of the server.
         source: the node.
         token: of the server; None: that of a server which this user runs on this machine.
+        ca: file or folder of CA certificates, beside those that the machine trusts.
         report: told what happened, once for every change.
     """
 
     def __init__(
-        self, server: str, source: Source, *, token: str | None, report: Callable[[str], None]
+        self,
+        server: str,
+        source: Source,
+        *,
+        token: str | None,
+        report: Callable[[str], None],
+        ca: Path | None = None,
     ) -> None:
         self._server = server
         self._url = ingest_url(server)
+        self._context = make_context(ca) if self._url.startswith("wss:") else None
         self._source = source
         self._token = token
         self._report = report
@@ -69,7 +80,9 @@ class Publisher:
                 finally:
                     tcp.close()  # if it was not handed over, or not yet let go
             except (OSError, ValueError, WebSocketException) as error:
-                self._say(f"not connected to {self._url}: {reason_of(error)}; trying again")
+                self._say(
+                    f"not connected to {self._url}: {reason_of(error, self._url)}; trying again"
+                )
                 back_off.failed(error)
             self._connected = False
             await asyncio.sleep(back_off.next_s())
@@ -83,6 +96,8 @@ class Publisher:
         async with connect(
             self._url,
             sock=tcp,
+            ssl=self._context,
+            create_connection=AsyncConnection,
             subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
             compression=None,  # costs three times the CPU, saves little (performance.md)
             max_size=MESSAGE_BYTES_MAX,

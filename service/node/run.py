@@ -228,6 +228,7 @@ class RunningNode:
                 damaged=self._journal.damaged,
             ),
             token=self._options.token,
+            ca=self._options.ca,
             report=self._report,
         )
         self._publishing = asyncio.create_task(self._publisher.run())

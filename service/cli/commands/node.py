@@ -15,6 +15,7 @@ import typer
 from devices.errors import CalibrationError, MissingExtraError, StorageError, UsageError
 from devices.facts import check_new_name
 from service.cli.options import (
+    CaOption,
     FootOptions,
     remark,
     say,
@@ -58,6 +59,7 @@ def node_command(
         str | None,
         typer.Option(help="Record a session of this name here; no server is needed for it."),
     ] = None,
+    ca: CaOption = None,
     end_with_parent: Annotated[
         bool, typer.Option("--end-with-parent", hidden=True, help="End when its parent dies.")
     ] = False,
@@ -75,6 +77,7 @@ def node_command(
     from platformdirs import user_state_path
 
     from foottile.environment import read_token
+    from foottile.tls import make_context
     from service.node.dial import ingest_url
     from service.node.options import NodeOptions
     from service.rig.options import RigOptions
@@ -88,6 +91,8 @@ def node_command(
         server = SERVER
     if server is not None:
         ingest_url(server)  # refuse a wrong address before anything else
+    if ca is not None:
+        make_context(ca)  # and what is no certificate
     if journal is not None and os.path.lexists(journal) and not journal.is_dir():
         raise UsageError(f"--journal {str(journal)!r} is no folder", remedy="Choose another one")
     if record is not None and not record.strip():
@@ -113,6 +118,7 @@ def node_command(
                 calibration=calibration,
                 calibration_problem=problem,
                 token=read_token(),
+                ca=ca,
             )
         )
     )

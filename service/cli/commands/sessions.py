@@ -20,6 +20,7 @@ from service.cli.many import (
     run_many,
 )
 from service.cli.options import (
+    CaOption,
     EndOption,
     JsonOption,
     StartOption,
@@ -56,6 +57,7 @@ ClockOption = Annotated[
 
 def sessions_command(
     server: ServerOption = None,
+    ca: CaOption = None,
     data: Annotated[
         Path | None, typer.Option(help="Data folder to look into, without any server.")
     ] = None,
@@ -103,7 +105,7 @@ def sessions_command(
     )
     if server is not None and data is not None:
         raise UsageError("--server and --data are two places to look in", remedy="Name one")
-    found = _of_server(server or SERVER, choice) if data is None else _in_folder(data, choice)
+    found = _of_server(server or SERVER, ca, choice) if data is None else _in_folder(data, choice)
     if as_json:
         print_json({"items": found})
         return
@@ -143,6 +145,7 @@ def pull_command(
         ),
     ] = None,
     server: ServerOption = None,
+    ca: CaOption = None,
     start_s: StartOption = None,
     end_s: EndOption = None,
     columns: ColumnsOption = None,
@@ -169,7 +172,10 @@ def pull_command(
     own_clock = _clock_named(clock)
     chosen = format_named(to) if take is None else together_named(to)
     part = Slice(start_s, end_s, _names(columns))
-    with foottile.connect(server or SERVER) as source, progress(f"pulling {session or take}"):
+    with (
+        foottile.connect(server or SERVER, ca=ca) as source,
+        progress(f"pulling {session or take}"),
+    ):
         if session is None:
             pulled = pull_take(source, str(take), out, part, chosen, options)
         elif part.is_all and chosen is PARQUET and not options.set_names and own_clock == "node":
@@ -321,13 +327,13 @@ def _of_take(take: str, data: Path | None) -> list[str]:
     return [each["id"] for each in sorted(found, key=lambda each: (each["node"], each["id"]))]
 
 
-def _of_server(url: str, choice: Choice) -> list[Mapping[str, Any]]:
+def _of_server(url: str, ca: Path | None, choice: Choice) -> list[Mapping[str, Any]]:
     import foottile
 
     def instant(t_ns: int | None) -> str | None:
         return None if t_ns is None else str(t_ns)
 
-    with foottile.connect(url) as server:
+    with foottile.connect(url, ca=ca) as server:
         found = server.sessions(
             choice.q,
             node=choice.nodes,

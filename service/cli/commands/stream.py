@@ -11,7 +11,7 @@ import typer
 
 from devices.errors import UsageError
 from service.cli.commands.sessions import SERVER, ColumnsOption, ServerOption
-from service.cli.options import remark
+from service.cli.options import CaOption, remark
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -38,6 +38,7 @@ def stream_command(
         int | None, typer.Option(min=1, max=2**53, help="End after so many; default: go on.")
     ] = None,
     server: ServerOption = None,
+    ca: CaOption = None,
 ) -> None:
     """Print live frames of a node with their estimates, a line each, until Ctrl-C.
 
@@ -57,7 +58,7 @@ def stream_command(
     lines = Lines(sys.stdout.buffer, to)
     try:
         with (
-            foottile.connect(server or SERVER) as source,
+            foottile.connect(server or SERVER, ca=ca) as source,
             source.live(node, names, policy=chosen, on_loss=_say_lost) as live,
         ):
             for batch in live:

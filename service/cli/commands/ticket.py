@@ -9,7 +9,7 @@ import typer
 
 from devices.errors import UsageError, needs_extra
 from service.cli.commands.sessions import SERVER, ServerOption
-from service.cli.options import JsonOption, print_json
+from service.cli.options import CaOption, JsonOption, print_json
 from service.cli.tickets import say_ticket
 
 
@@ -17,6 +17,7 @@ from service.cli.tickets import say_ticket
 def ticket_command(
     viewer: Annotated[bool, typer.Option("--viewer", help="One that may look, not press.")] = False,
     server: ServerOption = None,
+    ca: CaOption = None,
     data: Annotated[
         Path | None, typer.Option(help="Take the token from this data folder of the server.")
     ] = None,
@@ -30,7 +31,7 @@ def ticket_command(
     """
     import foottile
 
-    with foottile.connect(server or SERVER, _token_in(data)) as source:
+    with foottile.connect(server or SERVER, _token_in(data), ca=ca) as source:
         ticket = source.ticket(may="look" if viewer else "press")
     if as_json:
         print_json(ticket)

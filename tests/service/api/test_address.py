@@ -51,7 +51,12 @@ def test_a_machine_goes_by_its_own_name_and_no_other(
 def addresses(*listed: str) -> list[str]:
     """Addresses in their order; each is listed as `interface address [no-carrier] [first]`."""
     found = [
-        InterfaceAddress(*line.split()[:2], "no-carrier" not in line, "first" in line)
+        InterfaceAddress(
+            line.split()[0],
+            line.split()[1],
+            has_carrier="no-carrier" not in line,
+            is_first_host="first" in line,
+        )
         for line in listed
     ]
     return [each.address for each in sort_addresses(found)]

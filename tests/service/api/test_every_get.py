@@ -103,8 +103,7 @@ def got_by_old(running: Running, path: str, method: str = "GET") -> tuple[HTTPRe
         answer = HTTPResponse(raw, method=method)
         answer.begin()
         assert answer.getheader("transfer-encoding") is None, path
-        body = answer.fp.read() if answer.fp is not None else b""
-        return answer, body
+        return answer, answer.fp.read()
 
 
 def test_an_old_client_gets_the_body_and_no_chunks(sealed: Sealed) -> None:

@@ -35,6 +35,7 @@ class Publishing:
         server: str,
         token: str | None = None,
         earlier: Sequence[NodeStream] = (),
+        ca: Path | None = None,
     ) -> None:
         self.node = node
         self.stream = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
@@ -55,6 +56,7 @@ class Publishing:
             ),
             token=token,
             report=self.reports.append,
+            ca=ca,
         )
 
     async def __aenter__(self) -> Publishing:
