@@ -23,6 +23,7 @@ from storage.journal.stream_notes import StreamNotes
 from storage.wire import EncodedBatch
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
+from tests.tokens import SHARED_TOKEN
 from tests.waiting import PATIENCE_S
 
 
@@ -33,7 +34,7 @@ class Publishing:
         self,
         node: FakeNode,
         server: str,
-        token: str | None = None,
+        token: str = SHARED_TOKEN,
         earlier: Sequence[NodeStream] = (),
         ca: Path | None = None,
     ) -> None:
