@@ -108,7 +108,9 @@ class Guard:
     def _refusal(self, scope: Scope) -> tuple[HTTPStatus, str] | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        if len(headers.getlist("host")) != 1 or not self._is_ours(host):
+        # HTTP/1.0 needs no Host, and no browser speaks it: watchdogs and load balancers do.
+        is_old = scope.get("http_version") == "1.0" and "host" not in headers
+        if not is_old and (len(headers.getlist("host")) != 1 or not self._is_ours(host)):
             what = f"Host {host[:80]!r} is not this server; name it with --allow-host"
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"

@@ -36,6 +36,7 @@ async def serving(
         app,
         log_level="warning",
         access_log=False,
+        workers=1,  # else uvicorn reads WEB_CONCURRENCY, and ends if that is no number
         server_header=False,
         http=Http,
         ws=WebSocket,  # on websockets' sans-I/O, the fastest that is kept up (performance.md)

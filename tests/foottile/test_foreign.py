@@ -8,6 +8,7 @@ import pytest
 
 import foottile
 from foottile.foreign import explain_foreign
+from foottile.live_protocol import Asked, LiveProtocol
 from tests.service.fake_node import FakeNode
 from tests.service.node.publishing import Publishing
 from tests.service.running import Running
@@ -159,3 +160,22 @@ def test_a_proxy_of_the_environment_is_not_asked(
             with pytest.raises(foottile.UsageError, match="nobody"):
                 next(server.live("nobody"))
     assert asked == []
+
+
+def test_a_stream_that_has_begun_goes_on_when_a_login_page_is_over() -> None:
+    asked = Asked.of("http://lab:8000", "bench", (), "lossless", None, None)
+    protocol = LiveProtocol(asked)
+    html = {"content-type": "text/html"}
+    answers: tuple[tuple[int, dict[str, str]], ...] = (
+        (302, {"location": "http://x"}),
+        (200, html),
+        (511, html),
+        (502, html),
+        (503, {}),
+    )
+    for status, headers in answers:
+        assert protocol.refused(status, headers, b"") is not None
+    protocol.take('{"type": "stream", "boot_id": "b", "from_seq": 0}')
+    for status, headers in answers:
+        assert protocol.refused(status, headers, b"") is None
+    assert isinstance(protocol.refused(401, {}, b"{}"), foottile.RefusedError)

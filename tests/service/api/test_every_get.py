@@ -119,6 +119,19 @@ def test_an_old_client_gets_the_body_and_no_chunks(sealed: Sealed) -> None:
         assert got_by_old(running, path, "HEAD")[1] == b"", path
 
 
+def test_an_old_client_needs_no_host_and_changes_nothing_of_another_site(sealed: Sealed) -> None:
+    for asked_for, status in (
+        ("GET /api/v1/health HTTP/1.0\r\n\r\n", 200),
+        ("GET /api/v1/health HTTP/1.0\r\nHost: evil.example\r\n\r\n", 403),
+        ("GET /api/v1/health HTTP/1.1\r\n\r\n", 403),
+        ("POST /api/v1/nodes/bench/tare HTTP/1.0\r\nOrigin: http://evil.example\r\n\r\n", 403),
+    ):
+        port = sealed.running.port
+        with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as raw:
+            raw.sendall(asked_for.encode())
+            assert raw.recv(65536).split()[1] == str(status).encode(), asked_for
+
+
 def broken(_: object) -> Iterator[bytes]:
     yield b"x" * 65536
     raise RuntimeError("a part of this test")
