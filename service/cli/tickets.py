@@ -37,12 +37,16 @@ def remark_reach(urls: list[str], host: str) -> None:
         host: what it was told to listen on.
     """
     from service.api.address import is_everywhere
+    from service.api.interfaces import list_addresses
 
     if is_everywhere(host) and not any(reaches_others(url) for url in urls):
-        remark(
-            "this machine is in no network, so no phone reaches it: start a hotspot or join a "
-            "network; `foottile ticket` then shows its address"
-        )
+        if list_addresses(has_ipv6=True):
+            remark("this machine has addresses of IPv6 only: start the server with --host ::")
+        else:
+            remark(
+                "this machine is in no network, so no phone reaches it: start a hotspot or join a "
+                "network; `foottile ticket` then shows its address"
+            )
     if any("%25" in url for url in urls):
         remark(
             "an address with %25 is for a node or a Python program at the same cable: behind it "

@@ -92,6 +92,8 @@ def node_command(
     if server is not None:
         ingest_url(server)  # refuse a wrong address before anything else
     if ca is not None:
+        if server is None or not server.startswith(("https:", "wss:")):
+            raise UsageError("--ca is for a --server with https://")
         make_context(ca)  # and what is no certificate
     if journal is not None and os.path.lexists(journal) and not journal.is_dir():
         raise UsageError(f"--journal {str(journal)!r} is no folder", remedy="Choose another one")

@@ -44,6 +44,9 @@ def test_a_node_refuses_what_is_no_ca_before_anything_else(run: Run) -> None:
     done = run(*words, "--ca", "no-such-file.pem")
     assert done.code == 2
     assert "no-such-file.pem" in done.err
+    done = run("node", "--scene", "standing", "--ca", "no-such-file.pem")
+    assert done.code == 2
+    assert "https://" in done.err
 
 
 @pytest.mark.parametrize(("words", "_unknown"), COMMANDS)

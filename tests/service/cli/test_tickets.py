@@ -10,9 +10,10 @@ import httpx
 import pytest
 import segno
 
+from service.api import interfaces
 from service.api.logins import Logins, Right
 from service.cli.commands.serve import announce
-from service.cli.tickets import qr_lines
+from service.cli.tickets import qr_lines, remark_reach
 from tests.service.cli.outcome import Run
 from tests.service.running import ServeWith
 
@@ -97,6 +98,31 @@ def test_a_server_that_no_phone_reaches_shows_no_code(
     shown, logins = announced(tmp_path, capsys, url)
     assert "█" not in shown
     assert tickets_of(logins) == 0
+
+
+@pytest.mark.parametrize(
+    ("host", "url", "addresses", "word"),
+    [
+        ("0.0.0.0", "http://127.0.0.1:8000", [], "no network"),  # noqa: S104  # nothing listens
+        ("0.0.0.0", "http://127.0.0.1:8000", ["fe80::1%eth0"], "--host ::"),  # noqa: S104
+        ("::", "http://[fe80::1%25eth0]:8000", ["fe80::1%eth0"], "the other machine's"),
+        ("0.0.0.0", AWAY, ["192.168.4.1"], ""),  # noqa: S104  # nothing listens
+        ("127.0.0.1", "http://127.0.0.1:8000", [], ""),
+    ],
+)
+def test_what_keeps_others_away_is_remarked(
+    host: str,
+    url: str,
+    addresses: list[str],
+    word: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(interfaces, "list_addresses", lambda *, has_ipv6: addresses)
+    remark_reach([url], host)
+    said = capsys.readouterr().err
+    assert word in said
+    assert bool(said) is bool(word)
 
 
 @pytest.mark.parametrize(("option", "may"), [((), "press"), (("--viewer",), "look")])
