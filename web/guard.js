@@ -7,6 +7,7 @@
   var SCRIPTS_LATE_MS = 30000;
   var MOST = 5; // errors that are written out
   var box = null;
+  var lines = null;
   var errors = [];
   var count = 0;
   var isStarted = false;
@@ -42,6 +43,7 @@
       box.setAttribute("role", "alert");
       add(box, "h2", "");
       add(box, "p", "");
+      lines = add(box, "pre", "");
       var row = add(box, "p", "");
       addButton(row, "Load this page again", function () { location.reload(); });
       addButton(row, "Dismiss", function () { box.hidden = true; });
@@ -53,10 +55,9 @@
       box.hidden = false; // what was dismissed was something else
     }
     if (!errors.length) return;
-    var report = box.getElementsByTagName("pre")[0] || add(box, "pre", "");
     var more = count > errors.length ? "\n… and " + (count - errors.length) + " more" : "";
     // Without query and fragment: these may hold a ticket.
-    report.textContent = errors.join("\n") + more + "\n" + location.origin + location.pathname + "\n" + navigator.userAgent;
+    lines.textContent = errors.join("\n") + more + "\n" + location.origin + location.pathname + "\n" + navigator.userAgent;
   }
 
   function report(error) {

@@ -181,3 +181,25 @@ def test_a_browser_that_keeps_no_cookies_is_told_so(
     page.fill("#token-field", token)
     page.press("#token-field", "Enter")
     expect(page.locator("#token-why")).to_contain_text("blocks cookies")
+
+
+def test_a_page_that_was_put_aside_connects_again_and_tells_of_another_version(
+    scripted: Scripted, open_faulty: OpenFaulty
+) -> None:
+    second_hello = """
+      const parse = JSON.parse;
+      let hellos = 0;
+      JSON.parse = (text) => {
+        const value = parse(text);
+        if (value?.type === "hello" && hellos++) value.software = "FootTile 99.0";
+        return value;
+      };"""
+    with Play(scripted.node, 5.0):
+        page = open_faulty(scripted.url, script=second_hello)
+        expect(page.locator("body[data-live=true]")).to_have_count(1)
+        expect(page.locator("#notices")).to_be_empty()
+        page.evaluate("dispatchEvent(new PageTransitionEvent('pageshow', { persisted: true }))")
+        expect(page.locator("#notices")).to_contain_text("to FootTile 99.0")
+        expect(page.locator("body[data-live=true]")).to_have_count(1)
+        page.click("#notices button:has-text('Load again')")
+        expect(page.locator("#notices")).to_be_empty()

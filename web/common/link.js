@@ -1,6 +1,7 @@
 // The websocket: reconnects for ever, measures the round trip, and hands on parsed messages.
 
 import { enter, keptOut, letIn, look } from "./login.js";
+import { notice } from "./notices.js";
 
 const FIRST_WAIT_S = 0.3;
 const LONGEST_WAIT_S = 3;
@@ -22,11 +23,14 @@ export class Link {
     this.waitS = FIRST_WAIT_S;
     this.malformed = 0;
     this.retry = null;
-    enter().then(() => this.connect());
+    this.software = null; // as this page found it first
+    enter().finally(() => this.connect());
     setInterval(() => this.ping(), PING_EVERY_MS);
     // A phone back from sleep, or back in the WLAN, should not wait for the timer.
     addEventListener("online", () => this.hurry());
     document.addEventListener("visibilitychange", () => document.hidden || this.hurry());
+    // Put aside by the browser and taken out again, this page has a socket that may be dead without saying so.
+    addEventListener("pageshow", (event) => event.persisted && this.lost("this page was put aside"));
   }
 
   async connect() {
@@ -75,7 +79,16 @@ export class Link {
         this.roundTripMs = this.roundTripMs === null ? roundTripMs : 0.7 * this.roundTripMs + 0.3 * roundTripMs;
       }
     }
+    if (message.type === "hello") this.checkSoftware(message.software);
     this.onMessage(message);
+  }
+
+  /** Another version of the server may not understand the scripts of this one. */
+  checkSoftware(software) {
+    this.software ??= software;
+    if (software === this.software) return;
+    notice(`The server was changed from ${this.software} to ${software}, and this page is still the old one.`,
+      { press: ["Load again", () => location.reload()], stays: true });
   }
 
   ping() {

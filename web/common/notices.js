@@ -4,18 +4,22 @@ import { Refusal } from "./request.js";
 import { byId, el } from "./text.js";
 
 const GOOD_FOR_MS = 4000;
-const UNDO_FOR_MS = 10_000;
+const PRESS_FOR_MS = 10_000;
 const MOST = 2;
 
-/** `undo`: a way back, offered for as long as the notice stands. */
-export function notice(text, { bad = false, undo = null } = {}) {
+/**
+ * Show a short text. `press`, the words of a button and what it does, is offered for as long as the notice stands.
+ * @param {string} text
+ * @param {{bad?: boolean, press?: [string, () => unknown] | null, stays?: boolean}} [how]
+ */
+export function notice(text, { bad = false, press = null, stays = bad } = {}) {
   const box = byId("notices");
   const close = el("button", { type: "button", cls: "close", text: "×", "aria-label": "Dismiss" });
   const item = el("p", { cls: bad ? "notice bad" : "notice" }, el("span", { text: bad ? `Not done: ${text}` : text }));
-  if (undo) {
-    const back = el("button", { type: "button", cls: "small", text: "Undo" });
-    back.addEventListener("click", () => { item.remove(); undo(); });
-    item.append(back);
+  if (press) {
+    const button = el("button", { type: "button", cls: "small", text: press[0] });
+    button.addEventListener("click", () => { item.remove(); press[1](); });
+    item.append(button);
   }
   item.append(close);
   close.addEventListener("click", () => item.remove());
@@ -23,7 +27,7 @@ export function notice(text, { bad = false, undo = null } = {}) {
   for (const old of box.querySelectorAll(".bad")) old.remove();
   box.append(item);
   while (box.children.length > MOST) box.firstElementChild.remove();
-  if (!bad) setTimeout(() => item.remove(), undo ? UNDO_FOR_MS : GOOD_FOR_MS);
+  if (!stays) setTimeout(() => item.remove(), press ? PRESS_FOR_MS : GOOD_FOR_MS);
 }
 
 /** Show a refusal. Any other error is a fault of this page: thrown on, to guard.js. @param {unknown} error */

@@ -195,7 +195,7 @@ export class Sessions {
     await api.deleteSession(session.id);
     this.onDeleted(session.id);
     notice(`“${session.name}” is in the trash.`, {
-      undo: () => quietly(async () => this.onSession(await api.restoreSession(session.id))),
+      press: ["Undo", () => quietly(async () => this.onSession(await api.restoreSession(session.id)))],
     });
   }
 }
