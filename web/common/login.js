@@ -1,7 +1,7 @@
 // Getting in: a ticket or a token in the address, or a token typed in, becomes a cookie that no script can read.
 
 import { parseAnswer, Refusal, sendRequest } from "./request.js";
-import { el } from "./text.js";
+import { el, setText } from "./text.js";
 
 const PATH = "/api/v1/login";
 const WHERE = "Ask who started the server: “foottile ticket”, on that computer, shows an address and a code to scan "
@@ -143,5 +143,5 @@ function draw() {
     });
   }
   chip.hidden = !text;
-  chip.textContent = text;
+  setText(chip, text);
 }

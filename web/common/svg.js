@@ -1,5 +1,7 @@
 // Elements of SVG, and their numbers.
 
+import { printable } from "./text.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 
 /**
@@ -12,7 +14,7 @@ const SVG = "http://www.w3.org/2000/svg";
 export function svg(tag, attributes = {}, text = null) {
   const element = document.createElementNS(SVG, tag);
   for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, String(value));
-  if (text !== null) element.textContent = text;
+  if (text !== null) element.textContent = printable(text);
   return element;
 }
 

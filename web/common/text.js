@@ -23,6 +23,24 @@ export function byId(id, kind = HTMLElement) {
 /** Did it happen in something of this selector? A dialog keeps the focus for a moment after it has closed: ask for `dialog[open]`. @param {Event} event @param {string} selector */
 export const isInside = ({ target }, selector) => target instanceof Element && target.closest(selector) !== null;
 
+// Controls, formats (which turn the direction of text, or have no width) and halves of a character.
+const UNPRINTABLE = /[\p{Cc}\p{Cf}\p{Cs}\u2028\u2029]/gu;
+const BLANK = /[\t\n\r]/; // shown as a space
+const JOINER = /[\u200c\u200d]/; // part of some scripts, and of emoji
+
+/**
+ * Text as it may be shown: what has no picture of its own is spelt out, as `\x1b` or `\u202e`. For every name and
+ * text of people, on the page and on canvas; what is sent back to the server stays as it is.
+ * @param {string} text
+ */
+export const printable = (text) => String(text).replace(UNPRINTABLE, (found, at) => {
+  if (BLANK.test(found) || (JOINER.test(found) && text.charCodeAt(at - 1) > 127)) return found;
+  const code = found.codePointAt(0);
+  return code < 256 ? `\\x${code.toString(16).padStart(2, "0")}` : `\\u${code.toString(16).padStart(4, "0")}`;
+});
+
+const SHOWN_ATTRIBUTES = new Set(["aria-label", "label", "placeholder", "title"]);
+
 /**
  * An element with class, text and children; never markup from a string.
  * @template {keyof HTMLElementTagNameMap} T
@@ -34,9 +52,9 @@ export const isInside = ({ target }, selector) => target instanceof Element && t
 export function el(tag, { cls = "", text = null, ...attributes } = {}, ...children) {
   const element = document.createElement(tag);
   if (cls) element.className = cls;
-  if (text !== null) element.textContent = text;
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  element.append(...children);
+  if (text !== null) element.textContent = printable(text);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, SHOWN_ATTRIBUTES.has(name) ? printable(value) : value);
+  element.append(...children.map((child) => (typeof child === "string" ? printable(child) : child)));
   return element;
 }
 
@@ -46,10 +64,11 @@ export function el(tag, { cls = "", text = null, ...attributes } = {}, ...childr
  * @param {string} text
  */
 export function setText(element, text) {
-  if (element.textContent === text) return;
+  const shown = printable(text);
+  if (element.textContent === shown) return;
   const only = element.childNodes.length === 1 ? element.firstChild : null;
-  if (only instanceof Text && text !== "") only.data = text; // no new node per message
-  else element.textContent = text;
+  if (only instanceof Text && shown !== "") only.data = shown; // no new node per message
+  else element.textContent = shown;
 }
 
 /** @param {HTMLElement | SVGElement} element @param {string} name @param {string} value */

@@ -2,7 +2,7 @@
 
 import { call, Refusal } from "../common/api.js";
 import { enter, keptOut, letIn } from "../common/login.js";
-import { byId } from "../common/text.js";
+import { byId, setText } from "../common/text.js";
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const dress = () => document.documentElement.classList.toggle("dark-mode", dark.matches); // Swagger UI's own name
@@ -18,7 +18,7 @@ async function show() {
   } catch (error) {
     if (!(error instanceof Refusal)) throw error;
     byId("message").hidden = false;
-    byId("message").textContent = error.message;
+    setText(byId("message"), error.message);
     return;
   }
   globalThis.SwaggerUIBundle({

@@ -2,7 +2,7 @@
 
 import { coloursOf, fit, whenColoursChange } from "../common/axes.js";
 import { shadeOf, shadesOf } from "../common/heat.js";
-import { byId, number } from "../common/text.js";
+import { byId, number, printable } from "../common/text.js";
 import { runs } from "./points.js";
 import { Strip } from "./strip.js";
 import { unitOf } from "./tile.js";
@@ -80,7 +80,7 @@ export class TileTraces {
     context.fillStyle = colours.text;
     context.textAlign = "right";
     context.textBaseline = "middle";
-    rows.forEach(({ tile, top }, i) => { if (box.rowPx >= 9 || i % 4 === 0) context.fillText(tile.serial, LEFT_PX - 5, top + box.rowPx / 2); });
+    rows.forEach(({ tile, top }, i) => { if (box.rowPx >= 9 || i % 4 === 0) context.fillText(printable(tile.serial), LEFT_PX - 5, top + box.rowPx / 2); });
     if (box.rowPx < ROW_PX) this.drawColours(rows, known, tilesPast, { endS, windowS, ...box });
     else this.drawTraces(rows, known, { endS, windowS, ...box }, colours);
   }

@@ -3,7 +3,7 @@
 import { fit } from "../common/axes.js";
 import { FootLayout } from "../common/foot_layout.js";
 import { drawCurve, drawFrame, FONT } from "../common/frame.js";
-import { byId, el, setData, setText } from "../common/text.js";
+import { byId, el, printable, setData, setText } from "../common/text.js";
 
 const HIT_PX = 14;
 const PLAN_PX = 420;
@@ -127,7 +127,7 @@ export class CopPaths {
       context.arc(point.x, point.y, radius, 0, 7);
       context.stroke();
       context.fillStyle = colours.soft;
-      if (radius >= 13) context.fillText(tiles[i].serial, point.x, point.y);
+      if (radius >= 13) context.fillText(printable(tiles[i].serial), point.x, point.y);
     });
     context.setLineDash([]);
   }

@@ -1,7 +1,7 @@
 // Forces of many tiles as colours: a row for each, and what the colours mean.
 
 import { crisp } from "../common/axes.js";
-import { number } from "../common/text.js";
+import { number, printable } from "../common/text.js";
 import { drawHeat } from "./series.js";
 
 const STOPS = ["heat-0", "heat-1", "heat-2", "heat-3"];
@@ -26,7 +26,7 @@ export function drawTiles(plots, context, panel, box, view, x) {
   context.textAlign = "right";
   context.textBaseline = "middle";
   const every = Math.max(1, Math.ceil(13 / rowPx));
-  for (let i = 0; i < rows; i += every) context.fillText(whole.serials[i], box.left - 6, box.top + (i + 0.5) * rowPx);
+  for (let i = 0; i < rows; i += every) context.fillText(printable(whole.serials[i]), box.left - 6, box.top + (i + 0.5) * rowPx);
   // What the colours mean, at the right of the title.
   const bar = { left: box.right - 130, right: box.right - 60, top: box.top - 14, bottom: box.top - 4 };
   const blend = context.createLinearGradient(bar.left, 0, bar.right, 0);

@@ -1,7 +1,7 @@
 // What lies over all plots: stances with their numbers, marks, and the axis of time.
 
 import { crisp, decimalsOf, ticks } from "../common/axes.js";
-import { number } from "../common/text.js";
+import { number, printable } from "../common/text.js";
 
 /** @typedef {import("./plots.js").Plots} Plots */
 
@@ -117,7 +117,8 @@ export function drawMarks(plots, context, view, x, bottom) {
     context.lineTo(at, bottom);
     context.stroke();
     context.setLineDash([]);
-    let text = mark.label.length > 24 ? `${mark.label.slice(0, 23)}…` : mark.label;
+    const label = [...printable(mark.label)];
+    let text = label.length > 24 ? `${label.slice(0, 23).join("")}…` : label.join("");
     let width = context.measureText(text).width + 10;
     const before = at + width > plots.width; // no room on the right: the flag hangs to the left
     if ((before ? at - width : at) < freeFrom) { text = ""; width = 8; }

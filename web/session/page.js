@@ -7,7 +7,7 @@ import { enter } from "../common/login.js";
 import { notice, quietly } from "../common/notices.js";
 import { unlessRefused } from "../common/request.js";
 import { inSunlight } from "../common/sunlight.js";
-import { byId, setText } from "../common/text.js";
+import { byId, printable, setText } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
 import { drawHeader } from "./header.js";
 import { LedgerCard } from "./ledger.js";
@@ -32,7 +32,7 @@ async function look() {
     if (error.status === 0 || error.status >= 500) setTimeout(look, 3 * AGAIN_MS); // it may be back soon
     return;
   }
-  document.title = `${session.name} – FootTile`;
+  document.title = printable(`${session.name} – FootTile`);
   drawHeader(session);
   now = session;
   byId("edit").hidden = false;
@@ -74,7 +74,7 @@ async function change() {
     notice(error.message, { bad: true });
     now = await api.getSession(id);
   }
-  document.title = `${now.name} – FootTile`;
+  document.title = printable(`${now.name} – FootTile`);
   drawHeader(now);
 }
 

@@ -1,7 +1,7 @@
 // The plots as a picture to keep, with what they are of written above them.
 
 import { coloursOf } from "../common/axes.js";
-import { localTime } from "../common/text.js";
+import { localTime, printable } from "../common/text.js";
 
 const HEAD_PX = 34;
 
@@ -19,7 +19,7 @@ export function savePicture(plots, session) {
   context.scale(ratio, ratio);
   context.fillStyle = text;
   context.font = "700 14px system-ui, sans-serif";
-  context.fillText(`${session.name}, ${session.node}, ${localTime(new Date(session.started_t_ns / 1e6))}`, 8, 22, plots.width - 16);
+  context.fillText(printable(`${session.name}, ${session.node}, ${localTime(new Date(session.started_t_ns / 1e6))}`), 8, 22, plots.width - 16);
   canvas.toBlob((blob) => {
     const link = document.createElement("a");
     link.href = URL.createObjectURL(blob);

@@ -1,7 +1,7 @@
 // All plots of a session over one time axis, on one canvas; the cursor is on another above it.
 
 import { coloursOf, crisp, decimalsOf, fit, hatching, ticks, whenColoursChange } from "../common/axes.js";
-import { byId, number, setData } from "../common/text.js";
+import { byId, number, printable, setData } from "../common/text.js";
 import { KINDS, stretchesOf } from "./flags.js";
 import { HEAD_PX, drawMarks, drawPeaks, drawStances, drawTime } from "./overlay.js";
 import { drawTiles } from "./heat.js";
@@ -162,7 +162,7 @@ export class Plots {
   drawTitle(context, panel, box) {
     const { colours } = this;
     const inside = panel.tile !== undefined;
-    const text = `${panel.title}, ${panel.unit}`;
+    const text = printable(`${panel.title}, ${panel.unit}`);
     context.textAlign = "left";
     context.textBaseline = "top";
     const [left, top] = inside ? [box.left + 6, box.top + 2] : [box.left, box.top - 15];
