@@ -38,6 +38,7 @@ _MAX_BYTES_PER_ANSWER = 256
 
 REOPEN_NS = 1_000_000_000
 """From one attempt to open a port that is away to the next."""
+_UNANSWERED_MAX = 3
 UPTIME_NS = 1_000_000_000
 """Between two looks at the servo's uptime while it answers."""
 
@@ -98,6 +99,7 @@ class Dynamixel:
         self._answered_ns = clock.now_ns()
         self._was_silent = True
         self._restarted = False
+        self._unanswered = 0
         self._clock = clock
         self._id = servo_id
         self._baudrate = baudrate
@@ -161,10 +163,8 @@ class Dynamixel:
         """
         try:
             self._ensure_port()
-            if self._was_silent:
-                self.look_at_uptime()
             answer = self._exchange(self._position_request, n_data=self._firmware.asked_bytes)
-            if answer.done_ns - self._uptime_ns >= UPTIME_NS:
+            if self._was_silent or answer.done_ns - self._uptime_ns >= UPTIME_NS:
                 self.look_at_uptime()
         except ServoError:
             self._was_silent = True
@@ -204,12 +204,19 @@ class Dynamixel:
         self._was_silent = False
 
     def _read_register(self, register: Register) -> bytes | None:
-        """Read a register; None if the servo says that it has none there."""
+        """Read a register; None if the servo refuses, or never answers what it is asked there."""
+        if self._unanswered >= _UNANSWERED_MAX:
+            return None
         request = self._protocol.read_request(self._id, register.address, register.size)
         try:
-            return self._exchange(request, n_data=register.size).status.data
+            data = self._exchange(request, n_data=register.size).status.data
         except ServoStatusError:
             return None
+        except ServoTimeoutError:
+            self._unanswered += 1
+            raise
+        self._unanswered = 0
+        return data
 
     def close(self) -> None:
         """Close the port."""
@@ -387,7 +394,8 @@ def open_servo(
             remarks.append(slow)
         try:
             servo.check_model(model)
-            servo.look_at_uptime()
+            with contextlib.suppress(ServoTimeoutError, ServoPacketError):
+                servo.look_at_uptime()
         except ServoSetupError:
             servo.close()
             raise

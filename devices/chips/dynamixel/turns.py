@@ -53,8 +53,12 @@ class TurnCounter:
         elapsed_s = (reading.t_mono_ns - last.t_mono_ns) * 1e-9
         reach = SLACK_COUNTS + SPEED_MAX_COUNTS_PER_S * elapsed_s
         is_ambiguous = 2 * reach >= COUNTS_PER_TURN
-        has_wrapped = is_ambiguous and reading.count_range is CountRange.WRAPPED
-        if not reading.restarted and not has_wrapped and abs(moved) <= reach:
+        # Without a restart: in wheel mode, or by torque that was switched on in position control.
+        may_have_leapt = is_ambiguous and (
+            reading.count_range is CountRange.WRAPPED
+            or (reading.count_range is CountRange.ONE_TURN and not _stays_in_turn(last))
+        )
+        if not reading.restarted and not may_have_leapt and abs(moved) <= reach:
             return turns
         added = round(-moved / COUNTS_PER_TURN)
         if is_ambiguous or abs(moved + added * COUNTS_PER_TURN) > reach:

@@ -77,7 +77,7 @@ class EmulatedServo:
         self._speed = _SPEEDS[baudrate]
         self._unplugged = unplugged if unplugged is not None else Fault()
         self._unpowered = unpowered if unpowered is not None else Fault()
-        self._seen_ns = clock.now_ns()
+        self._seen_ns = self._plugged_ns = clock.now_ns()
         self._is_hung_up = False
         self._folder = tempfile.TemporaryDirectory(prefix="foottile-servo-")
         self._link = Path(self._folder.name, "ttyUSB0")
@@ -89,7 +89,9 @@ class EmulatedServo:
 
         An adapter that is back is plugged in by this: ask for it before each attempt to open it.
         """
-        if self._is_hung_up and not self._unplugged(self._clock.now_ns()):
+        now_ns = self._clock.now_ns()
+        if self._is_hung_up and not self._unplugged(now_ns):
+            self._plugged_ns = now_ns
             self._end_thread()
             self._plug_in()
         return str(self._link)
@@ -146,7 +148,7 @@ class EmulatedServo:
             data = os.read(self._line, 4096)
             received_ns = self._clock.now_ns()
             since_ns, self._seen_ns = self._seen_ns, received_ns
-            if self._unplugged.struck(since_ns, received_ns):
+            if self._unplugged.struck(self._plugged_ns, received_ns):
                 self._hang_up()
                 return
             if self._unpowered.struck(since_ns, received_ns):

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from devices.chips.dynamixel.packets import Instruction, Packet
 from devices.chips.dynamixel.reader import open_servo
 from devices.chips.dynamixel.reading import PositionReading
 from devices.chips.dynamixel.servo import PolledServo, ServoReader
@@ -269,6 +270,27 @@ def test_a_wheel_in_protocol_1_goes_on_beyond_its_turn() -> None:
     with faulty(position, protocol=1, mode=(6, bytes(4))) as source:
         seen = seen_each_100_ms(source, 6.0)
     assert seen[59] == pytest.approx(2 * 5_900, abs=40)
+
+
+class PositionOnly(FaultyServo):
+    """A servo that answers its position, its identity, and nothing else."""
+
+    def _answer(self, packet: Packet, received_ns: int) -> None:
+        if packet.instruction == Instruction.PING or packet.parameters[0] == 132:
+            super()._answer(packet, received_ns)
+
+
+def test_a_servo_without_registers_is_read_all_the_same() -> None:
+    clock = VirtualClock(1_000 * MS)
+    with PositionOnly(lambda _: 9000, clock) as servo:
+        driver = open_servo(servo.port, baudrate=1_000_000, clock=clock, timeout_s=0.25)
+        with contextlib.closing(driver):
+            source = PolledServo(driver, clock, rate_hz=100.0)
+            assert seen_each_100_ms(source, 4.0)[39] == 9000
+            with servo.silent():
+                source.latest(6_000 * MS)
+            source.latest(6_500 * MS)
+            assert not source.is_turn_known, "it may have restarted"
 
 
 def test_another_servo_in_its_place_is_not_read() -> None:

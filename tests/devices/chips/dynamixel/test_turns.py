@@ -124,6 +124,12 @@ def test_a_joint_that_cannot_leave_its_turn_is_known_again_once_it_answers() -> 
     assert second.counts == 3001
 
 
+def test_torque_that_was_switched_on_in_a_silence_may_have_begun_the_count_anew() -> None:
+    counter, joint = TurnCounter(), CountRange.ONE_TURN
+    counter.follow(reading(5000, 0, count_range=joint))
+    assert not counter.follow(reading(904, 1000, count_range=joint)).is_turn_known
+
+
 def test_a_count_beyond_what_a_frame_holds_is_not_known() -> None:
     counter = TurnCounter()
     counter.follow(reading(2**31 - 10, 0))
