@@ -200,6 +200,7 @@ class World:
             model=servo.model,
             protocol=servo.protocol,
             baudrate=servo.baudrate,
+            many_turns=not 0 <= servo.zero_counts < COUNTS_PER_TURN,
             unplugged=self._faults.of("servo_unplugged"),
             unpowered=self._faults.of("servo_restart"),
         ) as emulated:

@@ -46,6 +46,8 @@ _GATHER = 64
 
 # Real time. Generous: a reading lost because the machine is busy would change the file.
 _ANSWER_S = 10.0
+_SILENCE_S = 0.25
+"""The same of a servo that is to be silent: each request that it does not answer costs so much."""
 
 
 @dataclass(frozen=True)
@@ -237,6 +239,7 @@ def _duration_ns(options: SimulateOptions, ground_s: float | None) -> int:
 def _polled_servo(world: World, scene: ServoScene, now_ns: int, stack: ExitStack) -> PolledServo:
     line_clock = VirtualClock(now_ns)
     emulated = stack.enter_context(world.servo(scene, line_clock))
+    may_be_silent = any(fault.kind == "servo_restart" for fault in world.scene.fault)
     servo = open_servo(
         lambda: emulated.port,
         baudrate=scene.baudrate,
@@ -244,7 +247,7 @@ def _polled_servo(world: World, scene: ServoScene, now_ns: int, stack: ExitStack
         servo_id=scene.id,
         model=scene.model,
         protocol=scene.protocol,
-        timeout_s=_ANSWER_S,
+        patience_s=_SILENCE_S if may_be_silent else _ANSWER_S,
     )
     stack.callback(servo.close)
     return PolledServo(servo, line_clock, rate_hz=scene.rate_hz)

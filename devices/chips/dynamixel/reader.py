@@ -334,6 +334,7 @@ def open_servo(
     clock: Clock,
     servo_id: int = 1,
     timeout_s: float = 0.1,
+    patience_s: float | None = None,
     model: str = "MX-64",
     protocol: int = 2,
     waits: bool = False,
@@ -352,7 +353,9 @@ def open_servo(
         baudrate: of its line.
         clock: virtual or real.
         servo_id: its id.
-        timeout_s: how long an answer is waited for.
+        timeout_s: how long an answer is waited for, by the clock.
+        patience_s: how long the port waits for bytes, in real time: more than `timeout_s` on a
+            virtual clock, where a machine that is busy must not look like silence. None: as long.
         model: "MX-28" or "MX-64".
         protocol: 1 or 2.
         waits: a port that is not there yet is a remark, and is opened as soon as it is there.
@@ -367,7 +370,7 @@ def open_servo(
         nonlocal path
         if not isinstance(port, str):
             path = port()
-        line = open_line(path, baudrate, timeout_s)
+        line = open_line(path, baudrate, timeout_s if patience_s is None else patience_s)
         path = stable_path(path)
         return line
 

@@ -60,6 +60,7 @@ class EmulatedServo:
         baudrate: int = 1_000_000,
         return_delay_us: int = 500,
         status_return_level: int = 2,
+        many_turns: bool = False,
         unplugged: Fault | None = None,
         unpowered: Fault | None = None,
     ) -> None:
@@ -73,6 +74,7 @@ class EmulatedServo:
             baudrate=baudrate,
             return_delay_us=return_delay_us,
             status_return_level=status_return_level,
+            many_turns=many_turns,
         )
         self._speed = _SPEEDS[baudrate]
         self._unplugged = unplugged if unplugged is not None else Fault()

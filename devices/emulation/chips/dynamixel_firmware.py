@@ -59,6 +59,7 @@ class EmulatedFirmware(ABC):
         baudrate: of its line.
         return_delay_us: 0 to 508 in steps of 2.
         status_return_level: 0 ping only, 1 ping and reads, 2 all.
+        many_turns: its joint goes beyond one turn (extended position control).
 
     Raises:
         UsageError: no MX servo with this firmware runs at `baudrate`.
@@ -67,8 +68,8 @@ class EmulatedFirmware(ABC):
     version: ClassVar[int]
     _layout: ClassVar[_Layout]
     _baud_codes: ClassVar[Mapping[int, int]]
-    _mode_at_factory: ClassVar[bytes]
-    """Position control, within one turn."""
+    _modes: ClassVar[Mapping[bool, bytes]]
+    """Mode of operation: within one turn, as at the factory, and over many."""
     _answered_from: ClassVar[Mapping[int, int]] = _ANSWERED_FROM
     """Status return level from which an instruction is answered; every other needs level 2."""
 
@@ -81,6 +82,7 @@ class EmulatedFirmware(ABC):
         baudrate: int,
         return_delay_us: int,
         status_return_level: int,
+        many_turns: bool = False,
     ) -> None:
         if baudrate not in self._baud_codes:
             raise UsageError(
@@ -106,7 +108,7 @@ class EmulatedFirmware(ABC):
         if layout.protocol_type is not None:
             self.table[layout.protocol_type] = self.version
         mode = firmware.mode
-        self.table[mode.address : mode.address + mode.size] = self._mode_at_factory
+        self.table[mode.address : mode.address + mode.size] = self._modes[many_turns]
 
     @property
     def return_delay_ns(self) -> int:
@@ -161,7 +163,7 @@ class _Firmware1(EmulatedFirmware):
     """The factory's, Protocol 1.0. Its table ends behind Goal Acceleration."""
 
     version = 1
-    _mode_at_factory = struct.pack("<HH", 0, COUNTS_PER_TURN - 1)  # joint mode
+    _modes: ClassVar = {False: b"\x00\x00\xff\x0f", True: b"\xff\x0f\xff\x0f"}
     _layout = _Layout(
         size=74, firmware=2, servo_id=3, baud=4, return_delay=5, status_return_level=16
     )
@@ -201,7 +203,7 @@ class _Firmware2(EmulatedFirmware):
     """Protocol 2.0, called MX(2.0). Its table ends behind Indirect Data 56 (SDK mx_64.model)."""
 
     version = 2
-    _mode_at_factory = b"\x03"
+    _modes: ClassVar = {False: b"\x03", True: b"\x04"}
     _layout = _Layout(
         size=662,
         firmware=6,

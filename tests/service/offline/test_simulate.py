@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
-from devices.frames import FrameBatch, FrameStatus
+from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
+from devices.scene.emulated import FaultScene
 from devices.scene.file import load_scene
 from service.estimation.foot.geometry import rad_per_count
 from service.offline.simulate import SimulateOptions, Simulation
@@ -47,6 +48,35 @@ def test_any_turn_of_the_servo_reaches_frames_and_angle_unharmed(
     # 0.13 rad/s for 13 ms at most, and half a count of 0.15 mrad
     assert np.abs(error_rad[known]).max() < 2.5e-3
     assert np.ptp(frames.servo_counts[known]) > 300, "it has turned"
+
+
+def test_a_servo_that_goes_away_and_one_that_restarts_are_in_the_frames() -> None:
+    rolling = load_scene("rolling")
+    assert rolling.servo is not None
+    faults = (
+        FaultScene(kind="servo_unplugged", t_s=0.5, duration_s=0.3),
+        FaultScene(kind="servo_restart", t_s=2.5, duration_s=0.3),
+    )
+    # Beyond its turn, so that the restart leaves no angle.
+    servo = rolling.servo.model_copy(update={"zero_counts": 9000})
+    scene = rolling.model_copy(update={"servo": servo, "fault": faults})
+    with ExitStack() as stack:
+        options = SimulateOptions(scene=scene, seconds=3.5, foot=EmulatedFoot(lead_s=0.2))
+        simulation = Simulation(options, stack)
+        frames = FrameBatch.concatenate([batch for batch, _ in simulation.pieces()])
+    t_s = (frames.t_mono_ns - frames.t_mono_ns[0]) * 1e-9
+    stale = (frames.frame_status & FrameStatus.SERVO_STALE) != 0
+    turnless = (frames.frame_status & FrameStatus.SERVO_TURN_UNKNOWN) != 0
+
+    def within(begin_s: float, end_s: float) -> np.ndarray:
+        return (t_s > begin_s) & (t_s < end_s)
+
+    away, back, restarted = within(0.55, 1.4), within(1.7, 2.4), within(3.1, 3.5)
+    assert stale[away].all()
+    assert (frames.servo_counts[away] == NO_SERVO_COUNTS).all()
+    assert not (stale | turnless)[back].any()
+    assert turnless[restarted].all()
+    assert (np.abs(frames.servo_counts[restarted]) < 4096).all(), "it counts anew"
 
 
 @pytest.mark.parametrize("name", ["poppy", "mud"])
