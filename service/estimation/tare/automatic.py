@@ -24,6 +24,7 @@ from service.estimation.tare.unloaded import (
     NEAR_BASELINE_KPA,
     TareFrames,
     lowest,
+    window_begins,
 )
 
 LOOK_BACK_NS = 10_000_000_000  # a foot that walks is in the air within that time
@@ -68,7 +69,9 @@ def newest_unloaded_tare(
     steps_kpa = np.maximum(seen.step_noise_kpa, floor_kpa)
     usual_kpa = np.where(np.isnan(usual_kpa), steps_kpa, usual_kpa)
     window_ns = _window_ns(since_ns)
-    begins_ns = np.arange(int(since_ns[-1]) - window_ns, -1, -window_ns // 4)
+    last_ns = int(since_ns[-1]) - window_ns
+    begins_ns = window_begins(since_ns, last_ns, -(-window_ns // 4), window_ns)
+    begins_ns = begins_ns[begins_ns <= last_ns][::-1]
     firsts = np.searchsorted(since_ns, begins_ns)
     ends = np.searchsorted(since_ns, begins_ns + window_ns, side="right")
     windows = seen.quiet_windows(zip(firsts.tolist(), ends.tolist(), strict=True), usual_kpa)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Bools, Floats
+from devices.arrays import Bools, Floats, Times
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch, FrameStatus
@@ -208,6 +208,24 @@ class TareFrames:
             )
 
 
+def window_begins(since_ns: Times, begin_ns: int, step_ns: int, length_ns: int) -> Times:
+    """Return the begins of the windows that hold a frame, (windows,), rising, from 0 on.
+
+    Windows begin every step before and after one instant. A long gap, or a clock that was set, has
+    no windows: how many there are does not follow from how long the time is.
+
+    Args:
+        since_ns: (n,), of frames, rising.
+        begin_ns: of one window.
+        step_ns: from window to window; above 0.
+        length_ns: of a window.
+    """
+    last = np.unique((since_ns - begin_ns) // step_ns)
+    numbers = np.unique(last[:, None] - np.arange(-(-length_ns // step_ns)))
+    begins_ns = begin_ns + step_ns * numbers
+    return np.asarray(begins_ns[(begins_ns >= 0) & (begins_ns <= since_ns[-1])], dtype=np.int64)
+
+
 def lowest(windows: list[Window]) -> list[Window]:
     """Windows where no tile is higher than in the lowest window, except by chance."""
     lowest_kpa = np.min([window.mean_kpa for window in windows], axis=0, initial=np.inf)
@@ -283,7 +301,7 @@ def _recognised(seen: TareFrames, calibration: Calibration) -> slice:
         )
     # A bare tile is not calibrated: it may read anything, with the noise that it shows.
     noise_kpa = np.where(seen.calibrated, seen.bench_noise_kpa, seen.step_noise_kpa)
-    begins_ns = np.arange(0, int(seen.since_ns[-1]) + 1, WINDOW_NS // 2)
+    begins_ns = window_begins(seen.since_ns, 0, WINDOW_NS // 2, WINDOW_NS)
     firsts, ends = np.searchsorted(seen.since_ns, [begins_ns, begins_ns + WINDOW_NS])
     windows = seen.quiet_windows(zip(firsts.tolist(), ends.tolist(), strict=True), noise_kpa)
     near = [

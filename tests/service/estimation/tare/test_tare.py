@@ -18,7 +18,7 @@ from devices.errors import TareError
 from devices.frames import FrameBatch, FrameStatus, TileStatus
 from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.estimation.tare.tare import Tare
-from service.estimation.tare.unloaded import take_tare
+from service.estimation.tare.unloaded import take_tare, window_begins
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, UNLOADED_KPA, array_at, make_array
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.frames import loaded_frames
@@ -382,3 +382,28 @@ def test_a_tile_that_never_answers_is_no_tare_and_nothing_else_to_complain_of() 
     status[:, 1] = TileStatus.NO_ANSWER
     with pytest.raises(TareError):
         tare_of(loaded_frames(noise_counts(60, 2), status=status))
+
+
+# --- windows --------------------------------------------------------------------------------------
+
+
+@given(
+    steps_ns=st.lists(st.integers(1, 400), min_size=1, max_size=30),
+    begin_ns=st.integers(-500, 3000),
+    step_ns=st.integers(1, 100),
+    length_ns=st.integers(1, 400),
+)
+def test_windows_are_those_of_the_lattice_that_hold_a_frame(
+    steps_ns: list[int], begin_ns: int, step_ns: int, length_ns: int
+) -> None:
+    since_ns = np.cumsum([0, *steps_ns])
+    lattice = np.arange(begin_ns % step_ns, since_ns[-1] + 1, step_ns)
+    held = [at for at in lattice.tolist() if ((since_ns >= at) & (since_ns < at + length_ns)).any()]
+    found = window_begins(since_ns, begin_ns, step_ns, length_ns).tolist()
+    assert set(held) <= set(found) <= set(lattice.tolist())
+
+
+@pytest.mark.parametrize("gap_ns", [10**12, 10**18])
+def test_a_clock_that_was_set_makes_no_windows(gap_ns: int) -> None:
+    since_ns = np.array([0, 10, 20, gap_ns, gap_ns + 10])
+    assert len(window_begins(since_ns, 0, 5, 10)) < 20

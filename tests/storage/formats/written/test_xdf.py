@@ -149,3 +149,20 @@ def test_the_example_of_the_document_reads_it(
     exec(lines_of_documents("XDF"), found)  # noqa: S102  # our own
     np.testing.assert_array_equal(found["grf_n"], extra()["grf_n"].astype(np.float32))
     np.testing.assert_allclose(found["time_s"], frames().t_ns * 1e-9)
+
+
+def test_a_pause_of_years_has_one_clock_offset_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("storage.formats.written.xdf._OFFSET_EVERY_NS", 20_000_000)
+    batch = frames()
+    late = batch.select(np.arange(len(batch)))
+    late.t_ns[30:] += 10**17
+    late.t_mono_ns[30:] += 10**17
+    ahead = Rows(np.array([0, 2 * 10**17]), np.array([90 * 10**9] * 2), np.array([100] * 2))
+    clock = ClockTable({BOOTS[0]: ahead}, [StreamFacts(BOOTS[0], 10**18, True)], BOOTS)
+    found = {}
+    for each in (batch, late):
+        content = content_of(cut(each, extra(), ROWS))
+        chunks = export(content, make_array(node="left"), NOTES, "xdf", Slice(), clock)
+        streams, _ = read(b"".join(chunks))
+        found[each is late] = len(streams["left frames"]["clock_times"])
+    assert found[False] <= found[True] <= found[False] + 1
