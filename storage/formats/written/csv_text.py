@@ -38,12 +38,15 @@ class _Writer(pacsv.CSVWriter):
 
 
 class _CommaWriter:
-    """Numbers with a decimal comma, and semicolons between columns; Arrow's writer knows none."""
+    """Writer for Excel where numbers have a decimal comma, with semicolons between columns.
+
+    Without a byte order mark Excel takes the text for Windows-1252.
+    """
 
     def __init__(self, sink: BinaryIO, schema: pa.Schema) -> None:
         self._sink = sink
         names = (name.replace('"', '""') for name in schema.names)
-        self._sink.write((";".join(f'"{name}"' for name in names) + "\n").encode())
+        self._sink.write((";".join(f'"{name}"' for name in names) + "\n").encode("utf-8-sig"))
 
     def write_table(self, table: pa.Table) -> None:
         """Append rows."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
 from storage.formats.export import content_of
 from storage.formats.load_trace import read_load_trace
+from storage.formats.options import FormatOptions
 from storage.formats.slice import Slice
+from storage.formats.tables.registry import read_table
 from storage.schema import Array
 from storage.sessions.file import SessionWriter
 from tests.builders.arrays import PERIOD_NS, make_array, make_tile
@@ -129,6 +132,23 @@ def test_forces_of_some_tiles_only_are_refused(tmp_path: Path) -> None:
     path = exported(tmp_path, "csv", ESTIMATES, "t_ns", "force_n_2")
     with pytest.raises(LoadTraceError, match=re.escape("forces of tiles 2 only")):
         read_load_trace(path)
+
+
+def test_an_export_for_excel_is_read_again_with_its_umlauts(tmp_path: Path) -> None:
+    path = tmp_path / "out.csv"
+    info = make_array([make_tile(0, serial="Größe"), make_tile(1)])
+    content = content_of([(make_frames(ROWS, 2), {"force_n": ESTIMATE_N[:, [0, 2]]})])
+    options = FormatOptions(names="serial", times=True, decimal="comma", about=True)
+    path.write_bytes(b"".join(export(content, info, {}, "csv", Slice(), options=options)))
+    assert path.read_bytes().startswith(codecs.BOM_UTF8)
+    table = read_table(path, lambda name: name.startswith("force_n"))
+    found = table.columns["force_n_Größe"].astype(np.float32)
+    np.testing.assert_array_equal(found, ESTIMATE_N[:, 0])
+    options = FormatOptions(times=True, decimal="comma", about=True)
+    content = content_of([(make_frames(ROWS, 2), {"force_n": ESTIMATE_N[:, [0, 2]]})])
+    path.write_bytes(b"".join(export(content, info, {}, "csv", Slice(), options=options)))
+    found = cells(read_load_trace(path)).astype(np.float32)
+    np.testing.assert_array_equal(found, ESTIMATE_N[:, [0, 2]])
 
 
 def test_a_damaged_session_is_not_pressed(tmp_path: Path) -> None:

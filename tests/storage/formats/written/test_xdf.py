@@ -162,7 +162,9 @@ def test_a_pause_of_years_has_one_clock_offset_behind_it(monkeypatch: pytest.Mon
     found = {}
     for each in (batch, late):
         content = content_of(cut(each, extra(), ROWS))
-        chunks = export(content, make_array(node="left"), NOTES, "xdf", Slice(), clock)
+        chunks = export(
+            content, make_array(node="left"), NOTES, "xdf", Slice(), clock, options=NO_OPTIONS
+        )
         streams, _ = read(b"".join(chunks))
         found[each is late] = len(streams["left frames"]["clock_times"])
     assert found[False] <= found[True] <= found[False] + 1
