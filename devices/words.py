@@ -3,6 +3,15 @@
 from __future__ import annotations
 
 
+def is_utf8(text: str) -> bool:
+    """Is it text that JSON, Arrow and a network can carry? The names of some files are not."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def printable(text: str, *, keeps_lines: bool = False) -> str:
     r"""Return text that a terminal shows and does not obey, and that UTF-8 can carry.
 

@@ -8,6 +8,7 @@ import stat
 from pathlib import Path
 
 from devices.errors import StorageError
+from devices.words import is_utf8
 from storage.durable import LOCK_NAME, intended_name, make_folder, storage_errors
 
 _OURS = {
@@ -33,8 +34,15 @@ def keep_private(folder: Path) -> None:
         folder: where it will write; made if absent.
 
     Raises:
-        StorageError: it cannot be made, or not be closed to others.
+        StorageError: it cannot be made, or not be closed to others, or its path is not UTF-8.
     """
+    if not is_utf8(str(folder.absolute())):
+        raise StorageError(
+            "the path is not UTF-8",
+            where=str(folder.absolute()),
+            expected="a path that JSON can state: it is in messages and in files",
+            remedy="Rename the folder, or choose another one",
+        )
     os.umask(0o077)
     with storage_errors(folder):
         make_folder(folder)

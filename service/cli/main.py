@@ -6,12 +6,13 @@ import io
 import os
 import signal
 import sys
+from contextlib import suppress
 from typing import Annotated
 
 import typer
 
-from devices.errors import FootTileError
-from devices.words import printable
+from devices.errors import FootTileError, UsageError
+from devices.words import is_utf8, printable
 from foottile.errors import FootTileError as ClientError
 from service.cli.table import Commands, name_all
 from service.freed import give_back_freed
@@ -66,6 +67,7 @@ def main() -> None:
     # So that what is half-written is cleaned up when the machine is shut down, too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     try:
+        _check_texts()
         app()
     except FootTileError as error:
         sys.stderr.write(f"foottile: {error}\n")
@@ -84,6 +86,32 @@ def main() -> None:
         sys.stderr.write(f"foottile: {printable(str(error))}\n")
         _leave_unwritten()
         sys.exit(1)
+
+
+_PATH_VARIABLES = ("HOME", "TMPDIR", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME")
+
+
+def _check_texts() -> None:
+    """Refuse paths that are not UTF-8 before anything is done: results could not state them.
+
+    Raises:
+        UsageError: an argument, the working folder or a variable with a path is not UTF-8.
+    """
+    texts = {f"argument {number}": text for number, text in enumerate(sys.argv[1:], 1)}
+    texts |= {
+        f"the variable {name}": text
+        for name, text in os.environ.items()
+        if name in _PATH_VARIABLES or name.startswith("FOOTTILE_")
+    }
+    with suppress(OSError):  # it is gone
+        texts["the working folder"] = os.getcwd()
+    for what, text in texts.items():
+        if not is_utf8(text):
+            raise UsageError(
+                f"{what} is not UTF-8: {text!r}",
+                expected="paths that JSON can state: they are in results and messages",
+                remedy="Rename that file or folder",
+            )
 
 
 def _leave_unwritten() -> None:

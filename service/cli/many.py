@@ -15,6 +15,7 @@ from typing import IO, TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
+from devices.words import printable
 from service.cli.options import remark, say, stderr
 
 if TYPE_CHECKING:
@@ -212,8 +213,9 @@ def _progress(command: str, count: Callable[[], Iterator[Any]]) -> Iterator[Call
 
 def _failure(outcome: Outcome) -> str:
     """Place and reason; a reason may begin with a file in that place."""
-    within = outcome.reason.startswith((f"{outcome.place}/", f"{outcome.place}: "))
-    return outcome.reason if within else f"{outcome.place}: {outcome.reason}"
+    place = printable(outcome.place)
+    within = outcome.reason.startswith((f"{place}/", f"{place}: "))
+    return outcome.reason if within else f"{place}: {outcome.reason}"
 
 
 def _tell(summary: Summary, command: str, out: str | None, *, as_json: bool) -> None:

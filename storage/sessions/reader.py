@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from devices.errors import DamagedFileError, FileFormatError, UsageError
+from devices.errors import FileFormatError, UsageError
 from devices.frames import FrameBatch
 from storage.file_hash import FILE_HASH_KEY, FORMAT
 from storage.schema import FRAMES, KNOWN, Array, flat_of, flat_values, from_flat
@@ -237,14 +237,17 @@ class SessionReader:
         return [None] * len(self.footer.group_rows)  # nothing proves what an older version wrote
 
     def _time_axis(self) -> TimeAxis:
-        ids = stream_ids(self)
+        try:
+            ids = stream_ids(self)
+        except FileFormatError:  # another program's notes
+            return NODE_AXIS
         if len(set(ids)) < 2 or not self.has("part"):
             return NODE_AXIS
         if stated := self.notes.get(TIME_AXIS_NOTE):
             return TimeAxis.from_dicts(stated, where=str(self.path))
         try:
             clock = clock_beside(self)
-        except (UsageError, DamagedFileError):  # the frames are worth more than the clock
+        except (UsageError, FileFormatError):  # the frames are worth more than the clock
             clock = None
         period_ns = round(1e9 / self.info.nominal_rate_hz)
         return time_axis(self._part_spans(), clock, period_ns=period_ns)

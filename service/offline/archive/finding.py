@@ -13,7 +13,14 @@ from functools import partial
 from pathlib import Path
 
 from devices.errors import FootTileError
-from service.offline.archive.places import Place, is_remote, read_bytes, sessions_in, sizes_in
+from service.offline.archive.places import (
+    Place,
+    check_text,
+    is_remote,
+    read_bytes,
+    sessions_in,
+    sizes_in,
+)
 from service.offline.archive.sealed import Archive, Archived
 from service.offline.archive.staging import side_by_side
 from storage.durable import write_whole
@@ -66,6 +73,10 @@ def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]
     """The session, or why it is left out."""
     if place.is_file:
         return "it is a file by itself, and no session's folder", None
+    try:
+        check_text(place)
+    except FootTileError as error:
+        return error.what, None
     folder, sizes = Path(place.where), None
     if is_remote(place.where):
         if mirror is None:

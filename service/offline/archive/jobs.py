@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from devices.errors import FootTileError, StateError, UsageError
 from service.offline.archive.pieces import Pieces
-from service.offline.archive.places import Place, is_remote
+from service.offline.archive.places import Place, check_text, is_remote
 from service.offline.archive.results import Note, Results, files_in
 from service.offline.archive.staging import identity, staged
 from service.offline.archive.tasks import LongTask, Task
@@ -99,6 +99,7 @@ def failed(job: Job, reason: str) -> Outcome:
 
 def _done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]] | GoesOn:
     task, place = job.task, job.place
+    check_text(place)
     if job.out is None:
         with staged(place) as source, workspace(SYSTEM) as work:
             return "made", task.run(source, work)

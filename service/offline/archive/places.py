@@ -21,8 +21,9 @@ from urllib.parse import urlsplit
 import pyarrow.fs as fs
 
 from devices.errors import FileFormatError, StorageError, UsageError, needs_extra
-from devices.words import printable
+from devices.words import is_utf8, printable
 from foottile.environment import read_variable
+from storage.durable import ASIDE
 from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID
 
@@ -258,8 +259,29 @@ def _inside(root: str) -> Iterator[Place]:
         inside = f"{root}/sessions"
         inside = inside if _kind(inside) == fs.FileType.Directory else root
         for name in _names(inside):
-            if SESSION_ID.fullmatch(name):
+            if SESSION_ID.fullmatch(name) or _is_renamed(f"{inside}/{name}", name):
                 yield Place(f"{inside}/{name}", name)
+
+
+def _is_renamed(where: str, name: str) -> bool:
+    """Is it a session whose folder has another name than its id? In a store nobody looks."""
+    is_ours = name.startswith(".") or ASIDE in name
+    return not is_ours and not is_remote(where) and os.path.isfile(f"{where}/{SESSION_NAME}")
+
+
+def check_text(place: Place) -> None:
+    """Refuse a path that results could not state.
+
+    Raises:
+        UsageError: it is not UTF-8.
+    """
+    if not is_utf8(place.where):
+        raise UsageError(
+            "the path is not UTF-8",
+            where=place.where,
+            expected="a path that JSON can state",
+            remedy="Rename the folder",
+        )
 
 
 def _names(folder: str) -> Iterator[str]:
