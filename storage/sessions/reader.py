@@ -237,14 +237,14 @@ class SessionReader:
         return [None] * len(self.footer.group_rows)  # nothing proves what an older version wrote
 
     def _time_axis(self) -> TimeAxis:
+        if stated := self.notes.get(TIME_AXIS_NOTE):
+            return TimeAxis.from_dicts(stated, where=str(self.path))
         try:
             ids = stream_ids(self)
         except FileFormatError:  # another program's notes
             return NODE_AXIS
         if len(set(ids)) < 2 or not self.has("part"):
             return NODE_AXIS
-        if stated := self.notes.get(TIME_AXIS_NOTE):
-            return TimeAxis.from_dicts(stated, where=str(self.path))
         try:
             clock = clock_beside(self)
         except (UsageError, FileFormatError):  # the frames are worth more than the clock
