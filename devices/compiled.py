@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import pickle
 import threading
 from collections.abc import Callable, Iterator
@@ -59,10 +60,18 @@ def inlined(function: F) -> F:
 
 def _compiled(function: F, *, forceinline: bool) -> F:
     dispatcher: Any = numba.njit(forceinline=forceinline, **_OPTIONS)(function)
+    if not has_cache_folder():
+        return cast("F", dispatcher)
     with contextlib.suppress(RuntimeError):  # nowhere to keep it: no home, read-only installation
         # As numba.njit(cache=True) does, which stops at a cache that it cannot read or write.
         dispatcher._cache = _Kept(function)  # noqa: SLF001  # numba's own seam
     return cast("F", dispatcher)
+
+
+def has_cache_folder() -> bool:
+    """Is there a place for machine code? Without a home numba would make a folder named "~"."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~")
+    return bool(numba.config.CACHE_DIR) or os.path.isabs(home)
 
 
 class _Kept(FunctionCache):

@@ -11,13 +11,13 @@ import tomllib
 from pathlib import Path
 from typing import Annotated
 
-from platformdirs import user_data_path
 from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from devices.errors import UsageError
 from devices.inputs import read_text
 from foottile.environment import read_variable
 from service.api.doors import Bounds
+from service.user_folders import user_folder
 
 
 class Settings(Bounds):
@@ -29,7 +29,7 @@ class Settings(Bounds):
     """Address to listen on; 0.0.0.0: on every one."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """TCP port; 0: any that is free."""
-    data: Path = Field(default_factory=lambda: user_data_path("foottile"))
+    data: Path = Field(default_factory=lambda: user_folder("data", None, "--data"))
     """Folder for sessions, journals and what is known of nodes."""
     token: Annotated[str, Field(pattern=r"^[!-~]{8,200}$")] | None = None
     """Asked for on every change of state; made and kept in the data folder if none is given."""
@@ -73,7 +73,7 @@ def load_settings(config: Path | None, **given: object) -> Settings:
     from_environment = {name: value for name, value in read.items() if value is not None}
     chosen = {name: value for name, value in given.items() if value is not None}
     try:
-        return Settings.model_validate({**from_file, **from_environment, **chosen})
+        settings = Settings.model_validate({**from_file, **from_environment, **chosen})
     except ValidationError as error:
         complaint = error.errors()[0]
         name = ".".join(str(part) for part in complaint["loc"])
@@ -84,6 +84,7 @@ def load_settings(config: Path | None, **given: object) -> Settings:
         elif top in from_environment:
             where = variables[top]
         raise UsageError(f"setting {name!r}: {complaint['msg']}", where=where) from error
+    return settings.model_copy(update={"data": user_folder("data", settings.data, "--data")})
 
 
 def _read_file(config: Path) -> dict[str, object]:

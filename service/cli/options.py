@@ -99,10 +99,10 @@ def pair(text: str | None, option: str) -> tuple[float, float] | None:
 
 
 def data_folder(given: Path | None) -> Path:
-    """The data folder that an option names, or the user's."""
-    from platformdirs import user_data_path
+    """Return the data folder that `--data` names, or the user's."""
+    from service.user_folders import user_folder
 
-    return given if given is not None else user_data_path("foottile")
+    return user_folder("data", given, "--data")
 
 
 def output_path(path: Path, *inputs: Path) -> Path:

@@ -12,17 +12,23 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
-from platformdirs import user_cache_path
-
-from devices.errors import CalibrationError, DamagedFileError, StorageError, needs_extra
+from devices.errors import (
+    CalibrationError,
+    DamagedFileError,
+    StorageError,
+    UsageError,
+    needs_extra,
+)
 from devices.scene.emulated import Family
 from devices.scene.file import Scene, build_scene, load_scene
 from service.estimation.calibration import PRESETS, UNPROVEN, Calibration
 from service.estimation.effects import Parameter
 from service.rig.emulated import EmulatedFoot
 from service.sessions.calibration_file import calibration_of, not_one, write_calibration
+from service.user_folders import user_folder
 from service.version import SOFTWARE
 from storage.durable import make_folder, read_whole, set_aside
 
@@ -61,7 +67,7 @@ def find_calibration(
         CalibrationError: no such calibration, or it lacks a tile.
     """
     if name == BENCH:
-        folder = cache if cache is not None else user_cache_path("foottile") / "bench"
+        folder = cache if cache is not None else _cache_folder()
         scenes = [bench_scene(serial, family, repeatability) for serial in serials]
         entries = [_bench_tile(scene, parts_seed, folder, progress) for scene in scenes]
         return Calibration(
@@ -74,6 +80,13 @@ def find_calibration(
     for serial in serials:
         calibration.of(serial)
     return calibration
+
+
+def _cache_folder() -> Path | None:
+    """Return the folder of the bench's results in the user's cache; None: there can be none."""
+    with suppress(UsageError):
+        return user_folder("cache", None, "") / "bench"
+    return None
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -96,14 +109,16 @@ def read_calibration(path: Path) -> Calibration:
     return calibration_of(content, where=str(path))
 
 
-def _bench_tile(scene: Scene, parts_seed: int, folder: Path, progress: Progress) -> Calibration:
+def _bench_tile(
+    scene: Scene, parts_seed: int, folder: Path | None, progress: Progress
+) -> Calibration:
     serial = scene.tile[0].serial
     # Another version or another bench is another result.
     made_by = hashlib.sha256(f"{SOFTWARE}/{parts_seed}/{scene.model_dump_json()}".encode())
     name = f"{serial}-{made_by.hexdigest()[:16]}.json"
-    kept = folder / name
-    if (calibration := _kept_in(kept, serial, progress)) is not None:
-        return calibration
+    kept = folder / name if folder is not None else None
+    if kept is not None and (found := _kept_in(kept, serial, progress)) is not None:
+        return found
     if (SHIPPED / name).is_file():
         return read_calibration(SHIPPED / name)
     # Here, because only the emulated bench needs the physics.
@@ -122,8 +137,14 @@ def _bench_tile(scene: Scene, parts_seed: int, folder: Path, progress: Progress)
             reference=BENCH_REFERENCE,
             delay=BENCH_DELAY,
         )
+    if kept is None:
+        progress(
+            f"the calibration of {serial} is not kept: no home folder can be written. Name a "
+            "folder in XDG_CACHE_HOME"
+        )
+        return calibration
     try:
-        make_folder(folder)
+        make_folder(kept.parent)
         write_calibration(kept, calibration)
     except OSError as error:  # it is what it is without a cache
         progress(f"the calibration of {serial} is not kept: {error}")

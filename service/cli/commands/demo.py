@@ -20,6 +20,7 @@ from service.cli.options import (
     SECONDS_MAX,
     FootOptions,
     check_emulated,
+    data_folder,
     remark,
     scene_with,
     stop_on_signals,
@@ -67,7 +68,6 @@ def demo_command(
     being recorded, seals it, and ends both.
     """
     import uvloop
-    from platformdirs import user_data_path
 
     from service.api.doors import raise_open_files
     from service.rig.options import RigOptions
@@ -78,7 +78,9 @@ def demo_command(
     # The node finds it in the cache.
     calibration_of(RigOptions(the_scene, NODE, options.foot(the_scene)))
     arguments = [f"--scene={scene}", *options.as_arguments()]
-    folder = data if data is not None else user_data_path("foottile") / "demo"
+    folder = data_folder(data)
+    if data is None:
+        folder /= "demo"
     arguments.append(f"--journal={folder / 'node'}")
     uvloop.run(_demo(host, port, advertise, folder, seconds, arguments))
 

@@ -74,13 +74,12 @@ def node_command(
 
     Exit code 3: frames of a session are lost, or wait on this disk for their server.
     """
-    from platformdirs import user_state_path
-
     from foottile.environment import read_token
     from foottile.tls import make_context
     from service.node.dial import ingest_url
     from service.node.options import NodeOptions
     from service.rig.options import RigOptions
+    from service.user_folders import user_folder
     from storage.private import keep_private
 
     if end_with_parent:
@@ -95,8 +94,9 @@ def node_command(
         if server is None or not server.startswith(("https:", "wss:")):
             raise UsageError("--ca is for a --server with https://")
         make_context(ca)  # and what is no certificate
-    if journal is not None and os.path.lexists(journal) and not journal.is_dir():
-        raise UsageError(f"--journal {str(journal)!r} is no folder", remedy="Choose another one")
+    folder = user_folder("state", journal, "--journal")
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise UsageError(f"--journal {str(folder)!r} is no folder", remedy="Choose another one")
     if record is not None and not record.strip():
         raise UsageError("--record without a name", expected="the name of the session")
     if record is not None:
@@ -107,7 +107,6 @@ def node_command(
     the_scene = scene_with(scene, bus=bus, servo=servo)
     rig = RigOptions(the_scene, _name(name), options.foot(the_scene))
     calibration, problem = calibration_of(rig)
-    folder = journal if journal is not None else user_state_path("foottile")
     with suppress(StorageError):  # a card that takes nothing is said later, and stops nothing
         keep_private(folder)
     outcome = asyncio.run(

@@ -105,7 +105,11 @@ def sessions_command(
     )
     if server is not None and data is not None:
         raise UsageError("--server and --data are two places to look in", remedy="Name one")
-    found = _of_server(server or SERVER, ca, choice) if data is None else _in_folder(data, choice)
+    found = (
+        _of_server(server or SERVER, ca, choice)
+        if data is None
+        else _in_folder(data_folder(data), choice)
+    )
     if as_json:
         print_json({"items": found})
         return
