@@ -174,6 +174,14 @@ KNOWN = {
 }
 
 
+def numpy_dtype(kind: pa.DataType) -> np.dtype[Any]:
+    """Return the numpy type of an Arrow type of numbers.
+
+    `DataType.to_pandas_dtype` returns it, too, but imports pandas in pyarrow up to 25.
+    """
+    return pa.array([], kind).to_numpy().dtype
+
+
 # --- wire -----------------------------------------------------------------------------------------
 
 

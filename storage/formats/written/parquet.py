@@ -1,9 +1,15 @@
-"""Parquet, as a sealed session is, of what was asked for."""
+"""Parquet of a session or a slice, which readers of the last five years open.
+
+Pages are plain or have a dictionary. A sealed file is smaller, and takes newer readers for it:
+docs/formats.md has them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from storage.formats.export import Export
@@ -15,8 +21,12 @@ from storage.sessions.file import parquet_options
 def _write(export: Export) -> Iterator[bytes]:
     return in_pieces(
         export.tables(),
-        lambda sink, schema: pq.ParquetWriter(sink, schema, **parquet_options(schema)),
+        lambda sink, schema: pq.ParquetWriter(sink, schema, **_options(schema)),
     )
+
+
+def _options(schema: pa.Schema) -> dict[str, Any]:
+    return {**parquet_options(schema), "column_encoding": None}
 
 
 PARQUET = Format(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -82,45 +83,79 @@ def test_units_survive_the_file(tmp_path: Path) -> None:
     assert said["padc_1"][b"unit"] == b"counts"
 
 
-STEADY = {"seq", "t_mono_ns", "t_ns", "servo_counts"}
+DELTA = {"seq", "t_mono_ns", "t_ns", "padc_0", "padc_1", "servo_counts", "servo_age_us", "part"}
 
 
-def test_what_goes_on_steadily_is_delta_encoded_and_the_rest_split_into_its_bytes(
+def test_integers_are_delta_encoded_or_have_a_dictionary_and_only_floats_are_split_into_their_bytes(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "s.parquet"
     write(
         path,
         frames(500),
+        part=np.zeros(500, dtype=np.uint16),
         grf_n=np.random.default_rng(0).normal(size=500),
         contact=np.ones(500, dtype=np.uint8),
+        estimate_status=np.ones(500, dtype=np.uint16),
         true_grf_n=np.random.default_rng(1).normal(size=500),
         phase=np.array(["rest"] * 500),
     )
     group = pq.ParquetFile(path).metadata.row_group(0)
     chunks = [group.column(i) for i in range(group.num_columns)]
     assert {chunk.compression for chunk in chunks} == {"ZSTD"}
-    for chunk in chunks:
-        numbers = "DELTA_BINARY_PACKED" if chunk.path_in_schema in STEADY else "BYTE_STREAM_SPLIT"
-        expected = "RLE_DICTIONARY" if chunk.physical_type == "BYTE_ARRAY" else numbers
-        assert expected in chunk.encodings, chunk.path_in_schema
-
-
-def test_a_file_whose_integers_are_all_delta_encoded_as_before_is_read_as_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def as_before(schema: pa.Schema) -> dict[str, Any]:
-        floats = [pa.types.is_floating(field.type) for field in schema]
-        names = ["BYTE_STREAM_SPLIT" if is_float else "DELTA_BINARY_PACKED" for is_float in floats]
-        return {
-            "compression": "zstd",
-            "use_dictionary": False,
-            "write_page_checksum": True,
-            "column_encoding": dict(zip(schema.names, names, strict=True)),
+    # Of numbers of 32 and 64 bits; of levels and dictionaries, too, which everybody reads.
+    common = {"RLE", "PLAIN"}
+    found = {chunk.path_in_schema: set(chunk.encodings) - common for chunk in chunks}
+    expected = {
+        chunk.path_in_schema: {
+            "BYTE_STREAM_SPLIT"
+            if chunk.physical_type in ("FLOAT", "DOUBLE")
+            else "DELTA_BINARY_PACKED"
+            if chunk.path_in_schema in DELTA
+            else "RLE_DICTIONARY"
         }
+        for chunk in chunks
+    }
+    assert found == expected
+    assert len({encoding for each in expected.values() for encoding in each}) == 3
 
+
+def as_noisy_integers_were_split(schema: pa.Schema) -> dict[str, Any]:
+    steady = {"servo_counts", "part"}
+    return {
+        "compression": "zstd",
+        "use_dictionary": False,
+        "write_page_checksum": True,
+        "column_encoding": {
+            field.name: "DELTA_BINARY_PACKED"
+            if field.type in (pa.int64(), pa.uint64()) or field.name in steady
+            else "BYTE_STREAM_SPLIT"
+            for field in schema
+        },
+    }
+
+
+def as_all_integers_were_delta_encoded(schema: pa.Schema) -> dict[str, Any]:
+    floats = [pa.types.is_floating(field.type) for field in schema]
+    names = ["BYTE_STREAM_SPLIT" if is_float else "DELTA_BINARY_PACKED" for is_float in floats]
+    return {
+        "compression": "zstd",
+        "use_dictionary": False,
+        "write_page_checksum": True,
+        "column_encoding": dict(zip(schema.names, names, strict=True)),
+    }
+
+
+@pytest.mark.parametrize(
+    "older_options", [as_all_integers_were_delta_encoded, as_noisy_integers_were_split]
+)
+def test_a_file_with_the_encodings_of_an_older_version_is_read_as_ever(
+    older_options: Callable[[pa.Schema], dict[str, Any]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now = write(tmp_path / "now.parquet", frames(500))
-    monkeypatch.setattr("storage.sessions.file.parquet_options", as_before)
+    monkeypatch.setattr("storage.sessions.file.parquet_options", older_options)
     before = write(tmp_path / "before.parquet", frames(500))
     with SessionReader(now) as one, SessionReader(before) as other:
         assert_same_bits(one.frames(), other.frames())

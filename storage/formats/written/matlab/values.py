@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from storage.formats.export import Export
-from storage.schema import KNOWN, Array, Column
+from storage.schema import KNOWN, Array, Column, numpy_dtype
 
 
 def quantities_of(export: Export) -> list[Column]:
@@ -36,7 +36,7 @@ def class_of(column: Column) -> npt.DTypeLike:
     kind = column.type
     if pa.types.is_string(kind):
         return np.uint16
-    plain: npt.DTypeLike = kind.to_pandas_dtype()
+    plain = numpy_dtype(kind)
     if pa.types.is_floating(kind) or column.missing is None or kind.bit_width == 64:
         return plain
     return np.float32 if kind.bit_width <= 16 else np.float64

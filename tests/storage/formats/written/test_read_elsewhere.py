@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 
 import duckdb
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from storage.formats.options import NO_OPTIONS, FormatOptions
@@ -32,6 +34,23 @@ def check(found: pd.DataFrame) -> None:
     np.testing.assert_allclose(found["time_s"].astype(float), since_s, atol=1e-12)
     np.testing.assert_allclose(found["grf_n"].astype(float), columns["grf_n"], rtol=1e-6)
     assert found["phase"].tolist() == columns["phase"].tolist()
+
+
+def test_parquet_has_what_readers_of_2021_know(tmp_path: Path) -> None:
+    """Format 2.6 of 2018: no encoding, codec or logical type is newer."""
+    path = tmp_path / "all.parquet"
+    options = FormatOptions(times=True, names="serial")
+    path.write_bytes(exported("parquet", options=options))
+    file = pq.ParquetFile(path)
+    group = file.metadata.row_group(0)
+    chunks = [group.column(i) for i in range(group.num_columns)]
+    assert {"time_utc", "padc_T01", "grf_n", "phase"} <= {c.path_in_schema for c in chunks}
+    assert {e for chunk in chunks for e in chunk.encodings} == {"PLAIN", "RLE", "RLE_DICTIONARY"}
+    assert {chunk.compression for chunk in chunks} == {"ZSTD"}
+    types = {
+        json.loads(file.schema.column(i).logical_type.to_json())["Type"] for i in range(len(chunks))
+    }
+    assert types == {"None", "Int", "String", "Timestamp"}
 
 
 def test_pandas_reads_parquet_and_csv_with_instants_to_the_nanosecond(tmp_path: Path) -> None:
