@@ -18,6 +18,7 @@ from service.offline.comparison import CompareOptions, compare_session
 from service.plain_json import json_text
 from storage.checked_json import write_checked
 from storage.durable import write_whole
+from storage.schema import numpy_dtype
 from storage.sessions.comparisons import (
     REPORT_NAME,
     ROWS_MAX,
@@ -119,7 +120,7 @@ def _series(pairs: Pairs) -> pa.Table:
     return pa.table(
         [
             # from_pandas: NaN is null
-            pa.array(columns[field.name].astype(field.type.to_pandas_dtype()), from_pandas=True)
+            pa.array(columns[field.name].astype(numpy_dtype(field.type)), from_pandas=True)
             for field in SCHEMA
         ],
         schema=SCHEMA,

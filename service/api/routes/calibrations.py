@@ -285,6 +285,7 @@ async def get_calibration(calibration_id: str, request: Request, server: ServerS
     operation_id="deleteCalibration",
     summary="Delete a calibration",
     status_code=HTTPStatus.NO_CONTENT,
+    response_model=None,
     responses={**problems(_404="No such calibration."), **FULL},
 )
 async def delete_calibration(calibration_id: str, server: ServerState) -> None:

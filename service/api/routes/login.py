@@ -108,7 +108,11 @@ async def log_in(
 
 
 @router.delete(
-    "/login", operation_id="logOut", summary="Log out", status_code=HTTPStatus.NO_CONTENT
+    "/login",
+    operation_id="logOut",
+    summary="Log out",
+    status_code=HTTPStatus.NO_CONTENT,
+    response_model=None,
 )
 async def log_out(request: Request, response: Response, logins: LoginsState) -> None:
     """The cookie of this request is good for nothing from now on."""

@@ -205,6 +205,7 @@ async def list_tares(node: str, server: ServerState) -> TaresPage:
     operation_id="undoTare",
     summary="Undo a tare",
     status_code=HTTPStatus.NO_CONTENT,
+    response_model=None,
     responses=problems(
         _404="No such node, or no such tare that is not undone.",
         _412="Another tare is in force than If-Match names.",

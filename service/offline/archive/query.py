@@ -7,6 +7,7 @@ everything else that it could reach is locked before the first question is read.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -29,7 +30,8 @@ LOCKED: dict[str, Any] = {
     "allow_community_extensions": False,
     "python_enable_replacements": False,  # a name is a view, and no variable of this program
     "temp_directory": "",
-    "memory_limit": "50%",  # of the machine's: a question that needs more is refused
+    # Half of the machine's: a question that needs more is refused. DuckDB takes no "50%" up to 1.5.
+    "memory_limit": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2}B",
     "lock_configuration": True,
 }
 

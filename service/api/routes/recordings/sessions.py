@@ -286,6 +286,7 @@ async def change(
     operation_id="deleteSession",
     summary="Move to the trash",
     status_code=HTTPStatus.NO_CONTENT,
+    response_model=None,
     responses={
         **_UNKNOWN,
         **problems(_409="It is being recorded, or sealed."),
@@ -338,6 +339,7 @@ async def change_mark(
     operation_id="deleteEvent",
     summary="Remove a mark",
     status_code=HTTPStatus.NO_CONTENT,
+    response_model=None,
     responses={**_NO_EVENT, **CHANGED, **FULL},
 )
 async def remove_mark(
