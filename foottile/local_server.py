@@ -8,6 +8,7 @@ removed at logout, while a server in tmux runs on, and a service has none.
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import json
 import os
@@ -52,7 +53,8 @@ def find_local_server(url: str) -> LocalServer | None:
         return None
     if parts.scheme not in ("http", "ws") or not is_loopback(parts.hostname or ""):
         return None
-    record = _read_record(_record_path(port))
+    path = _record_path(port)
+    record = None if path is None else _read_record(path)
     if record is None or not _is_same_address(parts, urlsplit(record.url)):
         return None
     return record
@@ -68,6 +70,8 @@ def publish_local_server(server: LocalServer) -> Iterator[None]:
     import fcntl
 
     path = _record_path(urlsplit(server.url).port or 80)
+    if path is None:
+        raise FileNotFoundError(errno.ENOENT, "no home folder is known", f"user {os.getuid()}")
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not _is_private(path.parent.lstat()):
         path.parent.chmod(0o700)
@@ -98,9 +102,14 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _record_path(port: int) -> Path:
+def _record_path(port: int) -> Path | None:
+    try:
+        folder = user_state_path("foottile")
+    except RuntimeError:  # a user without a home
+        return None
     # A home may be shared by several machines.
-    return user_state_path("foottile") / "servers" / f"{socket.gethostname()}-{port}.json"
+    path = folder / "servers" / f"{socket.gethostname()}-{port}.json"
+    return path if path.is_absolute() else None
 
 
 def _read_record(path: Path) -> LocalServer | None:

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import foottile
+from foottile import local_server
 from foottile.local_server import LocalServer, find_local_server, is_loopback, publish_local_server
 
 URL = "http://127.0.0.1:8000"
@@ -177,3 +178,12 @@ def test_localhost_is_asked_at_the_address_of_the_record(record: Path) -> None:
 )
 def test_loopback_is_only_this_machine(host: str, expected: bool) -> None:
     assert is_loopback(host) is expected
+
+
+def test_a_user_without_a_home_finds_no_server_and_cannot_publish_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(local_server, "user_state_path", lambda _: Path("~/foottile"))
+    assert find_local_server(URL) is None
+    with pytest.raises(OSError, match="no home folder"), publish_local_server(SERVER):
+        pass
