@@ -26,6 +26,7 @@ from recording_data import Recording, at_rate, batches, emulated
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from devices.scene.file import load_scene
 from service.estimation.calibration import Calibration
+from service.identity import make_secret
 from service.link import PROTOCOL, Hello, Status
 from service.node.publisher import Publisher
 from service.node.sending import Source
@@ -219,10 +220,12 @@ class ReplayedNode:
         self.stream = NodeStream(nowhere, StreamNotes(array_info=info), None)
         self._wanted = Wanted(nowhere)
         self.said: list[str] = []
+        secret = make_secret()
         source = Source(
             present=lambda: self.stream,
             streams=lambda: {self.stream.boot_id: self.stream},
             hello=self._hello,
+            secret=lambda server_id: secret,
             status=lambda backlog: Status(missed_slots=0, backlog_frames=backlog),
             wanted=lambda server_id, wanted, known: None,
             damaged=lambda stream, numbers: None,
@@ -239,6 +242,7 @@ class ReplayedNode:
             array_info=self.stream.info,
             held=tuple(self.stream.held),
             next_seq=self.stream.next_seq,
+            t_mono_ns=time.monotonic_ns(),
             scene=load_scene(SCENE).model_dump(mode="json"),
             emulated=True,
             calibration=self._played.calibration,

@@ -1,7 +1,9 @@
 """The link between node and server, `foottile.v1`: what each side says, and why it hangs up.
 
     node                                  server
-    hello (arrays, what it has)      -->
+    identify (its name)              -->
+                                     <--  challenge (a nonce)
+    proof, hello (what it has)       -->
                                      <--  welcome (what the server lacks, what sessions need)
     stream, then Arrow messages      -->
                                      <--  ack (what is on the server's disk)
@@ -12,8 +14,10 @@
 Text messages are JSON with a `type`; a binary message is a record batch (`storage.wire`) of the
 stream that the node named last. Newest frames go first; what the server lacks of the past, of this
 stream and of earlier ones, follows behind them. The node forgets nothing that a session needs and
-that is not acknowledged; a new connection begins with hello again. Frames may come twice and in any
-order: a server takes each (stream, seq) once.
+that is not acknowledged; a new connection begins with identify again. Frames may come twice and in
+any order: a server takes each (stream, seq) once.
+
+A node proves that it is the machine that had its name before: `service.identity`.
 
 Every message carries a CRC-32 (zlib), because neither websockets nor Arrow notice a flipped bit:
 the last four bytes of a binary message, little endian, of all before; the last field of a text
@@ -48,7 +52,7 @@ from storage.intervals import NO_END
 _T = TypeVar("_T")
 
 SUBPROTOCOL = "foottile.v1"
-PROTOCOL = 2
+PROTOCOL = 3
 INGEST_PATH = "/api/v1/ingest"
 LIVE_PATH = "/api/v1/live"
 MESSAGE_BYTES_MAX = 1 << 20
@@ -73,6 +77,7 @@ _AnySeq = Annotated[int, Field(ge=0, le=NO_END)]
 
 BootId = Annotated[str, Field(pattern=f"^{BOOT_ID}$")]
 """Name of a stream."""
+_Hex256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Close(IntEnum):
@@ -96,6 +101,8 @@ class Close(IntEnum):
     """A stream that was asked for is not here, or not any more."""
     UNREADABLE = 4012
     """Frames that are kept cannot be read, and that will not mend by itself."""
+    WRONG_IDENTITY = 4013
+    """The name belongs to another machine, until a person accepts this one."""
 
 
 class HangUp(Exception):  # noqa: N818  # no error: how a connection ends
@@ -131,6 +138,37 @@ PairsByReason = Annotated[
 ]
 
 
+class Identify(Facts):
+    """First message: which node connects."""
+
+    type: Literal["identify"] = "identify"
+    protocol: Count
+    node: Label
+
+
+class Challenge(Facts):
+    """Request for a proof that the node is the machine that had its name before."""
+
+    type: Literal["challenge"] = "challenge"
+    protocol: Count
+    server_id: Label
+    """Name of the server's data folder: a node shares one secret with each."""
+    nonce: _Hex256
+    """Random, for this connection only."""
+    is_known: bool
+    """Does the server have a secret of this node? If not, it takes the one that the node sends."""
+
+
+class Proof(Facts):
+    """Answer to `challenge`. A node whose disk keeps no secret sends neither field."""
+
+    type: Literal["proof"] = "proof"
+    proof: _Hex256 | None = None
+    """`service.identity.make_proof`."""
+    secret: _Hex256 | None = None
+    """The secret itself: at first contact, or where a person has to accept this machine."""
+
+
 class EarlierStream(Facts):
     """An ended stream of this node, if the node still has frames of it or knows losses."""
 
@@ -159,6 +197,8 @@ class Hello(Facts):
     """What it has of its present stream."""
     next_seq: Seq
     """The number of the next frame to be taken."""
+    t_mono_ns: TMonoNs
+    """The clock that stamps its frames, read when this message was made."""
     lost: PairsByReason = Field(default={})
     """Numbers of its present stream that it should have and does not have, by reason."""
     t_ns_first: TNs = 0
@@ -203,8 +243,6 @@ class Welcome(Facts):
 
     type: Literal["welcome"] = "welcome"
     protocol: Count
-    server_id: Label = ""
-    """Name of its data folder: one server cannot give up what another one needs."""
     lacks: tuple[StreamNumbers, ...]
     """Of the present stream everything that the node has and the server has not, of earlier ones
     what sessions need. The present stream's last interval has no end."""
@@ -277,8 +315,8 @@ class Status(Facts):
     """How often what went wrong in this stream, by serial and reason."""
 
 
-SaidByNode = Hello | FramesOf | Probe | ClockRow | Status | Lost
-SaidByServer = Welcome | Ack | Wanted | Probe
+SaidByNode = Identify | Proof | Hello | FramesOf | Probe | ClockRow | Status | Lost
+SaidByServer = Challenge | Welcome | Ack | Wanted | Probe
 FromNode: TypeAdapter[SaidByNode] = TypeAdapter(Annotated[SaidByNode, Field(discriminator="type")])
 FromServer: TypeAdapter[SaidByServer] = TypeAdapter(
     Annotated[SaidByServer, Field(discriminator="type")]

@@ -21,12 +21,14 @@ from service.link import (
     SILENCE_S,
     SUBPROTOCOL,
     Ack,
+    Challenge,
     ClockRow,
     EarlierStream,
     FromServer,
     Hello,
     Lost,
     Probe,
+    SaidByServer,
     Wanted,
     Welcome,
     heard,
@@ -82,18 +84,18 @@ class Connection:
                     # What was never taken, nobody can have: it is not forgotten when it comes.
                     if stream is not None and first < stream.next_seq:
                         last = min(last, stream.next_seq - 1)
-                        stream.acknowledge(self._link.welcome.server_id, first, last)
+                        stream.acknowledge(self._link.server_id, first, last)
                 case Wanted():
                     self._take_wanted(message)
                 case Probe():
                     self._probes.answered(message)
-                case Welcome():
-                    raise LinkError("welcome was said before")
+                case Challenge() | Welcome():
+                    raise LinkError(f"{message.type} was said before")
 
     def _take_wanted(self, wanted: Wanted) -> None:
         earlier = (stream.array_info.boot_id for stream in self._link.hello.earlier)
         known = (*earlier, self._link.hello.array_info.boot_id)
-        self._link.source.wanted(self._link.welcome.server_id, wanted, known)
+        self._link.source.wanted(self._link.server_id, wanted, known)
 
     async def _tell_status(self) -> None:
         said = {stream.array_info.boot_id: stream.lost for stream in self._link.hello.earlier}
@@ -108,7 +110,7 @@ class Connection:
             await asyncio.sleep(STATUS_EVERY_S)
 
 
-def parse(message: str | bytes) -> Welcome | Ack | Wanted | Probe:
+def parse(message: str | bytes) -> SaidByServer:
     """What a server has said.
 
     Raises:
@@ -164,6 +166,7 @@ def hello_of(options: NodeOptions, journal: NodeJournal, present: NodeStream) ->
         array_info=present.info,
         held=tuple(present.held),
         next_seq=next_seq,
+        t_mono_ns=time.monotonic_ns(),
         lost=present.lost.as_pairs(),
         t_ns_first=_t_ns_first(present),
         scene=options.rig.scene.model_dump(mode="json"),

@@ -10,16 +10,30 @@ import asyncio
 import socket as sockets
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import WebSocketException
+from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.frames import CloseCode
 
 from devices.errors import LinkError
 from foottile.local_server import find_local_server
 from foottile.tls import make_context
 from foottile.websocket import AsyncConnection
-from service.link import MESSAGE_BYTES_MAX, SILENCE_S, SUBPROTOCOL, Hello, Welcome, say
+from service.identity import fingerprint_of, make_proof
+from service.link import (
+    MESSAGE_BYTES_MAX,
+    PROTOCOL,
+    SILENCE_S,
+    SUBPROTOCOL,
+    Challenge,
+    Close,
+    Identify,
+    Proof,
+    SaidByServer,
+    Welcome,
+    say,
+)
 from service.node.connection import Connection, parse
 from service.node.dial import BackOff, dial, ingest_url, reason_of
 from service.node.sending import Greeted, Source
@@ -53,6 +67,11 @@ class Publisher:
         self._report = report
         self._last_report = ""
         self._connected = False
+        self._fingerprint = ""
+        """Of the secret that it showed last."""
+        self._is_refused = False
+        """Did the server refuse it as another machine? Then it shows its secret, so that a person
+        can accept it."""
         self._wake = asyncio.Event()
         self._renewed = asyncio.Event()
 
@@ -80,9 +99,11 @@ class Publisher:
                 finally:
                     tcp.close()  # if it was not handed over, or not yet let go
             except (OSError, ValueError, WebSocketException) as error:
-                self._say(
-                    f"not connected to {self._url}: {reason_of(error, self._url)}; trying again"
-                )
+                reason = reason_of(error, self._url)
+                if _is_wrong_identity(error):
+                    self._is_refused = True
+                    reason += f" (this machine: {self._fingerprint or 'its disk keeps no secret'})"
+                self._say(f"not connected to {self._url}: {reason}; trying again")
                 back_off.failed(error)
             self._connected = False
             await asyncio.sleep(back_off.next_s())
@@ -107,29 +128,57 @@ class Publisher:
             additional_headers={"Authorization": f"Bearer {token}"} if token else {},
             proxy=None,
         ) as socket:
-            hello, welcome = await self._greet(socket)
-            link = Greeted(socket, self._source, hello, welcome, self._wake)
+            link = await self._greet(socket)
+            self._is_refused = False
             connection = Connection(link, delivered=back_off.succeeded)
             self._say(f"connected to {self._url}")
             self._connected = True
             await connection.run(self._renewed)
             await socket.close(CloseCode.GOING_AWAY, "another stream has begun")
 
-    async def _greet(self, socket: ClientConnection) -> tuple[Hello, Welcome]:
+    async def _greet(self, socket: ClientConnection) -> Greeted:
         if socket.subprotocol != SUBPROTOCOL:
             raise LinkError(
                 f"the server does not speak {SUBPROTOCOL}", where=self._url, expected=SUBPROTOCOL
             )
-        # In a thread: it looks into the journals of earlier streams.
+        node = self._source.present().info.node
+        await socket.send(say(Identify(protocol=PROTOCOL, node=node)))
+        challenge = await _answer(socket, Challenge)
+        # In threads: one keeps a secret, the other looks into the journals of earlier streams.
+        secret = await asyncio.to_thread(self._source.secret, challenge.server_id)
+        self._fingerprint = "" if secret is None else fingerprint_of(secret)
+        if secret is not None and challenge.is_known and not self._is_refused:
+            proof = Proof(proof=make_proof(secret, challenge, node))
+        else:
+            proof = Proof(secret=secret)
+        await socket.send(say(proof))
         hello = await asyncio.to_thread(self._source.hello)
         await socket.send(say(hello))
-        async with asyncio.timeout(SILENCE_S):
-            answer = parse(await socket.recv())
-        if not isinstance(answer, Welcome):
-            raise LinkError(f"the server answered hello with {answer.type!r}", expected="welcome")
-        return hello, answer
+        welcome = await _answer(socket, Welcome)
+        return Greeted(socket, self._source, challenge.server_id, hello, welcome, self._wake)
 
     def _say(self, message: str) -> None:
         if message != self._last_report:
             self._report(message)
         self._last_report = message
+
+
+_Kind = TypeVar("_Kind", Challenge, Welcome)
+
+
+async def _answer(socket: ClientConnection, kind: type[_Kind]) -> _Kind:
+    """Receive the next message, which has to be of a kind."""
+    async with asyncio.timeout(SILENCE_S):
+        answer: SaidByServer = parse(await socket.recv())
+    if not isinstance(answer, kind):
+        expected = kind.model_fields["type"].default
+        raise LinkError(f"the server said {answer.type!r}", expected=expected)
+    return answer
+
+
+def _is_wrong_identity(error: Exception) -> bool:
+    return (
+        isinstance(error, ConnectionClosed)
+        and error.rcvd is not None
+        and error.rcvd.code == Close.WRONG_IDENTITY
+    )

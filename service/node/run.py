@@ -25,6 +25,7 @@ from service.node.connection import hello_of
 from service.node.options import NodeOptions
 from service.node.publisher import Publisher
 from service.node.recording import NodeRecording
+from service.node.secrets import ServerSecrets
 from service.node.sending import Source
 from storage.journal.node.journal import NodeJournal
 from storage.journal.node.stream import NodeStream
@@ -223,6 +224,7 @@ class RunningNode:
                 present=self._present_stream,
                 streams=lambda: {stream.boot_id: stream for stream in self._journal.streams},
                 hello=lambda: hello_of(self._options, self._journal, self._present_stream()),
+                secret=ServerSecrets(self._journal.folder, self._report).share,
                 status=self._status,
                 wanted=self._want,
                 damaged=self._journal.damaged,

@@ -43,6 +43,8 @@ class Source:
         present: the stream that is being taken.
         streams: all streams that the node has, by boot_id.
         hello: describes them; asked for at every connection.
+        secret: the one that it shares with a server, by the server's id; made and kept on the disk
+            at first contact. None if the disk does not keep it.
         status: what the node counts; is given how many frames are behind.
         wanted: called with what the server's sessions need, and the streams that it knows.
         damaged: called with frames that turned out to be damaged on disk.
@@ -51,6 +53,7 @@ class Source:
     present: Callable[[], NodeStream]
     streams: Callable[[], Mapping[str, NodeStream]]
     hello: Callable[[], Hello]
+    secret: Callable[[str], str | None]
     status: Callable[[int], Status]
     wanted: Callable[[str, Wanted, tuple[str, ...]], None]
     damaged: Callable[[NodeStream, Intervals], None]
@@ -63,6 +66,7 @@ class Greeted:
     Attributes:
         socket: the connection.
         source: the node.
+        server_id: name of the server's data folder.
         hello: what it has said.
         welcome: what the server has answered.
         wake: set whenever there may be something to send.
@@ -70,6 +74,7 @@ class Greeted:
 
     socket: ClientConnection
     source: Source
+    server_id: str
     hello: Hello
     welcome: Welcome
     wake: asyncio.Event

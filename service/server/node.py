@@ -19,7 +19,7 @@ from devices.errors import (
     StateError,
     StorageError,
 )
-from devices.frames import ArrayInfo
+from devices.frames import ArrayInfo, FrameBatch
 from service.link import BOOT_ID, Hello, StreamNumbers
 from service.server.estimates.of_node import Estimated, NodeEstimates
 from service.server.pace import Pace
@@ -67,6 +67,8 @@ class ServerNode:
         """What is wrong with its array or its disk, as it said last."""
         self.fault_counts: dict[str, dict[str, int]] = {}
         """How often what went wrong in its stream, by serial and reason, as it said last."""
+        self.refused_ahead_frames = 0
+        """Frames of this stream that were refused because they are ahead of their time."""
         self.last_seq: int | None = None
         self.last_t_ns: int | None = None
         self.last_seen_t_ns: int | None = None
@@ -150,6 +152,16 @@ class ServerNode:
         return named
 
     @property
+    def refusals(self) -> list[str]:
+        """Warnings of frames of this stream that were refused."""
+        if not self.refused_ahead_frames:
+            return []
+        return [
+            f"{self.refused_ahead_frames} frames were refused: they are dated or numbered ahead of "
+            "this node's clock. Restart the node"
+        ]
+
+    @property
     def rate_hz(self) -> float | None:
         """Frames a second over the last second, by the node's clock; 0 if none came in it."""
         seen_t_ns = self.present.last_seen_t_ns
@@ -166,6 +178,7 @@ class ServerNode:
         if hello.array_info.boot_id != self.boot_id or self.last_seq is None:
             self.last_seq = self.last_t_ns = None
             self.troubles, self.fault_counts = (), {}
+            self.refused_ahead_frames = 0
             self._pace.clear()
         self.hello = hello
         self.has_spoken, self.greeted_t_ns = True, now_t_ns
@@ -178,7 +191,7 @@ class ServerNode:
         for earlier in hello.earlier:
             self._stream_of(earlier.array_info).has_ended(earlier)
         self.present = self._stream_of(hello.array_info)
-        self.present.is_present(hello)
+        self.present.is_present(hello, now_t_ns)
         # What is here but was never acknowledged, because the link broke before: acknowledge it.
         for name in self.order:
             stream = self.streams[name]
@@ -226,7 +239,9 @@ class ServerNode:
         """
         try:
             frames = stream.decoder.decode(payload)
-            stream.check(frames)
+            if ahead := stream.check(frames, now_t_ns):
+                self._refuse_ahead(frames, ahead)
+                return int(frames.seq[0]), int(frames.seq[-1]), []
             stream.take(frames, payload, now_t_ns)
         except FileFormatError as error:
             raise LinkError(f"node {self.name!r}: {error}") from error
@@ -324,6 +339,16 @@ class ServerNode:
         write_checked(self._folder / HELLO_FILE, hello.model_dump_json().encode())
         if hello is self.hello:  # it may have said it anew meanwhile
             self.has_words = False
+
+    def _refuse_ahead(self, frames: FrameBatch, why: str) -> None:
+        """Count frames that are ahead of their time; the first ones of a stream are logged."""
+        if not self.refused_ahead_frames:
+            first, last = int(frames.seq[0]), int(frames.seq[-1])
+            log.warning(
+                "node %s: frames %d to %d are refused: %s; further ones are counted",
+                *(self.name, first, last, why),
+            )
+        self.refused_ahead_frames += len(frames)
 
     def _stream_of(self, info: ArrayInfo) -> ServerStream:
         if info.boot_id not in self.streams:

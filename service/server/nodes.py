@@ -161,10 +161,15 @@ def _read_hello(path: Path) -> Hello:
     return hello
 
 
+def is_node_name(name: str) -> bool:
+    """Return whether this can be the name of a node, and of its folder."""
+    return _NODE_NAME.fullmatch(name) is not None
+
+
 def _check(hello: Hello) -> None:
     streams = [hello.array_info, *(each.array_info for each in hello.earlier)]
     for info in streams:
-        if not _NODE_NAME.fullmatch(info.node) or not IS_BOOT_ID.fullmatch(info.boot_id):
+        if not is_node_name(info.node) or not IS_BOOT_ID.fullmatch(info.boot_id):
             raise LinkError(
                 f"node {info.node[:80]!r} with boot_id {info.boot_id[:80]!r}",
                 expected="a name of letters, digits, '.', '_' and '-', and 32 hex digits",

@@ -197,7 +197,8 @@ class Recorder:
         """Keep a new measurement of a node's clock, with its sessions too.
 
         The stream's log has it already; sessions are written with their next change. A row says
-        what this server's own clock showed some seconds ago: one that is far from that is not kept.
+        what this server's own clock showed some seconds ago: one that is far from that is not kept,
+        nor is one that is far from the node's clock as hello stated it.
         """
         said_t_ns = row.t_mono_ns + node.info.utc_offset_ns + row.server_minus_node_ns
         if abs(said_t_ns - now_t_ns) > CLOCK_ROW_OFF_NS + row.uncertainty_ns:
@@ -206,6 +207,14 @@ class Recorder:
                 "%.0f s off. Was that set just now?",
                 node.name,
                 (said_t_ns - now_t_ns) * 1e-9,
+            )
+            return
+        limit = node.present.limit
+        if limit is not None and not limit.is_of_clock(row.t_mono_ns, row.uncertainty_ns, now_t_ns):
+            log.warning(
+                "node %s: a measurement of its clock is not kept: its time is not the one that the "
+                "node stated at connecting",
+                node.name,
             )
             return
         try:

@@ -18,6 +18,7 @@ from service.server.calibrations import CalibrationBook
 from service.server.data_folder import DataFolder
 from service.server.fits import Fits
 from service.server.full_rate.memory import Memories
+from service.server.identities import NodeIdentities
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
@@ -101,6 +102,7 @@ class Server:
             self.calibrations = CalibrationBook(data / "calibrations")
             self.frames = Memories()
             self.nodes = ServerNodes(data)
+            self.identities = NodeIdentities(data)
             self.sessions = SessionBook(
                 SessionFolder(data / "sessions"), Trash(data / "trash"), self._tell_session
             )
@@ -211,9 +213,31 @@ class Server:
         return [
             *self.folder.problems,
             *self.nodes.problems,
+            *self.identities.problems,
             *self.sessions.problems,
             *self.calibrations.problems,
         ]
+
+    def accept_replacement(self, node: str, fingerprint: str) -> None:
+        """Take the machine that asked last for a node from now on, as a person has decided.
+
+        Args:
+            node: name of the node.
+            fingerprint: of the machine.
+
+        Raises:
+            UnknownError: there is no such node.
+            StateError, ChangedError, StorageError: as `NodeIdentities.accept`.
+        """
+        the_node = self.nodes.find(node)
+        if the_node is None and node not in self.identities.replacements:
+            self.nodes.get(node)
+        self.identities.accept(node, fingerprint)
+        link = self.links.get(node)
+        if link is not None:
+            link.end(Close.WRONG_IDENTITY, "a person has accepted another machine under this name")
+        if the_node is not None:
+            self.tell_node(the_node)
 
     async def empty_trash(self) -> tuple[int, int]:
         """Delete what is in the trash for good; return the number of sessions and of bytes.
@@ -224,10 +248,14 @@ class Server:
         doomed = self.sessions.trash.doom()
         return len(doomed), await asyncio.to_thread(destroy, doomed)
 
+    def view_node(self, node: ServerNode) -> NodeView:
+        """Return a node as it is now, for answers and screens."""
+        return NodeView.of(node, self.recorder, self.identities.replacements.get(node.name))
+
     def node_as_json(self, node: ServerNode) -> dict[str, Any] | None:
         """How a node is, for screens; None if that cannot be said, which is said in the log."""
         with self._alone(f"node {node.name}, as screens see it"):
-            return NodeView.of(node, self.recorder).model_dump(mode="json")
+            return self.view_node(node).model_dump(mode="json")
         return None
 
     def tell_node(self, node: ServerNode) -> None:

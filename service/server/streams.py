@@ -14,6 +14,7 @@ from pathlib import Path
 from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, EarlierStream, Hello, PairsByReason
+from service.server.stream_limit import StreamLimit
 from service.sessions.ends import SessionStream, around_in
 from storage.clock.log import ClockLog, ClockOffset
 from storage.frame_rules import broken_rule
@@ -53,6 +54,8 @@ class ServerStream:
         self.last_seen_t_ns: int | None = None
         """When its last frame came, server's UTC."""
         self.missed_slots = 0
+        self.limit: StreamLimit | None = None
+        """Upper bounds of its frames; None: since the server was started it was never present."""
         self.unsynced = Intervals()
         """Frames appended to the journal since the last sync."""
         self.owed = Intervals()
@@ -215,8 +218,9 @@ class ServerStream:
             return asked - (self._forgotten - needed)
         return asked & needed
 
-    def is_present(self, hello: Hello) -> None:
+    def is_present(self, hello: Hello, now_t_ns: int) -> None:
         """The node takes this stream now."""
+        self.limit = StreamLimit.of(hello, now_t_ns)
         self.node_has = Intervals((*hello.held, (hello.next_seq, NO_END)))
         self._said(hello.lost, next_seq=None)
         self._see_from(min((first for first, _ in hello.held), default=hello.next_seq))
@@ -243,8 +247,16 @@ class ServerStream:
         notes = self.notes
         self._said(lost, next_seq=notes.next_seq, unsynced_tail_max=notes.unsynced_tail_max)
 
-    def check(self, frames: FrameBatch) -> None:
-        """Whether frames that came may be kept; those that may not are never asked for again.
+    def check(self, frames: FrameBatch, now_t_ns: int) -> str:
+        """Check frames that came; those that break a rule are never asked for again.
+
+        Args:
+            frames: of one message.
+            now_t_ns: the server's UTC.
+
+        Returns:
+            Why they may not be kept now, in words: they are ahead of their time. Frames with the
+            same numbers may still come. Empty if they may be kept.
 
         Raises:
             FileFormatError: they break a rule that `verify` asks for as well.
@@ -253,6 +265,10 @@ class ServerStream:
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         end = self.notes.next_seq
         wrong = broken_rule(frames, self.info)
+        if not wrong and self.limit is not None:
+            ahead = self.limit.violation(frames, now_t_ns)
+            if ahead:
+                return ahead
         if not wrong and end is not None and last >= end:
             wrong = f"the stream has ended with frame {end - 1}"
         if not wrong and self.journal is not None:
@@ -265,6 +281,7 @@ class ServerStream:
                 f"frames {first} to {last} of stream {self.boot_id} are refused: {wrong}",
                 expected="frames as docs/formats.md says",
             )
+        return ""
 
     def take(self, frames: FrameBatch, payload: bytes, now_t_ns: int) -> None:
         """Keep frames that came.

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from devices.errors import FootTileError
-from service.server.screens.views import NodeView, SessionView
+from service.server.screens.views import SessionView
 from service.server.server import Server
 from storage.server_id import SERVER_ID_NAME
 from tests.hostile.attack import Outcome, Play, attack
@@ -27,7 +27,7 @@ def served(server: Server) -> Served:
     """What a server gives away, by what it is of."""
     found: Served = {}
     for node in server.nodes:
-        found[f"node {node.name}"] = NodeView.of(node, server.recorder).model_dump_json()
+        found[f"node {node.name}"] = server.view_node(node).model_dump_json()
         for boot_id, stream in node.streams.items():
             numbers = list(stream.held)
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import subprocess
 import sys
@@ -18,19 +19,24 @@ from websockets.exceptions import ConnectionClosed
 
 from devices.frames import ArrayInfo
 from service.api.protocols import SAID_ON_LIVE_BYTES_MAX
+from service.identity import make_proof
 from service.link import (
     INGEST_PATH,
     LIVE_PATH,
     MESSAGE_BYTES_MAX,
     PROTOCOL,
     SUBPROTOCOL,
+    Challenge,
     ClockRow,
     EarlierStream,
     FramesOf,
     Hello,
+    Identify,
     Lost,
     Probe,
+    Proof,
     Status,
+    heard,
     with_check,
 )
 from storage.wire import messages_of
@@ -48,7 +54,7 @@ _GAP_MAX_S = 1.0
 _ANSWER_S = 10.0
 _WARM_UP = 2000
 """Tries after which memory is measured first."""
-_CODES = (1007, 1008, 1009, 4001, 4002, 4004, 4009, 4010)
+_CODES = (1007, 1008, 1009, 4001, 4002, 4004, 4009, 4010, 4013)
 """With which whoever says nonsense may be let go."""
 
 
@@ -207,6 +213,18 @@ class _Node(_Foreign):
 
     async def opened(self) -> ClientConnection:
         self.socket = await self.connected()
+        if self._begins_wrong and self.random.random() < 0.2:
+            return self.socket  # what comes is wrong before anything was said
+        await self.say(checked_text(_identify(self._name)))
+        challenge = Challenge.model_validate_json(await self.heard("challenge"))
+        if self._begins_wrong and self.random.random() < 0.2:
+            return self.socket
+        # A node of this name has this secret in every run.
+        secret = hashlib.sha256(self._name.encode()).hexdigest()
+        proof = Proof(secret=secret)
+        if challenge.is_known:
+            proof = Proof(proof=make_proof(secret, challenge, self._name))
+        await self.say(checked_text(json.loads(proof.model_dump_json())))
         if not self._begins_wrong:
             await self.say(checked_text(json.loads(_hello(self._info).model_dump_json())))
             await self.heard("welcome")
@@ -234,14 +252,18 @@ class _Node(_Foreign):
         await self.say(checked_text({"type": "probe", "id": 7}))
         await self.heard("probe")
 
-    async def heard(self, kind: str) -> None:
+    async def heard(self, kind: str) -> str:
         assert self.socket is not None
-        while json.loads(await self.socket.recv())["type"] != kind:
-            pass
+        while True:
+            text = heard(await self.socket.recv())
+            if json.loads(text)["type"] == kind:
+                return text
 
     def _wrong_hello(self) -> Any:
         random = self.random
+        first = random.choice([_identify(self._name), {"type": "proof", "secret": "0" * 64}])
         right = json.loads(_hello(self._info).model_dump_json())
+        right = random.choice([right, right, first])
         kind = random.randrange(20)
         if kind == 0:
             return damaged(random, checked_text(right))
@@ -306,6 +328,10 @@ class _Viewer(_Foreign):
                 return
 
 
+def _identify(name: str) -> dict[str, Any]:
+    return Identify(protocol=PROTOCOL, node=name).model_dump()
+
+
 def _hello(info: ArrayInfo) -> Hello:
     earlier = info.model_copy(update={"boot_id": info.boot_id[::-1]})
     return Hello(
@@ -313,6 +339,7 @@ def _hello(info: ArrayInfo) -> Hello:
         array_info=info,
         held=((0, 99), (200, 299)),
         next_seq=300,
+        t_mono_ns=time.monotonic_ns(),
         lost={"evicted": ((100, 199),)},
         scene={"name": "test", "tile": [{"x_m": 0.5, "on": True, "note": None}]},
         emulated=False,

@@ -19,6 +19,7 @@ from service.sessions.tares import TareHistory
 from storage.checked_json import write_checked
 from storage.clock.log import ClockLog, ClockOffset
 from storage.journal.node.wanted import ServerWants, Wanted
+from storage.secret_file import SECRETS_NAME, write_secrets
 from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.folder import FRAMES_NAME, Event, Part, SessionFolder
@@ -31,6 +32,8 @@ SEALED = "20200101T000000Z-00000a"
 DELETED = "20200101T000000Z-00000b"
 PENDING = "20200101T000000Z-00000c"
 FRAMES = 120
+SERVER_ID = "5" * 32
+SECRET = "5ec2e7" + "0" * 58
 REFUSED = "refused: "
 
 Readings = dict[str, str]
@@ -46,13 +49,15 @@ def make_server(data: Path) -> None:
         array_info=info,
         held=((0, FRAMES - 1),),
         next_seq=FRAMES,
+        t_mono_ns=0,
         scene={"name": "test"},
         emulated=True,
         calibration=make_calibration("T01", "T02"),
         calibration_problem=None,
     )
     write_checked(node / "hello.json", hello.model_dump_json().encode())
-    write_server_id(data / SERVER_ID_NAME, "5" * 32)
+    write_secrets(node / SECRETS_NAME, {"bench": SECRET})
+    write_server_id(data / SERVER_ID_NAME, SERVER_ID)
     (data / "token").write_text("a token that nobody has\n")
     folder = _journal(data, info)
     log = ClockLog(folder)
@@ -77,7 +82,8 @@ def make_node(root: Path) -> None:
     """A node's that recorded by itself and was killed."""
     folder = _journal(root, make_array(boot_id=BOOT))
     wanted = Wanted(folder.parent / "wanted.json")
-    wanted.say("5" * 32, ServerWants(streams={BOOT: ((0, None),)}, known=(BOOT,)))
+    write_secrets(folder.parent / SECRETS_NAME, {SERVER_ID: SECRET})
+    wanted.say(SERVER_ID, ServerWants(streams={BOOT: ((0, None),)}, known=(BOOT,)))
     wanted.save()
     _session(root, PENDING, 0, FRAMES - 1)
 

@@ -22,14 +22,18 @@ from devices.frames import (
     FrameStatus,
 )
 from service.estimation.calibration import Calibration
+from service.identity import make_proof, make_secret
 from service.link import (
     INGEST_PATH,
     PROTOCOL,
+    Challenge,
     ClockRow,
     EarlierStream,
     FramesOf,
     FromServer,
     Hello,
+    Identify,
+    Proof,
     Wanted,
     heard,
     with_check,
@@ -111,8 +115,11 @@ class FakeNode:
         tiles: int = 2,
         token: str | None = None,
         is_emulated: bool = False,
+        secret: str | None = None,
     ) -> None:
         self.running = running
+        self.secret: str | None = secret or make_secret()
+        """Shared with every server; None: its disk keeps none."""
         self.is_emulated = is_emulated
         self.name = name
         self.token = token
@@ -164,6 +171,7 @@ class FakeNode:
             "array_info": self.info,
             "held": ((0, self.seq - 1),) if self.seq else (),
             "next_seq": self.seq,
+            "t_mono_ns": time.monotonic_ns(),
             "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
             "scene": {"name": "test"},
             "emulated": self.is_emulated,
@@ -211,9 +219,29 @@ class FakeNode:
         )
         return self.socket
 
+    def open_and_identify(self, name: str | None = None) -> Challenge:
+        """Connect and name a node, by default this one; return the server's challenge."""
+        who = Identify(protocol=PROTOCOL, node=self.name if name is None else name)
+        self.open().send(who.model_dump_json())
+        challenge: Challenge = self.receive("challenge")
+        return challenge
+
+    def prove(self, **changes: Any) -> Spoken:
+        """Connect and prove who it is, as `open_and_identify` and `proof`."""
+        challenge = self.open_and_identify()
+        self.socket.send(self.proof(challenge, **changes).model_dump_json())
+        return self.socket
+
+    def proof(self, challenge: Challenge, **changes: Any) -> Proof:
+        """The answer of a node to a challenge."""
+        content: dict[str, Any] = {"secret": self.secret}
+        if challenge.is_known and self.secret is not None:
+            content = {"proof": make_proof(self.secret, challenge, self.name)}
+        return Proof(**content | changes)
+
     def open_with_hello(self, **changes: Any) -> None:
-        """Connect and say hello, which may be refused."""
-        self.open().send(self.hello(**changes).model_dump_json())
+        """Connect, prove who it is and say hello, which may be refused."""
+        self.prove().send(self.hello(**changes).model_dump_json())
 
     def receive(self, kind: str, timeout_s: float = PATIENCE_S) -> Any:
         """The next message of a kind; acknowledgements on the way are noted."""

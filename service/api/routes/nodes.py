@@ -33,6 +33,17 @@ class TareRequest(BaseModel):
     )
 
 
+class AcceptReplacementRequest(BaseModel):
+    """Which machine is accepted."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    fingerprint: str = Field(
+        pattern=r"^[0-9a-f]{4}(-[0-9a-f]{4}){3}$",
+        description="Of `replacement`, as it was shown and as the machine itself prints it.",
+    )
+
+
 class RecentQuery(BaseModel):
     """How far back, and up to where."""
 
@@ -100,13 +111,13 @@ def _expect_in_force(node: ServerNode, if_match: str | None) -> None:
 @router.get("", operation_id="listNodes", summary="All nodes the server knows")
 async def list_nodes(server: ServerState) -> Page[NodeView]:
     """Connected ones and those it remembers."""
-    return Page(items=[NodeView.of(node, server.recorder) for node in server.nodes])
+    return Page(items=[server.view_node(node) for node in server.nodes])
 
 
 @router.get("/{node}", operation_id="getNode", summary="One node", responses=_UNKNOWN)
 async def get_node(node: str, server: ServerState) -> NodeView:
     """Its array, calibration, tare, clock and counts."""
-    return NodeView.of(server.nodes.get(node), server.recorder)
+    return server.view_node(server.nodes.get(node))
 
 
 @router.get(
@@ -221,3 +232,28 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
     _expect_in_force(the_node, if_match)
     the_node.estimates.tare_keeper.undo(tare_id)
     server.tell_node(the_node)
+
+
+@router.post(
+    "/{node}/accept-replacement",
+    operation_id="acceptReplacement",
+    summary="Accept another machine under the name of a node",
+    status_code=HTTPStatus.NO_CONTENT,
+    responses={
+        **_UNKNOWN,
+        **problems(
+            _409="No other machine asks to connect under this name.",
+            _412="Another machine than this one asked last.",
+            _507="Disk full.",
+        ),
+    },
+)
+async def accept_replacement(
+    node: str, request: AcceptReplacementRequest, server: ServerState
+) -> None:
+    """The machine that `replacement` describes is the node from now on.
+
+    Accept it if the node's storage was replaced or its folder deleted, and its fingerprint is the
+    one that the machine prints. The machine before is disconnected, and refused from then on.
+    """
+    server.accept_replacement(node, request.fingerprint)

@@ -16,6 +16,7 @@ from service.private_paths import ShownText
 from service.server.book import mark_of, said_of
 from service.server.estimates.ranges import Ranges
 from service.server.estimates.tare_keeper import AutoTare
+from service.server.identities import Replacement
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
 from service.sessions.tare_file import RecordedTare
@@ -153,6 +154,21 @@ class ClockView(View):
     uncertainty_ns: int = Field(description="Half the round trip of that probe.")
 
 
+class ReplacementView(View):
+    """A machine that asked to connect under the name of this node, and was refused."""
+
+    fingerprint: str = Field(
+        description="The machine prints the same one.", examples=["3f2a-91bc-0d4e-77a1"]
+    )
+    address: str = Field(description="Where it connected from; behind a proxy the proxy's.")
+    asked_t_ns: int = Field(description="Server's UTC.")
+
+    @classmethod
+    def of(cls, replacement: Replacement) -> ReplacementView:
+        """Return it without its secret."""
+        return cls(**{name: getattr(replacement, name) for name in cls.model_fields})
+
+
 class NodeView(View):
     """One node, connected or remembered."""
 
@@ -203,9 +219,13 @@ class NodeView(View):
     last_t_ns: int | None
     last_seen_t_ns: int | None = Field(description="When its last frame came, server's UTC.")
     recording: list[str] = Field(description="Ids of sessions that are being recorded.")
+    replacement: ReplacementView | None = Field(
+        description="Another machine that asks to connect under this name. A person accepts it "
+        "with `accept-replacement`, or leaves it refused."
+    )
 
     @classmethod
-    def of(cls, node: ServerNode, recorder: Recorder) -> NodeView:
+    def of(cls, node: ServerNode, recorder: Recorder, replacement: Replacement | None) -> NodeView:
         """Of a node as it is now."""
         info, estimates = node.info, node.estimates
         live, keeper = estimates.live, estimates.tare_keeper
@@ -246,12 +266,17 @@ class NodeView(View):
             lost=lost,
             backlog_frames=node.backlog_frames,
             missed_slots=node.present.missed_slots,
-            troubles=[*node.troubles, *([WARMING] if is_warming() else [])],
+            troubles=[
+                *node.troubles,
+                *node.refusals,
+                *([WARMING] if is_warming() else []),
+            ],
             fault_counts=node.fault_counts,
             last_seq=node.last_seq,
             last_t_ns=node.last_t_ns,
             last_seen_t_ns=node.last_seen_t_ns,
             recording=[session.id for session in recorder.recording_on(node.name)],
+            replacement=None if replacement is None else ReplacementView.of(replacement),
         )
 
 

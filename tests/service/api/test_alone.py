@@ -144,10 +144,10 @@ def test_a_node_that_cannot_be_shown_is_left_out_of_the_screens_and_said_once(
 ) -> None:
     of = NodeView.of
 
-    def failing(known: ServerNode, recorder: Any) -> NodeView:
+    def failing(known: ServerNode, *rest: Any) -> NodeView:
         if known.name == "bench":
             raise ArithmeticError("as a bug would")
-        return of(known, recorder)
+        return of(known, *rest)
 
     node.connect()
     monkeypatch.setattr(NodeView, "of", failing)

@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed
 
 from service.api.doors import OWN_FILES, RESERVE, Bounds, Doors
 from service.api.protocols import accept
-from service.link import INGEST_PATH, LIVE_PATH, Close
+from service.link import INGEST_PATH, LIVE_PATH, PROTOCOL, Close, Identify
 from tests.service.fake_node import NodeOf, Play, Spoken
 from tests.service.running import Running, ServeWith, closed
 from tests.tokens import SHARED_TOKEN
@@ -242,9 +242,9 @@ def test_more_nodes_than_may_be_that_speak_at_once_are_told_to_come_later(
     with ExitStack() as sockets:
         dialled = [Spoken(sockets.enter_context(running.socket(INGEST_PATH))) for _ in nodes]
         for node, spoken in zip(nodes, dialled, strict=True):
-            spoken.send(node.hello().model_dump_json())
+            spoken.send(Identify(protocol=PROTOCOL, node=node.name).model_dump_json())
         told = [first_word(spoken) for spoken in dialled]
-    assert sorted(map(str, told)) == ["1013"] * 4 + ["welcome"] * 2
+    assert sorted(map(str, told)) == ["1013"] * 4 + ["challenge"] * 2
     until(lambda: not any(node["connected"] for node in running.http.get("/nodes").json()["items"]))
     nodes[-1].connect()
 

@@ -13,7 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from devices.frames import FrameBatch
-from service.link import INGEST_PATH, MESSAGE_BYTES_MAX
+from service.link import INGEST_PATH, MESSAGE_BYTES_MAX, PROTOCOL
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, closed
 
@@ -52,12 +52,18 @@ def test_another_subprotocol_is_refused(
     assert_goes_on(healthy)
 
 
+@pytest.mark.parametrize(
+    ("first", "says"),
+    [
+        ('{"type":"hello","protocol":2,"array_info":{}}', "protocol 2; this server speaks 3: node"),
+        ('{"type":"identify","protocol":4,"more":0}', "protocol 4; this server speaks 3: server"),
+    ],
+)
 def test_another_protocol_number_is_refused(
-    running: Running, healthy: FakeNode, node: FakeNode
+    running: Running, healthy: FakeNode, node: FakeNode, first: str, says: str
 ) -> None:
-    node.open().send('{"type":"hello","protocol":1,"first_seq":0}')  # with fields of its own
-    code, reason = let_go(node, healthy)
-    assert (code, reason) == (4002, "protocol 1; this server speaks 2: update the node")
+    node.open().send(first)  # with fields of its own
+    assert let_go(node, healthy) == (4002, says.replace(": ", ": update the "))
     assert running.http.get("/nodes/bench").status_code == 404
 
 
@@ -70,15 +76,15 @@ def test_another_protocol_number_is_refused(
         "null",
         "[]",
         "[" * 100_000,
-        '{"type":"hello"}',
+        '{"type":"identify"}',
         '{"type":"goodbye"}',
         '{"type":"probe","id":1}',
-        '{"type":"hello","protocol":2,"array_info":null}',
-        '{"type":"hello","😀":1}',
+        '{"type":"identify","protocol":3,"node":null}',
+        '{"type":"identify","😀":1}',
     ],
     ids=lambda first: repr(first[:30]),
 )
-def test_whoever_does_not_say_hello_first_is_let_go(
+def test_whoever_does_not_identify_first_is_let_go(
     healthy: FakeNode, node: FakeNode, first: str | bytes
 ) -> None:
     node.open().send(first)
@@ -86,6 +92,16 @@ def test_whoever_does_not_say_hello_first_is_let_go(
     # What is no JSON object goes without a checksum, as if it had been damaged.
     assert code == (4001 if isinstance(first, bytes) or first.endswith("}") else 4004)
     assert reason
+
+
+def test_no_step_of_the_handshake_can_be_left_out(healthy: FakeNode, node: FakeNode) -> None:
+    node.open_and_identify()
+    node.socket.send(node.hello().model_dump_json())
+    assert let_go(node, healthy) == (4001, "proof was expected, not hello")
+    node.prove().send('{"type":"probe","id":1}')
+    assert let_go(node, healthy) == (4001, "hello was expected, not probe")
+    node.prove().send(b"frames")
+    assert let_go(node, healthy) == (4001, "hello was expected, in text")
 
 
 @pytest.mark.parametrize(
@@ -108,7 +124,7 @@ def test_a_malformed_hello_is_refused_with_the_place(
     healthy: FakeNode, node: FakeNode, change: dict[str, Any]
 ) -> None:
     hello = json.loads(node.hello().model_dump_json()) | change
-    node.open().send(json.dumps(hello))
+    node.prove().send(json.dumps(hello))
     code, reason = let_go(node, healthy)
     assert code == 4001
     assert next(iter(change)) in reason
@@ -120,8 +136,10 @@ def test_a_malformed_hello_is_refused_with_the_place(
 def test_a_name_that_is_no_folders_name_is_refused(
     running: Running, node: FakeNode, name: str
 ) -> None:
+    node.open().send(json.dumps({"type": "identify", "protocol": PROTOCOL, "node": name}))
+    assert closed(node.socket)[0] == 4001
     info = node.info.model_copy(update={"node": name})
-    node.open_with_hello(array_info=info)
+    node.open_with_hello(array_info=info)  # after it has identified itself with a right one
     assert closed(node.socket)[0] == 4001
     assert running.http.get("/nodes").json()["items"] == []
     assert not (running.data / "outside").exists()
@@ -236,7 +254,7 @@ def test_a_name_that_is_in_use_is_refused_by_name(
 ) -> None:
     node.connect()
     node.send(10)
-    other = node_of(running)  # the same name, another boot
+    other = node_of(running, secret=node.secret)  # from a copy of its card: another stream
     other.open_with_hello()
     code, reason = closed(other.socket)
     assert code == 4009

@@ -51,6 +51,7 @@ class Publishing:
                 present=lambda: self.stream,
                 streams=lambda: {s.boot_id: s for s in (*self.earlier, self.stream)},
                 hello=self._hello,
+                secret=lambda server_id: node.secret,
                 status=self._status,
                 wanted=lambda *said: self.wanted.append(said),
                 damaged=lambda stream, numbers: self.damaged.append(numbers),

@@ -125,7 +125,7 @@ async def test_a_name_that_is_taken_is_reported(
     running: Running, node: FakeNode, node_of: NodeOf
 ) -> None:
     node.connect()
-    other = node_of(running)
+    other = node_of(running, secret=node.secret)
     async with Publishing(other, running.url) as publishing:
         await publishing.until(lambda: publishing.reports)
         await asyncio.sleep(0.3)

@@ -16,14 +16,19 @@ from websockets.asyncio.server import ServerConnection, serve
 import service.node.sending
 import service.server
 from devices.errors import UsageError
+from service.identity import fingerprint_of, make_proof
 from service.link import (
     PROTOCOL,
     SUBPROTOCOL,
     Ack,
+    Challenge,
+    Close,
     FramesOf,
     FromNode,
     Hello,
+    Identify,
     Lost,
+    Proof,
     StreamNumbers,
     Wanted,
     Welcome,
@@ -49,6 +54,8 @@ class Script:
 
     def __init__(self) -> None:
         self.port = 0
+        self.is_known = False
+        self.proofs: list[Proof] = []
         self.hellos: list[Hello] = []
         self.came: list[tuple[str, int, int]] = []
         """Stream, first and last number of each message of frames."""
@@ -67,13 +74,21 @@ class Script:
 
     async def serve(self, connection: ServerConnection) -> None:
         self.connection = connection
+        assert isinstance(FromNode.validate_json(heard(await connection.recv())), Identify)
+        challenge = Challenge(
+            protocol=PROTOCOL, server_id="played", nonce="0" * 64, is_known=self.is_known
+        )
+        await connection.send(say(challenge))
+        proof = FromNode.validate_json(heard(await connection.recv()))
+        assert isinstance(proof, Proof)
+        self.proofs.append(proof)
         hello = FromNode.validate_json(heard(await connection.recv()))
         assert isinstance(hello, Hello)
         self.hellos.append(hello)
         lacks = self.lacks or (
             StreamNumbers(boot_id=hello.array_info.boot_id, numbers=((0, None),)),
         )
-        welcome = Welcome(protocol=PROTOCOL, server_id="played", lacks=lacks, wanted=self.wanted)
+        welcome = Welcome(protocol=PROTOCOL, lacks=lacks, wanted=self.wanted)
         await connection.send(say(welcome))
         boot_id = hello.array_info.boot_id
         schema = wire_schema(hello.array_info)
@@ -108,6 +123,28 @@ async def played() -> AsyncIterator[Script]:
     ) as server:
         script.port = next(iter(server.sockets)).getsockname()[1]
         yield script
+
+
+@in_a_loop
+async def test_a_node_shows_its_secret_only_where_it_is_not_known_or_was_refused(
+    node: FakeNode,
+) -> None:
+    async with played() as script:
+        async with Publishing(node, script.url) as publishing:
+            await publishing.until(lambda: publishing.publisher.is_connected)
+            script.is_known = True
+            publishing.publisher.renew()
+            await publishing.until(lambda: len(script.hellos) == 2)
+            assert script.connection is not None
+            await script.connection.close(Close.WRONG_IDENTITY, "accept it")
+            await publishing.until(lambda: len(script.hellos) == 3)
+        assert node.secret is not None
+        fingerprint = fingerprint_of(node.secret)
+        assert any("accept it" in said and fingerprint in said for said in publishing.reports)
+    first, second, third = script.proofs
+    assert first == third == Proof(secret=node.secret)
+    challenge = Challenge(protocol=PROTOCOL, server_id="played", nonce="0" * 64, is_known=True)
+    assert second == Proof(proof=make_proof(node.secret, challenge, node.name))
 
 
 @in_a_loop

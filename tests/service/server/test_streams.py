@@ -57,6 +57,7 @@ class Told:
             "array_info": self.info[NEW],
             "held": (),
             "next_seq": 0,
+            "t_mono_ns": 10**12,
             "scene": {},
             "emulated": False,
             "calibration": None,

@@ -40,6 +40,7 @@ class Foot:
             array_info=info,
             held=(),
             next_seq=0,
+            t_mono_ns=0,
             scene={"name": "test", **scene},
             emulated=True,
             calibration=make_calibration(*info.serials),
@@ -91,8 +92,9 @@ class Foot:
         """Have the server take them."""
         schema = wire_schema(self.hello.array_info)
         for begin in range(0, len(frames), BATCH):
-            payload = encode(frames.rows(begin, begin + BATCH), schema)
-            _, _, due = self.node.take(self.node.present, payload, 0)
+            rows = frames.rows(begin, begin + BATCH)
+            now_t_ns = UTC_NS + int(rows.t_mono_ns[-1])
+            _, _, due = self.node.take(self.node.present, encode(rows, schema), now_t_ns)
             self.due += [int(seq) for piece, _ in due for seq in piece.seq]
 
     def live(self, seconds: float, counts: Any = 0.0, **how: Any) -> None:

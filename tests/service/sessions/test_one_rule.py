@@ -237,6 +237,7 @@ def server_on(data: Path, begun: Session) -> tuple[Recorder, ServerNode]:
         array_info=make_array(boot_id=PRESENT),
         held=(),
         next_seq=0,
+        t_mono_ns=0,
         scene={},
         emulated=True,
         calibration=None,

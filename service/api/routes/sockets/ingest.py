@@ -7,6 +7,7 @@ import json
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import TypeVar
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
@@ -25,8 +26,10 @@ from service.link import (
     FromNode,
     HangUp,
     Hello,
+    Identify,
     Lost,
     Probe,
+    Proof,
     SaidByNode,
     Status,
     Welcome,
@@ -36,12 +39,16 @@ from service.link import (
     say,
     understood,
 )
+from service.server.identities import Claim
 from service.server.node import ServerNode
+from service.server.nodes import is_node_name
 from service.server.server import Link, Server
 from service.server.streams import ServerStream
 from service.server_clock import utc_ns
 
 log = logging.getLogger("foottile.ingest")
+
+_Message = TypeVar("_Message", Identify, Proof, Hello)
 
 
 async def ingest(socket: WebSocket, server: Server) -> None:
@@ -49,8 +56,9 @@ async def ingest(socket: WebSocket, server: Server) -> None:
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
     try:
-        hello = await _greeting(socket, offered)
-        with _joined(server, hello) as link:
+        claim = await _challenge(socket, server, offered)
+        hello = await _receive_hello(socket, claim)
+        with _joined(server, hello, claim) as link:
             await _welcome(socket, server, link)
             await _serve(socket, server, link)
     except HangUp as end:
@@ -62,7 +70,8 @@ async def ingest(socket: WebSocket, server: Server) -> None:
         await _close(socket, HangUp(Close.BUG, "the server has a bug; its log says which"))
 
 
-async def _greeting(socket: WebSocket, offered: list[str]) -> Hello:
+async def _challenge(socket: WebSocket, server: Server, offered: list[str]) -> Claim:
+    """Ask the machine that connects for a proof that it is the node that it names."""
     if SUBPROTOCOL not in offered:
         raise HangUp(
             Close.WRONG_VERSION,
@@ -70,29 +79,78 @@ async def _greeting(socket: WebSocket, offered: list[str]) -> Hello:
         )
     first = await _receive(socket)
     if (protocol := _protocol_of(first)) is not None and protocol != PROTOCOL:
-        # Before it is read: another version's hello has other fields.
+        # Before it is read: another version's first message has other fields.
         raise HangUp(
             Close.WRONG_VERSION,
             f"protocol {protocol}; this server speaks {PROTOCOL}: update the "
             + ("node" if protocol < PROTOCOL else "server"),
         )
-    if isinstance(first, bytes):
-        raise HangUp(Close.REFUSED, "the first message has to be hello, in text")
-    hello = _parse(first)
-    if not isinstance(hello, Hello):
-        raise HangUp(Close.REFUSED, "the first message has to be hello")
+    who = _expect(Identify, first)
+    if not is_node_name(who.node):
+        raise HangUp(
+            Close.REFUSED, f"{who.node[:80]!r} is no name of a node: letters, digits, '.', '_', '-'"
+        )
+    with _try_later():
+        challenge = server.identities.challenge(who.node, server.id)
+    await send(socket, say(challenge))
+    answer = _expect(Proof, await _receive(socket))
+    client = socket.client
+    return Claim(who.node, challenge, answer, client.host if client is not None else "")
+
+
+async def _receive_hello(socket: WebSocket, claim: Claim) -> Hello:
+    hello = _expect(Hello, await _receive(socket))
+    if hello.array_info.node != claim.node:
+        raise HangUp(
+            Close.REFUSED,
+            f"node {claim.node!r} says hello as {hello.array_info.node[:80]!r}",
+        )
     return hello
 
 
+def _expect(kind: type[_Message], message: str | bytes) -> _Message:
+    name = kind.model_fields["type"].default
+    if isinstance(message, bytes):
+        raise HangUp(Close.REFUSED, f"{name} was expected, in text")
+    said = _parse(message)
+    if not isinstance(said, kind):
+        raise HangUp(Close.REFUSED, f"{name} was expected, not {said.type}")
+    return said
+
+
+def _is_proven(server: Server, claim: Claim) -> bool:
+    before = server.identities.replacements.get(claim.node)
+    try:
+        with _try_later():
+            return server.identities.is_proven(claim, utc_ns())
+    except HangUp:
+        asking, node = server.identities.replacements.get(claim.node), server.nodes.find(claim.node)
+        # It asks again and again: screens are told of each machine once.
+        is_new = asking is not None and (before is None or before.secret != asking.secret)
+        if node is not None and is_new:
+            server.tell_node(node)
+        raise
+
+
 @contextmanager
-def _joined(server: Server, hello: Hello) -> Iterator[Link]:
+def _try_later() -> Iterator[None]:
+    try:
+        yield
+    except StorageError as error:
+        raise HangUp(Close.TRY_LATER, str(error)) from error
+
+
+@contextmanager
+def _joined(server: Server, hello: Hello, claim: Claim) -> Iterator[Link]:
     """A node's place among those that are connected, for as long as it is."""
     name, boot_id = hello.array_info.node, hello.array_info.boot_id
+    is_proven = _is_proven(server, claim)
     other = server.links.get(name)
     if other is not None:
-        # A node that was switched off and on again knows the stream it had before.
+        # A node that was switched off and on again knows the stream it had before. The ids of
+        # streams are public, so without a secret they prove nothing.
         known = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
-        if other.node.boot_id not in known:
+        if not is_proven or other.node.boot_id not in known:
             raise HangUp(
                 Close.NAME_TAKEN,
                 f"a node {name!r} is connected already; give this one another name (--name)",
@@ -111,6 +169,8 @@ def _joined(server: Server, hello: Hello) -> Iterator[Link]:
             raise
         code = Close.TRY_LATER if isinstance(error, StorageError) else Close.REFUSED
         raise HangUp(code, str(error)) from error
+    if not is_proven:
+        server.identities.keep_first(claim)
     link = server.links[name] = Link(node)
     node.connected = True
     try:
@@ -127,7 +187,7 @@ async def _welcome(socket: WebSocket, server: Server, link: Link) -> None:
     node = link.node
     link.wanted = server.recorder.wanted(node.name)
     lacks = node.lacks(server.recorder.needed(node.name))
-    welcome = Welcome(protocol=PROTOCOL, server_id=server.id, lacks=lacks, wanted=link.wanted)
+    welcome = Welcome(protocol=PROTOCOL, lacks=lacks, wanted=link.wanted)
     await send(socket, say(welcome))
     log.info("node %s connected, stream %s", node.name, node.boot_id)
     server.tell_node(node)
@@ -183,8 +243,8 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
                 server.tell_node(node)
             case Lost():
                 _announced(node, said.boot_id).note_losses(said.lost)
-            case Hello():
-                raise HangUp(Close.REFUSED, "hello was said before")
+            case Identify() | Proof() | Hello():
+                raise HangUp(Close.REFUSED, f"{said.type} was said before")
 
 
 def _announced(node: ServerNode, boot_id: str) -> ServerStream:
@@ -252,12 +312,13 @@ def _frames(message: bytes) -> bytes:
 
 
 def _protocol_of(message: str | bytes) -> int | None:
-    """The protocol version in a hello, whatever else the hello holds; None without one."""
+    """Return the protocol of a first message, whatever else it holds; None without one."""
     try:
         said = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):
         return None
-    if not isinstance(said, dict) or said.get("type") != "hello":
+    # Until protocol 2 the first message was hello.
+    if not isinstance(said, dict) or said.get("type") not in ("identify", "hello"):
         return None
     protocol = said.get("protocol")
     return protocol if isinstance(protocol, int) else None

@@ -14,7 +14,7 @@ from service.server.full_rate.items import Begins, Item, Missing, Position, Rows
 from service.server.full_rate.reading import Policy, Reader
 from service.server.full_rate.recomputed import Recomputed
 from storage.journal.journal import Journal
-from tests.builders.arrays import PERIOD_NS
+from tests.builders.arrays import PERIOD_NS, UTC_NS
 from tests.service.server.full_rate.world import WAITING, World, bits
 
 FIRST, SECOND, THIRD = (f"{number:032x}" for number in range(3))
@@ -79,7 +79,7 @@ def test_frames_that_came_while_others_were_estimated_again_follow_them(world: W
     reader = world.reader("lossless", Position(FIRST, 0))
     assert isinstance(world.read(reader), Rows)
     world.node.take(  # they reach the journal, and no live picture
-        world.node.present, world.payload(40, 79), 0
+        world.node.present, world.payload(40, 79), UTC_NS
     )
     ((_, _, _, last),) = told(all_of(world, reader))
     assert last + 1 >= 80 - WAITING

@@ -220,6 +220,7 @@ class World:
         *earlier, present = self.streams.values()
         return Hello(
             protocol=PROTOCOL,
+            t_mono_ns=10**15,
             scene={"auto_tare": False},
             emulated=False,
             calibration=self._calibration,

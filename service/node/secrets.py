@@ -1,0 +1,65 @@
+"""The secrets that a node shares with servers, by the id of their data folders.
+
+They lie in the node's own folder, so a node that is renamed is another node, and each server has
+a secret of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from devices.errors import DamagedFileError, StorageError
+from service.identity import make_secret
+from storage.durable import put_aside
+from storage.secret_file import SECRETS_NAME, read_secrets, write_secrets
+
+_SERVERS_MAX = 256
+"""The oldest is dropped: the address of a server may answer with ever new ids."""
+
+
+class ServerSecrets:
+    """The secrets of one node.
+
+    Args:
+        folder: the node's own.
+        report: told what is damaged or cannot be kept, from another thread.
+    """
+
+    def __init__(self, folder: Path, report: Callable[[str], None]) -> None:
+        self._path = folder / SECRETS_NAME
+        self._report = report
+        self._reported = ""
+
+    def share(self, server_id: str) -> str | None:
+        """Return the secret for a server, made at first contact; it is on the disk then.
+
+        None: the disk does not keep it. A secret that is lost with the process would lock the node
+        out.
+        """
+        try:
+            secrets = self._read()
+            known = secrets.get(server_id)
+            if known is None:
+                known = make_secret()
+                kept = list(secrets.items())[1 - _SERVERS_MAX :]
+                write_secrets(self._path, dict([*kept, (server_id, known)]))
+        except StorageError as error:
+            self._tell(f"no secret is shared with the server: {error}")
+            return None
+        return known
+
+    def _read(self) -> dict[str, str]:
+        try:
+            return read_secrets(self._path)
+        except DamagedFileError as error:
+            self._tell(
+                f"{put_aside(self._path, error)}; servers that know this node refuse it until a "
+                "person accepts it"
+            )
+            return {}
+
+    def _tell(self, what: str) -> None:
+        if what != self._reported:
+            self._report(what)
+        self._reported = what

@@ -1,0 +1,79 @@
+"""Upper bounds of a running stream: how late its frames can be dated, and how far numbered, by now.
+
+The bounds follow from hello, in which a node states its clock and its next number, and from the
+server's clock, which counts suspend and never steps (`service.server_clock`). A node's clock gains
+no more on it than `FAST`; it may fall behind, where the node was suspended. So neither a date that
+was set nor an offset that the node measured changes them, and what was taken in the past is never
+beyond them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from devices.frames import FrameBatch
+from service.link import Hello
+from storage.clock.bounds import FAST
+from storage.layout import FRAMES_MAX
+
+AHEAD_MAX_NS = 60_000_000_000
+"""Tolerance: hello is some seconds old when it comes over a poor link, and a server may be busy."""
+_RATE_TOLERANCE = 2.0
+"""The nominal rate is the fastest that the schedule allows; no node is twice as fast."""
+
+
+@dataclass(frozen=True)
+class StreamLimit:
+    """Upper bounds of one stream, from its last hello.
+
+    Attributes:
+        hello_t_ns: when the server received hello, server's UTC.
+        t_mono_ns: the node's clock, as hello states it.
+        next_seq: number of the next frame, as hello states it.
+        rate_hz: nominal rate of the array.
+    """
+
+    hello_t_ns: int
+    t_mono_ns: int
+    next_seq: int
+    rate_hz: float
+
+    @classmethod
+    def of(cls, hello: Hello, now_t_ns: int) -> StreamLimit:
+        """Return the limit of the present stream of a node that says hello now."""
+        rate_hz = hello.array_info.nominal_rate_hz
+        return cls(now_t_ns, hello.t_mono_ns, hello.next_seq, rate_hz)
+
+    def violation(self, frames: FrameBatch, now_t_ns: int) -> str:
+        """Return why frames cannot have been taken yet, in words; empty if they can.
+
+        Args:
+            frames: of one message.
+            now_t_ns: the server's UTC.
+        """
+        ahead_ns = int(frames.t_mono_ns.max()) - self._clock_ns(now_t_ns)
+        if ahead_ns > self._tolerance_ns(now_t_ns):
+            return f"they are dated {ahead_ns * 1e-9:.0f} s ahead of the node's clock"
+        since_s = (now_t_ns - self.hello_t_ns + AHEAD_MAX_NS) * 1e-9
+        possible = self.next_seq + FRAMES_MAX + math.ceil(_RATE_TOLERANCE * self.rate_hz * since_s)
+        if int(frames.seq[-1]) > possible:
+            return f"by now no frame can have a number above {possible}"
+        return ""
+
+    def is_of_clock(self, t_mono_ns: int, uncertainty_ns: int, now_t_ns: int) -> bool:
+        """Return whether an instant that was just measured is one of the node's clock.
+
+        Args:
+            t_mono_ns: the instant, by the node's clock.
+            uncertainty_ns: half the time that measuring it took.
+            now_t_ns: the server's UTC.
+        """
+        off_ns = abs(t_mono_ns - self._clock_ns(now_t_ns))
+        return off_ns <= self._tolerance_ns(now_t_ns) + uncertainty_ns
+
+    def _clock_ns(self, now_t_ns: int) -> int:
+        return self.t_mono_ns + now_t_ns - self.hello_t_ns
+
+    def _tolerance_ns(self, now_t_ns: int) -> int:
+        return AHEAD_MAX_NS + math.ceil(FAST * abs(now_t_ns - self.hello_t_ns))

@@ -1,0 +1,53 @@
+"""`secrets.json`: what two machines share and nobody else may read, by the other one's name.
+
+A server keeps one in the folder of each node, a node one in its own folder.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from devices.errors import DamagedFileError
+from storage.checked_json import read_checked, write_checked
+from storage.durable import make_folder, storage_errors
+
+SECRETS_NAME = "secrets.json"
+_SECRET = re.compile(r"[0-9a-f]{64}")
+_OWNER_ONLY = 0o600
+"""Also in a folder that its owner has opened to a group."""
+
+
+def read_secrets(path: Path) -> dict[str, str]:
+    """Return the secrets by name, 64 hex digits each; none if there is no file.
+
+    Raises:
+        DamagedFileError: it is not what was written.
+        StorageError: it cannot be read now.
+    """
+    try:
+        content = json.loads(read_checked(path).text)
+    except FileNotFoundError:
+        return {}
+    found = content.get("secrets") if isinstance(content, dict) else None
+    if not isinstance(found, dict) or not all(
+        isinstance(secret, str) and _SECRET.fullmatch(secret) for secret in found.values()
+    ):
+        raise DamagedFileError(
+            "it holds no secrets", where=str(path), expected="64 hex digits by name"
+        )
+    return found
+
+
+def write_secrets(path: Path, secrets: Mapping[str, str]) -> None:
+    """Write the secrets, whole or not at all; they are on the disk when this returns.
+
+    Raises:
+        StorageError: the disk is full or not writable; the file before stays as it was.
+    """
+    with storage_errors(path.parent):
+        make_folder(path.parent)
+    text = json.dumps({"secrets": dict(secrets)}).encode()
+    write_checked(path, text, mode=_OWNER_ONLY)
