@@ -77,7 +77,7 @@ def followed(session: Session, node: ServerNode) -> list[Session]:
     Returns:
         The session, and those that take it up where the node came back with other tiles.
     """
-    found = [session]
+    found = [reattach(session, node)]
     while found[-1].parts[-1].seq_last is None:
         further = _step(found[-1], node)
         if not further:
@@ -86,8 +86,42 @@ def followed(session: Session, node: ServerNode) -> list[Session]:
     return found
 
 
+def reattach(session: Session, node: ServerNode) -> Session:
+    """Return the session with its open end in the stream that came back, if it left it too early.
+
+    A part is closed when its node announces another stream. If that one is gone, and the earlier
+    one goes on after all, as where a copy of a node's card was in its place for a while, then the
+    recording goes on in the earlier one, with all frames that it has had meanwhile.
+    """
+    left = session.parts[-1]
+    stream = node.streams.get(left.boot_id)
+    may_go_on = stream is not None and (left.boot_id in node.order or bool(stream.may_come))
+    if left.seq_last is not None or not node.has_spoken or may_go_on or left.boot_id in node.unread:
+        return session
+    for boot_id in node.order:
+        own = [part for part in session.parts if part.boot_id == boot_id]
+        stream = node.streams[boot_id]
+        ends = [part.seq_last for part in own if part.seq_last is not None]
+        seq_first = max(ends, default=-1) + 1
+        if own and (stream.held | stream.may_come).within(seq_first, NO_END):
+            session = _go_on_in(session, node, Part(boot_id=boot_id, seq_first=seq_first))
+    return session
+
+
+def _go_on_in(session: Session, node: ServerNode, part: Part) -> Session:
+    """Return the session with its open part ended and another one open."""
+    *before, left = at_end(session, streams_of(session, node), utc_ns()).parts
+    tails = {name: n for name, n in session.unsynced_tail_max.items() if name != part.boot_id}
+    parts = before if left.seq_last is None or left.seq_last < left.seq_first else [*before, left]
+    if parts and parts[-1].boot_id == part.boot_id:
+        part = parts.pop().model_copy(update={"seq_last": None})
+    return session.model_copy(update={"parts": (*parts, part), "unsynced_tail_max": tails})
+
+
 def given_up(session: Session, node: ServerNode | None) -> Session:
     """The session without what has not come: an open end is closed at what is here."""
+    if node is not None:
+        session = reattach(session, node)
     closed = broken_off(session, streams_of(session, node), utc_ns())
     return closed.model_copy(update={"given_up": True})
 
