@@ -10,6 +10,7 @@
 
 import { Link } from "./common/link.js";
 import { look } from "./common/login.js";
+import { ReplacementWarning } from "./common/replacement.js";
 import { inSunlight } from "./common/sunlight.js";
 import { byId, el, setText } from "./common/text.js";
 import { Actions } from "./live/actions.js";
@@ -69,6 +70,8 @@ const pause = new Pause(() => {
 pause.newest = () => state.frame;
 helpWithKeys();
 const notes = new Notes();
+const replacement = new ReplacementWarning();
+byId("replacement-box").append(replacement.element);
 const trash = new Trash(takeSession);
 const sessions = new Sessions({ onSession: takeSession, onDeleted: forgetSession });
 const tares = new Tares();
@@ -234,6 +237,7 @@ function tick() {
   setText(byId("away-title"), isAway ? `Node ${node.node} is away` : "");
   document.body.dataset.away = String(isAway);
   notes.draw(node, state.frame, nowMs, state.serverNowMs(), state.problems);
+  replacement.draw(node);
   tares.draw(node);
   byId("calibration-line").hidden = !node;
   setText(byId("calibration-name"), node?.calibration ? `Calibration “${node.calibration.name}”` : "No calibration");

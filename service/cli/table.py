@@ -20,6 +20,7 @@ SUMMARIES = {
     "serve": "Take in nodes, estimate, show live, record, and give sessions away over HTTP.",
     "node": "Take frames from an array, keep them on disk and publish them to a server.",
     "ticket": "Give a ticket for the live page: an address, and on a terminal its QR code.",
+    "accept-node": "Accept another machine under the name of a node.",
     "sessions": "List recorded sessions, newest first.",
     "pull": "Download a sealed session: data, description, events.",
     "stream": "Print live frames of a node with their estimates, a line each, until Ctrl-C.",
@@ -55,8 +56,9 @@ _MODULES = {"pull": "sessions", "export": "sessions"}
 
 def command_of(name: str) -> Callable[..., None]:
     """The function of a command."""
-    module = import_module(f"{_IN}.{_MODULES.get(name, name)}")
-    command: Callable[..., None] = getattr(module, f"{name}_command")
+    function = name.replace("-", "_")
+    module = import_module(f"{_IN}.{_MODULES.get(name, function)}")
+    command: Callable[..., None] = getattr(module, f"{function}_command")
     return command
 
 

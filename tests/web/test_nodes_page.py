@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
+from service.identity import fingerprint_of
 from tests.service.fake_node import FakeNode, Play
+from tests.service.running import closed
 from tests.waiting import until
 from tests.web.conftest import Field, wait_until
 from tests.web.scripted import Scripted
@@ -159,3 +161,34 @@ def test_a_viewer_sees_all_nodes_and_is_offered_no_button(
         server.running.http.post("/takes", json={"name": "by another one"})
         expect(page.locator("#take-running")).to_contain_text("“by another one” on 1 node")
         until(lambda: len(server.running.sessions()) == 1)
+
+
+@pytest.mark.parametrize("address", ["/nodes", "/"])
+def test_another_machine_that_asks_for_a_name_is_accepted_with_a_button(
+    scripted: Scripted, open_page: OpenPage, address: str
+) -> None:
+    stranger = FakeNode(scripted.running, scripted.node.name)
+    assert stranger.secret is not None
+    fingerprint = fingerprint_of(stranger.secret)
+
+    def ask() -> int:
+        stranger.prove(secret=stranger.secret, proof=None)
+        stranger.socket.send(stranger.hello().model_dump_json())
+        return closed(stranger.socket)[0]
+
+    try:
+        with Play(scripted.node, 5.0):
+            page = open_page(f"{scripted.url}{address}", *SIZES.args[1][0])
+            warning = page.locator(".replacement")
+            expect(warning).to_be_hidden()
+            assert ask() == 4013
+            expect(warning).to_contain_text(f"{fingerprint}, from 127.0.0.1")
+            assert complaints(page) == []
+            warning.locator("button").click()
+            expect(page.locator("#ask-text")).to_contain_text("is disconnected and refused")
+            page.click("#ask-yes")
+            expect(warning).to_be_hidden()
+            expect(page.locator("#notices")).to_contain_text(f"{fingerprint} is bench")
+        stranger.connect()
+    finally:
+        stranger.close()

@@ -35,6 +35,8 @@ const asked = (query) => new URLSearchParams(Object.entries(query).map(([name, v
 export const recent = (node, seconds, before, tiles) =>
   call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, { body: {} });
+/** @type {(node: string, fingerprint: string) => Promise<void>} */
+export const acceptReplacement = (node, fingerprint) => call("POST", `/nodes/${id(node)}/accept-replacement`, { body: { fingerprint } });
 export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
 /** @type {(node: string) => Promise<NodeCalibration>} */
 export const calibrationOf = (node) => call("GET", `/nodes/${id(node)}/calibration`);

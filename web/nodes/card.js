@@ -1,5 +1,6 @@
 // One node among others: is it live, what does it bear, how good is its link, what is recorded on it.
 
+import { ReplacementWarning } from "../common/replacement.js";
 import { duration, el, number, perSecond, plain, roughly, setData, setText } from "../common/text.js";
 import { whyNot } from "../live/grf.js";
 import { plainState } from "../sessions/state.js";
@@ -45,12 +46,13 @@ export class Card {
       const { openCalibration } = await import("../common/calibration.js");
       openCalibration(this.node);
     });
+    this.replacement = new ReplacementWarning();
     this.notes = part("ul", "node-notes");
     this.told = part("p", "node-session");
     this.element = el("li", { cls: "node", "data-node": name },
       el("div", { cls: "node-head" }, el("h2", {}, link), this.state),
       el("div", { cls: "node-grf" }, el("p", {}, this.bound, this.value, " ", this.unit), this.contact, this.sigma),
-      canvas, el("div", { cls: "node-more" }, facts, this.calibration, this.notes, this.told));
+      canvas, el("div", { cls: "node-more" }, facts, this.calibration, this.replacement.element, this.notes, this.told));
   }
 
   take(node) {
@@ -98,6 +100,7 @@ export class Card {
     setText(this.contact, contact === null ? "" : contact ? "contact" : "flight");
 
     this.writeFacts(node);
+    this.replacement.draw(node);
     this.writeNotes(node);
     this.writeSession();
   }

@@ -24,7 +24,7 @@ def test_a_summary_is_the_first_sentence_of_its_command(name: str) -> None:
 def test_every_command_that_is_written_is_in_the_table() -> None:
     folder = Path(inspect.getfile(commands)).parent
     written = {
-        line.removeprefix("def ").split("_command(")[0]
+        line.removeprefix("def ").split("_command(")[0].replace("_", "-")
         for path in folder.glob("*.py")
         for line in path.read_text().splitlines()
         if line.startswith("def ") and "_command(" in line
