@@ -34,7 +34,7 @@ _HERE = "the computer on which `foottile serve` runs"
 _AS_PROGRAM = (
     "A program sends the token as Authorization: Bearer TOKEN, and commands of foottile take it "
     "from FOOTTILE_TOKEN; the server keeps it in the file `token` of its data folder, unless it "
-    "was given one"
+    "was given one, and `foottile ticket --data` takes it from there"
 )
 _ASKED = (
     "To change something here the server's token is needed, or a login: `foottile ticket`, on "

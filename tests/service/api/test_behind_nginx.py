@@ -15,6 +15,7 @@ import httpx
 import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from service.api.doors import Bounds
 from service.link import INGEST_PATH, LIVE_PATH
@@ -162,7 +163,7 @@ def test_as_documented_people_log_in_record_watch_and_download(
             *(403, "another site"),
         )
     address = site.replace("https", "wss")
-    with connect(address + LIVE_PATH, ssl=tls, origin=site, proxy=None) as live:  # type: ignore[arg-type]  # a NewType of str
+    with connect(address + LIVE_PATH, ssl=tls, origin=Origin(site), proxy=None) as live:
         assert "hello" in live.recv(timeout=PATIENCE_S)
     with (
         pytest.raises(InvalidStatus) as refused,
