@@ -270,6 +270,7 @@ def test_every_operation_is_described(tmp_path: Path) -> None:
 def test_the_history_of_tares_says_why_and_where_the_baselines_are_going(
     running: Running, node: FakeNode
 ) -> None:
+    node.next_t_mono_ns -= 900_000_000_000
     node.connect()
     node.tared()
     node.next_t_mono_ns += 900_000_000_000  # a quarter of an hour later, one count more

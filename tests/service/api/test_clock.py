@@ -205,7 +205,10 @@ def test_the_servers_clock_set_by_an_hour_is_a_step_of_the_session(
     node.send(50)
     measured(node, 0)
     node.send(50)
+    node.taken_in()
+    node.leave()  # a server whose date is set has been started anew
     monkeypatch.setattr(server_clock, "_OFFSET_NS", server_clock._OFFSET_NS + HOUR_NS)
+    node.greet()
     measured(node, HOUR_NS)
     node.send(50)
     until(lambda: session.now()["frames"] == 150)
