@@ -10,7 +10,9 @@
 
 import { Link } from "./common/link.js";
 import { look } from "./common/login.js";
+import { quietly } from "./common/notices.js";
 import { ReplacementWarning } from "./common/replacement.js";
+import { loadModule } from "./common/request.js";
 import { inSunlight } from "./common/sunlight.js";
 import { byId, el, setText } from "./common/text.js";
 import { Actions } from "./live/actions.js";
@@ -209,10 +211,10 @@ byId("node-select").addEventListener("change", () => {
   chooseNode(chosen);
 });
 
-byId("calibration").addEventListener("click", async () => {
-  const { openCalibration } = await import("./common/calibration.js");
-  if (state.node) openCalibration(state.node);
-});
+byId("calibration").addEventListener("click", () => quietly(async () => {
+  const { openCalibration } = await loadModule(() => import("./common/calibration.js"));
+  if (state.node) await openCalibration(state.node);
+}));
 
 /** What must also be right while the tab draws nothing: live or frozen, and the counters. */
 function tick() {

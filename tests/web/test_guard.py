@@ -140,6 +140,19 @@ def test_each_way_to_fail_has_its_own_words(
         expect(page.locator("#guard")).to_have_count(0)
 
 
+@pytest.mark.parametrize("path", ["/", "/nodes"])
+def test_a_part_of_the_page_that_does_not_come_is_a_refusal(
+    scripted: Scripted, open_faulty: OpenFaulty, path: str
+) -> None:
+    def drop(route: Route) -> None:
+        route.abort()
+
+    page = open_faulty(f"{scripted.url}{path}", answers={"**/common/calibration.js": drop})
+    page.click("text=Calibration …")
+    expect(page.locator("#notices")).to_contain_text("part of this page could not be loaded")
+    expect(page.locator("#guard")).to_have_count(0)
+
+
 def test_a_silent_server_and_a_fault_of_the_page_are_told_apart(
     scripted: Scripted, open_faulty: OpenFaulty
 ) -> None:

@@ -71,6 +71,21 @@ async function orRefusal(pending, words) {
 }
 
 /**
+ * Load a module when it is wanted; a Refusal if its file does not come.
+ * @template T
+ * @param {() => Promise<T>} load
+ */
+export async function loadModule(load) {
+  try {
+    return await load();
+  } catch (error) {
+    // Chrome, Firefox and Safari have no kind of error for it, but words.
+    if (!/import\w+ (?:a )?module/i.test(String(error))) throw error;
+    throw new Refusal("A part of this page could not be loaded. Is the server running? Then load the page again.", 0);
+  }
+}
+
+/**
  * Parse an answer as JSON; a Refusal if it is none: something between this page and the server wrote it, or it was cut.
  * @param {Response} response
  * @param {string} text

@@ -1,6 +1,8 @@
 // One node among others: is it live, what does it bear, how good is its link, what is recorded on it.
 
+import { quietly } from "../common/notices.js";
 import { ReplacementWarning } from "../common/replacement.js";
+import { loadModule } from "../common/request.js";
 import { duration, el, number, perSecond, plain, roughly, setData, setText } from "../common/text.js";
 import { whyNot } from "../live/grf.js";
 import { plainState } from "../sessions/state.js";
@@ -42,10 +44,10 @@ export class Card {
       return [title, { row, value }];
     }));
     this.calibration = el("button", { type: "button", cls: "small", text: "Calibration …", "aria-label": `Calibration of ${name}` });
-    this.calibration.addEventListener("click", async () => {
-      const { openCalibration } = await import("../common/calibration.js");
-      openCalibration(this.node);
-    });
+    this.calibration.addEventListener("click", () => quietly(async () => {
+      const { openCalibration } = await loadModule(() => import("../common/calibration.js"));
+      await openCalibration(this.node);
+    }));
     this.replacement = new ReplacementWarning();
     this.notes = part("ul", "node-notes");
     this.told = part("p", "node-session");

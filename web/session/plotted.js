@@ -3,7 +3,7 @@
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
 import { quietly, showRefusal } from "../common/notices.js";
-import { unlessRefused } from "../common/request.js";
+import { loadModule, unlessRefused } from "../common/request.js";
 import { byId, setText } from "../common/text.js";
 import { offsetAt } from "./clock.js";
 import { axisWords, clockOn, stancesOn } from "./time_axis.js";
@@ -114,7 +114,7 @@ export class Plotted {
     const references = (await unlessRefused(api.listComparisons(this.session.id), { items: [] })).items;
     const open = async () => {
       byId("compare").hidden = true;
-      const { Compare } = await import("./compare.js");
+      const { Compare } = await loadModule(() => import("./compare.js"));
       await new Compare(this.session, this, offset, references).begin();
     };
     const asked = new URLSearchParams(location.search);
@@ -129,7 +129,7 @@ export class Plotted {
   /** Stances one upon another: its modules come only where there are stances. */
   async showOverlay() {
     if (!this.plots.stances.length) return;
-    const { StanceOverlay } = await import("./stance_overlay.js");
+    const { StanceOverlay } = await loadModule(() => import("./stance_overlay.js"));
     this.overlay = new StanceOverlay(this.session.id, this.plots.stances, (index) => this.goTo(index));
   }
 
