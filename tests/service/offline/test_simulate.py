@@ -69,7 +69,7 @@ def test_a_servo_that_goes_away_and_one_that_restarts_are_in_the_frames() -> Non
     turnless = (frames.frame_status & FrameStatus.SERVO_TURN_UNKNOWN) != 0
 
     def within(begin_s: float, end_s: float) -> np.ndarray:
-        return (t_s > begin_s) & (t_s < end_s)
+        return np.asarray((t_s > begin_s) & (t_s < end_s))
 
     away, back, restarted = within(0.55, 1.4), within(1.7, 2.4), within(3.1, 3.5)
     assert stale[away].all()
