@@ -40,6 +40,8 @@ STEPS_A_WIDTH = 32.0
 """A window has no more steps than that in its width, however fast one of the signals is."""
 DRIFT_MAX = 0.01
 """No clock of a reference is further off than by a hundredth: what lies beyond cannot overlap."""
+SAMPLES_MIN = 16
+"""Samples under a window, a width apart, from which four parameters are fitted."""
 CORRELATION_MIN = 0.5
 """Signals that resemble each other less at their best lag are not of the same load."""
 RIVAL_FROM = 0.8
@@ -267,10 +269,14 @@ def _fit(ours: Signal, reference: Signal, peak: Peak, coarse_s: float) -> _Fit:
         t_s, samples = own.t_s[::every], np.arange(len(own.t_s[::every]))
         to_s = t_s + lag_s + (drift * (t_s - fit.at_s) if fit is not None else 0.0)
         used = own.known[::every] & theirs.known_at(to_s)
-        if used.sum() < 10 * (_SCALE + 1):
+        if used.sum() < SAMPLES_MIN:
+            if width_s > last_s:  # too wide for a recording of one stance
+                continue
+            both = reference.known_at(ours.t_s + lag_s)
             raise ComparisonError(
-                f"reference and session overlap in {used.sum() * width_s:.2f} s without a gap",
-                expected="some stances that both have seen",
+                f"reference and session overlap in {both.sum() * ours.step_s:.2f} s: "
+                f"{used.sum()} samples, {1e3 * width_s:.3g} ms apart, without a gap near them",
+                expected=f"at least {SAMPLES_MIN}, as of one stance at 100 Hz",
             )
         fit = _fit_under(
             own.force_n[::every][used], theirs, t_s[used], samples[used], to_s[used], lag_s

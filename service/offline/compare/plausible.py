@@ -17,6 +17,8 @@ NEAR = 3.0
 """A scale within this factor of a thousand, or of a thousandth, is a wrong unit."""
 FEET = 10.0
 """A COP that travels over so many lengths of the foot is in another unit."""
+BORNE = 0.1
+"""Of the greatest force: where there is less, a COP does not tell its unit or its place."""
 OUTSIDE_SHARE = 0.05
 SCALE_FAR = 2.0
 """No gain of a mounted foot is further from one; a unit, or another foot, is."""
@@ -102,6 +104,9 @@ def cop_notes(pairs: Pairs, places_m: Floats) -> list[str]:
         ComparisonError: it is in another unit.
     """
     rows = pairs.contact & np.isfinite(pairs.reference_cop_m).all(axis=1)
+    # Under a few newtons a plate's centre of pressure is noise over noise, whatever its unit.
+    over_zero_n = pairs.reference_n - pairs.zero_left_n
+    rows &= over_zero_n > BORNE * np.max(over_zero_n, initial=0.0, where=rows)
     if not rows.any() or len(places_m) < 2:
         return []
     cop_m = pairs.reference_cop_m[rows]

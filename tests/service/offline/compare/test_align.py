@@ -254,3 +254,27 @@ def test_every_second_of_a_day_with_pauses_is_found() -> None:
     found = align(ours, reference)
     assert found.lag_s.value == pytest.approx(-2.5, abs=1e-3)
     assert found.scale.value == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("hz", [100.0, 200.0, 1000.0])
+@pytest.mark.parametrize("seconds", [0.8, 1.2])
+def test_a_reference_of_one_stance_is_aligned(hz: float, seconds: float) -> None:
+    rng = np.random.default_rng(8)
+    gait = Gait(rng, 2.0)
+    ours, _ = seen(rng, gait)
+    t_s = np.arange(0.2, 0.2 + seconds, 1.0 / hz)
+    force_n = gait.at(t_s) + 0.05 * rng.normal(size=len(t_s))
+    found = align(ours, Signal(t_s + 3.0, force_n))
+    assert found.lag_s.value == pytest.approx(3.0, abs=3e-3)
+    assert found.scale.value == pytest.approx(1.0, abs=0.05)
+    low, high = found.lag_s.interval_95
+    assert low <= 3.0 <= high
+
+
+def test_too_few_samples_are_refused_with_the_overlap_that_there_is() -> None:
+    rng = np.random.default_rng(8)
+    gait = Gait(rng, 2.0)
+    ours, _ = seen(rng, gait)
+    t_s = np.arange(0.2, 0.6, 0.01)
+    with pytest.raises(ComparisonError, match=r"overlap in 0\.(39|40) s"):
+        align(ours, Signal(t_s, gait.at(t_s)))

@@ -106,3 +106,9 @@ def test_a_cop_in_millimetres_read_as_metres_is_refused() -> None:
 def test_a_cop_beside_the_foot_is_said() -> None:
     (note,) = cop_notes(under(TRAVEL + 0.4), FOOT_M)
     assert "outside the foot in 100 % of its frames" in note
+
+
+def test_a_centre_of_pressure_under_a_few_newtons_tells_nothing_of_its_unit() -> None:
+    # As of a real plate: right under load, and anywhere within some samples of its zero.
+    x_m = np.where(FORCE_N > 1.0, 0.01, np.where(np.arange(len(FORCE_N)) % 2, 80.0, -80.0))
+    assert cop_notes(under(x_m), FOOT_M) == []
