@@ -6,6 +6,7 @@ Packages are really kept from being imported, in child processes, too.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from tests.service.process import Process
 from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 BLOCKER = """
 import sys
 absent = ["fastapi", "httptools", "httpx", "psutil", "starlette", "uvicorn"]
@@ -109,8 +111,34 @@ def test_what_is_missing_is_named_with_the_extra_that_brings_it(
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_the_lock_is_compiled_from_every_extra_but_those_that_say_why_not() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    command = (ROOT / "requirements.lock").read_text().splitlines()[1]
-    for extra in project["optional-dependencies"].keys() - {"rig", "bench", "opensim"}:
+@pytest.mark.parametrize(
+    ("lock", "left_out"),
+    [
+        ("requirements.lock", {"rig", "bench", "opensim"}),
+        ("requirements-lowest.lock", {"rig", "bench", "opensim", "dev"}),
+    ],
+)
+def test_a_lock_is_compiled_from_every_extra_but_those_that_say_why_not(
+    lock: str, left_out: set[str]
+) -> None:
+    command = (ROOT / lock).read_text().splitlines()[1]
+    for extra in PROJECT["optional-dependencies"].keys() - left_out:
         assert f"--extra {extra}" in command
+
+
+def test_the_lowest_versions_that_are_declared_are_those_of_their_lock() -> None:
+    text = (ROOT / "requirements-lowest.lock").read_text()
+    pins = dict(re.findall(r"^([a-z0-9-]+)==(\S+) ", text, re.MULTILINE))
+    product = PROJECT["optional-dependencies"].keys() - {"rig", "bench", "opensim", "dev"}
+    declared = [
+        *PROJECT["dependencies"],
+        *(each for extra in product for each in PROJECT["optional-dependencies"][extra]),
+    ]
+    lowest = dict(re.match(r"([a-z0-9-]+)>=([0-9.]+)", each).groups() for each in declared)  # type: ignore[union-attr]
+    assert len(lowest) > 20
+    stale = {
+        name: (pins.get(name), least)
+        for name, least in lowest.items()
+        if not f"{pins.get(name)}.".startswith(f"{least}.")
+    }
+    assert stale == {}

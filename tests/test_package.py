@@ -85,7 +85,7 @@ def copy_build_context(folder: Path) -> Path:
 def context_files(rules: list[str]) -> Iterator[Path]:
     """Yield every file of the checkout that Docker's build gets to see."""
     for top in ROOT.iterdir():
-        if top.name in (".git", ".venv"):
+        if top.name in (".git", ".venv", ".venv-lowest"):
             assert is_ignored(top.name, rules)
             continue
         for path in (top, *top.rglob("*")):

@@ -133,7 +133,7 @@ def messages_from(path: Path, begin: int, schema: pa.Schema) -> Iterator[Encoded
             try:
                 file.seek(begin)
                 pa.ipc.read_message(file)
-                payload = os.pread(file.fileno(), file.tell() - begin, begin)
+                payload = file.read_at(file.tell() - begin, begin)  # type: ignore[call-arg]  # stubs
                 message = EncodedBatch.of(decode(payload, schema), payload)
             except (pa.ArrowException, EOFError, OSError, FileFormatError):
                 return

@@ -16,6 +16,8 @@ import pytest
 from tests.tokens import SHARED_TOKEN
 from tests.waiting import PATIENCE_S, until
 
+BIN = Path(os.environ.get("FOOTTILE_BIN", Path(sys.executable).parent))
+"""Where the command is that is tested: scripts/lowest has one of its own."""
 Start = Callable[..., "Process"]
 
 
@@ -26,7 +28,7 @@ class Process:
         folder.mkdir(parents=True, exist_ok=True)
         # The package is found by where it is installed, not by the working directory.
         self.process = subprocess.Popen(
-            [str(Path(sys.executable).parent / "foottile"), *map(str, arguments)],
+            [str(BIN / "foottile"), *map(str, arguments)],
             cwd=folder,
             env={
                 **os.environ,

@@ -42,5 +42,7 @@ class Packed:
         rows = content.view(self._dtype)[:, 0]
         for name in self._dtype.names or ():
             rows[name] = values[name]
+            if rows[name].dtype.kind == "f":  # its sign depends on numpy's version and on n
+                rows[name][np.isnan(rows[name])] = np.nan
         data = content.tobytes()
         return [data[begin : begin + size] for begin in range(0, n * size, size)]

@@ -1,0 +1,78 @@
+"""The main job, command by command, as installed in FOOTTILE_BIN: `scripts/lowest` sets it.
+
+What each command does has its tests elsewhere. This one asks whether they work with the packages of
+that environment.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from contextlib import closing
+from pathlib import Path
+
+import httpx
+import pytest
+
+from storage.formats.written.registry import FORMATS
+from tests.service.process import Process
+from tests.waiting import PATIENCE_S, until
+
+pytestmark = pytest.mark.skipif(
+    "FOOTTILE_BIN" not in os.environ, reason="scripts/lowest runs it in an environment of its own"
+)
+
+COMPILE_S = 300.0
+"""In an environment that is new the first command compiles the models, beside other tests."""
+
+
+def run(folder: Path, *words: object) -> str:
+    """Run a command of that environment: what it prints."""
+    done = subprocess.run(
+        [Path(os.environ["FOOTTILE_BIN"]) / "foottile", *map(str, words)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=COMPILE_S,
+    )
+    assert done.returncode == 0, (words, done.stdout, done.stderr)
+    return done.stdout
+
+
+def test_a_session_is_recorded_served_pulled_proven_exported_compared_and_asked_about(
+    tmp_path: Path,
+) -> None:
+    plate = ("--force-plate", "plate.csv")
+    run(tmp_path, "simulate", "--scene", "rolling", "--seconds", 8, "--out", "s.parquet", *plate)
+    run(tmp_path, "compare", "s.parquet", "--reference", "plate.csv", "--out", "compared")
+    with closing(Process("serve", "--port", 0, "--data", "data", folder=tmp_path)) as server:
+        url = server.said("FootTile is at").split()[-1].rstrip("/")
+        words = ("--scene", "standing", "--server", url, "--name", "leg", "--journal", "node")
+        with closing(Process("node", *words, folder=tmp_path)) as node:
+            node.said("connected to")
+            with httpx.Client(base_url=f"{url}/api/v1", timeout=PATIENCE_S) as api:
+                asked = {"node": "leg", "name": "main job"}
+                begun = api.post("/sessions", json=asked).raise_for_status().json()
+                route = f"/sessions/{begun['id']}"
+                until(lambda: api.get(route).json()["frames"] > 200, PATIENCE_S)
+                api.post(f"{route}/stop").raise_for_status()
+                until(lambda: api.get(route).json()["state"] == "sealed", PATIENCE_S)
+                assert api.get(route).json()["complete"] is True
+            run(tmp_path, "pull", begun["id"], "--server", url, "--out", "pulled")
+            node.process.send_signal(signal.SIGINT)
+            assert node.ended(PATIENCE_S) == 0, node.err
+        server.process.send_signal(signal.SIGINT)
+        assert server.ended(PATIENCE_S) == 0, server.err
+    assert "whole and complete" in run(tmp_path, "verify", "data")
+    (frames,) = (tmp_path / "pulled").rglob("*.parquet")
+    for name in FORMATS:
+        out = tmp_path / f"exported.{name}"
+        body = ("--body", "calcn_r") if name == "opensim" else ()
+        run(tmp_path, "export", frames, "--format", name, "--out", out, *body)
+        assert out.stat().st_size > 0
+    question = "SELECT count(*) AS n FROM frames"
+    answer = json.loads(run(tmp_path, "query", question, "data", "--json"))
+    assert answer["left_out"] == {}
+    assert answer["rows"][0]["n"] > 200
