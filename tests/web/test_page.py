@@ -12,6 +12,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.web.conftest import Field, wait_until
+from tests.web.login import log_in
 
 pytestmark = pytest.mark.real_time
 
@@ -166,6 +167,7 @@ def test_a_killed_server_greys_the_page_within_a_second_and_it_comes_back(
     expect(page.locator("#frozen")).to_contain_text("No data")
     known.serve()
     expect(body).to_have_attribute("data-live", "true")
+    log_in(page.context, known.url)  # logins end with their server
     # What was recorded when the server was killed goes on, without a gap.
     expect(page.locator("#stop")).to_be_enabled()
     page.keyboard.press("s")
