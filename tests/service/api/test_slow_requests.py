@@ -13,9 +13,11 @@ import pytest
 
 from service.api.doors import Bounds
 from tests.service.running import Running, ServeWith
+from tests.tokens import SHARED_TOKEN
 from tests.waiting import PATIENCE_S
 
 TOKEN = "secret"  # noqa: S105  # of these tests
+SHOWN = f"Authorization: Bearer {SHARED_TOKEN}"
 
 
 @pytest.fixture
@@ -62,8 +64,10 @@ def test_empty_lines_for_ever_are_no_request(raw: socket.socket) -> None:
 
 def test_a_body_that_does_not_come_is_given_up(raw: socket.socket) -> None:
     raw.sendall(
-        b"POST /api/v1/sessions HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n"
-        b'Content-Type: application/json\r\n\r\n{"node"'
+        head(
+            "POST /api/v1/sessions", SHOWN, "Content-Length: 100", "Content-Type: application/json"
+        )
+        + b'{"node"'
     )
     assert problem_of(all_of(raw))[0] == 408
 
@@ -100,7 +104,7 @@ def head(asked: str, *headers: str) -> bytes:
 
 
 HEALTH = head("GET /api/v1/health")
-CHUNKED = head("POST /api/v1/sessions", "Transfer-Encoding: chunked")
+CHUNKED = head("POST /api/v1/sessions", SHOWN, "Transfer-Encoding: chunked")
 
 
 @pytest.mark.parametrize(
@@ -137,7 +141,7 @@ def test_a_token_behind_the_body_opens_nothing(serve_with: ServeWith) -> None:
 
 @pytest.mark.parametrize(
     "behind",
-    [head("POST /api/v1/sessions", "Content-Length: 9"), HEALTH[:-2]],
+    [head("POST /api/v1/sessions", SHOWN, "Content-Length: 9"), HEALTH[:-2]],
     ids=["body", "head"],
 )
 def test_a_request_that_does_not_come_waits_for_the_answer_to_the_one_before(

@@ -176,7 +176,7 @@ def test_of_a_session_that_is_deleted_on_the_way_there_is_no_zip_that_opens(
 
     def delete() -> None:
         assert begun.wait(30)
-        with httpx.Client(base_url=running.http.base_url, trust_env=False) as http:
+        with running.client() as http:
             assert http.delete(two[1].url).status_code == 204
         deleted.set()
 
