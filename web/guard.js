@@ -6,6 +6,7 @@
   var OLDEST = "Chrome, Edge or Android’s browser 109, Firefox 115, or Safari 16 (iOS 16)"; // scripts/browsers.json
   var SCRIPTS_LATE_MS = 30000;
   var MOST = 5; // errors that are written out
+  var ENOUGH = 100;
   var box = null;
   var lines = null;
   var errors = [];
@@ -55,12 +56,13 @@
       box.hidden = false; // what was dismissed was something else
     }
     if (!errors.length) return;
-    var more = count > errors.length ? "\n… and " + (count - errors.length) + " more" : "";
+    var more = count > errors.length ? "\n… and " + (count - errors.length) + " more" + (count < ENOUGH ? "" : " at least") : "";
     // Without query and fragment: these may hold a ticket.
     lines.textContent = errors.join("\n") + more + "\n" + location.origin + location.pathname + "\n" + navigator.userAgent;
   }
 
   function report(error) {
+    if (count >= ENOUGH) return; // one that comes with each frame must not write for ever
     count += 1;
     if (errors.length < MOST && errors.indexOf(error) < 0) errors.push(error);
     if (isOld()) {

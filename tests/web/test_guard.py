@@ -153,6 +153,21 @@ def test_a_part_of_the_page_that_does_not_come_is_a_refusal(
     expect(page.locator("#guard")).to_have_count(0)
 
 
+@pytest.mark.parametrize(
+    ("path", "where"), [("/", "#frozen-reason"), ("/nodes", "#link-down")], ids=["live", "nodes"]
+)
+def test_a_server_whose_websockets_are_blocked_is_not_said_to_be_away(
+    scripted: Scripted, open_faulty: OpenFaulty, path: str, where: str
+) -> None:
+    blocked = """
+      globalThis.WebSocket = class {
+        constructor() { setTimeout(() => this.onclose({ reason: "" }), 10); }
+        close() {}
+      };"""
+    page = open_faulty(f"{scripted.url}{path}", script=blocked)
+    expect(page.locator(where)).to_contain_text("may not pass WebSockets")
+
+
 def test_a_silent_server_and_a_fault_of_the_page_are_told_apart(
     scripted: Scripted, open_faulty: OpenFaulty
 ) -> None:

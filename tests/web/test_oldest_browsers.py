@@ -33,6 +33,12 @@ for (const [of, names] of Object.entries(newer)) {
   if (names === null) Reflect.deleteProperty(globalThis, of);
 }"""
 WITHOUT_NEWER = f"{{ const newer = {NEWER}; {_DELETE} }}"
+WITHOUT_STORAGE = """
+for (const name of ["localStorage", "sessionStorage"]) {
+  const get = () => { throw new DOMException("of this test", "SecurityError"); };
+  Object.defineProperty(globalThis, name, { get });
+}
+"""
 """Deletes what the newest Chrome has and one of our oldest browsers lacks."""
 
 
@@ -71,7 +77,7 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
 ) -> None:
     address = scripted.url.replace("127.0.0.1", "192.0.2.1")
     with Play(scripted.node, alive=True) as play:
-        page = open_page(address, *size, first=WITHOUT_NEWER)
+        page = open_page(address, *size, first=WITHOUT_NEWER + WITHOUT_STORAGE)
         expect(page.locator("body[data-live=true]")).to_have_count(1)
         assert not page.evaluate("isSecureContext")
         page.click("#tare")

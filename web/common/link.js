@@ -7,6 +7,8 @@ const FIRST_WAIT_S = 0.3;
 const LONGEST_WAIT_S = 3;
 const STEADY_AFTER_MS = 2000;
 const PING_EVERY_MS = 1000;
+const BLOCKED_AFTER = 3; // attempts that HTTP requests survive and the websocket does not
+const BLOCKED = "the server answers, but its live link does not open: a proxy or a filter in between may not pass WebSockets";
 const SILENT_AFTER_MS = 5000; // no message at all, although a heartbeat comes each second
 
 export class Link {
@@ -23,6 +25,7 @@ export class Link {
     this.waitS = FIRST_WAIT_S;
     this.malformed = 0;
     this.retry = null;
+    this.failures = 0; // attempts in a row that did not open
     this.software = null; // as this page found it first
     enter().finally(() => this.connect());
     setInterval(() => this.ping(), PING_EVERY_MS);
@@ -45,6 +48,7 @@ export class Link {
     socket.onopen = () => {
       if (socket !== this.socket) return;
       this.open = true;
+      this.failures = 0;
       this.heardMs = performance.now();
       this.unansweredSinceMs = null;
       this.onChange();
@@ -104,12 +108,12 @@ export class Link {
 
   lost(reason) {
     const socket = this.socket;
-    if (!this.open) look(); // was it refused, because a login is needed?
+    if (!this.open) this.explain(); // was it refused, because a login is needed?
     this.socket = null;
     this.open = false;
     this.roundTripMs = null;
     this.unansweredSinceMs = null;
-    this.closeReason = reason;
+    this.closeReason = reason || (this.failures < BLOCKED_AFTER ? "" : this.closeReason);
     if (socket) {
       socket.onclose = socket.onmessage = socket.onopen = null;
       socket.close();
@@ -117,6 +121,13 @@ export class Link {
     // Jitter, so that a room full of pages does not come back at one instant.
     this.retry = setTimeout(() => this.connect(), this.waitS * 1000 * (0.75 + 0.5 * Math.random()));
     this.waitS = Math.min(LONGEST_WAIT_S, this.waitS * 2);
+    this.onChange();
+  }
+
+  async explain() {
+    this.failures += 1;
+    if (!await look() || this.open || this.failures < BLOCKED_AFTER) return;
+    this.closeReason ||= BLOCKED;
     this.onChange();
   }
 

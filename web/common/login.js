@@ -51,9 +51,9 @@ addEventListener("hashchange", async () => {
   if (!refused) location.reload();
 });
 
-/** Ask the server who we are; while it is away nothing changes. */
+/** Ask the server who we are; while it is away nothing changes. Resolves to whether it answered. */
 export async function look() {
-  await ask("GET");
+  return (await ask("GET")).ok;
 }
 
 /** Resolves when nobody is kept out any more: asks, and if that is cancelled waits until it is wanted. */

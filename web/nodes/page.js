@@ -17,7 +17,7 @@ let serverAheadMs = 0;
 
 const takes = new Takes({
   recordings,
-  cannotRecord: () => (!link.open ? "The server cannot be reached." : [...cards.values()].some(({ node }) => node.connected) ? "" : "No node is connected."),
+  cannotRecord: () => (!link.open ? "The link to the server is down." : [...cards.values()].some(({ node }) => node.connected) ? "" : "No node is connected."),
   serverNowMs: () => Date.now() + serverAheadMs,
   onSession: takeSession,
   onRefused: (failed) => cards.forEach((card, name) => { card.refused = failed[name] ?? ""; }),
@@ -94,7 +94,7 @@ function write() {
   setText(byId("summary"), all.length ? `${live} of ${all.length} live` : "");
   byId("no-nodes").hidden = Boolean(all.length) || !link.open;
   const down = byId("link-down");
-  down.hidden = link.open || !link.socket && !all.length;
+  down.hidden = link.open || !link.failures && !all.length;
   setText(down, link.open ? "" : `Link to the server is down${link.closeReason ? ` (${link.closeReason})` : ""}; trying again.`);
   takes.draw();
 }
