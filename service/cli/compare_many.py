@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MISSED = "limit missed"
 """The verdict on a session of which a limit was missed."""
-_NUMBERS = ("contact_n", "reference_sigma_n", "reference_cop_sigma_m")
+_NUMBERS = ("rate_hz", "contact_n", "reference_sigma_n", "reference_cop_sigma_m")
 _TEXTS = ("map", "units", "sign", "lag_range_s", "cop_offset_m")
 _NAME = re.compile(r"[\w-][\w.-]*")
 Said = Mapping[str, str | float | None]
@@ -42,12 +42,15 @@ def options_of(said: Said, *, remove_offset: bool) -> CompareOptions:
 
     return CompareOptions(
         stated=Stated(
-            named_values(text("map"), "--map"), named_values(text("units"), "--units"), text("sign")
+            named_values(text("map"), "--map"),
+            named_values(text("units"), "--units"),
+            text("sign"),
+            _number(said, "rate_hz"),
         ),
         lag_range_s=pair(text("lag_range_s"), "--lag-range-s"),
         remove_offset=remove_offset,
         cop_offset_m=pair(text("cop_offset_m"), "--cop-offset-m") or (0.0, 0.0),
-        **{name: _number(said, name) for name in _NUMBERS},
+        **{name: _number(said, name) for name in _NUMBERS if name != "rate_hz"},
     )
 
 

@@ -13,7 +13,8 @@ ColumnsOfReference = Annotated[
     typer.Option(
         "--map",
         metavar="NAME=COLUMN,...",
-        help="Which columns are time_s, grf_n, cop_x_m, cop_y_m; - before a column turns it.",
+        help="Which columns are time_s, grf_n, cop_x_m, cop_y_m; - before a column turns it, + "
+        "between two adds them up.",
     ),
 ]
 UnitsOfReference = Annotated[
@@ -21,12 +22,22 @@ UnitsOfReference = Annotated[
     typer.Option(
         "--units",
         metavar="NAME=UNIT,...",
-        help="Of grf (N, kN, mN), cop (m, cm, mm) and time (s, ms, us, ns), unless columns "
-        "have our names.",
+        help="Of grf (N, kN, mN), cop (m, cm, mm) and time (s, ms, us, ns), unless the file or "
+        "our names state them.",
     ),
 ]
 SignOfReference = Annotated[
-    str | None, typer.Option("--sign", help="Of the reference's force under load: + or -.")
+    str | None,
+    typer.Option(
+        "--sign",
+        help="Of the reference's force under load: + or -; force platforms of C3D show it.",
+    ),
+]
+RateOfReference = Annotated[
+    float | None,
+    typer.Option(
+        "--rate-hz", help="Samples a second, of a reference with sample numbers or without times."
+    ),
 ]
 LagRange = Annotated[
     str | None,

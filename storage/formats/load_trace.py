@@ -21,6 +21,7 @@ from storage.formats.reference import Stated, as_reference
 from storage.formats.session_load import SESSION_COLUMN, as_load
 from storage.formats.tables.registry import read_table
 from storage.formats.tables.table import INSTANTS, OURS, Column, Table
+from storage.formats.tables.times import spread_even
 
 NUMBERS_MAX = 20_000_000
 """Rows times columns: an hour of eight cells at 500 rows a second, and 160 MB in memory."""
@@ -47,7 +48,7 @@ def read_load_trace(path: Path) -> LoadTrace:
     def numbers(name: str, *, may_be_empty: bool = False) -> Floats:
         return _numbers(columns, names, name, where, may_be_empty=may_be_empty)
 
-    time_s = numbers("time_s")
+    time_s, _ = spread_even(numbers("time_s"))
     if len(time_s) < 2:
         raise LoadTraceError(f"{len(time_s)} rows", where=where, expected="at least two")
     steps = np.flatnonzero(np.diff(time_s) <= 0.0)

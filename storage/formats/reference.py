@@ -19,6 +19,7 @@ from devices.errors import FileFormatError, UsageError
 from storage.formats.tables.registry import read_table
 from storage.formats.tables.session import read_session
 from storage.formats.tables.table import OURS, Table
+from storage.formats.tables.times import spread_even
 
 QUANTITIES = ("time_s", "grf_n", "cop_x_m", "cop_y_m")
 FACTORS: Mapping[str, Mapping[str, float]] = {
@@ -54,11 +55,19 @@ class Stated:
         columns: of `QUANTITIES` the column's name in the file; "-" before it turns its sign.
         units: of "time", "grf" and "cop", as in `FACTORS`.
         sign: of the force under load, "+" or "-".
+        rate_hz: of samples whose times are not in the file, or in it as numbers of samples.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     sign: str | None = None
+    rate_hz: float | None = None
+
+    @property
+    def names(self) -> set[str]:
+        """Names of columns of the file; of a sum its own, and those of its parts."""
+        given = {name.removeprefix("-") for name in self.columns.values()}
+        return given | {part for name in given for part in _parts(name)}
 
     def __post_init__(self) -> None:
         for name in self.columns:
@@ -71,6 +80,8 @@ class Stated:
                 raise UsageError(f"--units {name}={unit}", expected=" or ".join(FACTORS[name]))
         if self.sign is not None and self.sign not in SIGNS:
             raise UsageError(f"--sign {self.sign!r}", expected="+ or -, of the force under load")
+        if self.rate_hz is not None and not 0.0 < self.rate_hz < NUMBER_MAX:
+            raise UsageError(f"--rate-hz {self.rate_hz:g}", expected="samples a second, above 0")
 
 
 @dataclass(frozen=True)
@@ -103,7 +114,7 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
         UsageError: a unit or the sign is neither stated nor given by the file, or a stated one
             differs from the file's.
     """
-    named = {name.removeprefix("-") for name in stated.columns.values()}
+    named = stated.names
     table = read_session(path, named) or read_table(
         path, lambda name: name in named or name.lower() in OURS
     )
@@ -117,26 +128,28 @@ def as_reference(table: Table, stated: Stated) -> ReferenceData:
         FileFormatError, UsageError: as for `read_reference`.
     """
     where = table.where
-    time_s = _column(table, stated, "time_s")
-    grf_n, sign_note = _with_sign(table, stated, _column(table, stated, "grf_n"), time_s)
+    grf_n = _column(table, stated, "grf_n")
+    time_s = _times(table, stated, len(grf_n))
+    grf_n, sign_note = _with_sign(table, stated, grf_n, time_s)
     cop = [
         _column(table, stated, name)
         for name in ("cop_x_m", "cop_y_m")
         if name in stated.columns or name in table.columns
     ]
-    if len(cop) == 1:
-        raise UsageError(
-            "one coordinate of the centre of pressure only",
-            where=where,
-            remedy="Map cop_x_m and cop_y_m, or neither",
-        )
     notes = [*table.notes, *sign_note]
+    if len(cop) == 1:  # as of a treadmill, or a line of cells
+        has_x = "cop_x_m" in stated.columns or "cop_x_m" in table.columns
+        nothing = np.full(len(grf_n), np.nan)
+        cop = [cop[0], nothing] if has_x else [nothing, cop[0]]
+        notes.append(f"the centre of pressure is known along {'x' if has_x else 'y'} only")
     timed = ~np.isnan(time_s)
     if not timed.all():
         notes.append(f"{int((~timed).sum())} of {len(timed)} samples have no time: left out")
         time_s, grf_n, cop = time_s[timed], grf_n[timed], [column[timed] for column in cop]
     if len(time_s) < 2:
         raise FileFormatError(f"{len(time_s)} samples", where=where, expected="at least two")
+    time_s, spread_note = spread_even(time_s)
+    notes += filter(None, [spread_note])
     _check_time(time_s, where)
     if abs(time_s[0]) >= NUMBER_MAX:
         notes.append(
@@ -170,6 +183,24 @@ def as_reference(table: Table, stated: Stated) -> ReferenceData:
     )
 
 
+def _parts(name: str) -> list[str]:
+    return [part.strip() for part in name.split("+")]
+
+
+def _times(table: Table, stated: Stated, count: int) -> Floats:
+    """Return the times of all samples in s, by their numbers where their rate is stated."""
+    if stated.rate_hz is None:
+        return _column(table, stated, "time_s")
+    numbers = table.columns.get(stated.columns.get("time_s", ""), np.arange(count))
+    if not np.array_equal(numbers, np.rint(numbers)):
+        raise UsageError(
+            f"--rate-hz goes with numbers of samples, and {stated.columns['time_s']!r} has others",
+            where=table.where,
+            remedy="Leave out --rate-hz, or the time from --map",
+        )
+    return np.asarray(numbers / stated.rate_hz, dtype=np.float64)
+
+
 def _column(table: Table, stated: Stated, name: str) -> Floats:
     """Return a quantity in SI units, with NaN where a cell is empty.
 
@@ -179,9 +210,10 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
     """
     given = stated.columns.get(name, name)
     turned, theirs = given.startswith("-"), given.removeprefix("-")
-    if theirs not in table.columns:
+    parts = [theirs] if theirs in table.columns else _parts(theirs)
+    if absent := [part for part in parts if part not in table.columns]:
         raise FileFormatError(
-            f"no column {theirs!r} for {name} (it has "
+            f"no column {absent[0]!r} for {name} (it has "
             f"{', '.join(filter(None, table.names))[:200]})",
             where=table.where,
             expected=table.form,
@@ -189,8 +221,12 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
         )
     quantity = name.partition("_")[0]
     factors = FACTORS[quantity]
-    unit, of_file = stated.units.get(quantity), table.units.get(theirs)
-    if of_file is not None and of_file not in factors:
+    unit = stated.units.get(quantity)
+    of_parts = {table.units.get(part) for part in parts}
+    of_file = of_parts.pop() if len(of_parts) == 1 else None
+    if of_parts:
+        raise UsageError(f"the columns of {theirs!r} have different units", where=table.where)
+    if of_file not in factors:
         of_file = None
     if unit is not None and of_file is not None and unit != of_file:
         raise UsageError(
@@ -205,7 +241,8 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
             where=table.where,
             remedy=f"Add --units {quantity}={'|'.join(factors)}",
         )
-    values = np.asarray(table.columns[theirs] * factors[unit], dtype=np.float64)
+    total = sum(table.columns[part] for part in parts)
+    values = np.asarray(total * factors[unit], dtype=np.float64)
     # A centre of pressure may be anywhere while nothing bears: `_drop_far_cop`.
     greatest = {"time": TIME_MAX_S, "grf": NUMBER_MAX}.get(quantity)
     if greatest is not None and len(bad := np.flatnonzero(np.abs(values) >= greatest)):
@@ -225,12 +262,12 @@ def _with_sign(
     name = stated.columns.get("grf_n", "grf_n")
     if stated.sign is not None:
         return SIGNS[stated.sign] * grf_n, ()
-    if name.removeprefix("-") in table.positive:
+    bare = name.removeprefix("-")
+    parts = {bare} if bare in table.columns else set(_parts(bare))
+    if parts <= table.positive:
         return grf_n, ()
-    if name in table.plates:
-        return _positive_under_load(grf_n, time_s, table.where)
-    if name.removeprefix("-") in table.plates:  # turned by the user
-        return grf_n, ()
+    if parts <= table.plates:  # one that the user has turned is as they say
+        return (grf_n, ()) if name != bare else _positive_under_load(grf_n, time_s, table.where)
     raise UsageError(
         f"the sign of column {name!r} is not stated",
         where=table.where,
@@ -283,14 +320,14 @@ def _drop_far_cop(cop_m: Floats, grf_n: Floats, where: str) -> list[str]:
     Raises:
         FileFormatError: it is nowhere under load.
     """
-    far = ~(np.abs(cop_m) < NUMBER_MAX).all(axis=1) & ~np.isnan(cop_m).any(axis=1)
+    far = (np.abs(cop_m) >= NUMBER_MAX).any(axis=1)
     if not far.any():
         return []
     bears = far & (grf_n > BEARS * np.max(grf_n))
     if bears.any():
         sample = int(np.flatnonzero(bears)[0])
         raise FileFormatError(
-            f"the centre of pressure is {np.abs(cop_m[sample]).max():g} m away at sample "
+            f"the centre of pressure is {np.nanmax(np.abs(cop_m[sample])):g} m away at sample "
             f"{sample + 1}, under {grf_n[sample]:.4g} N",
             where=where,
             expected=f"numbers below {NUMBER_MAX:g}",

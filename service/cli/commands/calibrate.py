@@ -20,6 +20,7 @@ from service.cli.options import (
 from service.cli.reference_options import (
     ColumnsOfReference,
     LagRange,
+    RateOfReference,
     SignOfReference,
     UnitsOfReference,
     named_values,
@@ -77,6 +78,7 @@ def calibrate_command(
     columns: ColumnsOfReference = None,
     units: UnitsOfReference = None,
     sign: SignOfReference = None,
+    rate_hz: RateOfReference = None,
     lag_range_s: LagRange = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -99,7 +101,9 @@ def calibrate_command(
         from storage.formats.reference import Stated
 
         options = AgainstOptions(
-            stated=Stated(named_values(columns, "--map"), named_values(units, "--units"), sign),
+            stated=Stated(
+                named_values(columns, "--map"), named_values(units, "--units"), sign, rate_hz
+            ),
             lag_range_s=pair(lag_range_s, "--lag-range-s"),
             per_tile=per_tile,
             shear=shear,
@@ -112,7 +116,7 @@ def calibrate_command(
         per_tile
         or shear
         or reference_gain_sigma
-        or any(one is not None for one in (columns, units, sign, lag_range_s))
+        or any(one is not None for one in (columns, units, sign, rate_hz, lag_range_s))
     ):
         raise UsageError("that is said of a plate, and none is named", remedy="Add --against FILE")
     from service.cli.calibration_report import calibration_json, calibration_tables

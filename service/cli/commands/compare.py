@@ -17,6 +17,7 @@ from service.cli.options import JsonOption, print_json, progress, remark, say, s
 from service.cli.reference_options import (
     ColumnsOfReference,
     LagRange,
+    RateOfReference,
     SignOfReference,
     UnitsOfReference,
     named_values,
@@ -47,6 +48,7 @@ def compare_command(
     columns: ColumnsOfReference = None,
     units: UnitsOfReference = None,
     sign: SignOfReference = None,
+    rate_hz: RateOfReference = None,
     reference_sigma_n: Annotated[
         float | None,
         typer.Option(min=0.0, help="Standard uncertainty of the reference; tells coverage."),
@@ -106,6 +108,7 @@ def compare_command(
         "map": columns,
         "units": units,
         "sign": sign,
+        "rate_hz": rate_hz,
         "lag_range_s": lag_range_s,
         "contact_n": contact_n,
         "cop_offset_m": cop_offset_m,

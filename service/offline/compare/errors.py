@@ -246,7 +246,9 @@ def _cop(
     """Errors of the COP where both are in contact and state it, and the counts."""
     ours = np.stack([pairs.columns["cop_x_m"], pairs.columns["cop_y_m"]], axis=1)
     by_ours = rows & (pairs.columns["contact"] == 1) & np.isfinite(ours).all(axis=1)
-    by_reference = rows & pairs.contact & np.isfinite(pairs.reference_cop_m).all(axis=1)
+    known = np.isfinite(pairs.reference_cop_m)
+    axes = known[rows].any(axis=0)  # of a treadmill there is one
+    by_reference = rows & pairs.contact & known[:, axes].all(axis=1) & axes.any()
     both = by_ours & by_reference
     off_m = ours[both] - pairs.reference_cop_m[both]
     distance_m = np.hypot(*off_m.T)
@@ -262,7 +264,7 @@ def _cop(
     for axis, off in zip("xy", off_m.T, strict=True):
         sigma_m = pairs.columns[f"cop_sigma_{axis}_m"][both].astype(np.float64)
         # Across a line of tiles nothing is measured, and nothing is uncertain.
-        told = reference_sigma_m is not None and (sigma_m > 0.0).any()
+        told = reference_sigma_m is not None and (sigma_m > 0.0).any() and np.isfinite(off).any()
         most_m = INTERVAL_95 * np.hypot(sigma_m, reference_sigma_m or 0.0)
         figures[f"cop_coverage_{axis}_95"] = _mean(np.abs(off) <= most_m) if told else math.nan
     counts = {"ours": by_ours, "reference": by_reference, "both": both}

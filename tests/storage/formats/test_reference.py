@@ -8,9 +8,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, FootTileError, UsageError
 from storage.formats.reference import ReferenceData, Stated, read_reference
+from storage.formats.tables.times import spread_even
 
 LAB = Stated(
     {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "COPx", "cop_y_m": "COPy"},
@@ -140,10 +143,6 @@ def test_what_is_no_measurement_is_refused_by_name(tmp_path: Path, text: str, sa
         (Stated(LAB.columns, {"cop": "mm"}, "+"), "--units grf=N|kN|mN"),
         (Stated(LAB.columns, {"grf": "N"}, "+"), "--units cop=m|cm|mm"),
         (Stated(LAB.columns, LAB.units), "--sign +"),
-        (
-            Stated({"time_s": "Time", "grf_n": "Fz", "cop_x_m": "COPx"}, LAB.units, "+"),
-            "one coordinate",
-        ),
     ],
 )
 def test_units_and_sign_that_are_not_stated_are_not_guessed(
@@ -189,3 +188,68 @@ def test_files_of_another_shape_are_refused(tmp_path: Path, name: str, content: 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"away\.csv"):
         read_reference(tmp_path / "away.csv", LAB)
+
+
+# --- times ----------------------------------------------------------------------------------------
+
+
+@given(
+    count=st.integers(20, 300),
+    hz=st.sampled_from([50.0, 75.0, 100.0, 128.0, 200.0, 1000.0]),
+    quantum_s=st.sampled_from([0.005, 0.01]),
+    begin_s=st.floats(0.0, 100.0),
+)
+def test_rounded_times_are_spread_evenly_within_their_rounding(
+    count: int, hz: float, quantum_s: float, begin_s: float
+) -> None:
+    true_s = begin_s + np.arange(count) / hz
+    rounded_s = np.round(true_s / quantum_s) * quantum_s
+    found_s, note = spread_even(rounded_s)
+    np.testing.assert_allclose(found_s, true_s, atol=quantum_s)
+    assert bool(note) == bool((np.diff(rounded_s) == 0.0).any())
+    if note:
+        assert (np.diff(found_s) > 0.0).all()
+
+
+def test_times_that_pause_or_fall_are_not_spread() -> None:
+    time_s = np.repeat(np.arange(20.0), 2)
+    for other_s in (np.where(time_s > 10.0, time_s + 5.0, time_s), time_s[::-1]):
+        found_s, note = spread_even(other_s)
+        assert found_s is other_s
+        assert note == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [
+        ("n,Fz\n10,0\n11,5\n13,6\n", {"time_s": "n", "grf_n": "Fz"}),
+        ("Fz,x\n0,1\n5,1\n6,1\n", {"grf_n": "Fz"}),
+    ],
+)
+def test_samples_are_numbered_at_a_stated_rate(
+    tmp_path: Path, text: str, columns: dict[str, str]
+) -> None:
+    found = read(tmp_path, text, Stated(columns, {"grf": "N"}, "+", rate_hz=100.0))
+    expected = [0.1, 0.11, 0.13] if "time_s" in columns else [0.0, 0.01, 0.02]
+    np.testing.assert_allclose(found.time_s, expected)
+
+
+def test_a_rate_beside_times_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--rate-hz goes with numbers of samples"):
+        read(tmp_path, GOOD, Stated(LAB.columns, LAB.units, "+", rate_hz=100.0))
+
+
+def test_a_centre_of_pressure_of_one_axis_is_read(tmp_path: Path) -> None:
+    found = read(tmp_path, "time_s,grf_n,cop_y_m\n0,0,\n1,5,0.1\n", Stated())
+    np.testing.assert_array_equal(found.cop_m, [[np.nan, np.nan], [np.nan, 0.1]])
+    assert "along y only" in found.notes[0]
+
+
+def test_plates_are_added_up(tmp_path: Path) -> None:
+    text = "time_s,a (N),b (N),c (kN)\n0,1,2,0\n1,5,7,1\n"
+    found = read(tmp_path, text, Stated({"grf_n": "a (N) + b (N)"}, {}, "+"))
+    assert found.grf_n.tolist() == [3.0, 12.0]
+    with pytest.raises(UsageError, match="have different units"):
+        read(tmp_path, text, Stated({"grf_n": "a (N)+c (kN)"}, {}, "+"))
+    with pytest.raises(FileFormatError, match="no column 'd'"):
+        read(tmp_path, text, Stated({"grf_n": "a (N)+d"}, {}, "+"))
