@@ -163,7 +163,9 @@ MARKS = (Column("event", pa.string(), "1", "what people marked at this frame"),)
 """Placed when a session is read (`storage.formats.marks`); never in a sealed file."""
 
 TIMES = (
-    Column("time_s", pa.float64(), "s", "seconds after the session's first frame, of t_ns"),
+    Column(
+        "time_s", pa.float64(), "s", "seconds after the session's first frame, on its time axis"
+    ),
     Column("time_utc", pa.timestamp("ns", "UTC"), "UTC", "t_ns as a timestamp"),
 )
 """Made of `t_ns` when a session is read; never in a sealed file."""

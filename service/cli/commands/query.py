@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -80,7 +81,8 @@ def query_command(
     elif as_csv:
         from storage.formats.written.csv_text import write_csv
 
-        write_csv(sys.stdout.buffer, answer)
+        with _unwritable("the answer"):
+            write_csv(sys.stdout.buffer, answer)
     else:
         _print(answer)
     for place, reason in archive.left_out.items():
@@ -90,7 +92,41 @@ def query_command(
 
 
 def _rows(answer: pa.Table) -> list[dict[str, Any]]:
-    return [{name: _value(value) for name, value in row.items()} for row in answer.to_pylist()]
+    columns = {name: _values(answer.column(name), name) for name in answer.column_names}
+    return [
+        {name: _value(values[row]) for name, values in columns.items()}
+        for row in range(len(answer))
+    ]
+
+
+def _values(column: pa.ChunkedArray[Any], name: str) -> list[Any]:
+    """Return a column as Python has it, or as text where Python has no such value."""
+    import pyarrow as pa
+
+    with _unwritable(name):
+        try:
+            return column.to_pylist()
+        except (ValueError, ArithmeticError):  # a date behind the year 9999
+            return column.cast(pa.string()).to_pylist()
+
+
+@contextmanager
+def _unwritable(what: str) -> Iterator[None]:
+    """Turn what Arrow cannot write into an error with a way out.
+
+    Raises:
+        UsageError: in place of Arrow's.
+    """
+    import pyarrow as pa
+
+    try:
+        yield
+    except pa.ArrowException as error:
+        raise UsageError(
+            f"{what!r} has values that cannot be written here: {error}",
+            expected="numbers, text, and dates up to the year 9999",
+            remedy="Cast them to VARCHAR in the question, or write them with --out FILE.parquet",
+        ) from error
 
 
 def _value(value: Any) -> Any:
@@ -100,7 +136,7 @@ def _value(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(name): _value(each) for name, each in value.items()}
     if isinstance(value, Decimal):
-        return float(value) if value % 1 else int(value)
+        return int(value) if value == value.to_integral_value() else float(value)
     return value if isinstance(value, str | int | float | None) else str(value)
 
 
@@ -130,5 +166,5 @@ def _write(answer: pa.Table, path: Path) -> None:
 
     from storage.durable import whole_file
 
-    with whole_file(path) as file:
+    with whole_file(path) as file, _unwritable("the answer"):
         pq.write_table(answer, file, compression="zstd")

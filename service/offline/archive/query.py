@@ -63,8 +63,8 @@ def ask(archive: Archive, sql: str) -> pa.Table:
             for name, make in makers.items():
                 if name in asked:
                     connection.register(name, make())
-            return _plain(connection.sql(sql).to_arrow_table())
-        except duckdb.Error as error:
+            return _plain(_without_intervals(connection.sql(sql)).to_arrow_table())
+        except (duckdb.Error, pa.ArrowException) as error:
             raise _explained(error) from error
 
 
@@ -95,6 +95,19 @@ def _tables_in(node: Any) -> Iterator[str]:
     if isinstance(node, list):
         for each in node:
             yield from _tables_in(each)
+
+
+def _without_intervals(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
+    """Return the answer with intervals as text: of months neither CSV, Parquet nor JSON has any."""
+    if not any("INTERVAL" in str(kind) for kind in answer.types):
+        return answer
+    names = [f'"{name.replace(chr(34), chr(34) * 2)}"' for name in answer.columns]
+    return answer.project(
+        ", ".join(
+            f"CAST({name} AS VARCHAR) AS {name}" if "INTERVAL" in str(kind) else name
+            for name, kind in zip(names, answer.types, strict=True)
+        )
+    )
 
 
 def _plain(table: pa.Table) -> pa.Table:

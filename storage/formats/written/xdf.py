@@ -23,6 +23,7 @@ import pyarrow as pa
 from storage.formats.export import Export
 from storage.formats.written.format import Format
 from storage.formats.written.together import distinct, instants_of
+from storage.formats.written.xml_text import xml_text
 from storage.schema import KNOWN, NO_INSTANT, SERVER_TIME, Array
 
 _MAGIC = b"XDF:"
@@ -255,7 +256,7 @@ def _chunk(tag: int, content: bytes) -> bytes:
 
 def _texts(parent: Element, texts: Mapping[str, str]) -> None:
     for name, text in texts.items():
-        SubElement(parent, name).text = text
+        SubElement(parent, name).text = xml_text(text)
 
 
 XDF = Format(

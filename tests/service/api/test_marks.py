@@ -284,7 +284,7 @@ def test_a_damaged_table_of_events_is_an_error_and_marks_can_be_left_out(
     assert command(monkeypatch, "export", *arguments, "--no-marks") == 0
 
 
-SET = {
+SET: dict[str, list[dict[str, object]]] = {
     "PATCH": [{"name": "{}"}, {"subject": "{}"}, {"tags": ["{}"]}, {"notes": "{}"}],
     "POST": [{"label": "{}"}],
 }

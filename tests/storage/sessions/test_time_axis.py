@@ -153,7 +153,7 @@ def test_a_part_without_frames_takes_no_time_and_two_parts_of_one_stream_have_on
 def test_no_frame_of_a_time_is_left_out(
     shifts_ns: list[int], t_ns: list[int], begin_ns: int | None, end_ns: int | None
 ) -> None:
-    axis = TimeAxis(tuple(shifts_ns), ("node",) * len(shifts_ns))
+    axis = TimeAxis(tuple(shifts_ns))
     part = np.arange(len(t_ns), dtype=np.uint16) % len(shifts_ns)
     at_ns = axis.at(np.array(t_ns, dtype=np.int64), part)
     inside = np.ones(len(t_ns), dtype=bool)
@@ -166,6 +166,13 @@ def test_it_is_read_back_as_it_was_stated() -> None:
     axis = TimeAxis((0, -YEARS_57), ("node", "server"))
     assert TimeAxis.from_dicts(axis.as_dicts(), where="x") == axis
     assert NODE_AXIS.remark() == ""
-    for wrong in (None, [{}], [{"shift_ns": "a", "by": "node"}], [{"shift_ns": 1, "by": "x"}], 5):
+    odd: list[object] = [
+        None,
+        [{}],
+        [{"shift_ns": "a", "by": "node"}],
+        [{"shift_ns": 1, "by": "x"}],
+        5,
+    ]
+    for wrong in odd:
         with pytest.raises(ValueError, match="no time axis"):
             TimeAxis.from_dicts(wrong, where="x")

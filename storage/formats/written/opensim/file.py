@@ -30,6 +30,7 @@ from storage.formats.written.opensim.loads import COLUMNS, GROUND, Loads, loads_
 from storage.formats.written.reaction import Reaction, reactions_of
 from storage.formats.written.sink import Sink
 from storage.formats.written.together import distinct
+from storage.formats.written.xml_text import xml_text
 
 FRAMES_MAX = 2_000_000
 """An hour at 544 Hz, of all sessions together."""
@@ -144,7 +145,9 @@ def _external_force(foot: Foot) -> str:
         "point_identifier": f"{foot.prefix}ground_force_p",
         "torque_identifier": f"{foot.prefix}ground_torque_",
     }
-    inside = "".join(f"\t\t\t\t<{tag}>{escape(text)}</{tag}>\n" for tag, text in tags.items())
+    inside = "".join(
+        f"\t\t\t\t<{tag}>{escape(xml_text(text))}</{tag}>\n" for tag, text in tags.items()
+    )
     name = f"foottile_{foot.prefix}grf"
     return f'\t\t\t<ExternalForce name="{name}">\n{inside}\t\t\t</ExternalForce>\n'
 

@@ -98,7 +98,7 @@ def test_no_name_controls_a_terminal_or_makes_a_line(
     if is_sealed:
         run("recover", data)
     for arguments in COMMANDS[command]:
-        where = ("--data", data) if command in _IN_FOLDER else ()
+        where: tuple[object, ...] = ("--data", data) if command in _IN_FOLDER else ()
         if command == "recover":
             where = (data,)
         outcome = run(command, *arguments, *where)

@@ -94,3 +94,28 @@ def test_a_data_folder_without_a_session_yet_answers_with_nothing(run: Run, tmp_
     (tmp_path / "data" / "sessions").mkdir(parents=True)
     said = run("query", "SELECT count(*) AS n FROM sessions", "data", "--json").printed()
     assert said["rows"] == [{"n": 0}]
+
+
+ODD_VALUES = [
+    "DATE '20000-01-01'",
+    "TIMESTAMP '290000-01-01'",
+    "'infinity'::DATE",
+    "INTERVAL 100000000 YEARS",
+    "170141183460469231731687303715884105727::HUGEINT",
+    "[DATE '20000-01-01']",
+    "{'a': INTERVAL 1 MONTH}",
+]
+
+
+@pytest.mark.parametrize("value", ODD_VALUES)
+def test_a_value_that_python_or_a_format_has_not_is_text_or_a_sentence(
+    run: Run, tmp_path: Path, value: str
+) -> None:
+    (tmp_path / "sessions").mkdir()
+    for how in ((), ("--csv",), ("--json",), ("--out", "x.parquet")):
+        outcome = run("query", f"SELECT {value} AS x", "--data", ".", *how)
+        if outcome.code:
+            outcome.fails(2, "'", "VARCHAR")
+            assert outcome.err.count("\n") == 1
+        else:
+            assert "x" in outcome.out

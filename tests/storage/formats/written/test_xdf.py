@@ -168,3 +168,18 @@ def test_a_pause_of_years_has_one_clock_offset_behind_it(monkeypatch: pytest.Mon
         streams, _ = read(b"".join(chunks))
         found[each is late] = len(streams["left frames"]["clock_times"])
     assert found[False] <= found[True] <= found[False] + 1
+
+
+@pytest.mark.parametrize("odd", ["\ufffe", "\uffff", "\x08"])
+def test_what_xml_cannot_hold_is_an_escape_and_the_file_is_read(odd: str) -> None:
+    info = make_array()
+    tiles = tuple(tile.model_copy(update={"serial": f"T{odd}1"}) for tile in info.tiles)
+    info = info.model_copy(update={"tiles": tiles})
+    content = content_of(cut(frames(), extra(), 20))
+    found = b"".join(
+        export(content, info, NOTES, "xdf", Slice(), None, None, {"session": odd}, NO_OPTIONS)
+    )
+    streams, header = read(found)
+    shown = odd.encode("unicode_escape").decode()
+    assert header["session"] == [shown]
+    assert repr(f"T{shown}1")[1:-1] in str(streams)
