@@ -41,8 +41,8 @@ def can_be_shown(text: str) -> str:
     return text
 
 
-_MISLEADING = re.compile("[\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ufffe\uffff]")
-"""Line separators, overrides of the direction of writing, byte order marks, no characters.
+_MISLEADING = re.compile("[\u202a-\u202e\u2066-\u2069\ufeff\ufffe\uffff]")
+"""Overrides of the direction of writing, byte order marks, no characters.
 
 Joiners and other marks without width stay: Persian, Hindi and emoji are written with them.
 """

@@ -300,7 +300,6 @@ SET: dict[str, list[dict[str, object]]] = {
         "a\x9bb",
         "a\u202eb",
         "a\u2066b",
-        "a\u2028b",
         "\ufeffa",
     ],
 )

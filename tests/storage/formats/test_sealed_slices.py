@@ -131,10 +131,11 @@ def of_the_whole(
     with SessionReader(path) as reader:
         table = clock_beside(reader)
         times = {name: getattr(frames, name) for name in TIMES} | {"part": extra["part"]}
-        marks = place(events, [times], table, part) if events else None
+        axis = reader.axis
+        marks = place(events, [times], table, part, axis=axis) if events else None
         return outcome(
             lambda: export(
-                content_of([(frames, extra)]),
+                content_of([(frames, extra)], axis=axis),
                 reader.info,
                 reader.notes,
                 "arrow",
