@@ -55,6 +55,7 @@ def data(tmp_path: Path) -> Path:
 
 
 COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
+    "accept-node": ((HOSTILE, "--server", "http://127.0.0.1:1"),),
     "calibrate": ((ID, "--out", "cal.json"),),
     "compare": ((ID, "--reference", "gone.csv", "--out", "o"),),
     "estimate": ((ID, "--out", "x.parquet"),),
