@@ -37,7 +37,7 @@ def user_folder(kind: Kind, given: Path | None, option: str) -> Path:
     folder = _default(kind)
     if folder is None:
         problem = f"no home folder is known for user {os.getuid()}"
-    elif not _can_be_written(folder):
+    elif kind != "state" and not _can_be_written(folder):  # a node goes on without a disk
         problem = f"user {os.getuid()} cannot write in {str(folder)!r}"
     else:
         return folder

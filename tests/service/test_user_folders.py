@@ -51,9 +51,10 @@ def test_a_home_in_which_nothing_can_be_written_is_named_with_the_option(
     monkeypatch.setenv("HOME", str(tmp_path / "root"))
     monkeypatch.setattr(os, "access", lambda *_: False)  # as `/` is to user 12345
     with pytest.raises(UsageError, match=r"cannot write in .*root.* with --where"):
-        user_folder("state", None, "--where")
-    (tmp_path / "root" / ".local" / "state" / "foottile").mkdir(parents=True)
-    assert user_folder("state", None, "--where").is_dir()  # one that is there may be read
+        user_folder("data", None, "--where")
+    assert user_folder("state", None, "--where")  # a node goes on without a disk
+    (tmp_path / "root" / ".local" / "share" / "foottile").mkdir(parents=True)
+    assert user_folder("data", None, "--where").is_dir()  # one that is there may be read
 
 
 @pytest.mark.usefixtures("no_home")
