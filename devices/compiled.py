@@ -71,7 +71,7 @@ def _compiled(function: F, *, forceinline: bool) -> F:
 def has_cache_folder() -> bool:
     """Is there a place for machine code? Without a home numba would make a folder named "~"."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~")
-    return bool(numba.config.CACHE_DIR) or os.path.isabs(home)
+    return bool(os.environ.get("NUMBA_CACHE_DIR")) or os.path.isabs(home)
 
 
 class _Kept(FunctionCache):

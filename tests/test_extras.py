@@ -134,7 +134,9 @@ def test_the_lowest_versions_that_are_declared_are_those_of_their_lock() -> None
         *PROJECT["dependencies"],
         *(each for extra in product for each in PROJECT["optional-dependencies"][extra]),
     ]
-    lowest = dict(re.match(r"([a-z0-9-]+)>=([0-9.]+)", each).groups() for each in declared)  # type: ignore[union-attr]
+    lowest = dict(
+        pair for each in declared for pair in re.findall(r"^([a-z0-9-]+)>=([0-9.]+)", each)
+    )
     assert len(lowest) > 20
     stale = {
         name: (pins.get(name), least)
