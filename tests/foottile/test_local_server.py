@@ -133,7 +133,9 @@ def test_a_record_that_is_damaged_does_not_count(content: bytes) -> None:
     with publish_local_server(LocalServer("http://127.0.0.1:9", "x")):
         from foottile.local_server import _record_path
 
-        _record_path(9).write_bytes(content)
+        path = _record_path(9)
+        assert path is not None
+        path.write_bytes(content)
         assert find_local_server("http://127.0.0.1:9") is None
 
 

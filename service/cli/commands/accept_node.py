@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
@@ -10,7 +9,7 @@ import typer
 
 from devices.errors import StateError, needs_extra
 from service.cli.commands.sessions import SERVER, ServerOption
-from service.cli.options import data_folder, say
+from service.cli.options import CaOption, TokenFolderOption, read_data_token, say
 
 
 @needs_extra("server", "`foottile accept-node`")
@@ -21,7 +20,8 @@ def accept_node_command(
         typer.Option(help="Only the machine with this one; default: the one that asked last."),
     ] = None,
     server: ServerOption = None,
-    data: Annotated[Path | None, typer.Option(help="Its data folder, which has its token.")] = None,
+    ca: CaOption = None,
+    data: TokenFolderOption = None,
 ) -> None:
     """Accept another machine under the name of a node.
 
@@ -30,10 +30,9 @@ def accept_node_command(
     fingerprint with the one that the machine prints. Run it on the server's own computer.
     """
     import foottile
-    from service.api.address import known_token
 
     path = f"/nodes/{quote(node, safe='')}"
-    with foottile.connect(server or SERVER, known_token(data_folder(data))) as source:
+    with foottile.connect(server or SERVER, read_data_token(data), ca=ca) as source:
         asking = source.http.get(path)["replacement"]
         if asking is None:
             raise StateError(

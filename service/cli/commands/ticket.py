@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from devices.errors import UsageError, needs_extra
+from devices.errors import needs_extra
 from service.cli.commands.sessions import SERVER, ServerOption
-from service.cli.options import CaOption, JsonOption, print_json
+from service.cli.options import (
+    CaOption,
+    JsonOption,
+    TokenFolderOption,
+    print_json,
+    read_data_token,
+)
 from service.cli.tickets import say_ticket
 
 
@@ -18,9 +23,7 @@ def ticket_command(
     viewer: Annotated[bool, typer.Option("--viewer", help="One that may look, not press.")] = False,
     server: ServerOption = None,
     ca: CaOption = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Take the token from this data folder of the server.")
-    ] = None,
+    data: TokenFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Give a ticket for the live page: an address, and on a terminal its QR code.
@@ -31,22 +34,9 @@ def ticket_command(
     """
     import foottile
 
-    with foottile.connect(server or SERVER, _token_in(data), ca=ca) as source:
+    with foottile.connect(server or SERVER, read_data_token(data), ca=ca) as source:
         ticket = source.ticket(may="look" if viewer else "press")
     if as_json:
         print_json(ticket)
     else:
         say_ticket(ticket["urls"], viewer=viewer)
-
-
-def _token_in(data: Path | None) -> str | None:
-    from service.api.address import KEPT_IN, kept_token
-
-    try:
-        return None if data is None else kept_token(data)
-    except FileNotFoundError as error:
-        raise UsageError(
-            f"no token in the data folder {str(data)!r}",
-            expected=f"a file `{KEPT_IN}`, which a server makes unless FOOTTILE_TOKEN is set",
-            remedy="Name the folder of --data of `foottile serve`, or set FOOTTILE_TOKEN",
-        ) from error

@@ -33,6 +33,7 @@ SHORT = (
     "x.parquet",
 )
 COMMANDS: dict[str, tuple[object, ...]] = {
+    "accept-node": ("bench", "--server", "http://127.0.0.1:1"),
     "bench": ("--out", "bench", "--scene", "gone.toml"),
     "calibrate": ("s.parquet", "--out", "cal.json"),
     "compare": ("s.parquet", "--reference", "s.parquet", "--out", "o"),
