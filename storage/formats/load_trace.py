@@ -20,6 +20,7 @@ from devices.errors import FileFormatError, LoadTraceError, UsageError
 from storage.formats.reference import Stated, as_reference
 from storage.formats.session_load import SESSION_COLUMN, as_load
 from storage.formats.tables.registry import read_table
+from storage.formats.tables.session import read_axis
 from storage.formats.tables.table import INSTANTS, OURS, Column, Table
 from storage.formats.tables.times import spread_even
 
@@ -113,7 +114,7 @@ def _read(path: Path) -> tuple[dict[str, Column], list[str]]:
         names = [name.lower() for name in table.names if name]
         columns = _lower(table)
         if INSTANTS in columns:
-            columns = as_load(columns, table.schema, where=table.where)
+            columns = as_load(columns, table.schema, where=table.where, axis=read_axis(path))
         elif "grf_n" in columns and "fz_n" not in columns and "cell1_n" not in columns:
             columns = _of_reference(table)
     except (FileFormatError, UsageError) as error:

@@ -18,9 +18,10 @@ import pyarrow as pa
 from devices.errors import FileFormatError, LoadTraceError
 from storage.formats.tables.table import INSTANTS, Column
 from storage.schema import array_info
+from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 SESSION_COLUMN = re.compile(
-    r"t_ns|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)",
+    r"t_ns|part|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)",
 )
 """A pattern of the columns that are needed."""
 
@@ -28,7 +29,11 @@ _TOTAL = ("grf_n", "cop_x_m", "cop_y_m")
 
 
 def as_load(
-    columns: Mapping[str, Column], schema: pa.Schema | None, *, where: str
+    columns: Mapping[str, Column],
+    schema: pa.Schema | None,
+    *,
+    where: str,
+    axis: TimeAxis = NODE_AXIS,
 ) -> dict[str, Column]:
     """Return `time_s` and `cell1_n, ...` or `fz_n, cop_x_m, cop_y_m`, and `angle_rad` if known.
 
@@ -36,6 +41,7 @@ def as_load(
         columns: of a session; those that `SESSION_COLUMN` names.
         schema: of its Parquet file, which may describe the array; None of text.
         where: for errors.
+        axis: of the session.
 
     Raises:
         LoadTraceError: it has no load in its columns, or `t_ns` are no instants.
@@ -63,6 +69,8 @@ def as_load(
     t_ns = columns[INSTANTS]
     if t_ns.dtype.kind != "i":
         raise LoadTraceError("t_ns are no instants", where=where, expected="nanoseconds")
+    if axis.is_shifted:  # only a sealed file's is, and each of its rows has a part
+        t_ns = axis.at(t_ns, columns["part"].astype(np.int64))
     found["time_s"] = np.asarray((t_ns - t_ns[:1]) * 1e-9, dtype=np.float64)
     # Where nothing presses there is no centre of pressure, and none is needed.
     needed = [column for name, column in found.items() if not name.startswith("cop_")]

@@ -14,6 +14,7 @@ from devices.inputs import check_file
 from storage.formats.tables.table import INSTANTS, OURS, Table
 from storage.schema import KNOWN
 from storage.sessions.reader import SessionReader
+from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 SESSION_KEY = b"foottile.format"
 
@@ -42,6 +43,18 @@ def read_session(path: Path, named: Collection[str]) -> Table | None:
     columns["time_s"] = (t_ns - t_ns[0]) * 1e-9
     units = {name: unit for name in columns if (unit := OURS.get(name) or KNOWN[name].unit)}
     return Table(where, tuple(single), columns, units, frozenset(columns), epoch_ns=int(t_ns[0]))
+
+
+def read_axis(path: Path) -> TimeAxis:
+    """Return the time axis of a sealed session; of another file, that of its node's date.
+
+    Raises:
+        FileFormatError: it is damaged.
+    """
+    if not is_session(path):
+        return NODE_AXIS
+    with SessionReader(path) as reader:
+        return reader.axis
 
 
 def is_session(path: Path) -> bool:

@@ -14,6 +14,7 @@ import pytest
 
 import foottile
 from service.pull import pull_made
+from storage.formats.load_trace import read_load_trace
 from storage.formats.slice import Slice
 from storage.formats.written.registry import format_named
 from tests.builders.arrays import PERIOD_NS
@@ -139,6 +140,12 @@ def test_no_format_fills_the_years_between(sealed: Recording) -> None:
         for clock in ("node", "server"):
             size = len(sealed.data(format=name, clock=clock).content)
             assert size < 400 * frames_of_gap + 100_000, (name, clock)
+
+
+def test_a_load_has_no_years_between(sealed: Recording) -> None:
+    load = read_load_trace(sealed.folder / "frames.parquet")
+    gap_s = (GAP_NS + PERIOD_NS) * 1e-9
+    assert np.diff(load.time_s).max() == pytest.approx(gap_s, abs=SOON_S)
 
 
 def test_the_client_and_pull_give_both_clocks(
