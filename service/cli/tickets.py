@@ -6,10 +6,21 @@ import re
 import shutil
 import sys
 from io import StringIO
+from typing import Annotated
 from urllib.parse import urlsplit
+
+import typer
 
 from service.cli.options import is_shown, remark, say
 
+AdvertiseOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST",
+        help="Address or name to show to people, as behind a reverse proxy or in a container; "
+        "default: those of all interfaces.",
+    ),
+]
 _BORDER = 2
 _BLACK_ON_WHITE = "\x1b[38;5;231;48;5;16m"
 """Light blocks on a dark ground, whatever colours the terminal has: few phones read it inverted."""

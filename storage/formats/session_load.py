@@ -70,7 +70,7 @@ def as_load(
     if t_ns.dtype.kind != "i":
         raise LoadTraceError("t_ns are no instants", where=where, expected="nanoseconds")
     if axis.is_shifted:  # only a sealed file's is, and each of its rows has a part
-        t_ns = axis.at(t_ns, columns["part"].astype(np.int64))
+        t_ns = axis.at(np.asarray(t_ns, np.int64), columns["part"].astype(np.int64))
     found["time_s"] = np.asarray((t_ns - t_ns[:1]) * 1e-9, dtype=np.float64)
     # Where nothing presses there is no centre of pressure, and none is needed.
     needed = [column for name, column in found.items() if not name.startswith("cop_")]

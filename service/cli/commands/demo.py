@@ -26,7 +26,7 @@ from service.cli.options import (
     stop_on_signals,
     with_foot_options,
 )
-from service.cli.tickets import host_of, remark_reach
+from service.cli.tickets import AdvertiseOption, host_of, remark_reach
 
 if TYPE_CHECKING:
     import socket
@@ -46,14 +46,7 @@ def demo_command(
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
-    advertise: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST",
-            help="Address or name to show to people, as behind a reverse proxy or in a container; "
-            "default: those of all interfaces.",
-        ),
-    ] = None,
+    advertise: AdvertiseOption = None,
     data: Annotated[
         Path | None, typer.Option(help="Folder for sessions; default: one for demos.")
     ] = None,

@@ -12,7 +12,7 @@ import typer
 
 from devices.errors import needs_extra
 from service.cli.options import remark, say, stop_on_signals
-from service.cli.tickets import host_of, reaches_others, remark_reach, show_code
+from service.cli.tickets import AdvertiseOption, host_of, reaches_others, remark_reach, show_code
 
 if TYPE_CHECKING:
     from service.api.logins import Logins
@@ -37,14 +37,7 @@ def serve_command(
             help="Further name under which the server is reached; may be given several times."
         ),
     ] = None,
-    advertise: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST",
-            help="Address or name to show to people, as behind a reverse proxy or in a container; "
-            "default: those of all interfaces.",
-        ),
-    ] = None,
+    advertise: AdvertiseOption = None,
     private: Annotated[
         bool | None,
         typer.Option("--private", help="Ask for a login to look, too; default: only to change."),
