@@ -50,10 +50,6 @@ CaOption = Annotated[
         help="CA certificates in PEM that an https server's may be of, beside the machine's own.",
     ),
 ]
-TokenFolderOption = Annotated[
-    Path | None,
-    typer.Option("--data", help="Take the token from this data folder of the server."),
-]
 StartOption = Annotated[
     float | None, typer.Option(help="From so many seconds after the first frame.")
 ]
@@ -107,27 +103,6 @@ def data_folder(given: Path | None) -> Path:
     from service.user_folders import user_folder
 
     return user_folder("data", given, "--data")
-
-
-def read_data_token(folder: Path | None) -> str | None:
-    """Return the token that a server keeps in its data folder; None without a folder.
-
-    Raises:
-        UsageError: no token is there.
-    """
-    from service.api.address import KEPT_IN, kept_token
-
-    if folder is None:
-        return None
-    folder = data_folder(folder)
-    try:
-        return kept_token(folder)
-    except FileNotFoundError as error:
-        raise UsageError(
-            f"no token in the data folder {str(folder)!r}",
-            expected=f"a file `{KEPT_IN}`, which a server makes unless FOOTTILE_TOKEN is set",
-            remedy="Name the folder of --data of `foottile serve`, or set FOOTTILE_TOKEN",
-        ) from error
 
 
 def output_path(path: Path, *inputs: Path) -> Path:

@@ -1,4 +1,4 @@
-"""A ticket as people see it: the address that has it, and on a terminal a code for a phone."""
+"""Tickets and tokens on the command line: addresses, QR codes, and the token of a data folder."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import re
 import shutil
 import sys
 from io import StringIO
+from pathlib import Path
 from typing import Annotated
 from urllib.parse import urlsplit
 
 import typer
 
-from service.cli.options import is_shown, remark, say
+from devices.errors import UsageError
+from service.cli.options import data_folder, is_shown, remark, say
 
 AdvertiseOption = Annotated[
     str | None,
@@ -21,11 +23,36 @@ AdvertiseOption = Annotated[
         "default: those of all interfaces.",
     ),
 ]
+TokenFolderOption = Annotated[
+    Path | None,
+    typer.Option("--data", help="Take the token from this data folder of the server."),
+]
 _BORDER = 2
 _BLACK_ON_WHITE = "\x1b[38;5;231;48;5;16m"
 """Light blocks on a dark ground, whatever colours the terminal has: few phones read it inverted."""
 _WHITE_ON_WHITE = "\x1b[38;5;231;48;5;231m"
 _USUAL = "\x1b[0m"
+
+
+def read_data_token(folder: Path | None) -> str | None:
+    """Return the token that a server keeps in its data folder; None without a folder.
+
+    Raises:
+        UsageError: no token is there.
+    """
+    from service.api.address import KEPT_IN, kept_token
+
+    if folder is None:
+        return None
+    folder = data_folder(folder)
+    try:
+        return kept_token(folder)
+    except FileNotFoundError as error:
+        raise UsageError(
+            f"no token in the data folder {str(folder)!r}",
+            expected=f"a file `{KEPT_IN}`, which a server makes unless FOOTTILE_TOKEN is set",
+            remedy="Name the folder of --data of `foottile serve`, or set FOOTTILE_TOKEN",
+        ) from error
 
 
 def host_of(url: str) -> str:

@@ -9,7 +9,8 @@ import typer
 
 from devices.errors import StateError, needs_extra
 from service.cli.commands.sessions import SERVER, ServerOption
-from service.cli.options import CaOption, TokenFolderOption, read_data_token, say
+from service.cli.options import CaOption, say
+from service.cli.tickets import TokenFolderOption, read_data_token
 
 
 @needs_extra("server", "`foottile accept-node`")

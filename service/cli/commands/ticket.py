@@ -11,11 +11,9 @@ from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import (
     CaOption,
     JsonOption,
-    TokenFolderOption,
     print_json,
-    read_data_token,
 )
-from service.cli.tickets import say_ticket
+from service.cli.tickets import TokenFolderOption, read_data_token, say_ticket
 
 
 @needs_extra("server", "`foottile ticket`")
