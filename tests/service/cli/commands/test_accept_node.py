@@ -16,8 +16,7 @@ Accept = Callable[..., Outcome]
 
 @pytest.fixture
 def accept(run: Run, running: Running) -> Accept:
-    where = ("--server", running.url, "--data", str(running.data))
-    return lambda *arguments: run("accept-node", *arguments, *where)
+    return lambda *arguments: run("accept-node", *arguments, "--server", running.url)
 
 
 @pytest.fixture
