@@ -23,6 +23,9 @@ interface NodeCalibration {
   calibration: { id: string; name: string; absolute_scale: "measured" | "assumed" } | null;
 }
 
+/** A machine that asks to connect under the name of a node. */
+interface Replacement { fingerprint: string; address: string }
+
 interface Mark { id: string; label: string; t_ns: number; said: string }
 
 interface Tile {

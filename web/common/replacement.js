@@ -7,6 +7,7 @@ import { el, setText } from "./text.js";
 
 export class ReplacementWarning {
   constructor() {
+    /** @type {{node: string, replacement: Replacement | null} | null} */
     this.node = null;
     this.text = el("span");
     const accept = el("button", { type: "button", cls: "small presses", text: "Accept it …" });
@@ -15,7 +16,7 @@ export class ReplacementWarning {
     this.element.hidden = true;
   }
 
-  /** Called often. */
+  /** Called often. @param {{node: string, replacement: Replacement | null} | null} node */
   draw(node) {
     this.node = node;
     const asking = node?.replacement;
