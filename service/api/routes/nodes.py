@@ -239,6 +239,7 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
     operation_id="acceptReplacement",
     summary="Accept another machine under the name of a node",
     status_code=HTTPStatus.NO_CONTENT,
+    response_model=None,
     responses={
         **_UNKNOWN,
         **problems(
