@@ -18,6 +18,7 @@ import pytest
 
 from storage.formats.written.registry import FORMATS
 from tests.service.process import Process
+from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.skipif(
@@ -53,7 +54,9 @@ def test_a_session_is_recorded_served_pulled_proven_exported_compared_and_asked_
         words = ("--scene", "standing", "--server", url, "--name", "leg", "--journal", "node")
         with closing(Process("node", *words, folder=tmp_path)) as node:
             node.said("connected to")
-            with httpx.Client(base_url=f"{url}/api/v1", timeout=PATIENCE_S) as api:
+            with httpx.Client(
+                base_url=f"{url}/api/v1", headers=SHARED_BEARER, timeout=PATIENCE_S
+            ) as api:
                 asked = {"node": "leg", "name": "main job"}
                 begun = api.post("/sessions", json=asked).raise_for_status().json()
                 route = f"/sessions/{begun['id']}"
