@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 import ssl
+import stat
 from pathlib import Path
 
 from foottile.errors import UsageError
+
+_BYTES_MAX = 16 << 20
+"""Of a file of CAs: 70 times as many as Debian trusts."""
 
 
 def make_context(ca: str | os.PathLike[str] | None = None) -> ssl.SSLContext:
@@ -30,6 +34,7 @@ def make_context(ca: str | os.PathLike[str] | None = None) -> ssl.SSLContext:
             context.load_verify_locations(capath=path)  # they are read when one is needed
             has_some = any(each.suffix in (".pem", ".crt", ".0") for each in path.iterdir())
         else:
+            _check_file(path)
             context.load_verify_locations(cafile=path)
             has_some = len(context.get_ca_certs()) > before or _is_known(path)
     except (OSError, ValueError) as error:  # an ssl.SSLError is an OSError
@@ -39,6 +44,13 @@ def make_context(ca: str | os.PathLike[str] | None = None) -> ssl.SSLContext:
     if not has_some:
         raise UsageError(f"{str(path)!r}: there is no CA certificate in it; expected a file in PEM")
     return context
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what OpenSSL would wait for, as a pipe, or read for hours."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode) or found.st_size > _BYTES_MAX:
+        raise ValueError(f"it is no file of at most {_BYTES_MAX >> 20} MiB")
 
 
 def _is_known(path: Path) -> bool:

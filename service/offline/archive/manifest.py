@@ -21,6 +21,8 @@ _STATED = re.compile(r"(?i)sep=(.)")
 _PIECE = 1 << 20
 _LINE_MAX = 1 << 16
 """A longer line is none of a table: no file is read into memory for it."""
+_BYTES_MAX = 64 << 20
+"""Some 600,000 sessions. All of a file is read before its encoding is known."""
 
 
 def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
@@ -38,7 +40,7 @@ def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
         FileFormatError: a row has no session, or more or fewer cells than there are columns.
     """
     try:
-        check_file(path)
+        check_file(path, bytes_max=_BYTES_MAX)
         encoding = _encoding(path)
         with path.open(encoding=encoding, newline="") as file:
             head = list(islice(_lines(file), _HEAD_LINES))

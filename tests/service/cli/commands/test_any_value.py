@@ -189,6 +189,15 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("simulate", "load"): ("--scene", "standing", "--load", "{}"),
     ("verify", "targets"): ("{}",),
     ("verify", "manifest"): ("--manifest", "{}"),
+    ("accept-node", "ca"): ("bench", "--server", "https://127.0.0.1:1", "--ca", "{}"),
+    ("node", "ca"): ("--scene", "standing", "--server", "https://127.0.0.1:1", "--ca", "{}"),
+    ("pull", "ca"): (
+        *("20200101T000000Z-000000", "--out", "x", "--server", "https://127.0.0.1:1"),
+        *("--ca", "{}"),
+    ),
+    ("sessions", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
+    ("stream", "ca"): ("bench", "--server", "https://127.0.0.1:1", "--ca", "{}"),
+    ("ticket", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
 }
 WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ("calibrate", "out"): ("s.parquet", "--out", "{}"),
