@@ -149,7 +149,8 @@ def _print(answer: pa.Table) -> None:
     for name in answer.column_names:
         is_number = all(isinstance(row[name], int | float | None) for row in rows)
         justify: Any = "right" if is_number else "left"
-        table.add_column(escape(printable(name)), justify=justify, no_wrap=is_number)
+        # A row is one line: a text that goes on in the next could look like a line of ours.
+        table.add_column(escape(printable(name)), justify=justify, no_wrap=True)
     for row in rows:
         table.add_row(*(escape(printable(_text(value))) for value in row.values()))
     stdout.print(table)

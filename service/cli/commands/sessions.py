@@ -116,12 +116,8 @@ def sessions_command(
     table = Table(box=None, pad_edge=False)
     for heading in ("session", "name", "node", "s", "frames", "marks", "state"):
         right = heading in ("s", "frames", "marks")
-        table.add_column(
-            heading,
-            justify="right" if right else "left",
-            no_wrap=heading != "name",
-            overflow="fold",
-        )
+        # A row is one line: a name that goes on in the next could look like a line of ours.
+        table.add_column(heading, justify="right" if right else "left", no_wrap=True)
     for session in found:
         lossy = ", lossy" if session["complete"] == "lossy" else ""
         assumed = ", scale assumed" if session["absolute_scale"] == "assumed" else ""
