@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 _IN = "service.cli.commands"
 
 SUMMARIES = {
-    "demo": "Run a server and an emulated node, and show where the live page is.",
+    "demo": "Run a server and an emulated node, and print a link to the live page.",
     "serve": "Take in nodes, estimate, show live, record, and give sessions away over HTTP.",
     "node": "Take frames from an array, keep them on disk and publish them to a server.",
     "ticket": "Give a ticket for the live page: an address, and on a terminal its QR code.",
