@@ -13,6 +13,7 @@ from service.estimation.calibration import Calibration
 from service.sessions.calibration_file import content_of
 from tests.builders.calibrations import make_calibration
 from tests.service.fake_node import Play
+from tests.web.login import log_in
 from tests.web.received import Received
 from tests.web.scripted import Scripted
 from tests.web.test_accessible import SIZES, complaints
@@ -122,6 +123,7 @@ def test_a_viewer_sees_calibrations_and_cannot_press(
 
 def test_the_dialog_is_loaded_when_it_is_opened(scripted: Scripted, open_page: OpenPage) -> None:
     page = open_page("about:blank")
+    log_in(page.context, scripted.url)
     received = Received(page)
     page.goto(scripted.url)
     expect(page.locator("#calibration-name")).to_contain_text("Calibration")

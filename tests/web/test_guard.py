@@ -11,6 +11,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 from tests.service.fake_node import Play
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S, until
+from tests.web.login import log_in
 from tests.web.scripted import Scripted
 from tests.web.test_accessible import SIZES, complaints
 
@@ -33,6 +34,7 @@ def open_faulty(browser: Browser) -> Iterator[OpenFaulty]:
         answers: dict[str, Answer] | None = None,
     ) -> Page:
         contexts.append(browser.new_context(viewport={"width": size[0], "height": size[1]}))
+        log_in(contexts[-1], url)
         page = contexts[-1].new_page()
         page.set_default_timeout(1e3 * PATIENCE_S)
         if script:

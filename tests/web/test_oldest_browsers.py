@@ -12,6 +12,7 @@ from playwright.sync_api import Page, expect
 
 from tests.service.fake_node import Play
 from tests.service.running import Running
+from tests.tokens import SHARED_TOKEN
 from tests.waiting import until
 from tests.web.scripted import Scripted
 from tests.web.session_page import settled
@@ -77,7 +78,8 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
 ) -> None:
     address = scripted.url.replace("127.0.0.1", "192.0.2.1")
     with Play(scripted.node, alive=True) as play:
-        page = open_page(address, *size, first=WITHOUT_NEWER + WITHOUT_STORAGE)
+        link = f"{address}/#token={SHARED_TOKEN}"
+        page = open_page(link, *size, first=WITHOUT_NEWER + WITHOUT_STORAGE)
         expect(page.locator("body[data-live=true]")).to_have_count(1)
         assert not page.evaluate("isSecureContext")
         page.click("#tare")

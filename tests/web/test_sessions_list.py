@@ -16,6 +16,7 @@ from storage.sessions.folder import SessionFolder
 from tests.service.fake_node import FakeNode
 from tests.service.patient import be_patient
 from tests.service.running import Running
+from tests.web.login import log_in
 from tests.web.received import Received
 from tests.web.test_accessible import complaints
 
@@ -96,6 +97,7 @@ def test_the_first_load_with_a_thousand_sessions_is_small(
     archive: Running, open_page: OpenPage
 ) -> None:
     page = open_page("about:blank", 390, 844)
+    log_in(page.context, archive.url)
     received = Received(page)
     page.goto(archive.url)
     expect(page.locator("#sessions .session")).to_have_count(20)

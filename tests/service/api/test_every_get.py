@@ -15,9 +15,11 @@ import service.api.routes.downloads.zips as zips
 from storage.formats.written.registry import FORMATS
 from tests.service.api.sealed import Sealed
 from tests.service.running import Running
+from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S, until
 
 _PAGES = ("/", "/nodes", "/docs", "/docs/swagger-ui.css", "/static/app.js", "/no-such-page")
+BEARER = SHARED_BEARER["Authorization"]
 _OF_NOW = {"date", "content-length"}
 """Headers of answers that tell the time, and so differ from one to the next."""
 
@@ -99,7 +101,8 @@ def test_head_is_refused_where_get_is(sealed: Sealed) -> None:
 def got_by_old(running: Running, path: str, method: str = "GET") -> tuple[HTTPResponse, bytes]:
     """What follows the headers, byte by byte: until the server closes."""
     with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as raw:
-        raw.sendall(f"{method} {path} HTTP/1.0\r\nHost: localhost\r\n\r\n".encode())
+        lines = (f"{method} {path} HTTP/1.0", "Host: localhost", f"Authorization: {BEARER}", "", "")
+        raw.sendall("\r\n".join(lines).encode())
         answer = HTTPResponse(raw, method=method)
         answer.begin()
         assert answer.getheader("transfer-encoding") is None, path

@@ -66,6 +66,7 @@ import asyncio, os, subprocess, sys
 import foottile
 from service.node.dial import dial, ingest_url
 
+os.environ.pop("FOOTTILE_TOKEN", None)
 words = [sys.executable, "-c", "from service.cli.main import main; main()"]
 serve = subprocess.Popen(
     [*words, "serve", "--host", "::", "--port", "8000", "--data", os.environ["DATA"]],

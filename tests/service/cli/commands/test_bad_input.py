@@ -56,7 +56,6 @@ def test_a_wrong_scene_names_the_key(
         (GOOD_TRACE.replace("time_s", "time_ms"), ["time_s", "time_ms"]),
         (GOOD_TRACE.replace("fz_n", "fz_kn"), ["fz_n", "fz_kn"]),
         (GOOD_TRACE.replace("0.20,", "0.10,"), ["row 21", "rise"]),
-        (GOOD_TRACE.replace("0.20,", "0.19,"), ["row 21", "rise"]),
         (GOOD_TRACE.replace("0.20,30,", "0.20,nan,"), ["fz_n", "row 21"]),
         (GOOD_TRACE.replace("0.20,30,", "0.20,,"), ["fz_n", "row 21"]),
         (GOOD_TRACE.replace("0.20,30,0.0,0.0", "0.20,30,,"), ["row 21", "centre of pressure"]),
