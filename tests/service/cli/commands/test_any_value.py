@@ -228,6 +228,7 @@ IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("reproduce", "out"): ("--out", "{}"),
     ("serve", "data"): ("--port", 0, "--data", "{}"),
     ("sessions", "data"): ("--data", "{}"),
+    ("accept-node", "data"): ("bench", "--server", "http://127.0.0.1:1", "--data", "{}"),
     ("ticket", "data"): ("--server", "http://127.0.0.1:1", "--data", "{}"),
     ("verify", "data"): ("20200101T000000Z-000000", "--data", "{}"),
 }
