@@ -14,8 +14,6 @@ normal.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +21,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.tables.c3d import C3dFile, read_c3d
+from storage.formats.tables.plates import Plate, make_plate_table
 from storage.formats.tables.table import IsNeeded, Table, check_size
 
 FORM = "force platforms of types 1 to 4"
@@ -36,25 +35,6 @@ _FORCE_UNITS = {"n": "N", "newton": "N", "newtons": "N", "kn": "kN"}
 _MOMENT = re.compile(r"(k?N)[ .*·-]?(mm|cm|m)", re.IGNORECASE)
 FLAT_COS = 0.9999
 """A plate whose normal is nearer to an axis of the laboratory, within 0.8 degrees, lies flat."""
-
-
-@dataclass(frozen=True)
-class Plate:
-    """What one plate measures, in the units of the file; n samples.
-
-    Attributes:
-        fz: (n,), along its own z axis.
-        cop: (2, n), or None if nothing states where it is.
-        force: unit of the force; None if the file does not state it.
-        length: unit of the centre of pressure; None likewise.
-        notes: remarks for the user.
-    """
-
-    fz: Floats
-    cop: Floats | None
-    force: str | None
-    length: str | None
-    notes: tuple[str, ...] = ()
 
 
 def read_force_platforms(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
@@ -76,59 +56,28 @@ def read_force_platforms(path: Path, is_needed: IsNeeded, numbers_max: int) -> T
         )
     if not (np.isfinite(file.rate_hz) and file.rate_hz > 0.0):
         raise FileFormatError(f"ANALOG:RATE is {file.rate_hz:g}", where=file.where)
-    plates: dict[int, Plate] = {}
+    plates: list[Plate] = []
     notes: list[str] = []
     refusal: FileFormatError | None = None
     for number in range(1, count + 1):
         try:
-            plates[number] = _plate(file, number - 1, numbers_max)
-            notes += [f"plate {number}: {note}" for note in plates[number].notes]
+            plates.append(_plate(file, number - 1, numbers_max))
         except FileFormatError as error:
             notes.append(f"plate {number} is not read: {error.what}")
             refusal = refusal or error
     if refusal is not None and not plates:
         raise refusal
-    if len(plates) > 1:
-        notes.append(f"there are {len(plates)} plates: --map says which one")
-    return _table(file, plates, [*notes, *_zero_notes(file, plates)])
+    time_s = np.arange(len(plates[0].fz)) / file.rate_hz
+    return make_plate_table(file.where, time_s, plates, [*notes, *_zero_notes(file, plates)])
 
 
-def _table(file: C3dFile, plates: dict[int, Plate], notes: Sequence[str]) -> Table:
-    columns: dict[str, Floats] = {}
-    units = {"time_s": "s"}
-    for number, plate in plates.items():
-        columns[f"plate{number}_fz"] = plate.fz
-        if plate.force is not None:
-            units[f"plate{number}_fz"] = plate.force
-        for axis, cop in zip("xy", () if plate.cop is None else plate.cop, strict=False):
-            columns[f"plate{number}_cop_{axis}"] = cop
-            if plate.length is not None:
-                units[f"plate{number}_cop_{axis}"] = plate.length
-    forces = [f"plate{number}_fz" for number in plates]
-    if len(plates) == 1:
-        theirs = forces[0].removesuffix("_fz")
-        for ours, name in (("grf_n", "fz"), ("cop_x_m", "cop_x"), ("cop_y_m", "cop_y")):
-            if (found := f"{theirs}_{name}") in units:
-                columns[ours], units[ours] = columns[found], units[found]
-        forces.append("grf_n")
-    columns["time_s"] = np.arange(len(columns[forces[0]])) / file.rate_hz
-    return Table(
-        file.where,
-        tuple(columns),
-        columns,
-        units,
-        plates=frozenset(forces),
-        notes=tuple(notes),
-    )
-
-
-def _zero_notes(file: C3dFile, plates: dict[int, Plate]) -> list[str]:
+def _zero_notes(file: C3dFile, plates: list[Plate]) -> list[str]:
     zero = [int(frame) for frame in np.ravel(file.numbers("FORCE_PLATFORM", "ZERO"))]
     if len(zero) != 2 or not 1 <= zero[0] <= zero[1]:
         return []
     first, last = zero
     window = slice((first - 1) * file.samples_a_frame, last * file.samples_a_frame)
-    read = [plate.fz[window] for plate in plates.values()]
+    read = [plate.fz[window] for plate in plates]
     means = ", ".join(f"{fz.mean():.3f}" for fz in read if len(fz))
     return [
         f"frames {first} to {last} are to be its zero, in which plates read {means}: nothing is "
@@ -173,7 +122,8 @@ def _plate(file: C3dFile, i: int, numbers_max: int) -> Plate:
             channels[3:5] *= _METRES[lever] / _METRES[length]
     fz, local, note = _surface(kind, channels, _origin(file, i, kind))
     cop, turned = _in_plane(local, _of_plate(file, "CORNERS", i, (3, 4)))
-    return Plate(fz, cop, force, length, tuple(text for text in (note, turned) if text))
+    notes = tuple(text for text in (note, turned) if text)
+    return Plate(f"plate{i + 1}", fz, cop, force, length, notes=notes)
 
 
 def _same(units: set[str | None]) -> str | None:

@@ -12,7 +12,23 @@ from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
 from storage.formats.tables.pressure_plate import read_pressure_plate
 from storage.formats.tables.table import NUMBERS_MAX, IsNeeded, Table
-from storage.formats.tables.text import read_text_table
+from storage.formats.tables.text import HEAD_CHARACTERS, read_table_text, read_text_table
+
+
+@dataclass(frozen=True)
+class SavedText:
+    """Texts of a measuring program, told by their own head, whatever the ending.
+
+    Attributes:
+        is_one: tells by the first `HEAD_CHARACTERS` of a text whether it is one.
+        read: reads the needed columns of a text, of this path, up to so many numbers.
+    """
+
+    is_one: Callable[[str], bool]
+    read: Callable[[str, str, IsNeeded, int], Table]
+
+
+SAVED_TEXTS: tuple[SavedText, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -28,7 +44,16 @@ class TableFormat:
     read: Callable[[Path, IsNeeded, int], Table]
 
 
-TEXT = TableFormat((".csv", ".txt", ".tsv"), read_text_table)
+def _read_text(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
+    text = read_table_text(path)
+    head = text[:HEAD_CHARACTERS]
+    for one in SAVED_TEXTS:
+        if one.is_one(head):
+            return one.read(text, str(path), is_needed, numbers_max)
+    return read_text_table(text, str(path), is_needed, numbers_max)
+
+
+TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text)
 FORMATS = (
     TEXT,
     TableFormat((".parquet",), read_parquet),

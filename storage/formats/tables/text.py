@@ -83,15 +83,13 @@ class Layout:
     score: int = 0
 
 
-def read_text_table(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
-    """Read a text file of columns.
+def read_text_table(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -> Table:
+    """Read the columns of a text.
 
     Raises:
-        FileFormatError: it cannot be read, is too large, has no line of names above numbers, or a
-            cell of a needed column is no number.
+        FileFormatError: it is too large, has no line of names above numbers, or a cell of a needed
+            column is no number.
     """
-    where = str(path)
-    text = read_table_text(path)
     layout = find_layout(text, where)
     needed = needed_names(layout.names, is_needed, where)
     columns = parse_columns(text, layout, needed, numbers_max, where)

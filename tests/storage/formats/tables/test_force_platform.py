@@ -207,7 +207,7 @@ def test_of_two_plates_none_is_chosen_for_the_user(tmp_path: Path) -> None:
         read(path)
     found = read(path, Stated({"grf_n": "plate2_fz"}))
     np.testing.assert_allclose(found.grf_n, 0.5 * LOAD_N, atol=1e-4)
-    assert "there are 2 plates: --map says which one" in found.notes
+    assert "there are 2 plates or soles (plate1, plate2): --map says which one" in found.notes
 
 
 @pytest.mark.parametrize("content", [b"", b"junk", b"\x02\x50" + b"\xff" * 600])

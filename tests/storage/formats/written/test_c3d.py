@@ -359,7 +359,7 @@ def test_our_reader_of_references_finds_both(tmp_path: Path) -> None:
     found = read_reference(path, Stated({"grf_n": "plate2_fz", **cop_of(2)}))
     on = walk()["contact"] == 1
     np.testing.assert_allclose(found.grf_n, np.where(on, walk()["grf_n"], 0.0), atol=1e-3)
-    assert "2 plates" in found.notes[0]
+    assert "2 plates or soles" in found.notes[0]
 
 
 def cop_of(number: int) -> dict[str, str]:

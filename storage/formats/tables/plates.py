@@ -1,0 +1,71 @@
+"""A table of what force plates, load cells or soles measure, one or several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from devices.arrays import Floats
+from storage.formats.tables.table import Table
+
+
+@dataclass(frozen=True)
+class Plate:
+    """What one plate or sole measures, in the units of the file; n samples.
+
+    Attributes:
+        name: of its columns, as `plate1` or `left`: `plate1_fz`, `plate1_cop_x`, `plate1_cop_y`.
+        fz: (n,), along the plate's normal.
+        cop: (2, n), NaN where it is not known; None if nothing states where it is.
+        force: unit of the force; None if the file does not state it.
+        length: unit of the centre of pressure; None likewise.
+        is_positive: is the force positive under load? Else the load tells its sign.
+        notes: remarks for the user.
+    """
+
+    name: str
+    fz: Floats
+    cop: Floats | None
+    force: str | None
+    length: str | None
+    is_positive: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def make_plate_table(
+    where: str, time_s: Floats, plates: Sequence[Plate], notes: Sequence[str] = ()
+) -> Table:
+    """Return a table of plates; a single one has our names as well, where the file states units."""
+    columns: dict[str, Floats] = {}
+    units = {"time_s": "s"}
+    said = [*notes]
+    for plate in plates:
+        said += [f"{plate.name}: {note}" for note in plate.notes]
+        columns[f"{plate.name}_fz"] = plate.fz
+        if plate.force is not None:
+            units[f"{plate.name}_fz"] = plate.force
+        for axis, cop in zip("xy", () if plate.cop is None else plate.cop, strict=False):
+            columns[f"{plate.name}_cop_{axis}"] = cop
+            if plate.length is not None:
+                units[f"{plate.name}_cop_{axis}"] = plate.length
+    positive = {f"{plate.name}_fz" for plate in plates if plate.is_positive}
+    signed_by_load = {f"{plate.name}_fz" for plate in plates if not plate.is_positive}
+    if len(plates) == 1:
+        (plate,) = plates
+        for ours, theirs in (("grf_n", "fz"), ("cop_x_m", "cop_x"), ("cop_y_m", "cop_y")):
+            if (found := f"{plate.name}_{theirs}") in units:
+                columns[ours], units[ours] = columns[found], units[found]
+        (positive if plate.is_positive else signed_by_load).add("grf_n")
+    else:
+        names = ", ".join(plate.name for plate in plates)
+        said.append(f"there are {len(plates)} plates or soles ({names}): --map says which one")
+    columns["time_s"] = time_s
+    return Table(
+        where,
+        tuple(columns),
+        columns,
+        units,
+        positive=frozenset(positive),
+        plates=frozenset(signed_by_load),
+        notes=tuple(said),
+    )
