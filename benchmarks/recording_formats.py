@@ -163,7 +163,7 @@ def read_as_service(path: Path, column: str, begin_ns: int, end_ns: int) -> Valu
         first_ns = _first_t_ns(path)
         part = Slice((begin_ns - first_ns) * 1e-9, (end_ns - first_ns) * 1e-9, (column,))
         content = b"".join(ARROW.written(export_of(reader, part)))
-    return pa.ipc.open_stream(content).read_all().column(column).to_numpy()
+    return pa.ipc.open_file(content).read_all().column(column).to_numpy()
 
 
 def read_csv(path: Path, column: str, begin_ns: int, end_ns: int) -> Values:

@@ -166,7 +166,7 @@ def by_estimate(path: Path, start_s: float) -> Estimated:
 
 
 def _column(content: bytes) -> Values:
-    return pa.ipc.open_stream(io.BytesIO(content)).read_all().column(COLUMN).to_numpy()
+    return pa.ipc.open_file(io.BytesIO(content)).read_all().column(COLUMN).to_numpy()
 
 
 class Rest:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 Clock = Literal["node", "server"]
 
 _CHUNK = 1 << 16
+_BEGIN, _END = b"ARROW1\0\0", b"ARROW1"
+"""Of a file in Arrow's IPC format."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +85,15 @@ class Data:
         }
         with self._http.stream(f"/sessions/{self.session_id}/data", query) as answer:
             # Buffered: Arrow takes a read that gives less than it asked for as the end.
-            file = pa.PythonFile(io.BufferedReader(_Reading(answer), _CHUNK), mode="r")
+            content = io.BufferedReader(_Reading(answer), _CHUNK)
             try:
-                with pa.ipc.open_stream(file) as reader:
+                if content.read(len(_BEGIN)) != _BEGIN:
+                    raise EOFError("it is no Arrow file")
+                # Behind its first bytes an Arrow file is a stream, and needs no going back.
+                with pa.ipc.open_stream(pa.PythonFile(content, mode="r")) as reader:
                     yield from reader
+                if not content.read().endswith(_END):
+                    raise EOFError("its end is missing")
             except FootTileError:  # some are OSErrors, too
                 raise
             except (pa.ArrowInvalid, OSError, EOFError) as error:

@@ -19,6 +19,7 @@ from storage.sessions.file import EXPORT_COLUMN, EXPORT_KEY
 
 FORMATS = frozenset({"parquet", "arrow", "csv"})
 """Formats whose exports it recognises."""
+_ARROW_BEGIN = b"ARROW1\0\0"
 _HEADER_MAX = 1 << 20
 _SEMICOLONS = re.compile(r'"[^";,]*";')
 _OF_A_TILE = re.compile("|".join(f"{c.name}_." for c in KNOWN.values() if c.per_tile))
@@ -61,7 +62,7 @@ def verify_export(path: Path) -> ExportReport | None:
         begin = file.read(4)
     if begin == b"PAR1":
         return _parquet(path)
-    if begin == b"\xff\xff\xff\xff":
+    if begin == _ARROW_BEGIN[:4]:
         return _arrow(path)
     return _csv(path)
 
@@ -88,14 +89,17 @@ def _parquet(path: Path) -> ExportReport | None:
 
 def _arrow(path: Path) -> ExportReport | None:
     try:
-        with pa.OSFile(str(path), "r") as file, pa.ipc.open_stream(file) as stream:
-            said = stream.schema.metadata or {}
+        with pa.OSFile(str(path), "r") as file:
+            file.seek(len(_ARROW_BEGIN))  # a stream is there, which is read although its end lacks
+            with pa.ipc.open_stream(file) as stream:
+                said = stream.schema.metadata or {}
             if EXPORT_KEY not in said and ARRAY_INFO_KEY not in said:
                 return None
             report = ExportReport(path, "arrow", _source(said))
             try:
-                for batch in stream:
-                    batch.validate()
+                with pa.ipc.open_file(file) as whole:
+                    for i in range(whole.num_record_batches):
+                        whole.get_batch(i).validate()
             except Exception as error:  # damaged bytes may cause any error
                 report.problems.append(f"it cannot be read: {error}")
     except Exception:  # the same

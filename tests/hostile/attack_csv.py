@@ -111,7 +111,7 @@ def _written(to: str, frames: FrameBatch, extra: dict[str, Array], marks: Marks)
 
 
 def _wrong(written: dict[str, bytes], marks: Marks, frames: FrameBatch) -> str | None:
-    arrow = pa.ipc.open_stream(written["arrow"]).read_all()
+    arrow = pa.ipc.open_file(written["arrow"]).read_all()
     if not pq.read_table(io.BytesIO(written["parquet"])).equals(arrow):
         return "Parquet and Arrow differ"
     at: dict[int, list[str]] = {}

@@ -1,4 +1,4 @@
-"""Arrow: a stream of record batches, without compression."""
+"""Arrow: an IPC file of record batches (Feather version 2), without compression."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from storage.formats.written.sink import in_pieces
 
 
 def _write(export: Export) -> Iterator[bytes]:
-    return in_pieces(export.tables(), pa.ipc.new_stream)
+    return in_pieces(export.tables(), pa.ipc.new_file)
 
 
 ARROW = Format(
     "arrow",
     "Arrow",
     "pandas, polars, DuckDB, R",
-    "application/vnd.apache.arrow.stream",
+    "application/vnd.apache.arrow.file",
     _write,
     options=TABLE_OPTIONS,
 )

@@ -65,7 +65,7 @@ def parquet_of(answer: httpx.Response) -> pa.Table:
 
 
 def arrow_of(answer: httpx.Response) -> pa.Table:
-    return pa.ipc.open_stream(answer.content).read_all()
+    return pa.ipc.open_file(answer.content).read_all()
 
 
 def csv_of(answer: httpx.Response) -> pa.Table:

@@ -24,7 +24,7 @@ def table_of(answer: httpx.Response, to: str) -> pa.Table:
         case "parquet":
             return pq.read_table(io.BytesIO(answer.content))
         case "arrow":
-            return pa.ipc.open_stream(answer.content).read_all()
+            return pa.ipc.open_file(answer.content).read_all()
         case _:
             return pacsv.read_csv(io.BytesIO(answer.content))
 

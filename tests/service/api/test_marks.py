@@ -61,7 +61,7 @@ def test_a_mark_made_after_sealing_is_at_its_frame_in_every_format(session: Reco
     sealed = session.data().content
     mark(session, "a stone")
     arrow = session.data(format="arrow")
-    assert labels(pa.ipc.open_stream(arrow.content).read_all()) == {MARKED: "a stone"}
+    assert labels(pa.ipc.open_file(arrow.content).read_all()) == {MARKED: "a stone"}
     parquet = session.data(marks="true")
     assert labels(pq.read_table(io.BytesIO(parquet.content))) == {MARKED: "a stone"}
     rows = list(csv.DictReader(io.StringIO(session.data(format="csv").text)))
@@ -135,7 +135,7 @@ def test_a_mark_far_from_every_frame_is_counted_as_left_out(session: Recording) 
     mark(session, "a stone")
     answer = session.data(format="arrow")
     assert answer.headers["foottile-marks"] == "placed=1, left-out=1"
-    table = pa.ipc.open_stream(answer.content).read_all()
+    table = pa.ipc.open_file(answer.content).read_all()
     assert labels(table) == {MARKED: "a stone"}
     early, _ = json.loads(table.schema.metadata[b"foottile.notes"])["marks"]
     assert (early["label"], early["left_out"]) == ("years ago", "no frame within a second of it")
@@ -148,7 +148,7 @@ def test_a_session_that_is_still_recorded_has_its_marks_at_their_frames(
 ) -> None:
     recording = node.record()
     node.deliver(100, [5.0, 0.0])
-    before = pa.ipc.open_stream(recording.data(format="arrow").content).read_all()
+    before = pa.ipc.open_file(recording.data(format="arrow").content).read_all()
     assert labels(before) == {}
     t_ns = int(before["t_ns"][7].as_py()) + HOUR_NS
     answer = node.running.http.post(
@@ -156,7 +156,7 @@ def test_a_session_that_is_still_recorded_has_its_marks_at_their_frames(
     )
     assert answer.status_code == 201
     after = recording.data(format="arrow")
-    assert labels(pa.ipc.open_stream(after.content).read_all()) == {7: "a stone"}
+    assert labels(pa.ipc.open_file(after.content).read_all()) == {7: "a stone"}
     assert after.headers["etag"].startswith('W/"')
 
 

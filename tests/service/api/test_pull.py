@@ -152,7 +152,7 @@ def test_the_client_pulls_a_slice(sealed: Sealed, tmp_path: Path, to: str) -> No
     assert pulled["bytes"] == path.stat().st_size
     table = {
         "parquet": lambda: pq.read_table(path),
-        "arrow": lambda: pa.ipc.open_stream(path.read_bytes()).read_all(),
+        "arrow": lambda: pa.ipc.open_file(path.read_bytes()).read_all(),
         "csv": lambda: pacsv.read_csv(path),
     }[to]()
     whole = pq.read_table(io.BytesIO(sealed.content), columns=["t_ns", "grf_n"])

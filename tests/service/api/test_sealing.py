@@ -55,7 +55,7 @@ def test_a_download_before_the_seal_has_the_rounded_estimates_of_the_sealed_file
 ) -> None:
     session = tared.record()
     tared.deliver(200, [20.0, 60.0], noise=1)
-    before = pa.ipc.open_stream(session.data(format="arrow").content).read_all()
+    before = pa.ipc.open_file(session.data(format="arrow").content).read_all()
     tared.finish(session)
     sealed = pq.read_table(session.folder / "frames.parquet")
     said = {field.name: field.metadata or {} for field in sealed.schema}

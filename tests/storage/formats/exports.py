@@ -106,7 +106,7 @@ def read(content: bytes, to: str) -> pa.Table:
     if to == "parquet":
         return pq.read_table(io.BytesIO(content))
     if to == "arrow":
-        return pa.ipc.open_stream(content).read_all()
+        return pa.ipc.open_file(content).read_all()
     table = pacsv.read_csv(
         io.BytesIO(content),
         # A row of which the one column asked for is not known is an empty line.

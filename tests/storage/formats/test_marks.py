@@ -177,7 +177,7 @@ def exported(
 def read(content: bytes, to: str) -> pa.Table:
     if to == "parquet":
         return pq.read_table(io.BytesIO(content))
-    return pa.ipc.open_stream(content).read_all()
+    return pa.ipc.open_file(content).read_all()
 
 
 @pytest.mark.parametrize("to", ["parquet", "arrow"])

@@ -108,7 +108,7 @@ def sealed(
 
 def outcome(chunks: Callable[[], Any]) -> pa.Table | str:
     try:
-        return pa.ipc.open_stream(b"".join(chunks())).read_all().combine_chunks()
+        return pa.ipc.open_file(b"".join(chunks())).read_all().combine_chunks()
     except UsageError as error:
         return str(error)
 
@@ -242,7 +242,7 @@ def place_of(path: Path, group: int, name: str) -> tuple[int, int]:
 def table_of(path: Path, part: Slice) -> pa.Table:
     with SessionReader(path, only_slices=True) as reader:
         content = b"".join(ARROW.written(export_of(reader, part, options=NO_TIMES)))
-    return pa.ipc.open_stream(content).read_all()
+    return pa.ipc.open_file(content).read_all()
 
 
 def test_a_slice_reads_its_own_row_groups_and_columns_and_no_page_besides(tmp_path: Path) -> None:

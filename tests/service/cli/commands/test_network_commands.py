@@ -176,7 +176,7 @@ def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path
         assert done.returncode == 0, done.stderr
         tables[name] = {
             "parquet": pq.read_table,
-            "arrow": lambda out: pa.ipc.open_stream(out.read_bytes()).read_all(),
+            "arrow": lambda out: pa.ipc.open_file(out.read_bytes()).read_all(),
             "csv": pacsv.read_csv,
         }[name](out)
     names = ["seq", "t_ns", "force_n_0", "force_n_1", "contact"]

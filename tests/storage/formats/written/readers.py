@@ -72,7 +72,7 @@ def _parquet(content: bytes) -> list[Said]:
 
 
 def _arrow(content: bytes) -> list[Said]:
-    return [_of_json(json.loads(pa.ipc.open_stream(content).schema.metadata[EXPORT_KEY]))]
+    return [_of_json(json.loads(pa.ipc.open_file(content).schema.metadata[EXPORT_KEY]))]
 
 
 def _csv(content: bytes) -> list[Said]:

@@ -53,8 +53,9 @@ def test_parquet_has_what_readers_of_2021_know(tmp_path: Path) -> None:
     assert types == {"None", "Int", "String", "Timestamp"}
 
 
-def test_pandas_reads_parquet_and_csv_with_instants_to_the_nanosecond(tmp_path: Path) -> None:
+def test_pandas_reads_tables_with_instants_to_the_nanosecond(tmp_path: Path) -> None:
     check(pd.read_parquet(put(tmp_path, "parquet")))
+    check(pd.read_feather(put(tmp_path, "arrow")))
     check(pd.read_csv(put(tmp_path, "csv"), parse_dates=["time_utc"]))
     comma = put(tmp_path, "csv", FormatOptions(decimal="comma"))
     check(pd.read_csv(comma, sep=";", decimal=",", parse_dates=["time_utc"]))
@@ -77,7 +78,7 @@ def test_polars_reads_parquet_and_arrow(tmp_path: Path) -> None:
     polars = importlib.import_module("polars")
     for found in (
         polars.read_parquet(put(tmp_path, "parquet")),
-        polars.read_ipc_stream(put(tmp_path, "arrow")),
+        polars.read_ipc(put(tmp_path, "arrow")),
     ):
         assert found["t_ns"].to_list() == frames().t_ns.tolist()
         assert found["time_utc"].to_physical().to_list() == frames().t_ns.tolist()
