@@ -87,13 +87,7 @@ class Data:
             # Buffered: Arrow takes a read that gives less than it asked for as the end.
             content = io.BufferedReader(_Reading(answer), _CHUNK)
             try:
-                if content.read(len(_BEGIN)) != _BEGIN:
-                    raise EOFError("it is no Arrow file")
-                # Behind its first bytes an Arrow file is a stream, and needs no going back.
-                with pa.ipc.open_stream(pa.PythonFile(content, mode="r")) as reader:
-                    yield from reader
-                if not content.read().endswith(_END):
-                    raise EOFError("its end is missing")
+                yield from _read_batches(content)
             except FootTileError:  # some are OSErrors, too
                 raise
             except (pa.ArrowInvalid, OSError, EOFError) as error:
@@ -138,6 +132,20 @@ class Data:
         start_s = seconds.start if seconds.start is not None else self.start_s
         end_s = seconds.stop if seconds.stop is not None else self.end_s
         return replace(self, start_s=start_s, end_s=end_s)
+
+
+def _read_batches(content: io.BufferedReader) -> Iterator[pa.RecordBatch]:
+    """Read an Arrow file as it comes: behind its first bytes it is a stream.
+
+    Raises:
+        pa.ArrowInvalid, EOFError: it is damaged, or breaks off.
+    """
+    if content.read(len(_BEGIN)) != _BEGIN:
+        raise EOFError("it is no Arrow file")
+    with pa.ipc.open_stream(pa.PythonFile(content, mode="r")) as reader:
+        yield from reader
+    if not content.read().endswith(_END):
+        raise EOFError("its end is missing")
 
 
 class _Reading(io.RawIOBase):
