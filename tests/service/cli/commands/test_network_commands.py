@@ -300,7 +300,6 @@ def test_a_demo_ends_by_itself_after_its_seconds(tmp_path: Path) -> None:
         (("node", "--scene", "standing", "--name", "../x"), 2, "--name"),
         (("node", "--scene", "standing", "--servo", "/dev/ttyUSB9"), 2, "has no servo"),
         (("node", "--scene", "insole"), 2, "--load"),
-        (("node", "--scene", "standing", "--bus", "/dev/i2c-99"), 1, "/dev/i2c-99"),
         (("demo", "--scene", "nonsense"), 2, "no scene 'nonsense'"),
         (("sessions", "--server", "http://127.0.0.1:1"), 1, "no answer"),
         (("sessions", "--server", "ftp://x"), 2, "no server address"),
