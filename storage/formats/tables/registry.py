@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import FileFormatError
+from storage.formats.tables.bioware import is_bioware, read_bioware
 from storage.formats.tables.force_platform import read_force_platforms
 from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
@@ -28,7 +29,7 @@ class SavedText:
     read: Callable[[str, str, IsNeeded, int], Table]
 
 
-SAVED_TEXTS: tuple[SavedText, ...] = ()
+SAVED_TEXTS: tuple[SavedText, ...] = (SavedText(is_bioware, read_bioware),)
 
 
 @dataclass(frozen=True)

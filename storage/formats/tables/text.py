@@ -208,7 +208,7 @@ def _layout(lines: Sequence[str], delimiter: str) -> Layout | None:
     for i, (number, cells) in enumerate(rows):
         is_comment = number in comments
         names = split_cells(COMMENT.sub("", lines[number]), delimiter) if is_comment else cells
-        if len(names) < 2 or any(map(_is_number, names)):
+        if len(names) < 2 or any(map(is_number, names)):
             continue
         below = [row for row in rows[i + 1 :] if row[0] not in comments]
         units = below.pop(0)[1] if below and _are_units(below[0][1]) else []
@@ -216,8 +216,8 @@ def _layout(lines: Sequence[str], delimiter: str) -> Layout | None:
             found.append(_layout_of(names, units, delimiter, len(lines), []))
         elif below and (len(below[0][1]) == len(names) or not (is_comment or delimiter == BLANKS)):
             first, numbers = below[0]
-            if len(numbers) <= len(names) and any(map(_is_number, numbers)):
-                width = len(_split(lines[first], delimiter))
+            if len(numbers) <= len(names) and any(map(is_number, numbers)):
+                width = len(split_line(lines[first], delimiter))
                 padded = [*names, *[""] * (width - len(names))]
                 found.append(_layout_of(padded, units, delimiter, first, numbers))
     return max(found, key=lambda layout: layout.score, default=None)
@@ -230,12 +230,13 @@ def _layout_of(
     stated |= {
         name: unit.strip("[]() ") for name, unit in zip(names, units, strict=False) if name and unit
     }
-    count = sum(map(_is_number, numbers))
+    count = sum(map(is_number, numbers))
     others = sum(map(bool, numbers)) - count
     return Layout(tuple(names), delimiter, line, stated, count - others)
 
 
-def _split(line: str, delimiter: str) -> list[str]:
+def split_line(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line as they are."""
     if delimiter == BLANKS:
         return line.split()
     try:
@@ -246,20 +247,21 @@ def _split(line: str, delimiter: str) -> list[str]:
 
 def split_cells(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line, without those that are empty at its end."""
-    cells = [" ".join(cell.split()) for cell in _split(line, delimiter)]
+    cells = [" ".join(cell.split()) for cell in split_line(line, delimiter)]
     while cells and not cells[-1]:
         cells.pop()
     return cells
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Tell whether a cell holds a number, with a decimal point or a decimal comma."""
     return _NUMBER.fullmatch(cell) is not None
 
 
 def _are_units(cells: Sequence[str]) -> bool:
     units = [cell.strip("[]() ").lower() for cell in cells if cell]
     known = sum(unit in KNOWN_UNITS for unit in units)
-    return known > 0 and 2 * known >= len(units) and not any(map(_is_number, units))
+    return known > 0 and 2 * known >= len(units) and not any(map(is_number, units))
 
 
 def _body(text: str, layout: Layout) -> str:
