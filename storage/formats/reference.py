@@ -265,7 +265,7 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
 def _remedy_of_absent(table: Table, name: str) -> str:
     """Return what to do about a quantity without a column."""
     remedies = [f"Name it: --map {name}=COLUMN"]
-    if "column1" in table.names:
+    if "column1" in table.names and not any(one.endswith("_fz") for one in table.names):
         remedies.append("no line was found that names columns: --skip-rows states where it is")
     if name == "time_s":
         remedies.append("or, without times, state --rate-hz")

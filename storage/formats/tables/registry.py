@@ -9,6 +9,7 @@ from pathlib import Path
 from devices.errors import FileFormatError, UsageError
 from storage.formats.tables.bioware import is_bioware, read_bioware
 from storage.formats.tables.force_platform import read_force_platforms
+from storage.formats.tables.netforce import is_netforce, read_netforce
 from storage.formats.tables.nexus import is_nexus, read_nexus
 from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
@@ -38,6 +39,7 @@ class SavedText:
 SAVED_TEXTS: tuple[SavedText, ...] = (
     SavedText(is_bioware, read_bioware),
     SavedText(is_nexus, read_nexus),
+    SavedText(is_netforce, read_netforce),
 )
 
 
