@@ -50,6 +50,9 @@ def group_by_plate(columns: Sequence[DeviceColumn], where: str) -> list[dict[str
         if column.name.lower() in of_device[-1]:
             of_device.append({})
         of_device[-1][column.name.lower()] = i
+    groups = {
+        device: found for device, found in groups.items() if any("fz" in one for one in found)
+    }
     for device, found in groups.items():
         if any(one.keys() != found[0].keys() for one in found):
             raise FileFormatError(

@@ -95,6 +95,16 @@ def test_plates_of_one_name_follow_one_another_or_are_refused(tmp_path: Path) ->
     np.testing.assert_array_equal(found.grf_n, [527.0, 524.0, 524.0])
 
 
+def test_other_devices_are_left_out(tmp_path: Path) -> None:
+    heads = {"Device:": "\tDAQ\tDAQ\tDAQ", "abs": "\tV1\tV1\tV2", "\tN": "\tV\tV\tV"}
+    lines = [
+        line + next((more for head, more in heads.items() if line.startswith(head)), "\t1\t2\t3")
+        for line in ONE.splitlines()
+    ]
+    found = read(tmp_path, "\n".join(lines))
+    np.testing.assert_array_equal(found.grf_n, [0.0, 90.25, 100.5, 80.0])
+
+
 def test_units_are_those_of_the_file(tmp_path: Path) -> None:
     kilo = ONE.replace("\n\tN\tN\tm\tm", "\n\tN\tkN\tmm\tmm")
     found = read(tmp_path, kilo)
