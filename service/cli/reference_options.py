@@ -10,7 +10,7 @@ import typer
 from devices.errors import UsageError
 
 if TYPE_CHECKING:
-    from storage.formats.tables.text import StatedText
+    from storage.formats.tables.stated_text import StatedText
 
 ColumnsOfReference = Annotated[
     str | None,
@@ -77,7 +77,7 @@ def text_stated(said: Mapping[str, str | float | None]) -> StatedText:
     Raises:
         UsageError: one of them cannot be meant.
     """
-    from storage.formats.tables.text import StatedText
+    from storage.formats.tables.stated_text import StatedText
 
     def text(name: str) -> str | None:
         value = said.get(name)

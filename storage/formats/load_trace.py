@@ -21,8 +21,8 @@ from storage.formats.reference import Stated, as_reference
 from storage.formats.session_load import SESSION_COLUMN, as_load
 from storage.formats.tables.registry import read_table
 from storage.formats.tables.session import read_axis
+from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import INSTANTS, OURS, Column, Table
-from storage.formats.tables.text import StatedText
 from storage.formats.tables.times import spread_even
 
 NUMBERS_MAX = 20_000_000

@@ -18,8 +18,8 @@ from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
 from storage.formats.tables.registry import check_nothing_stated, read_table
 from storage.formats.tables.session import read_session
+from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import OURS, Table
-from storage.formats.tables.text import StatedText
 from storage.formats.tables.times import spread_even
 
 QUANTITIES = ("time_s", "grf_n", "cop_x_m", "cop_y_m")

@@ -14,13 +14,9 @@ from storage.formats.tables.nexus import is_nexus, read_nexus
 from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
 from storage.formats.tables.pressure_plate import read_pressure_plate
+from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import NUMBERS_MAX, IsNeeded, Table
-from storage.formats.tables.text import (
-    HEAD_CHARACTERS,
-    StatedText,
-    read_table_text,
-    read_text_table,
-)
+from storage.formats.tables.text import HEAD_CHARACTERS, read_table_text, read_text_table
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ line names are numbered: `column1`, `column2` and so on.
 
 from __future__ import annotations
 
-import codecs
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,8 +23,9 @@ import pyarrow.compute as pc
 import pyarrow.csv
 
 from devices.arrays import Floats
-from devices.errors import FileFormatError, UsageError
+from devices.errors import FileFormatError
 from devices.inputs import decode_text, read_bytes
+from storage.formats.tables.stated_text import DECIMALS, StatedText
 from storage.formats.tables.table import (
     INSTANTS,
     TEXT_BYTES_MAX,
@@ -65,52 +65,7 @@ _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.I
 _IN_BRACKETS = re.compile(r"[\[(]\s*([^\[\]()\s]+)\s*[\])]$")
 _GROUPED = r"^[+-]?[1-9]\d{0,2},\d{3}$"
 """A cell whose comma may be a decimal comma, or part thousands."""
-_DECIMALS = {
-    ",": re.compile(r"[+-]?([1-9]\d{0,2}(\.\d{3})+|\d*)(,\d*)?([eE][+-]?\d+)?"),
-    ".": re.compile(r"[+-]?([1-9]\d{0,2}(,\d{3})+|\d*)(\.\d*)?([eE][+-]?\d+)?"),
-}
-"""Numbers by the mark of their decimals; the other one may part thousands."""
 DECIMAL_REMEDY = "State the mark of decimals: --decimal , or --decimal ."
-
-
-@dataclass(frozen=True)
-class StatedText:
-    """What a user states of a text; what they do not is found out.
-
-    Attributes:
-        skip_rows: lines above the line of names, or above the numbers if no line names them.
-        units_row: number of the line of units, the first line of the file being 1.
-        decimal: mark of decimals, "," or "."; the other one may part thousands.
-        encoding: name of the encoding, as Python has it.
-    """
-
-    skip_rows: int | None = None
-    units_row: int | None = None
-    decimal: str | None = None
-    encoding: str | None = None
-
-    def __post_init__(self) -> None:
-        for option, value, least in (
-            ("--skip-rows", self.skip_rows, 0),
-            ("--units-row", self.units_row, 1),
-        ):
-            if value is not None and value < least:
-                raise UsageError(f"{option} {value}", expected=f"a whole number from {least} on")
-        if self.decimal is not None and self.decimal not in _DECIMALS:
-            raise UsageError(f"--decimal {self.decimal!r}", expected="a comma, or a point")
-        if self.encoding is not None:
-            try:
-                "".encode(self.encoding)
-                codecs.lookup(self.encoding)
-            except (LookupError, ValueError) as error:
-                raise UsageError(
-                    f"--encoding {self.encoding!r}", expected="a name such as utf-8, cp1252, cp932"
-                ) from error
-
-    @property
-    def is_plain(self) -> bool:
-        """Tell whether the text is stated to be a plain table, whatever its head looks like."""
-        return any(one is not None for one in (self.skip_rows, self.units_row, self.decimal))
 
 
 @dataclass(frozen=True)
@@ -460,7 +415,7 @@ def _with_points(cells: pa.Array[Any], name: str, decimal: str, where: str) -> p
     other = "." if decimal == "," else ","
     marked = pc.or_(pc.match_substring(cells, ","), pc.match_substring(cells, "."))
     marked = pc.and_(marked, pc.invert(pc.match_substring_regex(cells, NO_NUMBER)))
-    fits = pc.match_substring_regex(cells, f"^({_DECIMALS[decimal].pattern})$")
+    fits = pc.match_substring_regex(cells, f"^({DECIMALS[decimal].pattern})$")
     if pc.any(bad := pc.and_(marked, pc.invert(fits))).as_py():
         at = pc.index(bad, pa.scalar(True)).as_py()
         raise FileFormatError(

@@ -14,8 +14,8 @@ from devices.errors import FileFormatError, LoadTraceError, UsageError
 from storage.formats.load_trace import read_load_trace
 from storage.formats.reference import Stated, read_reference
 from storage.formats.tables.registry import read_table
+from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import Table
-from storage.formats.tables.text import StatedText
 
 PLAIN = "Time,Fz\n0.00,0.5\n0.01,-12.25\n0.02,1e3\n"
 FORMS: dict[str, Callable[[str], str | bytes]] = {
