@@ -28,6 +28,13 @@ from devices.scene.file import Scene, load_scene
 from devices.scene.hardware import EMULATED
 from devices.words import printable
 from foottile.environment import read_variable
+from service.cli.reference_options import (
+    Decimal,
+    Encoding,
+    SkipRows,
+    UnitsRow,
+    text_stated,
+)
 from service.plain_json import json_text
 
 if TYPE_CHECKING:
@@ -183,6 +190,10 @@ class FootOptions:
     load: Annotated[
         Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
     ] = None
+    skip_rows: SkipRows = None
+    units_row: UnitsRow = None
+    decimal: Decimal = None
+    encoding: Encoding = None
     load_scale: Annotated[float, typer.Option(help="Factor on every force of the load.")] = 1.0
     cop_scale: Annotated[float, typer.Option(help="Factor on the load's COP about its mean.")] = 1.0
     cop_offset_m: Annotated[
@@ -226,6 +237,16 @@ class FootOptions:
         if self.load is not None and scene.array.bus != EMULATED:
             raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
         plates = self._plates(scene)
+        of_text = {
+            "skip_rows": self.skip_rows,
+            "units_row": self.units_row,
+            "decimal": self.decimal,
+            "encoding": self.encoding,
+        }
+        if self.load is None and any(value is not None for value in of_text.values()):
+            raise UsageError(
+                "how a table is laid out is stated, and none is named", remedy="Add --load FILE"
+            )
         if scene.array.bus == EMULATED and scene.ground.kind == "trace" and self.load is None:
             raise UsageError(
                 f"scene {scene.name!r} presses a recorded load, and none was given",
@@ -233,7 +254,9 @@ class FootOptions:
             )
         offset_m = pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
         return EmulatedFoot(
-            load=read_load_trace(self.load) if self.load is not None else None,
+            load=(
+                read_load_trace(self.load, text_stated(of_text)) if self.load is not None else None
+            ),
             load_scale=self.load_scale,
             cop=CopTransform(self.cop_scale, offset_m, self.cop_axes),
             lead_s=self.lead_s,

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from devices.errors import UsageError
+
+if TYPE_CHECKING:
+    from storage.formats.tables.stated_text import StatedText
 
 ColumnsOfReference = Annotated[
     str | None,
@@ -39,12 +43,59 @@ RateOfReference = Annotated[
         "--rate-hz", help="Samples a second, of a reference with sample numbers or without times."
     ),
 ]
+SkipRows = Annotated[
+    int | None,
+    typer.Option(
+        "--skip-rows",
+        metavar="N",
+        help="Lines above the line of names, of a table in text; above the numbers, without names.",
+    ),
+]
+UnitsRow = Annotated[
+    int | None,
+    typer.Option("--units-row", metavar="N", help="Number of the line of units, from 1 on."),
+]
+Decimal = Annotated[
+    str | None,
+    typer.Option("--decimal", metavar=",|.", help="Mark of decimals of a table in text."),
+]
+Encoding = Annotated[
+    str | None,
+    typer.Option("--encoding", metavar="NAME", help="Of a table in text, as cp1252 or cp932."),
+]
 LagRange = Annotated[
     str | None,
     typer.Option(
         "--lag-range-s", metavar="A,B", help="Least and greatest lag, where several would fit."
     ),
 ]
+
+
+def text_stated(said: Mapping[str, str | float | None]) -> StatedText:
+    """Return how a text is laid out, by options or cells of these names.
+
+    Raises:
+        UsageError: one of them cannot be meant.
+    """
+    from storage.formats.tables.stated_text import StatedText
+
+    def text(name: str) -> str | None:
+        value = said.get(name)
+        return None if value is None else str(value)
+
+    return StatedText(
+        _whole_number(text("skip_rows"), "--skip-rows"),
+        _whole_number(text("units_row"), "--units-row"),
+        text("decimal"),
+        text("encoding"),
+    )
+
+
+def _whole_number(text: str | None, option: str) -> int | None:
+    try:
+        return None if text is None else int(text)
+    except ValueError:
+        raise UsageError(f"{option} {text!r}", expected="a whole number") from None
 
 
 def named_values(text: str | None, option: str) -> dict[str, str]:

@@ -21,6 +21,7 @@ from storage.formats.reference import Stated, as_reference
 from storage.formats.session_load import SESSION_COLUMN, as_load
 from storage.formats.tables.registry import read_table
 from storage.formats.tables.session import read_axis
+from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import INSTANTS, OURS, Column, Table
 from storage.formats.tables.times import spread_even
 
@@ -36,15 +37,19 @@ _COLUMN = re.compile(r"time_s|fz_n|cop_[xy]_m|angle_rad|cell\d+_n")
 _UNITS = {"time": "time_s", "fz": "fz_n", "cop_x": "cop_x_m", "cop_y": "cop_y_m"}
 
 
-def read_load_trace(path: Path) -> LoadTrace:
+def read_load_trace(path: Path, stated: StatedText | None = None) -> LoadTrace:
     """Read a load trace.
+
+    Args:
+        path: of the file.
+        stated: how it is laid out, if it is a text.
 
     Raises:
         LoadTraceError: unreadable, a session whose bytes are not those that were sealed, a column
             is missing or in another unit, times do not rise, or a force is not a number.
     """
     where = str(path)
-    columns, names = _read(path)
+    columns, names = _read(path, stated)
 
     def numbers(name: str, *, may_be_empty: bool = False) -> Floats:
         return _numbers(columns, names, name, where, may_be_empty=may_be_empty)
@@ -107,10 +112,10 @@ def _is_needed(name: str) -> bool:
     return bool(_COLUMN.fullmatch(name) or SESSION_COLUMN.fullmatch(name)) or name in OURS
 
 
-def _read(path: Path) -> tuple[dict[str, Column], list[str]]:
+def _read(path: Path, stated: StatedText | None) -> tuple[dict[str, Column], list[str]]:
     """Return the columns of a trace by name in lower case, and the names of all in the file."""
     try:
-        table = read_table(path, _is_needed, NUMBERS_MAX)
+        table = read_table(path, _is_needed, NUMBERS_MAX, stated)
         names = [name.lower() for name in table.names if name]
         columns = _lower(table)
         if INSTANTS in columns:

@@ -16,8 +16,9 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
-from storage.formats.tables.registry import read_table
+from storage.formats.tables.registry import check_nothing_stated, read_table
 from storage.formats.tables.session import read_session
+from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import OURS, Table
 from storage.formats.tables.times import spread_even
 
@@ -56,12 +57,14 @@ class Stated:
         units: of "time", "grf" and "cop", as in `FACTORS`.
         sign: of the force under load, "+" or "-".
         rate_hz: of samples whose times are not in the file, or in it as numbers of samples.
+        text: how it is laid out, if it is a text.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     sign: str | None = None
     rate_hz: float | None = None
+    text: StatedText = field(default_factory=StatedText)
 
     @property
     def names(self) -> set[str]:
@@ -115,9 +118,13 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
             differs from the file's.
     """
     named = stated.names
-    table = read_session(path, named) or read_table(
-        path, lambda name: name in named or name.lower() in OURS
-    )
+    table = read_session(path, named)
+    if table is not None:
+        check_nothing_stated(path, stated.text)
+    else:
+        table = read_table(
+            path, lambda name: name in named or name.lower() in OURS, stated=stated.text
+        )
     return as_reference(table, stated)
 
 
@@ -217,7 +224,7 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
             f"{', '.join(filter(None, table.names))[:200]})",
             where=table.where,
             expected=table.form,
-            remedy=f"Name it: --map {name}=COLUMN",
+            remedy=_remedy_of_absent(table, name),
         )
     quantity = name.partition("_")[0]
     factors = FACTORS[quantity]
@@ -253,6 +260,18 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
             remedy="State its unit, as --units time=ms" if quantity == "time" else "",
         )
     return -values if turned else values
+
+
+def _remedy_of_absent(table: Table, name: str) -> str:
+    """Return what to do about a quantity without a column."""
+    remedies = [f"Name it: --map {name}=COLUMN"]
+    if "column1" in table.names and not any(one.endswith("_fz") for one in table.names):
+        remedies.append("no line was found that names columns: --skip-rows states where it is")
+    if name == "time_s":
+        remedies.append("or, without times, state --rate-hz")
+    if not "".join(table.names).isascii():
+        remedies.append("if names are garbled, state --encoding")
+    return "; ".join(remedies)
 
 
 def _with_sign(

@@ -19,11 +19,16 @@ from service.cli.options import (
 )
 from service.cli.reference_options import (
     ColumnsOfReference,
+    Decimal,
+    Encoding,
     LagRange,
     RateOfReference,
     SignOfReference,
+    SkipRows,
     UnitsOfReference,
+    UnitsRow,
     named_values,
+    text_stated,
 )
 
 DELAY_MAX_MS = 1000.0
@@ -79,6 +84,10 @@ def calibrate_command(
     units: UnitsOfReference = None,
     sign: SignOfReference = None,
     rate_hz: RateOfReference = None,
+    skip_rows: SkipRows = None,
+    units_row: UnitsRow = None,
+    decimal: Decimal = None,
+    encoding: Encoding = None,
     lag_range_s: LagRange = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -91,6 +100,12 @@ def calibrate_command(
     load does not determine is refused. Exit codes: 0 good, 1 failed, no tile has a curve, 2 wrong
     usage, 3 written, but a tile was refused.
     """
+    of_text: dict[str, str | float | None] = {
+        "skip_rows": skip_rows,
+        "units_row": units_row,
+        "decimal": decimal,
+        "encoding": encoding,
+    }
     if against is not None:
         if len(recordings) > 1 or plot is not None or reference_delay_ms is not None:
             raise UsageError(
@@ -102,7 +117,11 @@ def calibrate_command(
 
         options = AgainstOptions(
             stated=Stated(
-                named_values(columns, "--map"), named_values(units, "--units"), sign, rate_hz
+                named_values(columns, "--map"),
+                named_values(units, "--units"),
+                sign,
+                rate_hz,
+                text_stated(of_text),
             ),
             lag_range_s=pair(lag_range_s, "--lag-range-s"),
             per_tile=per_tile,
@@ -116,7 +135,10 @@ def calibrate_command(
         per_tile
         or shear
         or reference_gain_sigma
-        or any(one is not None for one in (columns, units, sign, rate_hz, lag_range_s))
+        or any(
+            one is not None
+            for one in (columns, units, sign, rate_hz, lag_range_s, *of_text.values())
+        )
     ):
         raise UsageError("that is said of a plate, and none is named", remedy="Add --against FILE")
     from service.cli.calibration_report import calibration_json, calibration_tables

@@ -16,10 +16,14 @@ from service.cli.many import NOT_ALL, JobsOption, ManifestOption, SchedulerOptio
 from service.cli.options import JsonOption, print_json, progress, remark, say, say_lines
 from service.cli.reference_options import (
     ColumnsOfReference,
+    Decimal,
+    Encoding,
     LagRange,
     RateOfReference,
     SignOfReference,
+    SkipRows,
     UnitsOfReference,
+    UnitsRow,
     named_values,
 )
 from service.cli.result_folder import result_folder
@@ -49,6 +53,10 @@ def compare_command(
     units: UnitsOfReference = None,
     sign: SignOfReference = None,
     rate_hz: RateOfReference = None,
+    skip_rows: SkipRows = None,
+    units_row: UnitsRow = None,
+    decimal: Decimal = None,
+    encoding: Encoding = None,
     reference_sigma_n: Annotated[
         float | None,
         typer.Option(min=0.0, help="Standard uncertainty of the reference; tells coverage."),
@@ -109,6 +117,10 @@ def compare_command(
         "units": units,
         "sign": sign,
         "rate_hz": rate_hz,
+        "skip_rows": skip_rows,
+        "units_row": units_row,
+        "decimal": decimal,
+        "encoding": encoding,
         "lag_range_s": lag_range_s,
         "contact_n": contact_n,
         "cop_offset_m": cop_offset_m,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
@@ -207,7 +207,7 @@ class CompareTask:
     def options(self) -> dict[str, Any]:
         """As for any task; the reference is what is in it."""
         said = identity_of_file(self.reference)
-        options = {**vars(self.compare), "stated": vars(self.compare.stated)}
+        options = {**vars(self.compare), "stated": asdict(self.compare.stated)}
         return {"reference_sha256": said, "limits": self.limits, **options}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:

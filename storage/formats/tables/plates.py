@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from devices.arrays import Floats
 from storage.formats.tables.table import Table
 
@@ -16,7 +18,8 @@ class Plate:
     Attributes:
         name: of its columns, as `plate1` or `left`: `plate1_fz`, `plate1_cop_x`, `plate1_cop_y`.
         fz: (n,), along the plate's normal.
-        cop: (2, n), NaN where it is not known; None if nothing states where it is.
+        cop: (2, n), NaN where it is not known; None if nothing states where it is. Where nothing
+            presses it is no one's, whatever the file holds.
         force: unit of the force; None if the file does not state it.
         length: unit of the centre of pressure; None likewise.
         is_positive: is the force positive under load? Else the load tells its sign.
@@ -45,7 +48,7 @@ def make_plate_table(
         if plate.force is not None:
             units[f"{plate.name}_fz"] = plate.force
         for axis, cop in zip("xy", () if plate.cop is None else plate.cop, strict=False):
-            columns[f"{plate.name}_cop_{axis}"] = cop
+            columns[f"{plate.name}_cop_{axis}"] = np.where(plate.fz == 0.0, np.nan, cop)
             if plate.length is not None:
                 units[f"{plate.name}_cop_{axis}"] = plate.length
     positive = {f"{plate.name}_fz" for plate in plates if plate.is_positive}

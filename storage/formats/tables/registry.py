@@ -6,11 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, UsageError
+from storage.formats.tables.bioware import is_bioware, read_bioware
 from storage.formats.tables.force_platform import read_force_platforms
+from storage.formats.tables.netforce import is_netforce, read_netforce
+from storage.formats.tables.nexus import is_nexus, read_nexus
 from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
 from storage.formats.tables.pressure_plate import read_pressure_plate
+from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import NUMBERS_MAX, IsNeeded, Table
 from storage.formats.tables.text import HEAD_CHARACTERS, read_table_text, read_text_table
 
@@ -28,7 +32,11 @@ class SavedText:
     read: Callable[[str, str, IsNeeded, int], Table]
 
 
-SAVED_TEXTS: tuple[SavedText, ...] = ()
+SAVED_TEXTS: tuple[SavedText, ...] = (
+    SavedText(is_bioware, read_bioware),
+    SavedText(is_nexus, read_nexus),
+    SavedText(is_netforce, read_netforce),
+)
 
 
 @dataclass(frozen=True)
@@ -44,13 +52,16 @@ class TableFormat:
     read: Callable[[Path, IsNeeded, int], Table]
 
 
-def _read_text(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
-    text = read_table_text(path)
+def _read_text(
+    path: Path, is_needed: IsNeeded, numbers_max: int, stated: StatedText | None = None
+) -> Table:
+    stated = stated or StatedText()
+    text = read_table_text(path, stated.encoding)
     head = text[:HEAD_CHARACTERS]
-    for one in SAVED_TEXTS:
+    for one in () if stated.is_plain else SAVED_TEXTS:
         if one.is_one(head):
             return one.read(text, str(path), is_needed, numbers_max)
-    return read_text_table(text, str(path), is_needed, numbers_max)
+    return read_text_table(text, str(path), is_needed, numbers_max, stated)
 
 
 TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text)
@@ -63,15 +74,24 @@ FORMATS = (
 )
 
 
-def read_table(path: Path, is_needed: IsNeeded, numbers_max: int = NUMBERS_MAX) -> Table:
+def read_table(
+    path: Path,
+    is_needed: IsNeeded,
+    numbers_max: int = NUMBERS_MAX,
+    stated: StatedText | None = None,
+) -> Table:
     """Read the needed columns of a file; its ending tells the format, and any other is text.
 
     Raises:
         FileFormatError: the file cannot be read.
+        UsageError: how its text is laid out is stated, and it is none.
     """
     ending = path.suffix.lower()
     chosen = next((one for one in FORMATS if ending in one.endings), TEXT)
     try:
+        if chosen is TEXT:
+            return _read_text(path, is_needed, numbers_max, stated)
+        check_nothing_stated(path, stated)
         return chosen.read(path, is_needed, numbers_max)
     except MemoryError as error:
         raise FileFormatError(
@@ -79,3 +99,17 @@ def read_table(path: Path, is_needed: IsNeeded, numbers_max: int = NUMBERS_MAX) 
             where=str(path),
             remedy="Lift the limit (ulimit -v), or cut out the part that is needed",
         ) from error
+
+
+def check_nothing_stated(path: Path, stated: StatedText | None) -> None:
+    """Refuse what is stated of a text for a file that is none.
+
+    Raises:
+        UsageError: something is stated.
+    """
+    if stated is not None and stated != StatedText():
+        raise UsageError(
+            "--skip-rows, --units-row, --decimal and --encoding go with tables in text",
+            where=str(path),
+            remedy="Leave them out",
+        )

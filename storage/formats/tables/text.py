@@ -2,7 +2,9 @@
 
 The names stand in a line above the numbers. Above it there may be blank lines, comments, a title,
 or Excel's `sep=`; below it a line of units. Cells stand between commas, semicolons, tabs or blanks,
-with a decimal point or a decimal comma. The text is UTF-8, UTF-16, or else Windows-1252.
+with a decimal point or a decimal comma. The text is UTF-8, UTF-16, or else Windows-1252. What is
+found out otherwise than it is meant, or not at all, the user states (`StatedText`). Columns that no
+line names are numbered: `column1`, `column2` and so on.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ import pyarrow.csv
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from devices.inputs import decode_text, read_bytes
+from storage.formats.tables.stated_text import DECIMALS, StatedText
 from storage.formats.tables.table import (
     INSTANTS,
     TEXT_BYTES_MAX,
@@ -62,6 +65,7 @@ _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.I
 _IN_BRACKETS = re.compile(r"[\[(]\s*([^\[\]()\s]+)\s*[\])]$")
 _GROUPED = r"^[+-]?[1-9]\d{0,2},\d{3}$"
 """A cell whose comma may be a decimal comma, or part thousands."""
+DECIMAL_REMEDY = "State the mark of decimals: --decimal , or --decimal ."
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ class Layout:
         line: index of the first line of numbers.
         units: as the file states them, by name.
         score: numbers less other cells in the first line of numbers.
+        is_named: does a line name the columns? Else they are numbered.
     """
 
     names: tuple[str, ...]
@@ -81,23 +86,44 @@ class Layout:
     line: int
     units: Mapping[str, str]
     score: int = 0
+    is_named: bool = True
 
 
-def read_text_table(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -> Table:
+def read_text_table(
+    text: str,
+    where: str,
+    is_needed: IsNeeded,
+    numbers_max: int,
+    stated: StatedText | None = None,
+) -> Table:
     """Read the columns of a text.
 
     Raises:
-        FileFormatError: it is too large, has no line of names above numbers, or a cell of a needed
-            column is no number.
+        FileFormatError: it is too large, has no columns of numbers, or a cell of a needed column is
+            no number.
     """
-    layout = find_layout(text, where)
+    stated = stated or StatedText()
+    units, skip = None, stated.skip_rows or 0
+    if stated.units_row is not None:
+        units, text = _take_line(text, stated.units_row - 1)
+        if not units.strip():
+            raise FileFormatError(f"line {stated.units_row}, of units, is empty", where=where)
+        skip -= stated.units_row <= skip
+    text = text[_begin_of_line(text, skip) :]
+    if skip and not text.strip():
+        raise FileFormatError(f"nothing stands below {stated.skip_rows} lines", where=where)
+    layout = find_layout(text, where, stated)
+    if units is not None:
+        cells = split_cells(units, layout.delimiter)
+        layout = replace(layout, units={**layout.units, **_units_of(layout.names, cells)})
     needed = needed_names(layout.names, is_needed, where)
-    columns = parse_columns(text, layout, needed, numbers_max, where)
-    return make_table(where, layout.names, columns, units=layout.units, form=FORM)
+    columns = parse_columns(text, layout, needed, numbers_max, where, stated.decimal)
+    notes = () if layout.is_named else ("no line names its columns: they are numbered from 1 on",)
+    return make_table(where, layout.names, columns, units=layout.units, notes=notes, form=FORM)
 
 
-def read_table_text(path: Path) -> str:
-    r"""Read a text in the encoding that it has, with `\n` at the end of each line.
+def read_table_text(path: Path, encoding: str | None = None) -> str:
+    r"""Read a text in the encoding that it has, or is stated, with `\n` at the end of each line.
 
     Raises:
         FileFormatError: it cannot be read, or is too large.
@@ -107,44 +133,80 @@ def read_table_text(path: Path) -> str:
     except OSError as error:
         raise FileFormatError(f"cannot be read: {error}", where=str(path), expected=FORM) from error
     try:
-        text = decode_text(content)
-    except UnicodeDecodeError:
+        text = content.decode(encoding).removeprefix("\ufeff") if encoding else decode_text(content)
+    except UnicodeError as error:
+        if encoding is not None:
+            raise FileFormatError(
+                f"it is no text in {encoding}", where=str(path), remedy="State another --encoding"
+            ) from error
         # Names and titles of older programs; numbers are the same in every such encoding.
         text = content.decode("cp1252", errors="replace")
     if "\0" in text[:HEAD_CHARACTERS]:
-        raise FileFormatError("cannot be read: it is no text", where=str(path), expected=FORM)
+        raise FileFormatError(
+            "cannot be read: it is no text",
+            where=str(path),
+            expected=FORM,
+            remedy="" if encoding else "If it is one, state its encoding: --encoding NAME",
+        )
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def find_layout(text: str, where: str) -> Layout:
-    """Find the line of names, and how columns are parted.
+def find_layout(text: str, where: str, stated: StatedText | None = None) -> Layout:
+    """Find the line of names, if there is one, and how columns are parted.
 
     Raises:
-        FileFormatError: no line of names stands above numbers.
+        FileFormatError: it has no columns of numbers, or they can be parted in two ways.
     """
+    stated = stated or StatedText()
     lines = list(islice(_lines(text[:HEAD_CHARACTERS]), HEAD_LINES))
     first = next((line for line in lines if line.strip()), "")
-    stated = re.fullmatch(r"(?i)\"?sep=(.)\"?", first)
+    sep = re.fullmatch(r"(?i)\"?sep=(.)\"?", first)
+    delimiters = [sep[1]] if sep else DELIMITERS
+    is_first = stated.skip_rows is not None
     found = [
         layout
-        for delimiter in ([stated[1]] if stated else DELIMITERS)
-        if (layout := _layout(lines, delimiter)) is not None
+        for delimiter in delimiters
+        if (layout := _layout(lines, delimiter, is_first=is_first)) is not None
+    ]
+    if found:
+        return max(found, key=lambda layout: layout.score)
+    if not first:
+        raise FileFormatError("cannot be read: it is empty", where=where, expected=FORM)
+    found = [
+        layout
+        for delimiter in delimiters
+        if (layout := _nameless(lines, delimiter, is_first=is_first)) is not None
+        and not (delimiter == "," == stated.decimal)
     ]
     if not found:
         raise FileFormatError(
-            "no line of names stands above lines of numbers"
-            if first
-            else "cannot be read: it is empty",
+            "no line of names stands above lines of numbers",
             where=where,
             expected=FORM,
+            remedy="State how many lines stand above it: --skip-rows N",
         )
-    return max(found, key=lambda layout: layout.score)
+    best = max(found, key=lambda layout: layout.score)
+    if stated.decimal is None and best.delimiter == "," and best.score > 1 and len(found) > 1:
+        raise FileFormatError(
+            f"{lines[best.line][:40]!r} may be two numbers, or one with a decimal comma",
+            where=where,
+            expected=FORM,
+            remedy=DECIMAL_REMEDY,
+        )
+    return best
 
 
 def parse_columns(
-    text: str, layout: Layout, needed: Sequence[str], numbers_max: int, where: str
+    text: str,
+    layout: Layout,
+    needed: Sequence[str],
+    numbers_max: int,
+    where: str,
+    decimal: str | None = None,
 ) -> dict[str, Column]:
     """Return the numbers of the needed columns, without empty lines at the end.
+
+    The mark of decimals is found out if it is not stated.
 
     Raises:
         FileFormatError: a line has more or fewer cells than the first, a cell is no number, or
@@ -177,7 +239,9 @@ def parse_columns(
         name: pc.utf8_trim_whitespace(table[index]).combine_chunks()
         for name, index in zip(needed, indices, strict=True)
     }
-    has_comma = _has_decimal_comma(list(cells.values()), where)
+    if decimal is not None:
+        cells = {name: _with_points(column, name, decimal, where) for name, column in cells.items()}
+    has_comma = decimal is None and _has_decimal_comma(list(cells.values()), where)
     columns = {
         name: _numbers(column, name, where, has_comma=has_comma) for name, column in cells.items()
     }
@@ -195,20 +259,37 @@ def _lines(text: str) -> Iterator[str]:
         begin = end + 1
 
 
-def _layout(lines: Sequence[str], delimiter: str) -> Layout | None:
+def _begin_of_line(text: str, number: int) -> int:
+    """Return where a line begins, the first being 0; the end of the text if it has fewer."""
+    begin = 0
+    for _ in range(number):
+        begin = text.find("\n", begin) + 1
+        if begin == 0:
+            return len(text)
+    return begin
+
+
+def _take_line(text: str, number: int) -> tuple[str, str]:
+    """Return a line of a text, and the text without it."""
+    begin = _begin_of_line(text, number)
+    line, end, rest = text[begin:].partition("\n")
+    return line, text[:begin] + rest if end else text[:begin]
+
+
+def _layout(lines: Sequence[str], delimiter: str, *, is_first: bool) -> Layout | None:
     """Return the layout of a text whose cells this delimiter parts; None: it parts none.
 
     Of several lines that may be the names the one with most numbers below is taken: lines above it
-    state single values, such as a rate.
+    state single values, such as a rate. The first line is taken if it is stated to be the one.
     """
     rows = [(number, split_cells(line, delimiter)) for number, line in enumerate(lines)]
     rows = [(number, cells) for number, cells in rows if any(cells)]
     comments = {number for number, _ in rows if COMMENT.match(lines[number])}
     found: list[Layout] = []
-    for i, (number, cells) in enumerate(rows):
+    for i, (number, cells) in enumerate(rows[:1] if is_first else rows):
         is_comment = number in comments
         names = split_cells(COMMENT.sub("", lines[number]), delimiter) if is_comment else cells
-        if len(names) < 2 or any(map(_is_number, names)):
+        if len(names) < 2 or any(map(is_number, names)):
             continue
         below = [row for row in rows[i + 1 :] if row[0] not in comments]
         units = below.pop(0)[1] if below and _are_units(below[0][1]) else []
@@ -216,26 +297,44 @@ def _layout(lines: Sequence[str], delimiter: str) -> Layout | None:
             found.append(_layout_of(names, units, delimiter, len(lines), []))
         elif below and (len(below[0][1]) == len(names) or not (is_comment or delimiter == BLANKS)):
             first, numbers = below[0]
-            if len(numbers) <= len(names) and any(map(_is_number, numbers)):
-                width = len(_split(lines[first], delimiter))
+            if len(numbers) <= len(names) and any(map(is_number, numbers)):
+                width = len(split_line(lines[first], delimiter))
                 padded = [*names, *[""] * (width - len(names))]
                 found.append(_layout_of(padded, units, delimiter, first, numbers))
     return max(found, key=lambda layout: layout.score, default=None)
+
+
+def _nameless(lines: Sequence[str], delimiter: str, *, is_first: bool) -> Layout | None:
+    """Return the layout of numbers that no line names; None: this delimiter does not part them."""
+    for number, line in enumerate(lines):
+        cells = split_cells(line, delimiter)
+        if not any(cells) or COMMENT.match(line):
+            continue
+        if all(map(is_number, cells)):
+            names = tuple(f"column{i + 1}" for i in range(len(split_line(line, delimiter))))
+            return Layout(names, delimiter, number, {}, len(cells), is_named=False)
+        if is_first:
+            return None
+    return None
 
 
 def _layout_of(
     names: Sequence[str], units: Sequence[str], delimiter: str, line: int, numbers: Sequence[str]
 ) -> Layout:
     stated = {name: match[1] for name in names if (match := _IN_BRACKETS.search(name))}
-    stated |= {
-        name: unit.strip("[]() ") for name, unit in zip(names, units, strict=False) if name and unit
-    }
-    count = sum(map(_is_number, numbers))
+    stated |= _units_of(names, units)
+    count = sum(map(is_number, numbers))
     others = sum(map(bool, numbers)) - count
     return Layout(tuple(names), delimiter, line, stated, count - others)
 
 
-def _split(line: str, delimiter: str) -> list[str]:
+def _units_of(names: Sequence[str], units: Sequence[str]) -> dict[str, str]:
+    pairs = zip(names, units, strict=False)
+    return {name: unit.strip("[]() ") for name, unit in pairs if name and unit}
+
+
+def split_line(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line as they are."""
     if delimiter == BLANKS:
         return line.split()
     try:
@@ -246,30 +345,26 @@ def _split(line: str, delimiter: str) -> list[str]:
 
 def split_cells(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line, without those that are empty at its end."""
-    cells = [" ".join(cell.split()) for cell in _split(line, delimiter)]
+    cells = [" ".join(cell.split()) for cell in split_line(line, delimiter)]
     while cells and not cells[-1]:
         cells.pop()
     return cells
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Tell whether a cell holds a number, with a decimal point or a decimal comma."""
     return _NUMBER.fullmatch(cell) is not None
 
 
 def _are_units(cells: Sequence[str]) -> bool:
     units = [cell.strip("[]() ").lower() for cell in cells if cell]
     known = sum(unit in KNOWN_UNITS for unit in units)
-    return known > 0 and 2 * known >= len(units) and not any(map(_is_number, units))
+    return known > 0 and 2 * known >= len(units) and not any(map(is_number, units))
 
 
 def _body(text: str, layout: Layout) -> str:
     """Return the lines of numbers, without comments."""
-    begin = 0
-    for _ in range(layout.line):
-        begin = text.find("\n", begin) + 1
-        if begin == 0:
-            return ""
-    body = text[begin:].rstrip(" \n\x1a\x00")
+    body = text[_begin_of_line(text, layout.line) :].rstrip(" \n\x1a\x00")
     if not body:
         return ""
     if layout.delimiter == BLANKS:
@@ -297,6 +392,7 @@ def _has_decimal_comma(columns: Sequence[pa.Array[Any]], where: str) -> bool:
                 f"some numbers have a decimal point, and {first!r} has a comma",
                 where=where,
                 expected=expected,
+                remedy=DECIMAL_REMEDY,
             )
     if all(
         pc.all(pc.match_substring_regex(cells, _GROUPED)).as_py() is not False for cells in commas
@@ -305,8 +401,30 @@ def _has_decimal_comma(columns: Sequence[pa.Array[Any]], where: str) -> bool:
             f"{first!r} may have a decimal comma, or a comma between thousands",
             where=where,
             expected=expected,
+            remedy=DECIMAL_REMEDY,
         )
     return True
+
+
+def _with_points(cells: pa.Array[Any], name: str, decimal: str, where: str) -> pa.Array[Any]:
+    """Return numbers with a decimal point, of numbers whose mark of decimals is stated.
+
+    Raises:
+        FileFormatError: a cell is no such number.
+    """
+    other = "." if decimal == "," else ","
+    marked = pc.or_(pc.match_substring(cells, ","), pc.match_substring(cells, "."))
+    marked = pc.and_(marked, pc.invert(pc.match_substring_regex(cells, NO_NUMBER)))
+    fits = pc.match_substring_regex(cells, f"^({DECIMALS[decimal].pattern})$")
+    if pc.any(bad := pc.and_(marked, pc.invert(fits))).as_py():
+        at = pc.index(bad, pa.scalar(True)).as_py()
+        raise FileFormatError(
+            f"column {name} has {cells[at].as_py()[:40]!r} in row {at + 1} of its numbers",
+            where=where,
+            expected=f"{decimal!r} as the mark of decimals, and {other!r} between thousands only",
+            remedy="State the other --decimal, or none",
+        )
+    return pc.replace_substring(pc.replace_substring(cells, other, ""), decimal, ".")
 
 
 def _numbers(cells: pa.Array[Any], name: str, where: str, *, has_comma: bool) -> Column:

@@ -31,14 +31,17 @@ def test_each_row_is_compared_as_it_says_and_a_bad_one_fails_alone(
 ) -> None:
     plate_of(session, tmp_path / "newtons.csv")
     plate_of(session, tmp_path / "kilo.csv", unit=1e-3)
+    kilo = (tmp_path / "kilo.csv").read_text()
+    (tmp_path / "kilo.csv").write_text("a,b\n1,2\n" + kilo)
     rows = [
-        "session,reference,name,units,sign",
-        "session.parquet,newtons.csv,first,,",
-        'session.parquet,kilo.csv,second,"grf=kN,time=s",',
-        "session.parquet,gone.csv,third,,",
-        "session.parquet,newtons.csv,fourth,grf,",
-        "session.parquet,newtons.csv,../fifth,,",
-        "session.parquet,,sixth,,",
+        "session,reference,name,units,sign,skip_rows,encoding",
+        "session.parquet,newtons.csv,first,,,,",
+        'session.parquet,kilo.csv,second,"grf=kN,time=s",,2,cp1252',
+        "session.parquet,gone.csv,third,,,,",
+        "session.parquet,newtons.csv,fourth,grf,,,",
+        "session.parquet,newtons.csv,../fifth,,,,",
+        "session.parquet,,sixth,,,,",
+        "session.parquet,newtons.csv,seventh,,,1.5,",
     ]
     (tmp_path / "trials.csv").write_text("\n".join(rows) + "\n")
     asked = ("--map", "time_s=t,grf_n=F", "--units", "grf=N,time=s", "--sign", "+")
@@ -61,13 +64,13 @@ def test_each_row_is_compared_as_it_says_and_a_bad_one_fails_alone(
         "compare.made.json",
     }
     reasons = [line["reason"] for lines in said.values() for line in lines if "reason" in line]
-    assert len(reasons) == 4
-    for word in ("no such file", "--units 'grf'", "../fifth", "no reference"):
+    assert len(reasons) == 5
+    for word in ("no such file", "--units 'grf'", "../fifth", "no reference", "--skip-rows '1.5'"):
         assert any(word in reason for reason in reasons), reasons
     again = run(*words)
-    assert "0 made, 2 there before, 4 failed" in again.out
+    assert "0 made, 2 there before, 5 failed" in again.out
     missed = run(*words, "--limits", "grf_mae_n=1e-9")
-    assert "2 made, 0 there before, 4 failed; 2 limit missed" in missed.out
+    assert "2 made, 0 there before, 5 failed; 2 limit missed" in missed.out
 
 
 @pytest.mark.parametrize(
@@ -78,6 +81,7 @@ def test_each_row_is_compared_as_it_says_and_a_bad_one_fails_alone(
         ("--manifest", "list.csv"),
         ("--manifest", "list.csv", "--out", "o", "--reference", "x.csv"),
         ("--manifest", "list.csv", "--out", "o", "--units", "grf"),
+        ("--manifest", "list.csv", "--out", "o", "--decimal", ";"),
     ],
 )
 def test_what_is_said_twice_or_not_at_all_is_wrong_usage(

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, LoadTraceError, UsageError
 from storage.formats.load_trace import read_load_trace
 from storage.formats.reference import Stated, read_reference
 from storage.formats.tables.registry import read_table
+from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import Table
 
 PLAIN = "Time,Fz\n0.00,0.5\n0.01,-12.25\n0.02,1e3\n"
@@ -57,10 +58,15 @@ FORMS: dict[str, Callable[[str], str | bytes]] = {
 }
 
 
-def table_of(folder: Path, content: str | bytes, name: str = "plate.csv") -> Table:
+def table_of(
+    folder: Path,
+    content: str | bytes,
+    name: str = "plate.csv",
+    stated: StatedText | None = None,
+) -> Table:
     path = folder / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_table(path, lambda name: True)
+    return read_table(path, lambda name: True, stated=stated)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -123,11 +129,16 @@ def test_what_programs_write_for_no_number_is_none(tmp_path: Path, cell: str) ->
     ("text", "says"),
     [
         ("", "it is empty"),
-        ("0.0,1.0\n0.1,2.0\n", "no line of names"),
+        ("alone\nhere\n", "no line of names"),
+        ("alone\nhere\n", "--skip-rows N"),
+        ("633,21\n628,46\n", "may be two numbers, or one with a decimal comma"),
+        ("633,21\n628,46\n", "--decimal"),
         (PLAIN.replace("1e3", "much"), "column Fz is not numeric: 'much' in row 3"),
         (PLAIN + "0.03\n", "cannot be read"),
         (PLAIN + "0.03,1,2\n", "cannot be read"),
         ("t;Fz\n0.0;1,5\n", "have a decimal point, and '1,5' has a comma"),
+        ("t;Fz\n0.0;1,5\n", "--decimal , or --decimal ."),
+        ("t;Fz\n0;1,000\n1;1,500\n", "--decimal , or --decimal ."),
         ("t;Fz\n0;1,000\n1;1,500\n", "or a comma between thousands"),
         ('t,Fz\n0.5,"1,000.5"\n', "has a comma"),
     ],
@@ -168,3 +179,157 @@ def test_a_load_is_read_by_the_same_reader(tmp_path: Path) -> None:
     assert found.fz_n is not None
     assert found.fz_n.tolist() == [1.5, 2.5]
     np.testing.assert_array_equal(found.cop_m, [[np.nan, np.nan], [0.1, -0.2]])
+
+
+@pytest.mark.parametrize(
+    ("text", "stated", "names", "units"),
+    [
+        ("a,b\n1,2\nt,F\n0,1\n5,2\n", StatedText(skip_rows=2), ("t", "F"), {}),
+        ("t,F\n0,1\n5,2\n", StatedText(skip_rows=0), ("t", "F"), {}),
+        ("9\n8\n0;1\n5;2\n", StatedText(skip_rows=2), ("column1", "column2"), {}),
+        ("ms,kN\nt,F\n0,1\n5,2\n", StatedText(units_row=1), ("t", "F"), {"t": "ms", "F": "kN"}),
+        (
+            "\nms,kN,,\nt,F\n0,1\n5,2\n",
+            StatedText(skip_rows=2, units_row=2),
+            ("t", "F"),
+            {"t": "ms", "F": "kN"},
+        ),
+        (
+            "Hall\nt;F\nsec.;1;N\nms;kN\n0;1\n5;2\n",
+            StatedText(skip_rows=3, units_row=4),
+            ("column1", "column2"),
+            {"column1": "ms", "column2": "kN"},
+        ),
+    ],
+)
+def test_rows_of_names_and_units_are_where_they_are_stated_to_be(
+    tmp_path: Path,
+    text: str,
+    stated: StatedText,
+    names: tuple[str, ...],
+    units: dict[str, str],
+) -> None:
+    found = table_of(tmp_path, text, stated=stated)
+    assert (found.names, found.units) == (names, units)
+    np.testing.assert_array_equal(found.columns[names[0]], [0.0, 5.0])
+    np.testing.assert_array_equal(found.columns[names[1]], [1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("cells", "decimal", "numbers"),
+    [
+        (("1,000", "1,500"), ",", (1.0, 1.5)),
+        (("1,000", "1,500"), ".", (1000.0, 1500.0)),
+        (("1.000", "1.500"), ",", (1000.0, 1500.0)),
+        (("1.234.567,5", "-,25"), ",", (1234567.5, -0.25)),
+        (("1,234,567.5", "-.25"), ".", (1234567.5, -0.25)),
+        (("1,5e3", "nan"), ",", (1500.0, np.nan)),
+        (("1", "1.#QNAN"), ",", (1.0, np.nan)),
+    ],
+)
+def test_the_mark_of_decimals_is_the_stated_one(
+    tmp_path: Path, cells: tuple[str, str], decimal: str, numbers: tuple[float, float]
+) -> None:
+    text = "t;F\n0;{}\n1;{}\n".format(*cells)
+    found = table_of(tmp_path, text, stated=StatedText(decimal=decimal))
+    np.testing.assert_array_equal(found.columns["F"], numbers)
+
+
+@pytest.mark.parametrize(
+    ("cell", "decimal"),
+    [
+        ("0.500", ","),
+        ("1.5", ","),
+        ("0,500", "."),
+        ("1,5", "."),
+        ("1.5,5.5", ","),
+        ("12.34,5", ","),
+    ],
+)
+def test_numbers_that_have_another_mark_of_decimals_are_refused(
+    tmp_path: Path, cell: str, decimal: str
+) -> None:
+    with pytest.raises(FileFormatError, match=r"column F has .* in row 2.*--decimal"):
+        table_of(tmp_path, f"t;F\n0;1\n1;{cell}\n", stated=StatedText(decimal=decimal))
+
+
+def test_names_are_read_in_the_stated_encoding(tmp_path: Path) -> None:
+    text = "時間;力 (N)\n0,0;1,5\n0,5;2,5\n".encode("cp932")
+    garbled = Stated({"time_s": "時間", "grf_n": "力 (N)"}, sign="+")
+    path = tmp_path / "plate.csv"
+    path.write_bytes(text)
+    with pytest.raises(FileFormatError, match="if names are garbled, state --encoding"):
+        read_reference(path, garbled)
+    stated = Stated(garbled.columns, {}, "+", text=StatedText(encoding="cp932"))
+    np.testing.assert_array_equal(read_reference(path, stated).grf_n, [1.5, 2.5])
+    with pytest.raises(FileFormatError, match=r"it is no text in utf-8.*another --encoding"):
+        table_of(tmp_path, text, stated=StatedText(encoding="utf-8"))
+    without_mark = "t,F\n0,1\n".encode("utf-32-le")
+    with pytest.raises(FileFormatError, match=r"no text.*--encoding NAME"):
+        table_of(tmp_path, without_mark)
+    assert table_of(tmp_path, without_mark, stated=StatedText(encoding="utf-32-le")).names
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"skip_rows": -1},
+        {"units_row": 0},
+        {"decimal": ";"},
+        {"decimal": ""},
+        {"encoding": "hex"},
+        {"encoding": "no such"},
+        {"encoding": "a\0b"},
+        {"encoding": ""},
+    ],
+)
+def test_what_cannot_be_stated_of_a_text_is_wrong_usage(stated: dict[str, int | str]) -> None:
+    with pytest.raises(UsageError, match="--"):
+        StatedText(**stated)  # type: ignore[arg-type]
+
+
+def test_rows_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    for stated, says in (
+        (StatedText(skip_rows=9), "nothing stands below 9 lines"),
+        (StatedText(skip_rows=10**30), "nothing stands below"),
+        (StatedText(units_row=9), "line 9, of units, is empty"),
+    ):
+        with pytest.raises(FileFormatError, match=says):
+            table_of(tmp_path, PLAIN, stated=stated)
+
+
+def test_columns_that_no_line_names_are_numbered(tmp_path: Path) -> None:
+    text = "\n-3.5, 953.25, 28.5\n-4.25, 950.0, 27.5\n-4.0, 0.0, 27.0\n"
+    path = tmp_path / "plate.txt"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=r"it has column1, column2.*--skip-rows"):
+        read_reference(path, Stated())
+    found = read_reference(path, Stated({"grf_n": "column2"}, {"grf": "N"}, "+", rate_hz=100.0))
+    np.testing.assert_array_equal(found.grf_n, [953.25, 950.0, 0.0])
+    np.testing.assert_allclose(found.time_s, [0.0, 0.01, 0.02])
+    assert "no line names its columns: they are numbered from 1 on" in found.notes
+    with pytest.raises(FileFormatError, match="or, without times, state --rate-hz"):
+        read_reference(path, Stated({"grf_n": "column2"}, {"grf": "N"}, "+"))
+
+
+def test_how_a_text_is_laid_out_is_not_stated_of_other_files(tmp_path: Path) -> None:
+    for name in ("plate.c3d", "plate.parquet", "plate.mot"):
+        with pytest.raises(UsageError, match="go with tables in text"):
+            table_of(tmp_path, PLAIN, name, StatedText(decimal="."))
+    with pytest.raises(LoadTraceError, match="go with tables in text"):
+        read_load_trace(tmp_path / "plate.c3d", StatedText(skip_rows=1))
+
+
+def test_a_stated_layout_overrules_the_head_of_a_program(tmp_path: Path) -> None:
+    text = "BioWare Version 5\nt\tFz\n0\t1\n1\t2\n"
+    with pytest.raises(FileFormatError, match="no line of names"):
+        table_of(tmp_path, text)
+    assert table_of(tmp_path, text, stated=StatedText(skip_rows=1)).names == ("t", "Fz")
+
+
+def test_a_load_is_read_as_it_is_stated_to_be_laid_out(tmp_path: Path) -> None:
+    path = tmp_path / "load.csv"
+    path.write_text("a;b\n1;2\ntime_s;fz_n;cop_x_m;cop_y_m\n0;1,000;;\n1;1,500;;\n")
+    found = read_load_trace(path, StatedText(skip_rows=2, decimal=","))
+    assert found.fz_n is not None
+    assert found.fz_n.tolist() == [1.0, 1.5]

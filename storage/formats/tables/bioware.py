@@ -1,0 +1,85 @@
+"""Kistler BioWare's text export: facts of each device, a line of names, one of units, numbers.
+
+Each column has its device in the line `Device:`. Forces are those on the plate, positive under
+load. `Ax` and `Ay` are the centre of pressure on its surface, from its middle, in its own axes.
+"""
+
+from __future__ import annotations
+
+import re
+
+from devices.errors import FileFormatError
+from storage.formats.tables.device_columns import (
+    DeviceColumn,
+    group_by_plate,
+    make_plate,
+    needed_of,
+    read_columns,
+)
+from storage.formats.tables.plates import make_plate_table
+from storage.formats.tables.table import IsNeeded, Table
+from storage.formats.tables.text import is_number, split_cells
+
+FORM = "lines of facts, a line of names that begins with a time, lines of numbers"
+_NAMES = re.compile(
+    r"^\"?(?:\w+\.? )?time(?: *[\[(](?P<unit>\w+)[\])])?\"?(?P<delimiter>[\t;,])", re.I | re.M
+)
+_SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3}
+
+
+def is_bioware(head: str) -> bool:
+    """Tell whether a text is an export of BioWare."""
+    return re.match(r"\s*\"?bioware\b", head, re.IGNORECASE) is not None
+
+
+def read_bioware(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -> Table:
+    """Read the vertical force and centre of pressure of each plate.
+
+    Raises:
+        FileFormatError: it has no line of names or no force plate, or numbers do not fit them.
+    """
+    found = _NAMES.search(text)
+    if found is None:
+        raise FileFormatError("there is no line of names", where=where, expected=FORM)
+    delimiter = found["delimiter"]
+    facts = {
+        cells[0].strip(" :").lower(): cells[1:]
+        for line in text[: found.start()].split("\n")
+        if (cells := split_cells(line, delimiter))
+    }
+    line, _, rows = text[found.start() :].partition("\n")
+    names = split_cells(line, delimiter)[1:]
+    devices = [*facts.get("device", []), *[""] * len(names)]
+    units = [""] * (len(names) + 1)
+    below = split_cells(rows.partition("\n")[0], delimiter)
+    if not any(map(is_number, below)):
+        units = [*below, *units]
+        rows = rows.partition("\n")[2]
+    second = _SECONDS.get((found["unit"] or units[0]).strip("[]() ").lower())
+    if second is None:
+        raise FileFormatError(
+            f"its time is in {found['unit'] or units[0]}", where=where, expected="seconds"
+        )
+    columns = [
+        DeviceColumn("", "abs time", "s"),
+        *(
+            DeviceColumn(device or "plate", name, unit.strip("[]() "))
+            for name, device, unit in zip(names, devices, units[1:], strict=False)
+        ),
+    ]
+    plates = group_by_plate(columns, where)
+    indices = [0, *(i for plate in plates for i in needed_of(plate))]
+    numbers = read_columns(rows, delimiter, columns, indices, numbers_max, where)
+    notes = []
+    stated = next(iter(facts.get("samples (#)", [])), "")
+    if stated.isdecimal() and int(stated) > len(numbers[0]):
+        notes = [f"it holds {len(numbers[0])} of the {stated} samples that its head states"]
+    return make_plate_table(
+        where,
+        numbers[0] * second,
+        [
+            make_plate(f"plate{i + 1}", plate, columns, numbers, is_positive=True)
+            for i, plate in enumerate(plates)
+        ],
+        notes,
+    )

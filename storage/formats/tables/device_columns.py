@@ -1,0 +1,141 @@
+"""Columns of force plates in texts that name a device, a quantity and a unit for each column."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.errors import FileFormatError
+from storage.formats.tables.plates import Plate
+from storage.formats.tables.text import Layout, parse_columns, split_cells, split_line
+
+FORCE_UNITS = {"n": "N", "kn": "kN"}
+LENGTH_UNITS = frozenset(("m", "cm", "mm"))
+COP_NAMES = (("ax", "ay"), ("cx", "cy"))
+"""Coordinates of the centre of pressure, in lower case, as programs name them."""
+
+
+@dataclass(frozen=True)
+class DeviceColumn:
+    """What stands above a column of numbers.
+
+    Attributes:
+        device: name of the plate; empty for times and numbers of frames.
+        name: of the quantity, such as `Fz`.
+        unit: as the file states it; empty if it does not.
+    """
+
+    device: str
+    name: str
+    unit: str
+
+
+def group_by_plate(columns: Sequence[DeviceColumn], where: str) -> list[dict[str, int]]:
+    """Return the columns of each device that has a vertical force: indices by name in lower case.
+
+    Devices may share a name. Then a quantity that comes again belongs to the next one of them.
+
+    Raises:
+        FileFormatError: there is none, or which columns belong to one device is not clear.
+    """
+    groups: dict[str, list[dict[str, int]]] = {}
+    for i, column in enumerate(columns):
+        if not (column.device and column.name):
+            continue
+        of_device = groups.setdefault(column.device, [{}])
+        if column.name.lower() in of_device[-1]:
+            of_device.append({})
+        of_device[-1][column.name.lower()] = i
+    groups = {
+        device: found for device, found in groups.items() if any("fz" in one for one in found)
+    }
+    for device, found in groups.items():
+        if any(one.keys() != found[0].keys() for one in found):
+            raise FileFormatError(
+                f"which of the columns of {device!r} belong together is not clear",
+                where=where,
+                expected="a name of its own for each device, or the same columns for all",
+            )
+    plates = [one for found in groups.values() for one in found if "fz" in one]
+    if not plates:
+        names = ", ".join(dict.fromkeys(column.name for column in columns if column.name))
+        raise FileFormatError(
+            f"there is no force plate in it (its columns are {names[:200]})",
+            where=where,
+            expected="a column Fz",
+            remedy="Export the forces as well",
+        )
+    return plates
+
+
+def read_columns(
+    rows: str,
+    delimiter: str,
+    columns: Sequence[DeviceColumn],
+    indices: Sequence[int],
+    numbers_max: int,
+    where: str,
+) -> dict[int, Floats]:
+    """Return the numbers of some columns by index.
+
+    Raises:
+        FileFormatError: more numbers than names stand in a line, a cell is no number, or there are
+            no lines.
+    """
+    first = rows.partition("\n")[0]
+    if not first.strip():
+        raise FileFormatError(
+            "no lines of numbers stand below its names", where=where, expected="a whole file"
+        )
+    width = len(split_line(first, delimiter))
+    if len(split_cells(first, delimiter)) > len(columns) or width <= max(indices):
+        raise FileFormatError(
+            f"{len(columns)} names stand over {width} columns of numbers",
+            where=where,
+            expected="a name over each column",
+        )
+    heads: list[Any] = [*columns[:width], *[None] * (width - len(columns))]
+    names = [f"{i + 1} ({head.name})" if head else "" for i, head in enumerate(heads)]
+    layout = Layout(tuple(names), delimiter, 0, {})
+    found = parse_columns(rows, layout, [names[i] for i in indices], numbers_max, where)
+    return {i: np.asarray(found[names[i]], dtype=np.float64) for i in indices}
+
+
+def needed_of(plate: dict[str, int]) -> list[int]:
+    """Return the indices of a plate's vertical force and centre of pressure."""
+    return [plate["fz"], *_cop_of(plate)]
+
+
+def make_plate(
+    name: str,
+    plate: dict[str, int],
+    columns: Sequence[DeviceColumn],
+    numbers: dict[int, Floats],
+    *,
+    is_positive: bool = False,
+) -> Plate:
+    """Return a plate of its columns, with a note of its name in the file."""
+    head = columns[plate["fz"]]
+    cop = _cop_of(plate)
+    lengths = {columns[i].unit.lower() for i in cop}
+    length = lengths.pop() if len(lengths) == 1 else ""
+    return Plate(
+        name,
+        numbers[plate["fz"]],
+        np.stack([numbers[i] for i in cop]) if cop else None,
+        FORCE_UNITS.get(head.unit.lower()),
+        length if length in LENGTH_UNITS else None,
+        is_positive,
+        (f"{head.device!r} of the file",),
+    )
+
+
+def _cop_of(plate: dict[str, int]) -> list[int]:
+    return next(
+        ([plate[x], plate[y]] for x, y in COP_NAMES if x in plate and y in plate),
+        [],
+    )

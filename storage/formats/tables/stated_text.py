@@ -1,0 +1,55 @@
+"""How a text of columns is laid out, where a user states it."""
+
+from __future__ import annotations
+
+import codecs
+import re
+from dataclasses import dataclass
+
+from devices.errors import UsageError
+
+DECIMALS = {
+    ",": re.compile(r"[+-]?([1-9]\d{0,2}(\.\d{3})+|\d*)(,\d*)?([eE][+-]?\d+)?"),
+    ".": re.compile(r"[+-]?([1-9]\d{0,2}(,\d{3})+|\d*)(\.\d*)?([eE][+-]?\d+)?"),
+}
+"""Numbers by the mark of their decimals; the other one may part thousands."""
+
+
+@dataclass(frozen=True)
+class StatedText:
+    """What a user states of a text; what they do not is found out.
+
+    Attributes:
+        skip_rows: lines above the line of names, or above the numbers if no line names them.
+        units_row: number of the line of units, the first line of the file being 1.
+        decimal: mark of decimals, "," or "."; the other one may part thousands.
+        encoding: name of the encoding, as Python has it.
+    """
+
+    skip_rows: int | None = None
+    units_row: int | None = None
+    decimal: str | None = None
+    encoding: str | None = None
+
+    def __post_init__(self) -> None:
+        for option, value, least in (
+            ("--skip-rows", self.skip_rows, 0),
+            ("--units-row", self.units_row, 1),
+        ):
+            if value is not None and value < least:
+                raise UsageError(f"{option} {value}", expected=f"a whole number from {least} on")
+        if self.decimal is not None and self.decimal not in DECIMALS:
+            raise UsageError(f"--decimal {self.decimal!r}", expected="a comma, or a point")
+        if self.encoding is not None:
+            try:
+                "".encode(self.encoding)
+                codecs.lookup(self.encoding)
+            except (LookupError, ValueError) as error:
+                raise UsageError(
+                    f"--encoding {self.encoding!r}", expected="a name such as utf-8, cp1252, cp932"
+                ) from error
+
+    @property
+    def is_plain(self) -> bool:
+        """Tell whether the text is stated to be a plain table, whatever its head looks like."""
+        return any(one is not None for one in (self.skip_rows, self.units_row, self.decimal))
