@@ -8,6 +8,8 @@ import typer
 
 from devices.errors import UsageError
 
+SOLE_MAX_M = 1.0
+
 ColumnsOfReference = Annotated[
     str | None,
     typer.Option(
@@ -39,12 +41,40 @@ RateOfReference = Annotated[
         "--rate-hz", help="Samples a second, of a reference with sample numbers or without times."
     ),
 ]
+SoleOfReference = Annotated[
+    str | None,
+    typer.Option(
+        "--sole-m",
+        metavar="LENGTH[,WIDTH]",
+        help="Size of the insole, where the reference's centre of pressure is a part of it.",
+    ),
+]
 LagRange = Annotated[
     str | None,
     typer.Option(
         "--lag-range-s", metavar="A,B", help="Least and greatest lag, where several would fit."
     ),
 ]
+
+
+def sole_size(text: str | None) -> tuple[float, ...]:
+    """Return length, and width if it is stated, of an insole in m.
+
+    Raises:
+        UsageError: they are no sizes of an insole.
+    """
+    if text is None:
+        return ()
+    try:
+        size_m = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        size_m = ()
+    if len(size_m) not in (1, 2) or not all(0.0 < one < SOLE_MAX_M for one in size_m):
+        raise UsageError(
+            f"--sole-m {text!r} is no size of an insole",
+            expected=f"LENGTH or LENGTH,WIDTH, in metres, below {SOLE_MAX_M:g}",
+        )
+    return size_m
 
 
 def named_values(text: str | None, option: str) -> dict[str, str]:

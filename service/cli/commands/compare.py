@@ -19,6 +19,7 @@ from service.cli.reference_options import (
     LagRange,
     RateOfReference,
     SignOfReference,
+    SoleOfReference,
     UnitsOfReference,
     named_values,
 )
@@ -49,6 +50,7 @@ def compare_command(
     units: UnitsOfReference = None,
     sign: SignOfReference = None,
     rate_hz: RateOfReference = None,
+    sole_m: SoleOfReference = None,
     reference_sigma_n: Annotated[
         float | None,
         typer.Option(min=0.0, help="Standard uncertainty of the reference; tells coverage."),
@@ -109,6 +111,7 @@ def compare_command(
         "units": units,
         "sign": sign,
         "rate_hz": rate_hz,
+        "sole_m": sole_m,
         "lag_range_s": lag_range_s,
         "contact_n": contact_n,
         "cop_offset_m": cop_offset_m,

@@ -9,6 +9,7 @@ from pathlib import Path
 from devices.errors import FileFormatError
 from storage.formats.tables.force_platform import read_force_platforms
 from storage.formats.tables.loadsol import is_loadsol, read_loadsol
+from storage.formats.tables.moticon import is_moticon, read_moticon
 from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
 from storage.formats.tables.pressure_plate import read_pressure_plate
@@ -29,7 +30,10 @@ class SavedText:
     read: Callable[[str, str, IsNeeded, int], Table]
 
 
-SAVED_TEXTS: tuple[SavedText, ...] = (SavedText(is_loadsol, read_loadsol),)
+SAVED_TEXTS: tuple[SavedText, ...] = (
+    SavedText(is_loadsol, read_loadsol),
+    SavedText(is_moticon, read_moticon),
+)
 
 
 @dataclass(frozen=True)
