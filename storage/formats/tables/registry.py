@@ -12,8 +12,10 @@ from storage.formats.tables.loadsol import is_loadsol, read_loadsol
 from storage.formats.tables.moticon import is_moticon, read_moticon
 from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
+from storage.formats.tables.pedar import is_pedar, refuse_pedar
 from storage.formats.tables.pressure_plate import read_pressure_plate
 from storage.formats.tables.table import NUMBERS_MAX, IsNeeded, Table
+from storage.formats.tables.tekscan import is_tekscan, read_tekscan
 from storage.formats.tables.text import HEAD_CHARACTERS, read_table_text, read_text_table
 
 
@@ -33,6 +35,8 @@ class SavedText:
 SAVED_TEXTS: tuple[SavedText, ...] = (
     SavedText(is_loadsol, read_loadsol),
     SavedText(is_moticon, read_moticon),
+    SavedText(is_tekscan, read_tekscan),
+    SavedText(is_pedar, refuse_pedar),
 )
 
 
