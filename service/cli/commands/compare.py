@@ -34,8 +34,8 @@ def compare_command(
     reference: Annotated[
         Path | None,
         typer.Option(
-            help="What to compare with: .c3d, .csv, .parquet (or a session), .mot, .sto, or .npz "
-            "of a pressure plate."
+            help="What to compare with: .c3d, .csv, .txt, .parquet (or a session), .mot, .sto, "
+            ".asf, .bag, .mcap, .db3 or a bag's folder, or .npz of a pressure plate."
         ),
     ] = None,
     out: Annotated[

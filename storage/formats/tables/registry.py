@@ -14,6 +14,7 @@ from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
 from storage.formats.tables.pedar import is_pedar, refuse_pedar
 from storage.formats.tables.pressure_plate import read_pressure_plate
+from storage.formats.tables.rosbag import is_bag_folder, read_bag
 from storage.formats.tables.table import NUMBERS_MAX, IsNeeded, Table
 from storage.formats.tables.tekscan import is_tekscan, read_tekscan
 from storage.formats.tables.text import HEAD_CHARACTERS, read_table_text, read_text_table
@@ -63,8 +64,10 @@ def _read_text(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
 
 
 TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text)
+BAG = TableFormat((".bag", ".mcap", ".db3"), read_bag)
 FORMATS = (
     TEXT,
+    BAG,
     TableFormat((".parquet",), read_parquet),
     TableFormat((".c3d",), read_force_platforms),
     TableFormat((".mot", ".sto"), read_opensim),
@@ -80,6 +83,8 @@ def read_table(path: Path, is_needed: IsNeeded, numbers_max: int = NUMBERS_MAX) 
     """
     ending = path.suffix.lower()
     chosen = next((one for one in FORMATS if ending in one.endings), TEXT)
+    if is_bag_folder(path):
+        chosen = BAG
     try:
         return chosen.read(path, is_needed, numbers_max)
     except MemoryError as error:
