@@ -192,7 +192,8 @@ def _open_mcap(path: Path) -> _Bag:
 
     def messages(topics: list[str]) -> Iterator[_Message]:
         with path.open("rb") as file:
-            for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(topics):
+            reader = make_reader(file, validate_crcs=True)
+            for schema, channel, message in reader.iter_messages(topics):
                 if schema is not None and schema.name in WRENCHES:
                     decode = decoders[channel.message_encoding]
                     yield channel.topic, message.log_time, decode(message.data, WRENCH)
