@@ -50,8 +50,11 @@ def read_loadsol(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -
     first = lines[at + 1] if at + 1 < len(lines) else ""
     width = max(len(quantities), first.count(delimiter) + 1 if first else 0)
     times = [i for i, name in enumerate(quantities) if _TIME.fullmatch(name)]
-    named = enumerate(zip(quantities, sensors, strict=False))
-    forces = [i for i, (name, sole) in named if sole and _FORCE.fullmatch(name)]
+    forces = [i for i, name in enumerate(quantities) if _FORCE.fullmatch(name)]
+    if nameless := [i for i in forces if not (sensors[i : i + 1] and sensors[i])]:
+        raise FileFormatError(
+            f"the force in column {nameless[0] + 1} belongs to no sole", where=where, expected=FORM
+        )
     names = [""] * width
     for i in times:
         names[i] = f"Time[secs] in column {i + 1}"

@@ -110,6 +110,8 @@ def _frames(
         raise FileFormatError(
             f"a cell is no number: {error}", where=where, expected=FORM
         ) from error
+    if not np.isfinite(cells).all():
+        raise FileFormatError("a cell is not finite", where=where, expected=FORM)
     return numbers, cells.reshape(len(numbers), rows, columns)
 
 

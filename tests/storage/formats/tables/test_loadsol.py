@@ -105,6 +105,7 @@ def test_stamps_that_the_app_rounds_are_spread(tmp_path: Path) -> None:
         (text(*(line(i) for i in range(20)), "0.2\t1"), "cannot be read"),
         (text().partition("0.000")[0], "0 samples"),
         (text().replace("AB2-R", "AB2-L"), "two soles are of one side"),
+        (text().replace("AB1-L::medial", ""), "the force in column 3 belongs to no sole"),
         (text().replace("AB1-L::medial", "AB1-L"), "sole AB1-L is there twice"),
     ],
 )

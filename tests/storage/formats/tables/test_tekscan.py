@@ -97,6 +97,7 @@ def test_a_mirrored_sensor_has_no_centre_of_pressure(tmp_path: Path) -> None:
         (text(SECONDS_PER_FRAME="inf"), "SECONDS_PER_FRAME is no time"),
         (text(FRAMES[:3], end=""), "it is cut off: its last frame is 3 of 4"),
         (text((*FRAMES[:3], "B,0\n100,100\n0,x")), "a cell is no number"),
+        (text((*FRAMES[:3], "B,0\n100,100\n0,inf")), "a cell is not finite"),
         (text((*FRAMES[:3], "B,0\n100,100\n0")), "frame 4 has not 3 rows of 2 cells"),
         (text().replace("Frame 2", "Frame 1"), "the numbers of its frames do not rise"),
         (text((), end="Frame 1"), "there is no frame in it"),
