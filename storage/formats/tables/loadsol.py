@@ -88,7 +88,7 @@ def read_loadsol(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -
         )
         stamp = max(i for i in times if i < own[0])
         scale = 1e-3 if quantities[stamp].lower().endswith("[ms]") else 1.0
-        times_s.append(columns[names[stamp]] * scale)
+        times_s.append(np.asarray(columns[names[stamp]] * scale, dtype=np.float64))
     if len({plate.name for plate in plates}) < len(plates):
         raise FileFormatError("two soles are of one side", where=where, expected="one of each")
     time_s = _time_of(plates, times_s, is_needed, where)

@@ -17,7 +17,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.tables.plates import Plate, make_plate_table
-from storage.formats.tables.table import SOLE, IsNeeded, Table
+from storage.formats.tables.table import SOLE, Column, IsNeeded, Table
 from storage.formats.tables.text import Layout, parse_columns
 
 FORM = "facts behind #, a line of names that begins with # time, lines of numbers"
@@ -69,20 +69,21 @@ def read_moticon(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -
                 cop[1] *= -1.0
         elif axes:
             notes = ("its centre of pressure is in units that are not read",)
-        plates.append(Plate(side, columns[name], cop, match[2], SOLE, True, notes))
+        fz = np.asarray(columns[name], dtype=np.float64)
+        plates.append(Plate(side, fz, cop, match[2], SOLE, True, notes))
     return make_plate_table(where, _seconds(columns[names[0]], text, where), plates)
 
 
-def _seconds(time: Floats, text: str, where: str) -> Floats:
+def _seconds(time: Column, text: str, where: str) -> Floats:
     """Return times in seconds, which the file has in seconds or milliseconds.
 
     Raises:
         FileFormatError: they are longer than the recording that the file states.
     """
     if not len(time):
-        return time
+        return np.empty(0)
     step = float(np.nanmedian(np.diff(time))) if len(time) > 1 else 0.0
-    time_s = time / 1e3 if step > SECONDS_MAX else time
+    time_s = np.asarray(time / (1e3 if step > SECONDS_MAX else 1.0), dtype=np.float64)
     stated = _DURATION.search(text, 0, 1 << 16)
     if stated:
         duration_s = 3600.0 * int(stated[1] or 0) + 60.0 * int(stated[2]) + float(stated[3])

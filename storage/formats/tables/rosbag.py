@@ -76,7 +76,8 @@ def _table(bag: _Bag, where: str, is_needed: IsNeeded, numbers_max: int) -> Tabl
         if len(names) == 1 or any(is_needed(f"{name}_{column}") for column in _COLUMNS)
     ]
     found = _sensors(bag, needed, where, numbers_max)
-    plates, time_s, begin_ns = [], np.empty(0), 0
+    plates: list[Plate] = []
+    time_s, begin_ns = np.empty(0), 0
     forces: dict[str, Floats] = {}
     notes = []
     for topic, sensor in found.items():
@@ -101,7 +102,7 @@ def _table(bag: _Bag, where: str, is_needed: IsNeeded, numbers_max: int) -> Tabl
     table = make_plate_table(where, time_s, plates, notes)
     columns = {
         name: column
-        for name, column in (table.columns | forces).items()
+        for name, column in {**table.columns, **forces}.items()
         if name not in ("cop_x_m", "cop_y_m") and (plates or name != "time_s")
     }
     return replace(

@@ -65,8 +65,10 @@ def read_tekscan(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -
             where=where,
             expected=FORM,
         )
-    x_m = pitch_m[0] * ((rows - 1) / 2 - np.arange(rows))
-    y_m = pitch_m[1] * ((columns - 1) / 2 - np.arange(columns))
+    x_m, y_m = (
+        np.asarray(pitch * ((count - 1) / 2 - np.arange(count)), dtype=np.float64)
+        for pitch, count in zip(pitch_m, (rows, columns), strict=True)
+    )
     force_n, cop_m = add_cells(pressure * (_PASCALS[unit.lower()] * area_m2), x_m, y_m)
     notes = [f"a sensor of {rows} by {columns} cells, added up"]
     is_mirrored = any(facts.get(name, "0") != "0" for name in ("MIRROR_ROW", "MIRROR_COL"))
