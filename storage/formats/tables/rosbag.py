@@ -41,7 +41,10 @@ class _Bag:
 
 def is_bag_folder(path: Path) -> bool:
     """Tell whether a folder is one of ROS 2's bags."""
-    return (path / "metadata.yaml").is_file()
+    try:
+        return (path / "metadata.yaml").is_file()
+    except OSError:  # a name that is too long
+        return False
 
 
 @needs_extra("mcap", "To read ROS bags and MCAP")
@@ -202,7 +205,12 @@ def _open_mcap(path: Path) -> _Bag:
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     if summary is None:
-        raise FileFormatError("it is cut off: it has no summary", where=str(path), expected=FORM)
+        raise FileFormatError(
+            "it is cut off: it has no summary",
+            where=str(path),
+            expected=FORM,
+            remedy="Repair it with `mcap recover`",
+        )
     found = [
         channel.topic
         for channel in summary.channels.values()

@@ -107,7 +107,9 @@ def _frames(
     if not (np.diff(numbers) > 0.0).all():
         raise FileFormatError("the numbers of its frames do not rise", where=where, expected=FORM)
     try:
-        cells = np.loadtxt((line.replace("B", "0") for line in lines), delimiter=",", ndmin=2)
+        cells = np.loadtxt(
+            (line.upper().replace("B", "0") for line in lines), delimiter=",", ndmin=2
+        )
     except ValueError as error:
         raise FileFormatError(
             f"a cell is no number: {error}", where=where, expected=FORM
