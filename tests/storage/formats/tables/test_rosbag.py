@@ -19,7 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 from devices.errors import FileFormatError, FootTileError, UsageError
 from storage.formats.options import FormatOptions
 from storage.formats.reference import Stated, read_reference
-from tests.storage.formats.written.test_mcap import estimates, frames, written
+from tests.storage.formats.exports import frames
+from tests.storage.formats.written.test_mcap import estimates, written
 
 BEGIN_NS = 1_750_000_000_123_456_789
 STEP_NS = 5_000_000
@@ -123,7 +124,7 @@ def write_mcap1(folder: Path, samples: Sequence[Sample]) -> Path:
             raw = types.serialize_ros1(message(types, one, is_first=True), WRENCH)
             at_ns = one.logged_ns or one.t_ns
             writer.add_message(channels[one.topic], at_ns, bytes(raw), at_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,8 @@ FACTS = {
 FRAMES = ("B,0\n0,0\n0,0", "B,0\n0,0\n0,20", "B,60\n0,0\n20,0", "B,0\n100,100\n0,0")
 
 
-def text(frames: tuple[str, ...] = FRAMES, end: str = "@@\n", **facts: str | None) -> str:
-    stated = {name: value for name, value in (FACTS | facts).items() if value is not None}
+def text(frames: Sequence[str] = FRAMES, /, *, end: str = "@@\n", **facts: str) -> str:
+    stated = {name: value for name, value in (FACTS | facts).items() if value}
     head = "".join(f"{name} {value}\r\n" for name, value in stated.items())
     body = "".join(f"Frame {i + 1}\n{frame}\n\n" for i, frame in enumerate(frames))
     return f"{head}ASCII_DATA @@\r\n\r\n{body}{end}"
@@ -57,15 +58,13 @@ def test_cells_add_up_to_force_and_centre_of_pressure(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("facts", "newtons"),
     [
-        ({"UNITS": "MPa", "SATURATION_PRESSURE": None}, 1e3),
+        ({"UNITS": "MPa", "SATURATION_PRESSURE": ""}, 1e3),
         ({"UNITS": "PSI"}, 6.894757293),
         ({"SENSEL_AREA": "5e-05 m2"}, 1.0),
         ({"SENSEL_AREA": "0.5 cm2"}, 1.0),
     ],
 )
-def test_units_are_those_of_the_file(
-    tmp_path: Path, facts: dict[str, str | None], newtons: float
-) -> None:
+def test_units_are_those_of_the_file(tmp_path: Path, facts: dict[str, str], newtons: float) -> None:
     np.testing.assert_allclose(read(tmp_path, text(**facts)).grf_n[3], 10.0 * newtons)
 
 
@@ -89,7 +88,7 @@ def test_a_mirrored_sensor_has_no_centre_of_pressure(tmp_path: Path) -> None:
     ("content", "said"),
     [
         (text(UNITS="Raw"), "UNITS is Raw"),
-        (text(UNITS=None), "UNITS is not there"),
+        (text(UNITS=""), "UNITS is not there"),
         (text(ROWS="4"), "frame 1 has not 4 rows of 2 cells"),
         (text(COLS="²"), "COLS is ²"),
         (text(SENSEL_AREA="50"), "SENSEL_AREA is 50"),
