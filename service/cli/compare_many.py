@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from devices.errors import UsageError
 from service.cli.many import run_plan, spread_over
 from service.cli.options import pair
-from service.cli.reference_options import named_values, text_stated
+from service.cli.reference_options import named_values, sole_size, text_stated
 
 if TYPE_CHECKING:
     from service.offline.archive.jobs import Job
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MISSED = "limit missed"
 """The verdict on a session of which a limit was missed."""
 _NUMBERS = ("rate_hz", "contact_n", "reference_sigma_n", "reference_cop_sigma_m")
-_TEXTS = ("map", "units", "sign", "lag_range_s", "cop_offset_m")
+_TEXTS = ("map", "units", "sign", "sole_m", "lag_range_s", "cop_offset_m")
 _OF_TEXT = ("skip_rows", "units_row", "decimal", "encoding")
 _NAME = re.compile(r"[\w-][\w.-]*")
 Said = Mapping[str, str | float | None]
@@ -48,6 +48,7 @@ def options_of(said: Said, *, remove_offset: bool) -> CompareOptions:
             text("sign"),
             _number(said, "rate_hz"),
             text_stated(said),
+            sole_size(text("sole_m")),
         ),
         lag_range_s=pair(text("lag_range_s"), "--lag-range-s"),
         remove_offset=remove_offset,

@@ -12,6 +12,8 @@ from devices.errors import UsageError
 if TYPE_CHECKING:
     from storage.formats.tables.stated_text import StatedText
 
+SOLE_MAX_M = 1.0
+
 ColumnsOfReference = Annotated[
     str | None,
     typer.Option(
@@ -63,6 +65,14 @@ Encoding = Annotated[
     str | None,
     typer.Option("--encoding", metavar="NAME", help="Of a table in text, as cp1252 or cp932."),
 ]
+SoleOfReference = Annotated[
+    str | None,
+    typer.Option(
+        "--sole-m",
+        metavar="LENGTH[,WIDTH]",
+        help="Size of the insole, where the reference's centre of pressure is a part of it.",
+    ),
+]
 LagRange = Annotated[
     str | None,
     typer.Option(
@@ -96,6 +106,26 @@ def _whole_number(text: str | None, option: str) -> int | None:
         return None if text is None else int(text)
     except ValueError:
         raise UsageError(f"{option} {text!r}", expected="a whole number") from None
+
+
+def sole_size(text: str | None) -> tuple[float, ...]:
+    """Return length, and width if it is stated, of an insole in m.
+
+    Raises:
+        UsageError: they are no sizes of an insole.
+    """
+    if text is None:
+        return ()
+    try:
+        size_m = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        size_m = ()
+    if len(size_m) not in (1, 2) or not all(0.0 < one < SOLE_MAX_M for one in size_m):
+        raise UsageError(
+            f"--sole-m {text!r} is no size of an insole",
+            expected=f"LENGTH or LENGTH,WIDTH, in metres, below {SOLE_MAX_M:g}",
+        )
+    return size_m
 
 
 def named_values(text: str | None, option: str) -> dict[str, str]:

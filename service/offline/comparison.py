@@ -156,7 +156,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     notes += [*data.notes, *cop_notes(pairs, places_m), *far_notes(alignment)]
     notes += [*_remarks(alignment, pairs, options)]
     at_ns = int(t_ns[0]) + round(1e9 * alignment.at_s)
-    by_clocks = None if data.epoch_ns is None else _clock_lag(path, reference_path, at_ns)
+    by_clocks = _clock_lag(path, reference_path, at_ns) if is_session(reference_path) else None
     notes += clock_notes(alignment, by_clocks)
     trials, what = trials_of(pairs.columns["t_ns"], pairs.columns["part"], marks)
     return Comparison(

@@ -19,7 +19,7 @@ from devices.errors import FileFormatError, UsageError
 from storage.formats.tables.registry import check_nothing_stated, read_table
 from storage.formats.tables.session import read_session
 from storage.formats.tables.stated_text import StatedText
-from storage.formats.tables.table import OURS, Table
+from storage.formats.tables.table import OURS, SOLE_UNITS, Table
 from storage.formats.tables.times import spread_even
 
 QUANTITIES = ("time_s", "grf_n", "cop_x_m", "cop_y_m")
@@ -58,6 +58,7 @@ class Stated:
         sign: of the force under load, "+" or "-".
         rate_hz: of samples whose times are not in the file, or in it as numbers of samples.
         text: how it is laid out, if it is a text.
+        sole_m: length, and width if it is known, of an insole whose file states parts of them.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -65,6 +66,7 @@ class Stated:
     sign: str | None = None
     rate_hz: float | None = None
     text: StatedText = field(default_factory=StatedText)
+    sole_m: tuple[float, ...] = ()
 
     @property
     def names(self) -> set[str]:
@@ -227,12 +229,14 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
             remedy=_remedy_of_absent(table, name),
         )
     quantity = name.partition("_")[0]
-    factors = FACTORS[quantity]
+    factors = dict(FACTORS[quantity])
     unit = stated.units.get(quantity)
     of_parts = {table.units.get(part) for part in parts}
     of_file = of_parts.pop() if len(of_parts) == 1 else None
     if of_parts:
         raise UsageError(f"the columns of {theirs!r} have different units", where=table.where)
+    if of_file in SOLE_UNITS:
+        factors[of_file] = _size_of_sole(theirs, of_file, stated, table.where)
     if of_file not in factors:
         of_file = None
     if unit is not None and of_file is not None and unit != of_file:
@@ -272,6 +276,22 @@ def _remedy_of_absent(table: Table, name: str) -> str:
     if not "".join(table.names).isascii():
         remedies.append("if names are garbled, state --encoding")
     return "; ".join(remedies)
+
+
+def _size_of_sole(column: str, unit: str, stated: Stated, where: str) -> float:
+    """Return the length or width of an insole, in m.
+
+    Raises:
+        UsageError: it is not stated.
+    """
+    axis = SOLE_UNITS.index(unit)
+    if axis >= len(stated.sole_m):
+        raise UsageError(
+            f"column {column!r} is in {unit}, and the file does not state how long they are",
+            where=where,
+            remedy=f"Add --sole-m {('LENGTH', 'LENGTH,WIDTH')[axis]}, of the insole in metres",
+        )
+    return stated.sole_m[axis]
 
 
 def _with_sign(

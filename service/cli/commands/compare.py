@@ -22,6 +22,7 @@ from service.cli.reference_options import (
     RateOfReference,
     SignOfReference,
     SkipRows,
+    SoleOfReference,
     UnitsOfReference,
     UnitsRow,
     named_values,
@@ -37,8 +38,8 @@ def compare_command(
     reference: Annotated[
         Path | None,
         typer.Option(
-            help="What to compare with: .c3d, .csv, .parquet (or a session), .mot, .sto, or .npz "
-            "of a pressure plate."
+            help="What to compare with: .c3d, .csv, .txt, .parquet (or a session), .mot, .sto, "
+            ".asf, .bag, .mcap, .db3 or a bag's folder, or .npz of a pressure plate."
         ),
     ] = None,
     out: Annotated[
@@ -57,6 +58,7 @@ def compare_command(
     units_row: UnitsRow = None,
     decimal: Decimal = None,
     encoding: Encoding = None,
+    sole_m: SoleOfReference = None,
     reference_sigma_n: Annotated[
         float | None,
         typer.Option(min=0.0, help="Standard uncertainty of the reference; tells coverage."),
@@ -121,6 +123,7 @@ def compare_command(
         "units_row": units_row,
         "decimal": decimal,
         "encoding": encoding,
+        "sole_m": sole_m,
         "lag_range_s": lag_range_s,
         "contact_n": contact_n,
         "cop_offset_m": cop_offset_m,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from storage.formats.tables.table import Table
+from storage.formats.tables.table import SOLE, SOLE_UNITS, Table
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Plate:
         cop: (2, n), NaN where it is not known; None if nothing states where it is. Where nothing
             presses it is no one's, whatever the file holds.
         force: unit of the force; None if the file does not state it.
-        length: unit of the centre of pressure; None likewise.
+        length: unit of the centre of pressure, or `SOLE`; None likewise.
         is_positive: is the force positive under load? Else the load tells its sign.
         notes: remarks for the user.
     """
@@ -47,16 +47,19 @@ def make_plate_table(
         columns[f"{plate.name}_fz"] = plate.fz
         if plate.force is not None:
             units[f"{plate.name}_fz"] = plate.force
-        for axis, cop in zip("xy", () if plate.cop is None else plate.cop, strict=False):
+        for axis, cop, part in zip(
+            "xy", () if plate.cop is None else plate.cop, SOLE_UNITS, strict=False
+        ):
             columns[f"{plate.name}_cop_{axis}"] = np.where(plate.fz == 0.0, np.nan, cop)
             if plate.length is not None:
-                units[f"{plate.name}_cop_{axis}"] = plate.length
+                units[f"{plate.name}_cop_{axis}"] = part if plate.length == SOLE else plate.length
     positive = {f"{plate.name}_fz" for plate in plates if plate.is_positive}
     signed_by_load = {f"{plate.name}_fz" for plate in plates if not plate.is_positive}
     if len(plates) == 1:
         (plate,) = plates
         for ours, theirs in (("grf_n", "fz"), ("cop_x_m", "cop_x"), ("cop_y_m", "cop_y")):
-            if (found := f"{plate.name}_{theirs}") in units:
+            found = f"{plate.name}_{theirs}"
+            if found in units and units[found] not in SOLE_UNITS:
                 columns[ours], units[ours] = columns[found], units[found]
         (positive if plate.is_positive else signed_by_load).add("grf_n")
     else:

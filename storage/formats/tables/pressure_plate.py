@@ -55,20 +55,25 @@ def read_pressure_plate(path: Path, is_needed: IsNeeded, numbers_max: int) -> Ta
         )
     area_m2 = float(pitch_m.prod()) if named[0] == "pressure_kpa" else 1.0
     force_n = cells * (_CELLS[named[0]] * area_m2)
-    grf_n = force_n.sum(axis=(1, 2))
-    along_x = force_n.sum(axis=2) @ (origin_m[0] + pitch_m[0] * np.arange(cells.shape[1]))
-    along_y = force_n.sum(axis=1) @ (origin_m[1] + pitch_m[1] * np.arange(cells.shape[2]))
-    bears = grf_n > 0.0
-    divisor_n = np.where(bears, grf_n, np.nan)
-    columns = {
-        "time_s": time_s,
-        "grf_n": grf_n,
-        "cop_x_m": along_x / divisor_n,
-        "cop_y_m": along_y / divisor_n,
-    }
+    x_m, y_m = (origin_m[i] + pitch_m[i] * np.arange(cells.shape[i + 1]) for i in (0, 1))
+    grf_n, (cop_x_m, cop_y_m) = add_cells(force_n, x_m, y_m)
+    columns = {"time_s": time_s, "grf_n": grf_n, "cop_x_m": cop_x_m, "cop_y_m": cop_y_m}
     notes = (f"a plate of {cells.shape[1]} by {cells.shape[2]} cells, added up",)
     needed = {name: column for name, column in columns.items() if is_needed(name)}
     return make_table(where, columns, needed, notes=notes)
+
+
+def add_cells(force_n: Floats, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
+    """Add the forces of cells up to a force (n,) and its centre of pressure (2, n).
+
+    Args:
+        force_n: (n, cells along x, cells along y), of each cell.
+        x_m: (cells along x,), places of the cells.
+        y_m: (cells along y,), likewise.
+    """
+    total_n = force_n.sum(axis=(1, 2))
+    moments = np.stack([force_n.sum(axis=2) @ x_m, force_n.sum(axis=1) @ y_m])
+    return total_n, moments / np.where(total_n > 0.0, total_n, np.nan)
 
 
 def _arrays(path: Path, bytes_max: int) -> dict[str, Floats]:

@@ -9,13 +9,18 @@ from pathlib import Path
 from devices.errors import FileFormatError, UsageError
 from storage.formats.tables.bioware import is_bioware, read_bioware
 from storage.formats.tables.force_platform import read_force_platforms
+from storage.formats.tables.loadsol import is_loadsol, read_loadsol
+from storage.formats.tables.moticon import is_moticon, read_moticon
 from storage.formats.tables.netforce import is_netforce, read_netforce
 from storage.formats.tables.nexus import is_nexus, read_nexus
 from storage.formats.tables.opensim import read_opensim
 from storage.formats.tables.parquet import read_parquet
+from storage.formats.tables.pedar import is_pedar, refuse_pedar
 from storage.formats.tables.pressure_plate import read_pressure_plate
+from storage.formats.tables.rosbag import is_bag_folder, read_bag
 from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import NUMBERS_MAX, IsNeeded, Table
+from storage.formats.tables.tekscan import is_tekscan, read_tekscan
 from storage.formats.tables.text import HEAD_CHARACTERS, read_table_text, read_text_table
 
 
@@ -35,7 +40,11 @@ class SavedText:
 SAVED_TEXTS: tuple[SavedText, ...] = (
     SavedText(is_bioware, read_bioware),
     SavedText(is_nexus, read_nexus),
-    SavedText(is_netforce, read_netforce),
+    SavedText(is_loadsol, read_loadsol),
+    SavedText(is_moticon, read_moticon),
+    SavedText(is_tekscan, read_tekscan),
+    SavedText(is_pedar, refuse_pedar),
+    SavedText(is_netforce, read_netforce),  # last: it has no head of its own
 )
 
 
@@ -65,8 +74,10 @@ def _read_text(
 
 
 TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text)
+BAG = TableFormat((".bag", ".mcap", ".db3"), read_bag)
 FORMATS = (
     TEXT,
+    BAG,
     TableFormat((".parquet",), read_parquet),
     TableFormat((".c3d",), read_force_platforms),
     TableFormat((".mot", ".sto"), read_opensim),
@@ -88,6 +99,8 @@ def read_table(
     """
     ending = path.suffix.lower()
     chosen = next((one for one in FORMATS if ending in one.endings), TEXT)
+    if is_bag_folder(path):
+        chosen = BAG
     try:
         if chosen is TEXT:
             return _read_text(path, is_needed, numbers_max, stated)

@@ -21,6 +21,10 @@ NUMBERS_MAX = 50_000_000
 """Rows times columns that are read: 400 MB in memory."""
 OURS: Mapping[str, str] = {"time_s": "s", "grf_n": "N", "fz_n": "N", "cop_x_m": "m", "cop_y_m": "m"}
 """Names that state the unit and the sign of their column, in any case, with the unit."""
+SOLE = "sole"
+"""Unit of a centre of pressure that is a part of the sole, along it and across."""
+SOLE_UNITS = ("sole lengths", "sole widths")
+"""Units of its coordinates, x and y."""
 INSTANTS = "t_ns"
 """Name of a session's column of instants, whose numbers need all 64 bits."""
 

@@ -15,6 +15,7 @@ import pytest
 
 from storage.checked_json import read_checked
 from tests.service.cli.outcome import Run, scene_text
+from tests.storage.formats.tables.test_rosbag import Sample, write_bag1
 
 pytestmark = pytest.mark.slow
 
@@ -129,6 +130,8 @@ def test_what_the_reference_has_not_is_a_missed_limit_too(
         ((*LAB, "--sign", "-", "--lag-range-s", "100,200"), 1, "do not overlap"),
         ((*LAB, "--sign", "-", "--limits", "grf=1"), 2, "a limit of grf_frames"),
         ((*LAB, "--sign", "-", "--limits", "grf_mae_n"), 2, "NAME=VALUE"),
+        ((*LAB, "--sign", "-", "--sole-m", "260"), 2, "--sole-m '260' is no size of an insole"),
+        ((*LAB, "--sign", "-", "--sole-m", "0.2,x"), 2, "is no size of an insole"),
     ],
 )
 def test_what_cannot_be_compared_is_named_and_leaves_nothing_behind(
@@ -175,3 +178,40 @@ def test_a_range_of_lags_that_leaves_the_true_one_out_is_named_with_what_fits(
     asked = (*LAB, "--sign", "-", "--lag-range-s", "-0.2,0.1", "--out", "o")
     said = "Without --lag-range-s 3.21 s fits best"
     run("compare", session, "--reference", plate, *asked).fails(1, said)
+
+
+def test_an_insole_gives_cop_with_its_size(run: Run, session: Path, tmp_path: Path) -> None:
+    table = pq.read_table(session)
+    time_s = (table["t_ns"].to_numpy() - table["t_ns"][0].as_py()) * 1e-9
+    names = "# time\tleft total force[N]" + "".join(
+        f"\tleft center of pressure {axis}[-0.5...+0.5]" for axis in "XY"
+    )
+    rows = zip(time_s.tolist(), table["true_grf_n"].to_pylist(), strict=True)
+    lines = (f"{t:.4f}\t{force_n:.3f}\t0.1\t0" for t, force_n in rows if t > 0.3)
+    (tmp_path / "walk.txt").write_text("\n".join(["# Duration: 00:10.000", names, *lines]) + "\n")
+    asked = ("--reference", "walk.txt", "--map", "cop_x_m=left_cop_x", "--out", "o")
+    run("compare", session, *asked).fails(2, "Add --sole-m LENGTH, of the insole in metres")
+    assert run("compare", session, *asked, "--sole-m", "0.26").code == 0
+    content = json.loads((tmp_path / "o" / "compare.json").read_text())
+    assert "the centre of pressure is known along x only" in content["notes"]
+    series = pq.read_table(tmp_path / "o" / "series.parquet")["reference_cop_x_m"].to_numpy()
+    np.testing.assert_allclose(series[np.isfinite(series)], 0.026, atol=1e-9)
+
+
+def test_the_lag_of_a_ros_bag_is_that_of_the_clocks(
+    run: Run, session: Path, tmp_path: Path
+) -> None:
+    table = pq.read_table(session)
+    late_ns = table["t_ns"].to_numpy() + 300_000_000
+    forces_n = table["true_grf_n"].to_numpy()
+    samples = [
+        Sample("/foot", int(t_ns), (0.0, 0.0, -float(force_n), 0.0, 0.0, 0.0))
+        for t_ns, force_n in zip(late_ns, forces_n, strict=True)
+        if np.isfinite(force_n)
+    ]
+    bag = write_bag1(tmp_path, samples)
+    assert run("compare", session, "--reference", bag, "--out", "o").code == 0
+    lag_s = json.loads((tmp_path / "o" / "compare.json").read_text())["alignment"]["lag_s"]
+    low_s, high_s = lag_s["interval_95"]
+    assert low_s < 0.3 < high_s
+    assert high_s - low_s < 0.01

@@ -333,3 +333,16 @@ def test_a_load_is_read_as_it_is_stated_to_be_laid_out(tmp_path: Path) -> None:
     found = read_load_trace(path, StatedText(skip_rows=2, decimal=","))
     assert found.fz_n is not None
     assert found.fz_n.tolist() == [1.0, 1.5]
+
+
+def test_pressures_of_a_pedar_insole_are_refused_without_their_areas(tmp_path: Path) -> None:
+    text = (
+        "file name:  A.sol\tdate/time  01.01.26 09.00\nsensor type:  v_1 \n"
+        "total time [secs]:  0.020\ttime per frame [secs]:  0.02000\tscanning rate [Hz]:   50\n"
+        "pressure values in  kPa\n\nmask definition: \nleft insole: 1,2,\nright insole: 1,2,\n\n"
+        "time[secs]    \t      1\t      2\t      1\t      2\n"
+        "    0.02000\t  0.000\t 15.000\t  2.500\t  0.000\n"
+    )
+    with pytest.raises(FileFormatError, match="pressures of 4 sensors in kPa") as caught:
+        table_of(tmp_path, text, "walk.asc")
+    assert "areas" in caught.value.what
