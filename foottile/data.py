@@ -134,7 +134,7 @@ class Data:
         return replace(self, start_s=start_s, end_s=end_s)
 
 
-def _read_batches(content: io.BufferedReader) -> Iterator[pa.RecordBatch]:
+def _read_batches(content: io.BufferedIOBase) -> Iterator[pa.RecordBatch]:
     """Read an Arrow file as it comes: behind its first bytes it is a stream.
 
     Raises:
