@@ -29,10 +29,15 @@ from devices.scene.hardware import EMULATED
 from devices.words import printable
 from foottile.environment import read_variable
 from service.cli.reference_options import (
+    ColumnsOfReference,
     Decimal,
     Encoding,
+    RateOfReference,
+    SignOfReference,
     SkipRows,
+    UnitsOfReference,
     UnitsRow,
+    named_values,
     text_stated,
 )
 from service.plain_json import json_text
@@ -40,6 +45,7 @@ from service.plain_json import json_text
 if TYPE_CHECKING:
     from service.rig.emulated import EmulatedFoot
     from service.rig.plates import PlateFiles
+    from storage.formats.reference import Stated
 
 SEED_MAX = 2**63 - 1
 SECONDS_MAX = NUMBER_MAX = 1e9
@@ -190,6 +196,10 @@ class FootOptions:
     load: Annotated[
         Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
     ] = None
+    map_: ColumnsOfReference = None
+    units: UnitsOfReference = None
+    sign: SignOfReference = None
+    rate_hz: RateOfReference = None
     skip_rows: SkipRows = None
     units_row: UnitsRow = None
     decimal: Decimal = None
@@ -226,6 +236,7 @@ class FootOptions:
         from devices.emulation.ground.load_trace import CopTransform
         from service.rig.emulated import EmulatedFoot
         from storage.formats.load_trace import read_load_trace
+        from storage.formats.reference import Stated
 
         for option, value, least in (
             ("--load-scale", self.load_scale, 0.0),
@@ -237,15 +248,11 @@ class FootOptions:
         if self.load is not None and scene.array.bus != EMULATED:
             raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
         plates = self._plates(scene)
-        of_text = {
-            "skip_rows": self.skip_rows,
-            "units_row": self.units_row,
-            "decimal": self.decimal,
-            "encoding": self.encoding,
-        }
-        if self.load is None and any(value is not None for value in of_text.values()):
+        stated = self._stated()
+        if self.load is None and stated != Stated():
             raise UsageError(
-                "how a table is laid out is stated, and none is named", remedy="Add --load FILE"
+                "what a table does not state itself is stated, and none is named",
+                remedy="Add --load FILE",
             )
         if scene.array.bus == EMULATED and scene.ground.kind == "trace" and self.load is None:
             raise UsageError(
@@ -254,15 +261,30 @@ class FootOptions:
             )
         offset_m = pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
         return EmulatedFoot(
-            load=(
-                read_load_trace(self.load, text_stated(of_text)) if self.load is not None else None
-            ),
+            load=read_load_trace(self.load, stated) if self.load is not None else None,
             load_scale=self.load_scale,
             cop=CopTransform(self.cop_scale, offset_m, self.cop_axes),
             lead_s=self.lead_s,
             seed=self.seed,
             parts_seed=self.parts_seed,
             plates=plates,
+        )
+
+    def _stated(self) -> Stated:
+        from storage.formats.reference import Stated
+
+        of_text: dict[str, str | float | None] = {
+            "skip_rows": self.skip_rows,
+            "units_row": self.units_row,
+            "decimal": self.decimal,
+            "encoding": self.encoding,
+        }
+        return Stated(
+            named_values(self.map_, "--map"),
+            named_values(self.units, "--units"),
+            self.sign,
+            self.rate_hz,
+            text_stated(of_text),
         )
 
     def _plates(self, scene: Scene) -> PlateFiles:

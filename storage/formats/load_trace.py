@@ -21,7 +21,6 @@ from storage.formats.reference import Stated, as_reference
 from storage.formats.session_load import SESSION_COLUMN, as_load
 from storage.formats.tables.registry import read_table
 from storage.formats.tables.session import read_axis
-from storage.formats.tables.stated_text import StatedText
 from storage.formats.tables.table import INSTANTS, OURS, Column, Table
 from storage.formats.tables.times import spread_even
 
@@ -34,22 +33,23 @@ NUMBER_MAX = 1e9
 _COLUMN = re.compile(r"time_s|fz_n|cop_[xy]_m|angle_rad|cell\d+_n")
 """A pattern of those that are read."""
 
+_NAME_THEM = "Or name them: --map time_s=COLUMN,grf_n=COLUMN,cop_x_m=COLUMN,cop_y_m=COLUMN"
 _UNITS = {"time": "time_s", "fz": "fz_n", "cop_x": "cop_x_m", "cop_y": "cop_y_m"}
 
 
-def read_load_trace(path: Path, stated: StatedText | None = None) -> LoadTrace:
+def read_load_trace(path: Path, stated: Stated | None = None) -> LoadTrace:
     """Read a load trace.
 
     Args:
         path: of the file.
-        stated: how it is laid out, if it is a text.
+        stated: what a user says of it; of columns, units, sign and rate it is read as a reference.
 
     Raises:
         LoadTraceError: unreadable, a session whose bytes are not those that were sealed, a column
             is missing or in another unit, times do not rise, or a force is not a number.
     """
     where = str(path)
-    columns, names = _read(path, stated)
+    columns, names = _read(path, stated or Stated())
 
     def numbers(name: str, *, may_be_empty: bool = False) -> Floats:
         return _numbers(columns, names, name, where, may_be_empty=may_be_empty)
@@ -81,6 +81,7 @@ def read_load_trace(path: Path, stated: StatedText | None = None) -> LoadTrace:
             f"no load in its columns ({', '.join(names)})",
             where=where,
             expected=_other_unit(names, "fz_n") or "fz_n, or cell1_n, cell2_n, ...",
+            remedy=_NAME_THEM,
         )
     fz_n = numbers("fz_n") if has_total else None
     cells_n = np.stack([numbers(name) for _, name in cells], axis=1) if cells else None
@@ -112,16 +113,22 @@ def _is_needed(name: str) -> bool:
     return bool(_COLUMN.fullmatch(name) or SESSION_COLUMN.fullmatch(name)) or name in OURS
 
 
-def _read(path: Path, stated: StatedText | None) -> tuple[dict[str, Column], list[str]]:
+def _read(path: Path, stated: Stated) -> tuple[dict[str, Column], list[str]]:
     """Return the columns of a trace by name in lower case, and the names of all in the file."""
+    named = stated.names
     try:
-        table = read_table(path, _is_needed, NUMBERS_MAX, stated)
+        table = read_table(
+            path, lambda name: name in named or _is_needed(name), NUMBERS_MAX, stated.text
+        )
         names = [name.lower() for name in table.names if name]
+        if stated != Stated(text=stated.text):
+            columns = _of_reference(table, stated)
+            return columns, list(dict.fromkeys([*names, *columns]))
         columns = _lower(table)
         if INSTANTS in columns:
             columns = as_load(columns, table.schema, where=table.where, axis=read_axis(path))
         elif "grf_n" in columns and "fz_n" not in columns and "cell1_n" not in columns:
-            columns = _of_reference(table)
+            columns = _of_reference(table, stated)
     except (FileFormatError, UsageError) as error:
         raise LoadTraceError(
             error.what, where=error.where, expected=error.expected, remedy=error.remedy
@@ -131,15 +138,17 @@ def _read(path: Path, stated: StatedText | None) -> tuple[dict[str, Column], lis
             f"no load in its columns ({', '.join(names)[:200]})",
             where=table.where,
             expected=_other_unit(names, "time_s") or "time_s, and fz_n or cell1_n, cell2_n, ...",
+            remedy=_NAME_THEM,
         )
     return columns, list(dict.fromkeys([*names, *columns]))
 
 
-def _of_reference(table: Table) -> dict[str, Column]:
-    found = as_reference(table, Stated())
-    if len(found.time_s) < len(table.columns["time_s"]):
+def _of_reference(table: Table, stated: Stated) -> dict[str, Column]:
+    found = as_reference(table, stated)
+    count = len(next(iter(table.columns.values())))
+    if len(found.time_s) < count:
         raise LoadTraceError(
-            f"{len(table.columns['time_s']) - len(found.time_s)} samples have no force",
+            f"{count - len(found.time_s)} samples have no force",
             where=table.where,
             expected="a force in each",
             remedy="Cut them out, or fill them from their neighbours on purpose",

@@ -16,6 +16,8 @@ from hypothesis import strategies as st
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
 from storage.formats.load_trace import read_load_trace
+from storage.formats.reference import Stated
+from tests.builders.c3d import c3d_bytes, force_plate
 
 Read = Callable[[str | bytes], LoadTrace]
 
@@ -384,3 +386,43 @@ def test_columns_that_are_no_load_are_not_read(tmp_path: Path) -> None:
     trace = read_load_trace(path)
     assert trace.fz_n is not None
     assert trace.fz_n.tolist() == [1.0, 2.0]
+
+
+def test_a_plate_of_several_is_named_and_its_unit_stated(tmp_path: Path) -> None:
+    load_n = np.linspace(0.0, 200.0, 50)
+    nothing = np.zeros(50)
+    wrench = [nothing, nothing, load_n, -20.0 * load_n, 10.0 * load_n, nothing]
+    more = {
+        "USED": 2,
+        "TYPE": [2, 2],
+        "CORNERS": np.repeat(force_plate(2, 6)["FORCE_PLATFORM"]["CORNERS"], 2, axis=0),
+        "ORIGIN": np.zeros((2, 3)),
+        "CHANNEL": np.arange(1, 13).reshape(2, 6),
+    }
+    content = force_plate(2, 12, **more)
+    content["ANALOG"]["UNITS"] = ["V"] * 12
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, np.stack([*[nothing] * 6, *wrench], axis=1)))
+    with pytest.raises(LoadTraceError, match=r"plate2_fz.*--map time_s=COLUMN,grf_n=COLUMN"):
+        read_load_trace(path)
+    columns = {"grf_n": "plate2_fz", "cop_x_m": "plate2_cop_x", "cop_y_m": "-plate2_cop_y"}
+    with pytest.raises(LoadTraceError, match=r"not stated.*--units grf="):
+        read_load_trace(path, Stated(columns))
+    trace = read_load_trace(path, Stated(columns, {"grf": "N", "cop": "mm"}))
+    assert trace.fz_n is not None
+    assert trace.cop_m is not None
+    np.testing.assert_allclose(trace.fz_n, load_n, atol=1e-4)
+    np.testing.assert_allclose(trace.cop_m[1:], [[-0.01, -0.02]] * 49, atol=1e-6)
+
+
+def test_names_units_and_sign_of_a_table_are_stated(tmp_path: Path) -> None:
+    path = tmp_path / "trace.csv"
+    path.write_text("Time,Fz,Px,Py\n0,0,,\n10,-0.2,4,-5\n20,-0.3,5,-6\n")
+    columns = {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "Px", "cop_y_m": "Py"}
+    stated = Stated(columns, {"time": "ms", "grf": "kN", "cop": "mm"}, "-")
+    trace = read_load_trace(path, stated)
+    np.testing.assert_allclose(trace.time_s, [0.0, 0.01, 0.02])
+    assert trace.fz_n is not None
+    assert trace.cop_m is not None
+    np.testing.assert_allclose(trace.fz_n, [0.0, 200.0, 300.0])
+    np.testing.assert_allclose(trace.cop_m[1:], [[0.004, -0.005], [0.005, -0.006]])

@@ -89,6 +89,7 @@ def test_a_wrong_load_trace_names_the_place(
         (["--scene", "standing", "--load", "gone.csv"], 1, ["gone.csv"]),
         (["--scene", "standing", "--load", "gone.csv", "--decimal", ";"], 2, ["--decimal"]),
         (["--scene", "standing", "--seconds", "2", "--skip-rows", "1"], 2, ["--load"]),
+        (["--scene", "standing", "--seconds", "2", "--map", "grf_n=Fz"], 2, ["--load"]),
         (["--scene", "standing", "--seconds", "2", "--out", "gone/s.parquet"], 2, ["gone"]),
         (["--scene", "standing", "--seconds", "2", "--cop-offset-m", "1"], 2, ["--cop-offset-m"]),
         (["--scene", "standing", "--seconds", "0.02"], 1, ["T01", "20"]),

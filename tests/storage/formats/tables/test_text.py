@@ -317,7 +317,7 @@ def test_how_a_text_is_laid_out_is_not_stated_of_other_files(tmp_path: Path) -> 
         with pytest.raises(UsageError, match="go with tables in text"):
             table_of(tmp_path, PLAIN, name, StatedText(decimal="."))
     with pytest.raises(LoadTraceError, match="go with tables in text"):
-        read_load_trace(tmp_path / "plate.c3d", StatedText(skip_rows=1))
+        read_load_trace(tmp_path / "plate.c3d", Stated(text=StatedText(skip_rows=1)))
 
 
 def test_a_stated_layout_overrules_the_head_of_a_program(tmp_path: Path) -> None:
@@ -330,7 +330,7 @@ def test_a_stated_layout_overrules_the_head_of_a_program(tmp_path: Path) -> None
 def test_a_load_is_read_as_it_is_stated_to_be_laid_out(tmp_path: Path) -> None:
     path = tmp_path / "load.csv"
     path.write_text("a;b\n1;2\ntime_s;fz_n;cop_x_m;cop_y_m\n0;1,000;;\n1;1,500;;\n")
-    found = read_load_trace(path, StatedText(skip_rows=2, decimal=","))
+    found = read_load_trace(path, Stated(text=StatedText(skip_rows=2, decimal=",")))
     assert found.fz_n is not None
     assert found.fz_n.tolist() == [1.0, 1.5]
 
