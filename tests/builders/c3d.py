@@ -24,6 +24,7 @@ def c3d_bytes(
     samples_a_frame: int = 10,
     is_integer: bool = False,
     frames_in_header: int | None = None,
+    measures_in_header: int | None = None,
 ) -> bytes:
     """A file with one point and these analog samples.
 
@@ -35,14 +36,16 @@ def c3d_bytes(
         samples_a_frame: analog samples in each.
         is_integer: samples are stored as integers of 16 bits, which they have to be.
         frames_in_header: as the header counts them; None: rightly.
+        measures_in_header: analog samples of a frame, likewise.
     """
     parameters = _section(groups)
     frames = len(analog) // samples_a_frame
     begin = 2 + len(parameters) // BLOCK
     channels = analog.shape[1]
+    measures = channels * samples_a_frame if measures_in_header is None else measures_in_header
     head = struct.pack(
         "<BB5HfHHf",
-        *(2, 0x50, 1, channels * samples_a_frame, 1),
+        *(2, 0x50, 1, measures, 1),
         *((frames if frames_in_header is None else frames_in_header), 0),
         *(1.0 if is_integer else -1.0, begin, samples_a_frame, point_hz),
     )

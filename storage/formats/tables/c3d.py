@@ -25,6 +25,8 @@ FORM = "a whole C3D file"
 BLOCK = 512
 KEY = 0x50
 INTEL, DEC, SGI = 84, 85, 86
+RATE_TOLERANCE = 1e-4
+"""Rates that differ by less are one: more than a clock, and what rounding makes."""
 Value = npt.NDArray[Any] | list[str]
 Parameters = Mapping[str, Mapping[str, Value]]
 Raw = npt.NDArray[Any]
@@ -39,6 +41,7 @@ class C3dFile:
         parameters: by group and name; the first dimension is that which changes fastest.
         rate_hz: of analog samples.
         samples_a_frame: analog samples in a frame of points.
+        notes: remarks for the user.
         channels: how many channels there are.
         raw: (samples, channels), as stored.
     """
@@ -49,6 +52,7 @@ class C3dFile:
     samples_a_frame: int
     channels: int
     raw: Raw
+    notes: tuple[str, ...] = ()
 
     def texts(self, group: str, name: str) -> list[str]:
         """Return a parameter of texts; empty if there is none."""
@@ -71,8 +75,7 @@ class C3dFile:
         Raises:
             FileFormatError: the file states no scale for one of them.
         """
-        is_unsigned = "".join(self.texts("ANALOG", "FORMAT")).strip().upper() == "UNSIGNED"
-        scale, offset = self._of_channels("SCALE"), self._of_channels("OFFSET")
+        scale, offset = self._of_channels("SCALE"), self.offsets()
         general = float(np.ravel(self.numbers("ANALOG", "GEN_SCALE"))[:1].sum() or 1.0)
         at = list(channels)
         if max(at) >= min(len(scale), len(offset)):
@@ -82,10 +85,17 @@ class C3dFile:
                 expected=f"one of each for each of {self.channels} channels",
             )
         raw = self.raw[:, at].T
-        if is_unsigned:
-            offset = offset % 65536
+        if self._is_unsigned():
             raw = raw.view(np.uint16) if raw.dtype.itemsize == 2 else raw
         return np.asarray((raw - offset[at, None]) * (scale[at, None] * general), dtype=np.float64)
+
+    def offsets(self) -> Floats:
+        """Return what is stored for zero, of each channel."""
+        offset = self._of_channels("OFFSET")
+        return offset % 65536 if self._is_unsigned() else offset
+
+    def _is_unsigned(self) -> bool:
+        return "".join(self.texts("ANALOG", "FORMAT")).strip().upper() == "UNSIGNED"
 
     def _of_channels(self, name: str) -> Floats:
         more = (f"{name}{number}" for number in range(2, 2 + self.channels // 255))
@@ -135,8 +145,13 @@ def _parse(content: bytes, where: str) -> C3dFile:
     )
     analog, point = parameters.get("ANALOG", {}), parameters.get("POINT", {})
     channels = _count(analog.get("USED"))
+    point_hz, analog_hz = _number(point.get("RATE")) or frame_hz, _number(analog.get("RATE"))
     if channels and measures % channels == 0:
-        samples_a_frame = measures // channels
+        by_rates = analog_hz / point_hz if point_hz > 0.0 else 0.0
+        if measures != channels or abs(by_rates - samples_a_frame) > 1e-3:
+            samples_a_frame = measures // channels
+        # Some programs write the channels where their samples in a frame should be.
+        measures = channels * samples_a_frame
     elif measures:
         raise FileFormatError(
             f"a frame has {measures} analog samples of {channels} channels",
@@ -154,14 +169,23 @@ def _parse(content: bytes, where: str) -> C3dFile:
     else:
         stored = np.frombuffer(values, kind)
     samples = stored.reshape(frames, width)[:, 4 * points :] if width else np.empty((frames, 0))
-    rate_hz = _number(analog.get("RATE")) or frame_hz * samples_a_frame
+    samples_a_frame = max(1, samples_a_frame)
+    by_frames_hz = point_hz * samples_a_frame
+    rate_hz = by_frames_hz if by_frames_hz > 0.0 else analog_hz
+    notes = []
+    if analog_hz > 0.0 and abs(rate_hz - analog_hz) > RATE_TOLERANCE * rate_hz:
+        notes.append(
+            f"ANALOG:RATE states {analog_hz:g} Hz, and {samples_a_frame} samples in each frame at "
+            f"{point_hz:g} Hz are {rate_hz:g} Hz, which is taken"
+        )
     return C3dFile(
         where,
         parameters,
-        rate_hz,
-        max(1, samples_a_frame),
+        rate_hz if notes or not analog_hz > 0.0 else analog_hz,
+        samples_a_frame,
         channels,
         samples.reshape(-1, channels) if channels else np.empty((0, 0)),
+        tuple(notes),
     )
 
 

@@ -14,6 +14,7 @@ normal.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,14 @@ import numpy as np
 from devices.arrays import Floats
 from devices.errors import FileFormatError
 from storage.formats.tables.c3d import C3dFile, read_c3d
+from storage.formats.tables.plate_geometry import (
+    Pose,
+    correct_place,
+    force_and_place,
+    in_plane,
+    off_middle,
+    pose_of,
+)
 from storage.formats.tables.plates import Plate, make_plate_table
 from storage.formats.tables.table import IsNeeded, Table, check_size
 
@@ -30,11 +39,21 @@ _CHANNELS = {1: 6, 2: 6, 3: 8, 4: 6}
 _FORCES = {1: range(2, 3), 2: range(2, 3), 3: range(4, 8)}
 """Channels of vertical forces, by type. Those of type 4 are volts, or anything: in which units its
 matrix makes forces of them the file does not state."""
+_POLYNOMIAL = 12
+"""Coefficients of FPCOPPOLY for a plate."""
+FILLED_OFFSET = 1000.0
+"""Samples without a sign have their zero at such an OFFSET or beyond: stored zeros are none."""
+OFF_PLATE = 5.0
+"""So many times as far as the edge is a wrong unit, not a wrong ORIGIN."""
+OFF_PART = 0.05
+"""Part of the loaded samples off the plate that is said."""
+BEARS_N = 10.0
+"""A plate that never bears so much has no centre of pressure to speak of."""
+AT_MIDDLE = 2e-3
+"""Nearer to the middle, the edge being 1, a foot's centre of pressure does not stay."""
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _FORCE_UNITS = {"n": "N", "newton": "N", "newtons": "N", "kn": "kN"}
 _MOMENT = re.compile(r"(k?N)[ .*·-]?(mm|cm|m)", re.IGNORECASE)
-FLAT_COS = 0.9999
-"""A plate whose normal is nearer to an axis of the laboratory, within 0.8 degrees, lies flat."""
 
 
 def read_force_platforms(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
@@ -57,7 +76,7 @@ def read_force_platforms(path: Path, is_needed: IsNeeded, numbers_max: int) -> T
     if not (np.isfinite(file.rate_hz) and file.rate_hz > 0.0):
         raise FileFormatError(f"ANALOG:RATE is {file.rate_hz:g}", where=file.where)
     plates: list[Plate] = []
-    notes: list[str] = []
+    notes = [*file.notes]
     refusal: FileFormatError | None = None
     for number in range(1, count + 1):
         try:
@@ -106,24 +125,93 @@ def _plate(file: C3dFile, i: int, numbers_max: int) -> Plate:
         )
     check_size(len(file.raw), len(numbers), numbers_max, file.where)
     channels = file.samples([n - 1 for n in numbers])
+    notes = [*_drop_filled(file, numbers, channels)]
     stated = file.of_channels("UNITS")
     units = [stated[n - 1].strip() if n <= len(stated) else "" for n in numbers]
     force = _same({_FORCE_UNITS.get(units[at].lower()) for at in _FORCES.get(kind, ())})
     position = next(iter(file.texts("POINT", "UNITS")), "").strip().lower()
     length = position if position in _METRES else None
+    origin, pose = _origin(file, i, kind), pose_of(_of_plate(file, "CORNERS", i, (3, 4)))
+    factor = 1.0
     if kind == 4:
-        channels, length = _matrix(file, i) @ channels, None
-    elif kind != 3 and length is not None:
+        channels = _matrix(file, i) @ channels
+    elif kind in (1, 2) and length is not None:
         # Levers come in the unit of positions, which the corners have.
         lever = _same({_lever(unit, force if kind == 2 else None) for unit in units[3:5]})
-        if lever is None:
-            length = None
-        else:
-            channels[3:5] *= _METRES[lever] / _METRES[length]
-    fz, local, note = _surface(kind, channels, _origin(file, i, kind))
-    cop, turned = _in_plane(local, _of_plate(file, "CORNERS", i, (3, 4)))
-    notes = tuple(text for text in (note, turned) if text)
-    return Plate(f"plate{i + 1}", fz, cop, force, length, notes=notes)
+        factor = 1.0 if lever is None else _METRES[lever] / _METRES[length]
+        length = None if lever is None else length
+    fz, local = force_and_place(kind, channels, origin, factor)
+    cop = None
+    if local is None:
+        notes.append("ORIGIN does not state where its sensors are: no centre of pressure")
+    elif pose is None:
+        notes.append("CORNERS do not state where it is: no centre of pressure")
+    else:
+        _, other = force_and_place(kind, channels, origin)
+        if factor != 1.0 and other is not None and _is_other_unit(fz, local, other, pose):
+            local = other
+            notes.append(
+                f"its {'moments' if kind == 2 else 'places'} are not in {units[3]}, as the file "
+                f"states, but in the unit of its corners, {length}: else they were off the plate"
+            )
+        if kind == 3:
+            local, note = _without_bending(file, i, local, length)
+            notes.append(note)
+        if not (force == "N" and np.max(np.abs(fz[np.isfinite(fz)]), initial=0.0) < BEARS_N):
+            notes += _off_notes(local, fz, pose)
+        cop, note = in_plane(local, pose)
+        notes.append(note)
+    return Plate(f"plate{i + 1}", fz, cop, force, length, notes=tuple(filter(None, notes)))
+
+
+def _drop_filled(file: C3dFile, numbers: list[int], channels: Floats) -> Iterator[str]:
+    """Set to NaN what was not recorded: stored as zeros in all channels, where zero is no zero."""
+    filled = ~file.raw[:, [n - 1 for n in numbers]].any(axis=1)
+    offsets = file.offsets()[[n - 1 for n in numbers]]
+    if filled.any() and np.abs(offsets).max() >= FILLED_OFFSET:
+        channels[:, filled] = np.nan
+        yield f"{int(filled.sum())} of its samples are stored as zeros and were not recorded"
+
+
+def _is_other_unit(fz: Floats, local: Floats, other: Floats, pose: Pose) -> bool:
+    """Tell whether a centre of pressure is on the plate only in the unit of the corners.
+
+    Args:
+        fz: force, (n,).
+        local: place in the unit that the file states.
+        other: place in the unit of the corners. Where that is the smaller one, both are on the
+            plate: one of them at its very middle.
+        pose: of the plate.
+    """
+    off, off_other = (
+        float(np.median(far)) if len(far := off_middle(place, fz, pose.half)) else 0.0
+        for place in (local, other)
+    )
+    return off_other <= 1.0 and (off > OFF_PLATE or off_other > OFF_PLATE * off)
+
+
+def _without_bending(
+    file: C3dFile, i: int, local: Floats, length: str | None
+) -> tuple[Floats, str]:
+    """Correct the centre of pressure by the polynomial of the plate, if the file has one."""
+    polynomial = _of_plate(file, "FPCOPPOLY", i, (_POLYNOMIAL,))
+    if polynomial is None or not polynomial.any():
+        return local, ""
+    if length != "mm":
+        return local, "FPCOPPOLY is not applied: its positions are not in mm"
+    return correct_place(local, polynomial), "COP is corrected for bending (FPCOPPOLY)"
+
+
+def _off_notes(local: Floats, fz: Floats, pose: Pose) -> Iterator[str]:
+    off = off_middle(local, fz, pose.half)
+    part = float((off > 1.0).mean()) if len(off) else 0.0
+    if part > OFF_PART:
+        yield (
+            f"COP is off the plate in {part:.0%} of the samples under load: its moments, ORIGIN or "
+            "CORNERS are not what the file states"
+        )
+    elif len(off) and float(np.quantile(off, 0.9)) < AT_MIDDLE:
+        yield "COP does not leave the middle of the plate: its moments may be in another unit"
 
 
 def _same(units: set[str | None]) -> str | None:
@@ -140,12 +228,21 @@ def _lever(unit: str, force: str | None) -> str | None:
 
 
 def _matrix(file: C3dFile, i: int) -> Floats:
-    matrix = _of_plate(file, "CAL_MATRIX", i, (6, 6))
-    if matrix is None:
+    """Return the calibration matrix of a plate of type 4.
+
+    Raises:
+        FileFormatError: there is none, or it is of another size.
+    """
+    stored = file.numbers("FORCE_PLATFORM", "CAL_MATRIX").astype(np.float64)
+    stored = stored.reshape((*stored.shape, 1, 1, 1)[:3], order="F")
+    is_by_row = "".join(file.texts("FORCE_PLATFORM", "MATRIX_STORE")).strip().upper() == "BYROW"
+    if stored.shape[:2] != (6, 6) or i >= stored.shape[2] or not np.isfinite(stored[:, :, i]).all():
         raise FileFormatError(
-            "it is of type 4, without CAL_MATRIX", where=file.where, expected="a matrix of 6 by 6"
+            f"it is of type 4, with a CAL_MATRIX of {' by '.join(map(str, stored.shape))}",
+            where=file.where,
+            expected="a matrix of 6 by 6 for each plate",
         )
-    return matrix
+    return stored[:, :, i].T if is_by_row else stored[:, :, i]
 
 
 def _of_plate(file: C3dFile, name: str, i: int, shape: tuple[int, ...]) -> Floats | None:
@@ -171,83 +268,3 @@ def _origin(file: C3dFile, i: int, kind: int) -> Floats:
     if kind == 3:
         return np.array([abs(origin[0]), abs(origin[1]), -abs(origin[2])])
     return -origin if origin[2] > 0.0 else origin
-
-
-def _surface(kind: int, channels: Floats, origin: Floats) -> tuple[Floats, Floats | None, str]:
-    """Return force along z, and the centre of pressure on the surface from its middle, (2, n)."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        if kind == 1:
-            return channels[2], channels[3:5], ""
-        if kind == 3:  # Fx12 Fx34 Fy14 Fy23 Fz1 Fz2 Fz3 Fz4
-            fx, fy = channels[0] + channels[1], channels[2] + channels[3]
-            one, two, three, four = channels[4:8]
-            fz = one + two + three + four
-            if not (origin[0] > 0.0 and origin[1] > 0.0):
-                return (
-                    fz,
-                    None,
-                    "ORIGIN does not state where its sensors are: no centre of pressure",
-                )
-            mx = origin[1] * (one + two - three - four)
-            my = origin[0] * (-one + two + three - four)
-            origin = np.array([0.0, 0.0, origin[2]])
-        else:
-            fx, fy, fz, mx, my = channels[:5]
-        # Moments about the middle of the surface: M + F x origin.
-        mx = mx + fy * origin[2] - fz * origin[1]
-        my = my + fz * origin[0] - fx * origin[2]
-        cop = np.stack([-my, mx]) / fz
-    cop[:, ~np.isfinite(cop).all(axis=0)] = np.nan
-    return fz, cop, ""
-
-
-def _in_plane(local: Floats | None, corners: Floats | None) -> tuple[Floats | None, str]:
-    """Return a centre of pressure in the plane of the plate, from the laboratory's origin."""
-    if local is None:
-        return None, ""
-    nowhere = "CORNERS do not state where it is: no centre of pressure"
-    if corners is None:
-        return None, nowhere
-    x = corners[:, 0] + corners[:, 3] - corners[:, 1] - corners[:, 2]
-    y = corners[:, 0] + corners[:, 1] - corners[:, 2] - corners[:, 3]
-    z = np.cross(x, y)
-    if not np.linalg.norm(z) > 0.0:
-        return None, nowhere
-    x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
-    y = np.cross(z, x)
-    place = corners.mean(axis=1)[:, None] + np.outer(x, local[0]) + np.outer(y, local[1])
-    normal = -z
-    axis = int(np.argmax(np.abs(normal)))
-    up = np.zeros(3)
-    up[axis] = np.sign(normal[axis])
-    cos = float(up @ normal)
-    # The axes of the laboratory that become x and y when `up` becomes z, the shortest way.
-    to_z = _shortest_turn(up, np.array([0.0, 0.0, 1.0]))
-    turn = np.eye(3) if cos > FLAT_COS else _shortest_turn(normal, up)
-    notes = []
-    if axis != 2 or up[2] < 0.0:
-        names = ("x", "y", "z")
-        first, second = (
-            ("" if row.sum() > 0.0 else "-") + names[int(np.argmax(np.abs(row)))]
-            for row in to_z[:2]
-        )
-        name = ("" if up[axis] > 0.0 else "-") + names[axis]
-        notes.append(
-            f"its normal is {name} of the laboratory: COP is along {first} and {second} of it"
-        )
-    if cos <= FLAT_COS:
-        notes.append(
-            f"it is tilted by {np.degrees(np.arccos(min(1.0, cos))):.1f} degrees: force is along "
-            "its normal, and COP in its plane"
-        )
-    return (to_z @ turn @ place)[:2], "; ".join(notes)
-
-
-def _shortest_turn(begin: Floats, end: Floats) -> Floats:
-    """Return the rotation by the smallest angle that takes one unit vector to another."""
-    cos = float(begin @ end)
-    if cos < -1.0 + 1e-12:  # half a turn, about x
-        return np.diag([1.0, -1.0, -1.0])
-    v = np.cross(begin, end)
-    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + cos))

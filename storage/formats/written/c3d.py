@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from devices.arrays import Floats
-from devices.errors import StorageError
+from devices.errors import FootTileError, StorageError
 from devices.frames import TileInfo
 from storage.formats.export import Export
 from storage.formats.written.described import ascii_of, clock_bound, described
@@ -76,6 +76,17 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
             with path.open("rb") as file:
                 while piece := file.read(_PIECE):
                     yield piece
+    except FootTileError:
+        raise
+    except MemoryError as error:
+        raise StorageError(
+            "there is not enough memory to write it",
+            remedy="Lift the limit (ulimit -v), or ask for a slice",
+        ) from error
+    except (RuntimeError, ValueError) as error:  # in words of ezc3d, which are not for the user
+        raise StorageError(
+            "ezc3d cannot write it", remedy="Ask for a slice, or for another format"
+        ) from error
     except OSError as error:
         raise StorageError(
             f"cannot be written: {error}",

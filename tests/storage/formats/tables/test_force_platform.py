@@ -147,7 +147,7 @@ def test_a_spike_of_the_other_sign_is_no_load(tmp_path: Path) -> None:
     ("more", "said"),
     [
         ({"USED": 0}, "no force platform"),
-        ({"TYPE": [7]}, "of type 7; expected force platforms of types 1 to 4"),
+        ({"TYPE": [6]}, "of type 6; expected force platforms of types 1 to 4"),
         ({"CHANNEL": np.array([[1, 2, 3, 4, 5, 60]])}, "expected 6 of the 6 channels"),
     ],
 )

@@ -283,6 +283,26 @@ def test_a_disk_that_is_full_ends_in_an_error_and_no_bytes(monkeypatch: pytest.M
         list(C3D.written(export_of_walk()))
 
 
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (RuntimeError("please open a GitHub issue"), "ezc3d cannot write it"),
+        (ValueError("please open a GitHub issue"), "ezc3d cannot write it"),
+        (MemoryError("std::bad_alloc"), "not enough memory"),
+    ],
+)
+def test_no_message_of_the_library_is_passed_on(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
+) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("ezc3d.c3d.write", refuse)
+    with pytest.raises(StorageError, match=said) as caught:
+        list(C3D.written(export_of_walk()))
+    assert str(error) not in str(caught.value)
+
+
 def test_nothing_is_left_behind_by_one_who_goes_away(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

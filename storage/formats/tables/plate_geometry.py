@@ -1,0 +1,145 @@
+"""Force and centre of pressure of a plate from its channels, and its place in the laboratory.
+
+Types are those of the C3D user guide (FORCE_PLATFORM:TYPE).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from devices.arrays import Floats
+
+LOADED = 0.2
+"""Of its greatest force: above that a plate is loaded."""
+FLAT_COS = 0.9999
+"""A plate whose normal is nearer to an axis of the laboratory, within 0.8 degrees, lies flat."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Place of a plate in the laboratory, from its corners.
+
+    Attributes:
+        middle: (3,), of its surface.
+        axes: (3, 3), its x, y and z as columns.
+        half: (2,), half its lengths along x and y.
+    """
+
+    middle: Floats
+    axes: Floats
+    half: Floats
+
+
+def pose_of(corners: Floats | None) -> Pose | None:
+    """Return the pose by the corners, (3, 4); None if they state none."""
+    if corners is None:
+        return None
+    x = corners[:, 0] + corners[:, 3] - corners[:, 1] - corners[:, 2]
+    y = corners[:, 0] + corners[:, 1] - corners[:, 2] - corners[:, 3]
+    z = np.cross(x, y)
+    if not np.linalg.norm(z) > 0.0:
+        return None
+    half = 0.25 * np.array([np.linalg.norm(x), np.linalg.norm(y)])
+    x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
+    return Pose(corners.mean(axis=1), np.stack([x, np.cross(z, x), z], axis=1), half)
+
+
+def force_and_place(
+    kind: int, channels: Floats, origin: Floats, factor: float = 1.0
+) -> tuple[Floats, Floats | None]:
+    """Return the force along z, (n,), and its place on the surface from the middle, (2, n).
+
+    There is no place where the origin does not state where the sensors are.
+
+    Args:
+        kind: type of the plate.
+        channels: as the type has them.
+        origin: (3,), from the plate's origin to the middle of its surface, in its own axes.
+        factor: on levers or places of the channels, to be in the unit of the origin.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if kind == 1:
+            return channels[2], factor * channels[3:5]
+        if kind == 3:  # four sensors: Fx12 Fx34 Fy14 Fy23 Fz1 Fz2 Fz3 Fz4
+            fx, fy = channels[0] + channels[1], channels[2] + channels[3]
+            one, two, three, four = channels[4:8]
+            fz = one + two + three + four
+            if not (origin[0] > 0.0 and origin[1] > 0.0):
+                return fz, None
+            mx = origin[1] * (one + two - three - four)
+            my = origin[0] * (-one + two + three - four)
+            origin = np.array([0.0, 0.0, origin[2]])
+        else:
+            fx, fy, fz, mx, my = channels[:5]
+            mx, my = factor * mx, factor * my
+        # Moments about the middle of the surface: M + F x origin.
+        mx = mx + fy * origin[2] - fz * origin[1]
+        my = my + fz * origin[0] - fx * origin[2]
+        place = np.stack([-my, mx]) / fz
+    place[:, ~np.isfinite(place).all(axis=0)] = np.nan
+    return fz, place
+
+
+def correct_place(place: Floats, polynomial: Floats) -> Floats:
+    """Return a place in mm without what the bending of a plate with four sensors adds.
+
+    Args:
+        place: (2, n), from the middle.
+        polynomial: (12,), Kistler's six coefficients for x, then for y (FPCOPPOLY).
+    """
+    x, y = place
+    with np.errstate(over="ignore", invalid="ignore"):
+        added = [
+            (p[0] * v**4 + p[1] * v**2 + p[2]) * u**3 + (p[3] * v**4 + p[4] * v**2 + p[5]) * u
+            for u, v, p in ((x, y, polynomial[:6]), (y, x, polynomial[6:]))
+        ]
+        return np.asarray(place - np.stack(added))
+
+
+def off_middle(place: Floats, fz: Floats, half: Floats) -> Floats:
+    """Return how far off the middle each place under load is, 1 being the edge."""
+    size = np.where(np.isfinite(place).all(axis=0) & np.isfinite(fz), np.abs(fz), 0.0)
+    loaded = size > LOADED * np.max(size, initial=0.0)
+    return np.asarray(np.max(np.abs(place[:, loaded]) / half[:, None], axis=0))
+
+
+def in_plane(place: Floats, pose: Pose) -> tuple[Floats, str]:
+    """Return a place in the plane of the plate from the laboratory's origin, and a note."""
+    normal, notes = -pose.axes[:, 2], []
+    axis = int(np.argmax(np.abs(normal)))
+    if axis == 2 and normal[2] < 0.0:
+        # No plate hangs from the ceiling: its corners run the other way round.
+        normal = -normal
+        notes.append("its CORNERS run counterclockwise: it is taken to face up")
+    at = pose.middle[:, None] + pose.axes[:, :2] @ place
+    up = np.zeros(3)
+    up[axis] = np.sign(normal[axis])
+    cos = float(up @ normal)
+    # The axes of the laboratory that become x and y when `up` becomes z, the shortest way.
+    to_z = _shortest_turn(up, np.array([0.0, 0.0, 1.0]))
+    turn = np.eye(3) if cos > FLAT_COS else _shortest_turn(normal, up)
+    if axis != 2:
+        names = ("x", "y", "z")
+        first, second = (
+            ("" if row.sum() > 0.0 else "-") + names[int(np.argmax(np.abs(row)))]
+            for row in to_z[:2]
+        )
+        name = ("" if up[axis] > 0.0 else "-") + names[axis]
+        notes.append(
+            f"its normal is {name} of the laboratory: COP is along {first} and {second} of it"
+        )
+    if cos <= FLAT_COS:
+        notes.append(
+            f"it is tilted by {np.degrees(np.arccos(min(1.0, cos))):.1f} degrees: force is along "
+            "its normal, and COP in its plane"
+        )
+    return (to_z @ turn @ at)[:2], "; ".join(notes)
+
+
+def _shortest_turn(begin: Floats, end: Floats) -> Floats:
+    """Return the rotation by the smallest angle that takes one unit vector to another."""
+    v = np.cross(begin, end)
+    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + float(begin @ end)))
