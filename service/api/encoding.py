@@ -13,9 +13,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from pydantic import ConfigDict, TypeAdapter
 
 from storage.schema import Array
+
+ARROW_STREAM = "application/vnd.apache.arrow.stream"
+"""Media type of an Arrow IPC stream."""
 
 _JSON = TypeAdapter(dict[str, Any], config=ConfigDict(ser_json_inf_nan="null"))
 _LEVEL = 1
@@ -54,3 +58,12 @@ def _plain(values: Array) -> list[Any]:
 def packed(numbers: bytes) -> bytes:
     """Numbers as gzip, quickly."""
     return gzip.compress(numbers, _LEVEL)
+
+
+def write_arrow_stream(table: pa.Table) -> bytes:
+    """Write a table as an Arrow IPC stream."""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as stream:
+        stream.write_table(table)
+    content: bytes = sink.getvalue().to_pybytes()
+    return content

@@ -13,20 +13,24 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from devices.errors import UnknownError, UsageError
-from service.api.encoding import numbers_as_json, packed, takes_gzip
+from service.api.encoding import (
+    ARROW_STREAM,
+    numbers_as_json,
+    packed,
+    takes_gzip,
+    write_arrow_stream,
+)
 from service.api.routes.access import SecondsQuery, ServerState, has_it, problems
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX, Seen, overview_of_session
 from service.version import SOFTWARE
 from storage.formats.slice import Slice
-from storage.formats.written.arrow import ARROW
 from storage.schema import Array
 from storage.sessions.folder import Session
 from storage.sessions.time_axis import Basis
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
-_ARROW = ARROW.media_type
 _ONE_AT_A_TIME = CapacityLimiter(1)
 """Each thread that makes pictures keeps memory of them; and one picture waits for few others, which
 take milliseconds."""
@@ -80,7 +84,7 @@ class OverviewView(BaseModel):
     summary="At any zoom",
     response_model=OverviewView,
     responses={
-        200: {"description": "Bins, in the order of the frames.", "content": {_ARROW: {}}},
+        200: {"description": "Bins, in the order of the frames.", "content": {ARROW_STREAM: {}}},
         304: {"description": "It is what If-None-Match names."},
         **problems(
             _404="No such session, or nothing was recorded.",
@@ -106,7 +110,7 @@ async def overview(
     session = server.sessions.get(session_id)
     if session.state == "sealed" and session.sha256 is None:
         raise UnknownError(f"session {session_id}: {session.problem}")
-    as_arrow = _ARROW in accept
+    as_arrow = ARROW_STREAM in accept
     as_gzip = not as_arrow and takes_gzip(accept_encoding)
     if session.sha256 is None:
         return await _so_far(session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
@@ -121,7 +125,7 @@ async def overview(
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     if as_gzip:
         headers |= {"Content-Encoding": "gzip"}
-    media_type = _ARROW if as_arrow else "application/json"
+    media_type = ARROW_STREAM if as_arrow else "application/json"
     return Response(content, headers=headers, media_type=media_type)
 
 
@@ -139,7 +143,9 @@ async def _so_far(
 
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     headers = {"Cache-Control": "no-store"} | ({"Content-Encoding": "gzip"} if as_gzip else {})
-    return Response(content, headers=headers, media_type=_ARROW if as_arrow else "application/json")
+    return Response(
+        content, headers=headers, media_type=ARROW_STREAM if as_arrow else "application/json"
+    )
 
 
 def _content(
@@ -179,11 +185,7 @@ def _written(
         return packed(text) if as_gzip else text
     metadata = {"foottile.overview": json.dumps(about)}
     table = pa.table({name: pa.array(v) for name, v in columns.items()}, metadata=metadata)
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, table.schema) as stream:
-        stream.write_table(table)
-    made: bytes = sink.getvalue().to_pybytes()
-    return made
+    return write_arrow_stream(table)
 
 
 def _in_seconds(seen: Seen) -> dict[str, Array]:

@@ -9,7 +9,6 @@ from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
-import pyarrow as pa
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,18 +16,16 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
 from devices.errors import StateError, UnknownError
-from service.api.encoding import packed, takes_gzip
+from service.api.encoding import ARROW_STREAM, packed, takes_gzip, write_arrow_stream
 from service.api.routes.access import ServerState, has_it, problems
 from service.server.server import Server
 from service.sessions.stance_overlay import overlay_of_session
 from service.sessions.stances import stances_of_session
 from service.version import SOFTWARE
-from storage.formats.written.arrow import ARROW
 from storage.sessions.folder import Session
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
-_ARROW = ARROW.media_type
 _ONE_AT_A_TIME = CapacityLimiter(1)
 """An overlay reads every frame under load: of several that are asked for one after the other is."""
 _DIGITS = 6
@@ -65,7 +62,7 @@ class StanceView(BaseModel):
     summary="Stances",
     response_model=list[StanceView],
     responses={
-        200: {"description": "All stances, in their order.", "content": {_ARROW: {}}},
+        200: {"description": "All stances, in their order.", "content": {ARROW_STREAM: {}}},
         **problems(
             _404="No such session, nothing was recorded, or it has no estimates.",
             _409="Stances are counted when the session is sealed.",
@@ -84,11 +81,8 @@ async def stances(
     session = _sealed(session_id, server)
     folder = server.sessions.folder.path(session_id)
     table = await run_in_threadpool(stances_of_session, folder, frames_sha256=session.sha256)
-    if _ARROW in accept:
-        sink = pa.BufferOutputStream()
-        with pa.ipc.new_stream(sink, table.schema) as stream:
-            stream.write_table(table)
-        return Response(sink.getvalue().to_pybytes(), media_type=_ARROW)
+    if ARROW_STREAM in accept:
+        return Response(write_arrow_stream(table), media_type=ARROW_STREAM)
     rows: list[dict[str, Any]] = table.to_pylist()
     return rows
 
