@@ -135,6 +135,7 @@ class _Foreign(ABC):
 
     def __init__(self, served: Served, random: Random) -> None:
         self._url = served.url.replace("http", "ws")
+        self._headers = served.shown
         self.random = random
         self.socket: ClientConnection | None = None
 
@@ -169,6 +170,7 @@ class _Foreign(ABC):
     async def connected(self, query: str = "") -> ClientConnection:
         return await connect(
             self._url + self.path + query,
+            additional_headers=self._headers,
             subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
             compression=None,
             ping_interval=None,

@@ -244,14 +244,14 @@ def test_a_second_node_of_the_same_name_is_told_why_it_is_not_let_in(
     )
     assert node.stderr is not None
     said = ""
-    while "already" not in said:
-        line = node.stderr.readline()
-        assert line, said
-        said += line
-    node.terminate()
-    node.wait(20)
-    node.stderr.close()
-    assert "--name" in said
+    with node.stderr:
+        while "not connected" not in said:
+            line = node.stderr.readline()
+            assert line, said
+            said += line
+        node.terminate()
+        node.wait(20)
+    assert "foottile accept-node demo" in said
     assert demo.get("/nodes/demo").json()["connected"]
 
 
