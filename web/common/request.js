@@ -1,6 +1,7 @@
 // One HTTP request with a time limit. Each way to fail has its own words: a fault of this page is none of the server's.
 
 export const PATIENCE_S = 10;
+const BROKE_OFF = "The server’s answer broke off. Try again.";
 
 /** A refusal by the server, or no answer from it (`status` 0); `message` says what happened and what to do. */
 export class Refusal extends Error {
@@ -46,9 +47,11 @@ export async function sendRequest(path, options, { patienceS = PATIENCE_S, stop 
     // Made first: from here on a TypeError is one of the network, by the specification of fetch.
     const request = new Request(path, { ...options, cache: "no-store", signal: limit.signal });
     const response = await orRefusal(fetch(request), "The server cannot be reached. Is it running, and is this device in its network?");
-    return { response, text: await orRefusal(response.text(), "The server’s answer broke off. Try again.") };
+    return { response, text: await orRefusal(response.text(), BROKE_OFF) };
   } catch (error) {
     if (isLate) throw new Refusal(`The server did not answer within ${patienceS} s. Try again.`, 0);
+    // Firefox breaks requests off when the page is left.
+    if (!limit.signal.aborted && /** @type {Error} */ (error).name === "AbortError") throw new Refusal(BROKE_OFF, 0);
     throw error;
   } finally {
     clearTimeout(timer);
