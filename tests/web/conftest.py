@@ -154,6 +154,9 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
 
     yield open_
     for context in contexts:
+        # A context that is closed while a page of it begins to load may stay open without end.
+        for page in context.pages:
+            page.close()
         context.close()
     # A server that was killed on purpose, or refuses, shows up there: that is not the page's fault.
     others = ("ERR_", "WebSocket", "responded with a status of 4")

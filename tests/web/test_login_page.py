@@ -100,8 +100,8 @@ def test_a_viewer_is_offered_nothing_and_the_server_refuses_it(
         )
         assert status == 403
         assert recorded(server) == ["by another one"]
-        # In the same tab; later, since Playwright may wait without end for a page that goes meanwhile.
-        page.evaluate("(url) => setTimeout(() => { location.href = url; })", address(server))
+        with page.expect_navigation():
+            page.evaluate("(url) => { location.href = url; }", address(server))  # in the same tab
         expect(page.locator("#record")).to_be_visible()
         expect(page.locator("#login")).to_be_hidden()
 
