@@ -8,7 +8,7 @@ from statistics import median
 
 from rich.table import Table
 
-from service.cli.options import say, stdout
+from service.cli.options import remark, say, stdout
 from service.estimation.stances import Stance
 from service.offline.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
 from service.offline.findings import Findings
@@ -20,6 +20,7 @@ PHASES = {
     "unloading": "while unloading",
 }
 ASSUMED_SCALE = "The scale of this calibration is assumed: do not trust the newtons."
+PULL_LONG_S = 0.25
 EMULATED = "Errors of an emulated foot; the paper's 1 N and 4 mm are a real one's."
 
 
@@ -78,6 +79,12 @@ def tell_findings(findings: Findings) -> None:
         say(ASSUMED_SCALE)
     if findings.stances:
         say(stances_line(findings.stances))
+    if findings.pull.duration_s > PULL_LONG_S:
+        remark(
+            f"The GRF is below zero for {findings.pull.duration_s:.2f} s, by up to "
+            f"{findings.pull.most_n:.1f} N: the foot was probably loaded during the tare. "
+            "Name an unloaded interval with --tare-s BEGIN,END."
+        )
     if findings.accuracy is not None:
         stdout.print(accuracy_table(findings.accuracy))
 
@@ -89,6 +96,7 @@ def findings_json(findings: Findings) -> dict[str, object]:
         "absolute_scale": scale,
         "stances": [stance.as_dict() for stance in findings.stances],
         "accuracy": findings.accuracy,
+        "pull": findings.pull,
     }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.frames import FrameBatch
+from service.estimation.estimates import EstimateStatus
 from service.estimation.stances import Stance, Stances
 from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 
@@ -22,6 +23,25 @@ PLATE = "true_plate_n"
 Columns = Mapping[str, npt.NDArray[Any]]
 
 
+PULL_SIGMAS = 4.0
+PULL_MIN_N = 1.0
+"""A GRF below zero by both, or whose tile has lost its baseline, is a pull; mud pulls, too, for a
+moment."""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Time in which the estimates have the ground pull at the foot, as after a loaded tare.
+
+    Attributes:
+        duration_s: in all.
+        most_n: strongest of it.
+    """
+
+    duration_s: float = 0.0
+    most_n: float = 0.0
+
+
 @dataclass(frozen=True)
 class Findings:
     """Findings of a session; empty without estimates."""
@@ -31,6 +51,7 @@ class Findings:
     """None without the truth."""
     assumed_scale: bool | None = None
     """Whether newtons rest on an assumed scale."""
+    pull: Pull = Pull()
 
 
 class FindingsOf:
@@ -45,10 +66,12 @@ class FindingsOf:
         self._stances: list[Stance] = []
         self._judging = judging
         self._judged: list[Columns] = []
+        self._pull = Pull()
 
     def feed(self, batch: FrameBatch, columns: Columns) -> None:
         """Take the next frames."""
         self._stances += self._gathered.feed(batch.seq, batch.t_ns, columns)
+        self._feel_pull(batch, columns)
         if self._judging:
             known = {"t_ns": batch.t_ns, **columns}
             names = [name for name in (*COMPARED, PLATE) if name != PLATE or name in known]
@@ -63,7 +86,20 @@ class FindingsOf:
                 judged["true_grf_n"] = judged[PLATE]
             accuracy = accuracy_of(judged, lag_ms=plan.lag_ns * 1e-6)
         stances = *self._stances, *self._gathered.finish()
-        return Findings(stances, accuracy, plan.assumed_scale)
+        return Findings(stances, accuracy, plan.assumed_scale, self._pull)
+
+    def _feel_pull(self, batch: FrameBatch, columns: Columns) -> None:
+        grf_n = columns["grf_n"]
+        is_lost = (columns["estimate_status"] & EstimateStatus.BASELINE_LOST) != 0
+        is_sure = is_lost | (grf_n < -PULL_SIGMAS * columns["grf_sigma_n"])
+        pulls = (grf_n < -PULL_MIN_N) & is_sure
+        if not pulls.any() or len(batch) < 2:  # of one frame no period is known
+            return
+        period_s = float(np.median(np.diff(batch.t_ns))) * 1e-9
+        self._pull = Pull(
+            self._pull.duration_s + period_s * int(np.count_nonzero(pulls)),
+            max(self._pull.most_n, float(-grf_n[pulls].min())),
+        )
 
 
 def joined(pieces: Sequence[Columns]) -> dict[str, npt.NDArray[Any]]:

@@ -136,8 +136,8 @@ def estimate_command(
                 "lag_ms": lag_ms,
                 "tare": {
                     "source": plan.tare.source,
-                    "begin_s": plan.tare.begin_s,
-                    "end_s": plan.tare.end_s,
+                    "begin_s": result.tare_s[0],
+                    "end_s": result.tare_s[1],
                 },
                 "asks_for": result.asked,
                 **findings_json(result.findings),
@@ -147,7 +147,7 @@ def estimate_command(
     say(
         f"{path}: {result.frames} frames, calibration {plan.calibration.name} "
         f"({plan.calibration.id}), models {', '.join(plan.models)}, tare {plan.tare.source} "
-        f"{plan.tare.begin_s:.2f} to {plan.tare.end_s:.2f} s"
+        f"{result.tare_s[0]:.2f} to {result.tare_s[1]:.2f} s"
     )
     tell_findings(result.findings)
     for name, newtons in result.asked.items():

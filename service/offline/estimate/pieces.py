@@ -147,8 +147,9 @@ def join_pieces(
         stream = _going_on(what, folder, pieces)
         ordered = in_order(_read(what, folder, pieces), where=str(source))
         frames = write_estimated(out, what, session.notes, stream, ordered, remark)
+        begin_t_ns = session.span_ns()[0]
     assert stream.plan is not None  # noqa: S101  # it goes on with one
-    return Estimated(frames, stream.plan)
+    return Estimated(frames, stream.plan, begin_t_ns)
 
 
 def _write(path: Path, what: Prepared, given: Iterator[Piece]) -> int:

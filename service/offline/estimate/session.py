@@ -37,6 +37,7 @@ class Estimated:
     Attributes:
         frames: how many.
         plan: what their estimates begin with.
+        begin_t_ns: of the first frame of the session.
         findings: stances, and errors against the truth; empty if nobody asked.
         asked: models that it asks for and that were not named, with the newtons expected of each;
             likewise.
@@ -44,8 +45,16 @@ class Estimated:
 
     frames: int
     plan: EstimationPlan
+    begin_t_ns: int
     findings: Findings = field(default_factory=Findings)
     asked: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def tare_s(self) -> tuple[float, float]:
+        """Begin and end of the tare from the first frame; negative before it."""
+        tare = self.plan.tare
+        end_s = (tare.t_ns - self.begin_t_ns) * 1e-9
+        return end_s - (tare.end_s - tare.begin_s), end_s
 
 
 def estimate_session(
@@ -77,6 +86,7 @@ def estimate_session(
         )
     with SessionReader(source, only_slices=not part.is_all) as session:
         what = prepared(session, request, remark)
+        begin_t_ns = session.span_ns()[0] if session.footer.group_rows else 0
         notes, stretch = dict(session.notes), Stretch()
         if session.axis.is_shifted:  # the clock table may not lie beside what is written
             notes[TIME_AXIS_NOTE] = session.axis.as_dicts()
@@ -95,9 +105,8 @@ def estimate_session(
     if not frames or stream.plan is None:
         said = "the session has no frames" + ("" if part.is_all else " in that time")
         raise FileFormatError(said, where=str(source))
-    if judged is None:
-        return Estimated(frames, stream.plan)
-    return Estimated(frames, stream.plan, *judged.finish(stream.plan))
+    found = () if judged is None else judged.finish(stream.plan)
+    return Estimated(frames, stream.plan, begin_t_ns, *found)
 
 
 def write_estimated(

@@ -18,6 +18,7 @@ from storage.formats.slice import Slice
 from storage.schema import ESTIMATES
 from storage.sessions.file import SessionWriter
 from storage.sessions.reader import SessionReader
+from tests.builders.arrays import PERIOD_NS
 from tests.service.sessions.pieces import array, calibration, frames, hopping, options
 from tests.storage.formats.exports import export
 
@@ -35,16 +36,19 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def estimated(source: Path, out: Path, *, exact: bool = False) -> SessionReader:
-    request = EstimateRequest(
+    estimate_session(source, out, request(exact=exact), remark=lambda _: None)
+    return SessionReader(out)
+
+
+def request(*, exact: bool = False, tare_s: tuple[float, float] | None = None) -> EstimateRequest:
+    return EstimateRequest(
         calibration=None,
         models=("static", "denoise"),
         lag_ms=100.0,
         scene=None,
-        tare_s=None,
+        tare_s=tare_s,
         exact=exact,
     )
-    estimate_session(source, out, request, remark=lambda _: None)
-    return SessionReader(out)
 
 
 def estimates_of(reader: SessionReader) -> dict[str, np.ndarray]:
@@ -143,3 +147,33 @@ def _is_estimate(flat: str) -> bool:
 
 def _fields(reader: SessionReader) -> list[Any]:
     return list(reader.footer.schema)
+
+
+def test_the_interval_of_the_tare_is_in_the_time_of_the_session_and_can_be_given_back(
+    raw: Path, tmp_path: Path
+) -> None:
+    once = estimate_session(raw, tmp_path / "once.parquet", request(), remark=lambda _: None)
+    begin_s, end_s = once.tare_s
+    assert 0.0 <= begin_s < end_s
+    given = request(tare_s=(max(0.0, begin_s - 1e-4), end_s + 1e-4))
+    again = estimate_session(raw, tmp_path / "again.parquet", given, remark=lambda _: None)
+    np.testing.assert_array_equal(again.plan.tare.baseline_kpa, once.plan.tare.baseline_kpa)
+    assert again.tare_s == once.tare_s
+
+
+def test_after_a_loaded_tare_the_ground_pulls_for_as_long_as_the_foot_is_unloaded(
+    tmp_path: Path,
+) -> None:
+    load_n = np.where(np.arange(2500) // 500 % 2 == 1, 6.0, 0.0)
+    forces_n = load_n[:, None] + np.random.default_rng(0).normal(0.0, 0.5, (2500, 2))
+    raw, out = tmp_path / "raw.parquet", tmp_path / "out.parquet"
+    notes = {"calibration": calibration().model_dump(mode="json")}
+    with SessionWriter(raw, array(), notes) as writer:
+        writer.append(frames(forces_n, lead=400), {})
+    found = [
+        estimate_session(raw, out, request(tare_s=tare_s), remark=lambda _: None).findings.pull
+        for tare_s in ((0.1, 0.9), (600 * PERIOD_NS * 1e-9, 900 * PERIOD_NS * 1e-9))
+    ]
+    assert found[0].duration_s == 0.0
+    assert found[1].most_n == pytest.approx(12.0, abs=4.0)
+    assert found[1].duration_s == pytest.approx(1500 * PERIOD_NS * 1e-9, rel=0.05)
