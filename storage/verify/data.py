@@ -20,14 +20,14 @@ from storage.journal.segment import SUFFIX
 from storage.journal.segment_format import INDEX_SUFFIX
 from storage.journal.stream_notes import NOTES_FILE
 from storage.sessions.claims import SESSION_NAME
-from storage.sessions.folder import FRAMES_NAME, SESSION_ID, SessionFolder
+from storage.sessions.folder import FRAMES_NAME, SESSION_ID, Ledger, SessionFolder
 from storage.verify.exported import ExportReport, verify_export
 from storage.verify.journal import StreamReport, verify_stream
 from storage.verify.others import Others, check_json, verify_others
 from storage.verify.segment import SegmentReport, verify_segment
 from storage.verify.session import SessionReport, verify_lone_file, verify_session
 
-Verdict = Literal["complete", "lossy", "pending", "damaged", "export"]
+Verdict = Literal["complete", "unproven", "lossy", "pending", "damaged", "export"]
 
 _STREAM_NAME = re.compile(r"[0-9a-f]{32}")
 
@@ -188,25 +188,28 @@ def _told(report: FolderReport, path: Path, data: Path) -> Iterator[None]:
 
 
 def verdict_of(report: Report) -> Verdict:
-    """The worst of what was found.
+    """Return the worst of what was found.
 
     Frames of a journal that no session needs may be deleted: that is no loss.
     """
-    if isinstance(report, FolderReport):
-        parts: list[Report] = [*report.sessions, *report.streams]
-        verdicts = {verdict_of(part) for part in parts}
-        if report.problems:
-            return "damaged"
-        order: tuple[Verdict, ...] = ("damaged", "pending", "lossy")
-        return next((verdict for verdict in order if verdict in verdicts), "complete")
     if report.problems:
         return "damaged"
     if isinstance(report, ExportReport):
         return "export"
-    if not isinstance(report, SessionReport) or report.in_trash:
-        return "complete"
-    if report.ledger is None or any(part.pending for part in report.ledger.parts):
+    verdicts: set[Verdict] = set()
+    if isinstance(report, FolderReport):
+        verdicts = {verdict_of(part) for part in (*report.sessions, *report.streams)}
+    elif isinstance(report, SessionReport) and not report.in_trash:
+        verdicts = {_of_ledger(report.ledger)}
+    if not isinstance(report, SegmentReport) and report.unproven:
+        verdicts.add("unproven")
+    order: tuple[Verdict, ...] = ("damaged", "pending", "lossy", "unproven")
+    return next((verdict for verdict in order if verdict in verdicts), "complete")
+
+
+def _of_ledger(ledger: Ledger | None) -> Verdict:
+    if ledger is None or any(part.pending for part in ledger.parts):
         return "pending"
-    if report.ledger.lossy:
+    if ledger.lossy:
         return "lossy"
-    return "complete" if report.ledger.complete else "pending"
+    return "complete" if ledger.complete else "pending"

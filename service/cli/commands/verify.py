@@ -16,7 +16,7 @@ from service.cli.many import (
     is_one,
     run_many,
 )
-from service.cli.options import JsonOption, data_folder, print_json, progress, remark, say
+from service.cli.options import JsonOption, data_folder, print_json, progress, say
 
 if TYPE_CHECKING:
     from storage.sessions.folder import Ledger
@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from storage.verify.journal import StreamReport
     from storage.verify.session import SessionReport
 
-_EXIT = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1, "export": 4}
+_EXIT = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1, "unproven": 4, "export": 4}
+_IN_LINE = {"unproven": "not all proven"}
 _SENTENCE = {
     "complete": "Everything is whole and complete.",
     "lossy": "Everything is whole, but some frames are lost for good: they are counted above.",
     "pending": "Everything is whole, but not every session is sealed yet.",
     "damaged": "Something is damaged: do not trust what is named above.",
+    "unproven": "Nothing is damaged, but not all of it can be proven: it is named above.",
     "export": "An export: it proves nothing; the session that it was made from does.",
 }
 
@@ -60,9 +62,10 @@ def verify_command(
     """Prove sessions and journals from their files alone: checksums, hashes, order and ledger.
 
     Nothing is written, and a server may run meanwhile. Exit codes: 0 everything is whole and
-    complete, 1 something is damaged, 2 wrong usage, 3 whole, but lossy or not yet sealed, 4 an
-    export, which proves nothing: verify the session that it says it was made from. Of many sessions
-    it is 1 if one is damaged, and 3 if one could not be read, too.
+    complete, 1 something is damaged, 2 wrong usage, 3 whole, but lossy or not yet sealed, 4 not
+    all can be proven, as of a file that lies outside its session, and of an export: verify the
+    session that it was made from. Of many sessions it is 1 if one is damaged, and 3 if one could
+    not be read, too.
     """
     from storage.verify.data import verdict_of, verify
 
@@ -159,14 +162,18 @@ def _tell(report: Report, *, is_part: bool = False) -> None:
     for text in remarks:
         say(f"  {text}")
     for what in () if is_part else unproven:
-        remark(f"not proven: {what}")
+        say(f"  not proven: {what}")
 
 
 def _session_line(report: SessionReport) -> str:
     from storage.verify.data import verdict_of
 
     verdict: Verdict = verdict_of(report)
-    said = "in the trash" if report.in_trash and verdict != "damaged" else verdict
+    said = (
+        "in the trash"
+        if report.in_trash and verdict != "damaged"
+        else _IN_LINE.get(verdict, verdict)
+    )
     name = f" ({report.name})" if report.name else ""
     return f"session {report.id or report.path.name}{name}: {said}, {_counts(report.ledger)}"
 
