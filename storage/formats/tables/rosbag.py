@@ -18,6 +18,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, FootTileError, needs_extra
+from devices.inputs import check_file
 from storage.formats.tables.plates import Plate, make_plate_table
 from storage.formats.tables.table import IsNeeded, Table, check_size, repeated_name
 
@@ -56,6 +57,9 @@ def read_bag(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
     """
     where = str(path)
     try:
+        for file in path.iterdir() if path.is_dir() else (path,):
+            if not file.is_dir():
+                check_file(file)  # the libraries would wait for a pipe, and read a device for ever
         bag = _open_mcap(path) if path.suffix.lower() == ".mcap" else _open_rosbag(path)
         return _table(bag, where, is_needed, numbers_max)
     except (FootTileError, ModuleNotFoundError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -267,3 +268,26 @@ def test_our_own_export_to_foxglove_has_no_wrenches(tmp_path: Path) -> None:
 def test_a_unit_that_is_not_ros_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is in N, not in kN"):
         read_reference(write_bag1(tmp_path, walk()), Stated(units={"grf": "kN"}))
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("ending", [".bag", ".mcap", ".db3"])
+def test_a_pipe_or_a_device_is_refused_and_not_waited_for(tmp_path: Path, ending: str) -> None:
+    pipe, device = tmp_path / f"pipe{ending}", tmp_path / f"device{ending}"
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    for path in (pipe, device):
+        with pytest.raises(FileFormatError, match="not a file that can be read whole"):
+            read_reference(path, LEFT)
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("name", ["metadata.yaml", "frames.db3"])
+def test_a_pipe_in_the_folder_of_a_bag_is_refused_and_not_waited_for(
+    tmp_path: Path, name: str
+) -> None:
+    folder = tmp_path / "bag.db3"
+    folder.mkdir()
+    os.mkfifo(folder / name)
+    with pytest.raises(FileFormatError, match="not a file that can be read whole"):
+        read_reference(folder, LEFT)
