@@ -15,8 +15,9 @@ import numpy as np
 
 from devices.arrays import Floats
 
-REST_S = 3.0
+REST_S = 4.0
 HOLD_S = 5.0
+"""Marks come some tenths of a second late; a fit takes no step that is shorter than 2 s."""
 STEADY_S = 1.0
 """So long the pressure has to stand still before a step begins."""
 LOADED_KPA = 0.3
