@@ -71,9 +71,10 @@ def test_the_readme_plots_what_was_pulled_over_seconds(
         pytest.importorskip(name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    with client.connect(running.url) as server, server.record("left", "a trial") as session:
-        until(lambda: session.refresh().frames > 100)
-    session.wait()
+    with client.connect(running.url) as server:
+        with server.record("left", "a trial") as session:
+            until(lambda: session.refresh().frames > 100)
+        session.wait()
     pulled = foottile("pull", session.id, "--out", tmp_path / "here", "--server", running.url)
     assert pulled.ended(PATIENCE_S) == 0, pulled.err
     (block,) = re.findall(r"```python\n(import pandas.*?)```", README.read_text(), re.DOTALL)

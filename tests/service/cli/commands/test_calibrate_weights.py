@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow.parquet as pq
 import pytest
 
@@ -88,18 +89,17 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
     assert run("estimate", "others.parquet", *asked_for).code == 0
     table = pq.read_table("estimated.parquet")
     force_n, sigma_n, true_n = (
-        np.stack(table[name].to_numpy())[:, 0] if name + "_0" not in table.column_names else
-        table[name + "_0"].to_numpy()
+        np.stack(table[name].to_numpy().tolist())[:, 0]
         for name in ("force_n", "force_sigma_n", "true_force_n")
-    )  # fmt: skip
-    for grams in OTHERS_G:
-        settled = _settled(true_n, 1e-3 * grams * STANDARD_GRAVITY_M_S2)
+    )
+    for mass_g in OTHERS_G:
+        settled = _settled(true_n, 1e-3 * mass_g * STANDARD_GRAVITY_M_S2)
         error_n, half_n = (force_n - true_n)[settled], 1.96 * sigma_n[settled]
-        assert (np.abs(error_n) <= half_n).mean() > 0.9, grams
-        assert half_n.mean() < 0.25 * true_n[settled].mean(), grams
+        assert (np.abs(error_n) <= half_n).mean() > 0.9, mass_g
+        assert half_n.mean() < 0.25 * true_n[settled].mean(), mass_g
 
 
-def _settled(true_n: Floats, force_n: float) -> Floats:
+def _settled(true_n: Floats, force_n: float) -> npt.NDArray[np.intp]:
     """Rows of a load, from half of its time on."""
     rows = np.flatnonzero(np.abs(true_n - force_n) < 1e-3 * force_n)
     return rows[len(rows) // 2 :]
