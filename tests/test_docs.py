@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator
+from importlib.util import module_from_spec, spec_from_file_location
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -382,6 +383,16 @@ def test_every_decision_is_in_the_list_and_says_what_would_change_our_mind() -> 
         text = record.read_text("utf-8")
         for word in ("Context", "Decision", "Consequences", "What would change our mind"):
             assert f"\n**{word}.** " in text, record.name
+
+
+def test_the_page_of_symptoms_is_that_of_its_document() -> None:
+    spec = spec_from_file_location("help_page", ROOT / "scripts" / "help_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    help_page = module_from_spec(spec)
+    spec.loader.exec_module(help_page)
+    text = help_page.SOURCE.read_text("utf-8")
+    assert help_page.PAGE.read_text("utf-8") == help_page.render_page(text)
 
 
 def test_every_path_in_the_picture_exists() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
@@ -19,7 +20,46 @@ INTERVAL_95 = 1.96
 
 def calibration_tables(calibration: Calibration) -> list[Table]:
     """Quality of every tile's curve, where it ends, and what else is known of it."""
-    return [_curves(calibration), _ranges(calibration), _effects(calibration)]
+    weighed = [
+        _weights(calibration, tile) for tile in calibration.tiles if tile.weights is not None
+    ]
+    if len(weighed) == len(calibration.tiles):
+        return weighed
+    return [_curves(calibration), _ranges(calibration), _effects(calibration), *weighed]
+
+
+def _weights(calibration: Calibration, tile: TileCalibration) -> Table:
+    """Every weight on a tile, what was left of it, and the interval of a force like it."""
+    facts = tile.weights
+    assert facts is not None  # noqa: S101  # the caller has looked
+    table = _table(
+        f"Tile {tile.serial}, {len(facts.steps)} weights",
+        [
+            "pressure: above the rest before it;",
+            "settled: last second less the first;",
+            "residual: the curve less the weight;",
+            "95 %: half width of the interval, which holds",
+            "95 of 100 other loads that have settled;",
+            "a fast load is not in it: gas adds 10 to 20 %",
+            "for some 50 ms",
+            f"reference: {calibration.reference}; {calibration.date}",
+        ],
+        *("weight", "force\nN", "pressure\nkPa", "noise\nkPa", "settled\nkPa"),
+        *("residual\nN", "95 %\nN"),
+    )
+    grid = [point.gauge_kpa for point in facts.band_95]
+    halves_n = [point.new_loading_n for point in facts.band_95]
+    for step in sorted(facts.steps, key=lambda step: step.force_n):
+        table.add_row(
+            escape(step.weight),
+            _number(step.force_n, 2),
+            _number(step.gauge_kpa, 2),
+            _number(step.noise_kpa, 2),
+            f"{step.settle_kpa:+.2f}",
+            f"{step.residual_n:+.2f}",
+            f"±{np.interp(step.gauge_kpa, grid, halves_n):.2f}",
+        )
+    return table
 
 
 def _table(title: str, notes: Sequence[str], *headings: str) -> Table:
@@ -33,7 +73,9 @@ def _table(title: str, notes: Sequence[str], *headings: str) -> Table:
         padding=(0, 1, 0, 0),
     )
     for heading in headings:
-        table.add_column(heading, justify="left" if heading == "tile" else "right", no_wrap=True)
+        table.add_column(
+            heading, justify="left" if heading in ("tile", "weight") else "right", no_wrap=True
+        )
     return table
 
 
@@ -172,7 +214,7 @@ def calibration_json(calibration: Calibration) -> dict[str, object]:
 _OF_A_TILE = {
     *("serial", "r2", "rmse_n", "cv_rmse_n", "hysteresis_n", "range_kpa", "monotonic"),
     *("coefficients", "absolute_scale", "repeats", "covariance", "baseline_kpa", "noise_kpa"),
-    "bench",
+    *("bench", "weights"),
 }
 
 

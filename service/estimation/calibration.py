@@ -90,7 +90,9 @@ class TileCalibration(CalibrationPart):
     effects: Effects = Effects()
     """What of the dome beside its static curve is known."""
     bench: BenchFacts | None = None
-    """What the recordings were like; None for a preset."""
+    """What the recordings were like; None for a preset, and for dead weights."""
+    weights: WeightFacts | None = None
+    """The dead weights that the curve was fitted to; None: it was not."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -109,6 +111,14 @@ class TileCalibration(CalibrationPart):
             if not is_monotonic(rubber.coefficients, self.range_u):
                 raise ValueError("the curve beneath rubber does not rise all over its range")
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_weights_as_before(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave absent weights out, so that ids of older calibrations stay the same."""
+        content: dict[str, Any] = written(self)
+        if self.weights is None:
+            content.pop("weights", None)
+        return content
 
     @property
     def range_u(self) -> tuple[float, float]:
@@ -309,3 +319,30 @@ class BenchFacts(CalibrationPart):
     """Greatest change of the unloaded pressure between repeats of a file, from the second on."""
     band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
     """At ten equal steps from zero to the end of the range."""
+
+
+class WeightStep(CalibrationPart):
+    """A dead weight on a tile, and what the tile read after it had settled."""
+
+    weight: Label
+    """As it was written: `500 g +-0.5 %`."""
+    force_n: Number
+    gauge_kpa: Number
+    noise_kpa: NotNegative
+    """Standard deviation of a reading."""
+    settle_kpa: Number
+    """Last second of the step less its first."""
+    residual_n: Number
+    """Force of the curve less that of the weight."""
+
+
+class WeightFacts(CalibrationPart):
+    """Facts about the dead weights that a curve was fitted to."""
+
+    steps: Annotated[tuple[WeightStep, ...], Field(max_length=_ROWS_MAX)]
+    baseline_drift_kpa: NotNegative
+    """Greatest change of the unloaded pressure since the first rest."""
+    scale_sigma: NotNegative
+    """Standard uncertainty of the weights' common scale, a part of the force."""
+    band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
+    """At ten equal steps; `new_loading_n` is what an estimate of a settled load states."""

@@ -1,8 +1,8 @@
 """A bench recording whose programme is in its marks, as whoever moves the spindle made them.
 
 A mark says what is done from its instant on: `T01 load` that tile T01 is under the spindle, which
-goes down; `soak` and `end` that nothing is. Others are remarks. A misspelt one is refused: a stroke
-would go on where it had ended.
+goes down; `T01 500 g` that a weight stands on it; `soak` and `end` that nothing does. Others are
+remarks. A misspelt one is refused: a stroke would go on where it had ended.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.errors import CalibrationError
+from service.estimation.fitting.bench.weights import parse_weight
 from storage.schema import NO_INSTANT
 from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.folder import Event
@@ -23,7 +24,12 @@ PRESSED = ("rest", "load", "unload", "hold", "release", "tap")
 """What is done with a tile, named before it."""
 IDLE = {"soak": "soak", "end": "rest"}
 """What is said of no tile, and the phase that it is."""
-_FORM = "SERIAL and one of " + ", ".join(PRESSED) + "; or " + " or ".join(IDLE)
+_FORM = (
+    "SERIAL and one of "
+    + ", ".join(PRESSED)
+    + ", or a weight such as 500 g, 4.9 N or 500 g +-0.5 %; or "
+    + " or ".join(IDLE)
+)
 
 Programme = tuple[npt.NDArray[np.object_], npt.NDArray[np.str_]]
 """Of every frame: serial of the tile under the spindle or None, and phase."""
@@ -72,6 +78,10 @@ def _said_by(event: Event, serials: Sequence[str], where: str) -> tuple[str, str
     label = event.label.strip()
     if label in IDLE:
         return "", IDLE[label]
+    for serial in serials:
+        weight = label.removeprefix(f"{serial} ").strip()
+        if weight != label and parse_weight(weight) is not None:
+            return serial, weight
     serial, _, phase = (part.strip() for part in label.rpartition(" "))
     if serial in serials and phase in PRESSED:
         return serial, phase

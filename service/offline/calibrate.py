@@ -17,9 +17,11 @@ from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import Parameter
 from service.estimation.fitting.bench.indentation import Indentation, pressed_in
+from service.estimation.fitting.bench.weights import has_weights
 from service.estimation.fitting.effects_fit import fit_effects
 from service.estimation.fitting.fit import fit_tile
 from service.estimation.fitting.timing import UNKNOWN_DELAY, resolved
+from service.estimation.fitting.weights_fit import fit_weights
 from service.offline.bench_marks import Programme, programme_of
 from storage.sessions.reader import SessionReader
 
@@ -154,6 +156,16 @@ def _refuse_contradiction(first: Pressed, second: Pressed) -> None:
 
 def _fitted(pressed: Sequence[Pressed], delay: Parameter) -> TileCalibration:
     recordings = [each.indentation for each in pressed]
+    weighted = [has_weights(recording) for recording in pressed_in(recordings)]
+    if any(weighted):
+        if not all(weighted):
+            raise CalibrationError(
+                "one recording has dead weights, another one strokes of a mill",
+                where=", ".join(recording.where for recording in recordings),
+                remedy="Calibrate from one kind of them",
+            )
+        tile = fit_weights(pressed_in(recordings))
+        return tile.model_copy(update={"coefficient_words": pressed[0].chip})
     tile = fit_tile(*pressed_in(recordings))
     return tile.model_copy(
         update={
@@ -167,6 +179,12 @@ def _in_words(tile: TileCalibration) -> str:
     """What was found, in a line."""
     effects = tile.effects
     found = [f"curve to {tile.range_kpa[1]:.1f} kPa"]
+    if (facts := tile.weights) is not None:
+        last = facts.band_95[-1]
+        return (
+            f"{found[0]} from {len(facts.steps)} weights, "
+            f"{last.force_n:.1f} +-{last.new_loading_n:.1f} N (95 %) at its end"
+        )
     if (gas := effects.gas) is not None:
         found.append(f"gas {gas.gamma.value:.2f} in {1e3 * gas.tau_s.value:.0f} ms")
     if (rubber := effects.rubber) is not None:

@@ -21,6 +21,7 @@ from tests.service.running import Running
 from tests.waiting import PATIENCE_S, until
 
 PAGE = Path(__file__).parents[2] / "docs" / "client.md"
+README = PAGE.parents[1] / "README.md"
 URL = "http://laptop.local:8000"
 
 
@@ -57,6 +58,35 @@ def test_every_python_example_runs(
     if lacking:
         pytest.skip(f"all but the notebook's: {', '.join(lacking)} is not installed")
     assert Path("trial.png").stat().st_size > 1000
+
+
+def test_the_readme_plots_what_was_pulled_over_seconds(
+    running: Running,
+    left: FakeNode,
+    foottile: Start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("pandas", "matplotlib"):
+        pytest.importorskip(name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    with client.connect(running.url) as server:
+        with server.record("left", "a trial") as session:
+            until(lambda: session.refresh().frames > 100)
+        session.wait()
+    pulled = foottile("pull", session.id, "--out", tmp_path / "here", "--server", running.url)
+    assert pulled.ended(PATIENCE_S) == 0, pulled.err
+    (block,) = re.findall(r"```python\n(import pandas.*?)```", README.read_text(), re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(compile(block.replace("SESSION", session.id), str(README), "exec"), names)  # noqa: S102  # our own page
+    (line,) = names["axes"].lines
+    time_s, grf_n = line.get_data()
+    assert len(time_s) == session.frames
+    assert time_s[0] == 0.0
+    assert time_s[-1] == pytest.approx(session.duration_s, abs=0.1)
+    assert max(grf_n) > 10.0
+    assert Path("grf.png").stat().st_size > 1000
 
 
 def test_every_line_for_the_shell_runs(

@@ -19,7 +19,7 @@ OpenPage = Callable[..., Page]
 
 
 def explained() -> list[tuple[str, str]]:
-    text = (LIVE_JS / "why.js").read_text("utf-8")
+    text = (LIVE_JS / "why.js").read_text("utf-8").partition("const SECTIONS")[0]
     return re.findall(r"^  \[/(.+)/, \"(.+)\"\],$", text, re.MULTILINE)
 
 
@@ -34,6 +34,14 @@ def test_every_flag_of_frames_and_estimates_is_explained() -> None:
 def test_an_explanation_has_two_sentences_in_plain_words(why: str) -> None:
     assert re.fullmatch(r"[A-Z][^.]+\. [A-Z][^.]+\.", why), why
     assert "slot" not in why
+
+
+def test_a_warning_links_to_a_section_that_is_there() -> None:
+    text = (LIVE_JS / "why.js").read_text("utf-8").partition("const SECTIONS")[2]
+    sections = re.findall(r', "([a-z-]+)"\],$', text, re.MULTILINE)
+    assert len(sections) > 3
+    help_page = (LIVE_JS.parent / "tile-reads-nonsense.html").read_text("utf-8")
+    assert set(sections) <= set(re.findall(r'<h2 id="([a-z-]+)">', help_page))
 
 
 @pytest.mark.real_time
@@ -51,6 +59,10 @@ def test_a_warning_says_since_when_and_why_and_stays_open(
         since = note.locator("time").text_content()
         note.get_by_text("why?").click()
         expect(note.locator("p")).to_contain_text("what it bears is not known")
+        with page.expect_popup() as opened:
+            note.get_by_role("link", name="What to do").click()
+        expect(opened.value.locator("#it-is-missing")).to_be_in_viewport()
+        assert complaints(opened.value) == []
         tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer", "another trouble")
         expect(page.locator("#notes")).to_contain_text("Another trouble.")
         expect(note.locator("p")).to_be_visible()

@@ -3,7 +3,7 @@
 import { ESTIMATE, FRAME, TILE } from "../common/bits.js";
 import { lossesInWords } from "../common/losses.js";
 import { byId, el, localTime, number, roughly, setData, setText } from "../common/text.js";
-import { whyOf } from "./why.js";
+import { helpOf, whyOf } from "./why.js";
 
 const HOLD_MS = 3000;
 const FIRST_MS = 3000; // what is said so soon after the page was opened may be older
@@ -105,8 +105,10 @@ function item(text, mayBeOlder) {
   const why = whyOf(text);
   const says = el("span", { cls: "note-text", text });
   if (!why) return el("li", {}, says, since);
+  const help = helpOf(text);
+  const link = help ? el("a", { href: help, target: "_blank", text: "What to do" }) : "";
   return el("li", {}, el("details", {},
-    el("summary", {}, says, since, " ", el("span", { cls: "ask", text: "why?" })), el("p", { text: why })));
+    el("summary", {}, says, since, " ", el("span", { cls: "ask", text: "why?" })), el("p", {}, `${why} `, link)));
 }
 
 function standing(node, frame, serverNowMs) {

@@ -25,3 +25,18 @@ const WHY = [
 
 /** Two sentences, or "". @param {string} text */
 export const whyOf = (text) => WHY.find(([begins]) => begins.test(text))?.[1] ?? "";
+
+/** @type {[begins: RegExp, section: string][]} */
+const SECTIONS = [
+  [/^Tile missing|does not answer/, "it-is-missing"],
+  [/^A tile repeats one reading|^A tile reads no further/, "it-stands-still"],
+  [/^A tile reads too little|^Below the calibrated|^Not tared|^Tare/, "a-force-in-the-air"],
+  [/^Above the 115|^After a load|^Scale assumed|^No calibration/, "too-low"],
+  [/out of the chip's range|^Bus fault/, "it-jumps"],
+];
+
+/** What to do about a warning of a tile, as an address; "" where it is of no tile. @param {string} text */
+export function helpOf(text) {
+  const section = SECTIONS.find(([begins]) => begins.test(text))?.[1];
+  return section ? `/static/tile-reads-nonsense.html#${section}` : "";
+}

@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 from devices.errors import UsageError, needs_extra
+from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import (
+    CaOption,
     JsonOption,
     output_path,
     pair,
@@ -30,6 +32,7 @@ from service.cli.reference_options import (
     named_values,
     text_stated,
 )
+from storage.sessions.folder import FRAMES_NAME
 
 DELAY_MAX_MS = 1000.0
 """No reference of use here is later."""
@@ -37,14 +40,40 @@ DELAY_MAX_MS = 1000.0
 
 @needs_extra("server", "`foottile calibrate`")
 def calibrate_command(
+    out: Annotated[Path, typer.Option(help="Calibration file to write (JSON).")],
     recordings: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
             metavar="IN...",
-            help="Indentation recordings; repeats of a tile may be spread over several.",
+            help="Bench recordings; repeats of a tile may be spread over several.",
         ),
-    ],
-    out: Annotated[Path, typer.Option(help="Calibration file to write (JSON).")],
+    ] = None,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Guide through dead weights on a tile of a running node."),
+    ] = False,
+    tile: Annotated[
+        str | None, typer.Option(help="With --live: its serial; of several: T01,T02.")
+    ] = None,
+    weights: Annotated[
+        str,
+        typer.Option(help="With --live: in the order in which they are put on; g, kg or N."),
+    ] = "200g,500g,1kg,1.5kg,2kg",
+    within_percent: Annotated[
+        float,
+        typer.Option(min=0.0, max=50.0, help="With --live: how far each weight may be off."),
+    ] = 1.0,
+    node: Annotated[
+        str | None, typer.Option(help="With --live: the node; default: the only one.")
+    ] = None,
+    assign: Annotated[
+        bool, typer.Option("--assign", help="With --live: have the node use it from now on.")
+    ] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="With --live: accept what comes out, do not ask.")
+    ] = False,
+    server: ServerOption = None,
+    ca: CaOption = None,
     name: Annotated[
         str | None, typer.Option(help="What it is called; default: the file's name.")
     ] = None,
@@ -93,13 +122,46 @@ def calibrate_command(
 ) -> None:
     """Fit every tile that was pressed in the recordings, and say how good the fit is.
 
-    A recording is a session with reference_force_n, pressed_tile and phase, as the mill or
-    `foottile simulate --scene indentation` makes it. A tile whose recording gives no believable
+    With --live it guides through dead weights on tiles of a running node and has the server fit
+    them: docs/calibrate-a-tile.md. Else a recording is a session with reference_force_n,
+    pressed_tile and phase, as the mill or `foottile simulate --scene indentation` makes it, or with
+    marks that say which weight stood on which tile. A tile whose recording gives no believable
     curve is refused with the reason. With --against it is a session of the mounted foot on a force
     plate: its calibration is written with the foot's gains, and its shear if asked for; what the
     load does not determine is refused. Exit codes: 0 good, 1 failed, no tile has a curve, 2 wrong
-    usage, 3 written, but a tile was refused.
+    usage, 3 written, but a tile was refused; with --live: not accepted, and not written.
     """
+    if live:
+        if recordings or tile is None or against is not None or plot is not None:
+            raise UsageError(
+                "--live goes with --tile, and without recordings, --plot and --against",
+                remedy="foottile calibrate --live --tile T01 --out cal.json",
+            )
+        from service.cli.commands.calibrate_live import LiveWeights, calibrate_live
+
+        calibrate_live(
+            output_path(out),
+            LiveWeights(
+                tiles=tuple(part.strip() for part in tile.split(",")),
+                weights=weights,
+                within_percent=within_percent,
+                node=node,
+                name=name or f"{tile}, dead weights",
+                reference="dead weights" if reference == "not stated" else reference,
+                assign=assign,
+                yes=yes,
+            ),
+            server or SERVER,
+            ca,
+            as_json=as_json,
+        )
+        return
+    if not recordings:
+        raise UsageError("no recording is named", expected="IN..., or --live with --tile")
+    if tile is not None or assign or yes or node is not None or server is not None:
+        raise UsageError(
+            "--tile, --node, --server, --assign and --yes go with --live", remedy="Add --live"
+        )
     of_text: dict[str, str | float | None] = {
         "skip_rows": skip_rows,
         "units_row": units_row,
@@ -143,6 +205,7 @@ def calibrate_command(
         raise UsageError("that is said of a plate, and none is named", remedy="Add --against FILE")
     from service.cli.calibration_report import calibration_json, calibration_tables
     from service.estimation.effects import Parameter
+    from service.estimation.fitting.bench.weights import has_weights
     from service.estimation.fitting.timing import UNKNOWN_DELAY
     from service.offline.calibrate import calibrate_recordings, read_recordings
     from service.sessions.calibration_file import write_calibration
@@ -158,7 +221,13 @@ def calibrate_command(
     path = output_path(out, *recordings)
     plot_path = output_path(plot, out, *recordings) if plot is not None else None
     with progress("fitting"):
-        pressed = read_recordings(recordings)
+        pressed = read_recordings(
+            [each / FRAMES_NAME if each.is_dir() else each for each in recordings]
+        )
+        if plot_path is not None and any(
+            has_weights(one.indentation) for each in pressed.values() for one in each
+        ):
+            raise UsageError("--plot draws strokes of a mill, and these are dead weights")
         calibration = calibrate_recordings(
             pressed, name=name or path.stem, reference=reference, delay=delay, progress=remark
         )

@@ -34,13 +34,17 @@ from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
+    from service.offline.estimate.changes import Change
 
 
 @needs_extra("server", "`foottile estimate`")
 def estimate_command(
     out: Annotated[
         str,
-        typer.Option(help="Session to write, with the new estimates; for many, a folder or URI."),
+        typer.Option(
+            help="Session to write, with the new estimates; .parquet is added to a name without "
+            "an ending; for many, a folder or URI."
+        ),
     ],
     sessions: Annotated[
         list[str] | None,
@@ -93,6 +97,7 @@ def estimate_command(
     from service.estimation.asked import SEEN
     from service.offline.archive.places import is_remote
     from service.offline.archive.tasks import EstimateTask
+    from service.offline.estimate.changes import change_between, read_stored
     from service.offline.estimate.session import estimate_session
     from storage.formats.slice import Slice
 
@@ -116,15 +121,14 @@ def estimate_command(
     (session,) = map(Path, sessions or ())
     # The session itself may be the output: it is replaced whole, and nothing raw is lost.
     path = output_path(
-        Path(out), *(Path(name) for name in (calibration, scene) if name is not None)
+        _with_ending(Path(out)), *(Path(name) for name in (calibration, scene) if name is not None)
     )
+    source = session / FRAMES_NAME if session.is_dir() else session
     with progress(f"estimating {session}"):
-        result = estimate_session(
-            session / FRAMES_NAME if session.is_dir() else session,
-            path,
-            task,
-            remark=remark,
-        )
+        before = read_stored(source)
+        result = estimate_session(source, path, task, remark=remark)
+        after = None if before is None else read_stored(path)
+    change = None if before is None or after is None else change_between(before, after)
     plan = result.plan
     if as_json:
         print_json(
@@ -134,6 +138,7 @@ def estimate_command(
                 "calibration_id": plan.calibration.id,
                 "models": plan.models,
                 "lag_ms": lag_ms,
+                "change": change,
                 "tare": {
                     "source": plan.tare.source,
                     "begin_s": result.tare_s[0],
@@ -149,12 +154,31 @@ def estimate_command(
         f"({plan.calibration.id}), models {', '.join(plan.models)}, tare {plan.tare.source} "
         f"{result.tare_s[0]:.2f} to {result.tare_s[1]:.2f} s"
     )
+    say(f"look-ahead {lag_ms:g} ms{_describe(change)}")
     tell_findings(result.findings)
     for name, newtons in result.asked.items():
         remark(
             f"{SEEN[name]}: model {name!r} is not named, and is good for {newtons:.2f} N of the "
             "GRF here; the calibration offers it"
         )
+
+
+def _with_ending(out: Path) -> Path:
+    """Return where a session is written: programs tell a file's format by its ending."""
+    return out if out.suffix or out.exists() else out.with_name(f"{out.name}.parquet")
+
+
+def _describe(change: Change | None) -> str:
+    if change is None:
+        return ""
+    before = f" (before: {change.lag_before_ms:g} ms)"
+    if not change.frames:
+        return before
+    return (
+        f"{before}; GRF changes by {change.grf_rms_n:.2f} N (RMS), "
+        f"{change.grf_most_n:.2f} N at most, contact in {change.contact_frames} of "
+        f"{change.frames} frames"
+    )
 
 
 def _for_workers(named: str | None) -> Calibration | str | None:

@@ -66,6 +66,7 @@ def test_nothing_is_under_the_spindle_in_a_soak_and_after_the_end(recorded: Path
     [
         ("T01 laod", "says no step of a bench"),
         ("T09 load", "of a tile of T01"),
+        ("T01 500", "or a weight such as 500 g"),
         ("load", "says no step of a bench"),
         ("Soak", "says no step of a bench"),
     ],
@@ -86,3 +87,11 @@ def test_without_a_step_or_a_table_of_marks_it_is_no_bench(recorded: Path) -> No
     (recorded / "events.parquet").unlink()
     with pytest.raises(CalibrationError, match="not an indentation recording"):
         read_recordings([path])
+
+
+def test_a_mark_that_names_a_weight_is_a_step(recorded: Path) -> None:
+    newest, *others = session_in(recorded).events[1:]
+    path = marked(recorded, newest.model_copy(update={"label": "T01 500 g +-0.5 %"}), *others)
+    ((found,),) = read_recordings([path]).values()
+    assert found.indentation.phase[-1] == "500 g +-0.5 %"
+    assert found.indentation.under_spindle[-1]

@@ -1,0 +1,139 @@
+"""Dead weights: which one stood on a tile, and what the tile read while it did.
+
+A step names the weight and how far it may be off, `500 g +-0.5 %`. One that a kitchen scale or a
+force sensor has read is written the same way. The reading that counts is that of the end of the
+step, above the end of the rest before it, because the rubber goes on creeping for seconds.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from devices.errors import CalibrationError
+from service.estimation.fitting.bench.indentation import Indentation, place
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+GRAVITY_SIGMA = 0.0015
+"""Relative; gravity differs by 0.5 % between pole and equator, and 0.1 % by height."""
+TOLERANCE_PERCENT = 1.0
+"""Of a weight whose tolerance is not stated."""
+LEAST_NS = 2_000_000_000
+"""A shorter step or rest does not show whether the tile has settled."""
+_PART_NS = 1_000_000_000  # the end of a step, and its beginning, which are compared
+_READINGS_MIN = 10
+_WEIGHT = re.compile(
+    r"(?P<size>\d{1,6}(?:\.\d{1,6})?) ?(?P<unit>g|kg|N)"
+    r"(?: ?(?:\+-|±) ?(?P<off>\d{1,2}(?:\.\d{1,4})?) ?%)?"
+)
+_NEWTONS = {"g": 1e-3 * STANDARD_GRAVITY_M_S2, "kg": STANDARD_GRAVITY_M_S2, "N": 1.0}
+_HEAVIEST_N = 1000.0
+
+
+@dataclass(frozen=True)
+class Weight:
+    """A known force, with its standard uncertainty as a part of it."""
+
+    force_n: float
+    relative_sigma: float
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A weight on a tile, and the tile's pressure; in kPa above the rest before it.
+
+    Attributes:
+        text: the weight as it was written.
+        weight: its force.
+        gauge_kpa: mean over the last second.
+        noise_kpa: standard deviation of a reading in that second.
+        settle_kpa: mean of the last second less that of the first.
+        baseline_kpa: absolute pressure of the rest before it.
+    """
+
+    text: str
+    weight: Weight
+    gauge_kpa: float
+    noise_kpa: float
+    settle_kpa: float
+    baseline_kpa: float
+
+
+def parse_weight(text: str) -> Weight | None:
+    """Return the force of `500 g`, `0.5 kg +-1 %` or `4.9 N`; None: it names no weight."""
+    found = _WEIGHT.fullmatch(text.strip())
+    if found is None:
+        return None
+    force_n = float(found["size"]) * _NEWTONS[found["unit"]]
+    if not 0.0 < force_n <= _HEAVIEST_N:
+        return None
+    # A tolerance bounds the error: its standard uncertainty is that of a uniform distribution.
+    percent = TOLERANCE_PERCENT if found["off"] is None else float(found["off"])
+    gravity = 0.0 if found["unit"] == "N" else GRAVITY_SIGMA
+    return Weight(force_n, float(np.hypot(0.01 * percent / np.sqrt(3.0), gravity)))
+
+
+def has_weights(recording: Indentation) -> bool:
+    """Return whether any step of the tile is a weight."""
+    return any(parse_weight(str(phase)) for phase in np.unique(_steps(recording)))
+
+
+def holds(recording: Indentation) -> list[Hold]:
+    """Return every weight that stood on the tile, in order of time.
+
+    Raises:
+        CalibrationError: a step is too short or has no readings, none was a rest before it, or the
+            chip was at its end.
+    """
+    steps = _steps(recording)
+    begins = np.flatnonzero(np.append(True, steps[1:] != steps[:-1]))
+    ends = np.append(begins[1:], len(steps))
+    found: list[Hold] = []
+    baseline_kpa: float | None = None
+    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
+        text = str(steps[begin])
+        if text == "rest":
+            baseline_kpa, _, _ = _settled(recording, begin, end, text)
+        elif (weight := parse_weight(text)) is not None:
+            if baseline_kpa is None:
+                raise CalibrationError(
+                    f"there is no rest before the weight of {text}",
+                    where=place(recording),
+                    expected="a rest of 2 s or more with nothing on the tile",
+                    remedy="Record once more, and begin with an empty tile",
+                )
+            end_kpa, noise_kpa, settle_kpa = _settled(recording, begin, end, text)
+            found.append(
+                Hold(text, weight, end_kpa - baseline_kpa, noise_kpa, settle_kpa, baseline_kpa)
+            )
+    return found
+
+
+def _steps(recording: Indentation) -> np.ndarray:
+    """Return the step of every reading; empty where nothing is done with this tile."""
+    return np.where(recording.under_spindle, recording.phase, "")
+
+
+def _settled(recording: Indentation, begin: int, end: int, text: str) -> tuple[float, float, float]:
+    """Return mean and noise of the last second of a step, and what it moved since the first."""
+    t_ns, kpa = recording.t_ns[begin:end], recording.kpa[begin:end]
+    where, step = place(recording), "rest" if text == "rest" else f"weight of {text}"
+    if np.isinf(kpa).any():
+        raise CalibrationError(
+            f"the chip was at its end under the {step}",
+            where=where,
+            remedy="Leave this weight out: the tile's range ends below it",
+        )
+    known = np.isfinite(kpa)
+    first = kpa[known & (t_ns < t_ns[0] + _PART_NS)]
+    last = kpa[known & (t_ns > t_ns[-1] - _PART_NS)]
+    if t_ns[-1] - t_ns[0] < 0.9 * LEAST_NS or min(len(first), len(last)) < _READINGS_MIN:
+        raise CalibrationError(
+            f"the {step} lasted {1e-9 * (t_ns[-1] - t_ns[0]):.1f} s with {known.sum()} readings",
+            where=where,
+            expected=f"{1e-9 * LEAST_NS:g} s or more of readings",
+            remedy="Remove the marks of this step on the session's page, or record once more",
+        )
+    return float(last.mean()), float(last.std(ddof=1)), float(last.mean() - first.mean())

@@ -1,0 +1,224 @@
+"""A tile's curve from a few dead weights, with an interval that is as wide as they are few.
+
+The curve is a parabola through zero: five weights do not bear the third coefficient of the paper's
+cubic, which costs 1.5 times the interval and gains nothing (benchmarks/dead_weights.py). Residuals
+are taken relative to the force. The file states standard uncertainties, which estimates multiply by
+1.96; here they are widened by Student's t for the weights that are left over, so that the interval
+holds 95 of 100 new loads that have settled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import stdtrit
+
+from devices.arrays import Floats
+from devices.errors import CalibrationError
+from service.estimation.calibration import (
+    BASIS,
+    BandPoint,
+    TileCalibration,
+    WeightFacts,
+    WeightStep,
+)
+from service.estimation.effects import EffectName, Effects
+from service.estimation.fitting.bench.indentation import Indentation, place
+from service.estimation.fitting.bench.weights import Hold, holds
+from service.estimation.fitting.confidence import cubic_basis, curve_n
+from service.estimation.models.static import StaticCurves
+
+HOLDS_MIN = 5
+LEVELS_MIN = 4
+"""Different weights: three would leave the shape of the curve to a single one."""
+LEVEL_APART = 1.1
+"""Weights within a tenth of one another are one level."""
+SMALL_N = 2.0
+"""Below this force an error is absolute rather than relative."""
+RESIDUAL_MAX = 0.3
+"""Part of the force; six times the paper's scatter between loadings."""
+DRIFT_MAX_KPA = 2.0
+"""Of the unloaded pressure between the first and any later rest: as far as a dome that creeps by
+15 % may go. Each weight is taken above its own rest."""
+RANGE_MIN_KPA = 1.0
+TERMS = 2
+_BAND_STEPS = 10
+_NOT_SEEN: dict[EffectName, str] = {
+    "temperature": "dead weights show no change of temperature",
+    "gas": "dead weights show no fast load",
+    "rubber": "dead weights show no release",
+    "hysteresis": "dead weights show no slow stroke",
+}
+
+
+def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
+    """Fit the curve of one tile to all weights that stood on it, in one recording or several.
+
+    Raises:
+        CalibrationError: there are too few weights, or they show no curve.
+    """
+    where = ", ".join(place(recording) for recording in recordings)
+    per_file = [holds(recording) for recording in recordings]
+    steps = [step for found in per_file for step in found]
+    _refuse_too_few(steps, where)
+    drift_kpa = max(
+        max(abs(step.baseline_kpa - found[0].baseline_kpa) for step in found)
+        for found in per_file
+        if found
+    )
+    if drift_kpa > DRIFT_MAX_KPA:
+        raise CalibrationError(
+            f"the unloaded pressure drifts by {drift_kpa:.2f} kPa between rests",
+            where=where,
+            expected=f"at most {DRIFT_MAX_KPA:g} kPa",
+            remedy="Let the tile reach the room's temperature and rest longer between weights; "
+            "if it goes on falling, the dome leaks",
+        )
+    force_n = np.array([step.weight.force_n for step in steps])
+    gauge_kpa = np.array([step.gauge_kpa for step in steps])
+    high_kpa = float(gauge_kpa.max())
+    _refuse_no_rise(force_n, gauge_kpa, steps, where)
+    basis = cubic_basis(gauge_kpa, 0.0, high_kpa)[:, :TERMS]
+    weight = 1.0 / np.hypot(force_n, SMALL_N)
+    design = basis * weight[:, None]
+    (c1, c2), *_ = np.linalg.lstsq(design, force_n * weight, rcond=None)
+    residual_n = basis @ np.array([c1, c2]) - force_n
+    _refuse_contradictions(residual_n, force_n, steps, where)
+    freedom = len(steps) - TERMS
+    variance = float(((residual_n * weight) ** 2).sum() / freedom)
+    widened = float(stdtrit(freedom, 0.975)) / 1.96
+    scatter = widened * float(np.sqrt(variance))
+    if not min(c1, c1 + 2.0 * c2) > 0.0:
+        raise CalibrationError(
+            "the fitted curve is not monotonic: force would fall while pressure rises",
+            where=where,
+            remedy="Check what each weight is, and put them on the middle of the dome",
+        )
+    covariance = np.zeros((BASIS, BASIS))
+    covariance[:TERMS, :TERMS] = scatter**2 * np.linalg.inv(design.T @ design)
+    slope = (c1 + 2.0 * c2 * gauge_kpa / high_kpa) / high_kpa
+    settle = slope * np.array([step.settle_kpa for step in steps]) / force_n
+    # One scale weighs them all: their error does not average out.
+    scale = max(step.weight.relative_sigma for step in steps)
+    spread_n = force_n - force_n.mean()
+    tile = TileCalibration(
+        serial=recordings[0].serial,
+        p_input="gauge_kpa",
+        p_offset_kpa=0.0,
+        p_scale_kpa=high_kpa,
+        f_offset_n=0.0,
+        f_scale_n=1.0,
+        zero_mode="subtract_f0",
+        coefficients=(0.0, float(c1), float(c2), 0.0),
+        range_kpa=(0.0, high_kpa),
+        monotonic=True,
+        absolute_scale="measured",
+        covariance=tuple(map(tuple, covariance.tolist())),
+        relative_misfit=float(np.sqrt(scatter**2 + (settle**2).mean() + scale**2)),
+        loop_misfit_n=scatter * SMALL_N,
+        r2=float(1.0 - (residual_n**2).sum() / (spread_n**2).sum()),
+        rmse_n=float(np.sqrt((residual_n**2).mean())),
+        cv_rmse_n=_left_out_rms_n(design, force_n, weight, basis),
+        hysteresis_n=None,
+        repeats=len(steps),
+        baseline_kpa=float(np.mean([step.baseline_kpa for step in steps])),
+        noise_kpa=float(np.sqrt(np.mean([step.noise_kpa**2 for step in steps]))),
+        effects=Effects(refused=_NOT_SEEN),
+    )
+    return tile.model_copy(
+        update={
+            "weights": WeightFacts(
+                steps=tuple(
+                    WeightStep(
+                        weight=step.text,
+                        force_n=step.weight.force_n,
+                        gauge_kpa=step.gauge_kpa,
+                        noise_kpa=step.noise_kpa,
+                        settle_kpa=step.settle_kpa,
+                        residual_n=residual,
+                    )
+                    for step, residual in zip(steps, residual_n.tolist(), strict=True)
+                ),
+                baseline_drift_kpa=drift_kpa,
+                scale_sigma=scale,
+                band_95=_band(tile),
+            )
+        }
+    )
+
+
+def _band(tile: TileCalibration) -> tuple[BandPoint, ...]:
+    """Return the curve with the half widths that an estimate of a settled load states."""
+    gauge_kpa = np.linspace(0.0, tile.range_kpa[1], _BAND_STEPS + 1)
+    found = StaticCurves([tile]).force(gauge_kpa[:, None])
+    basis = cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
+    mean_n = 1.96 * np.sqrt(np.maximum(((basis @ np.array(tile.covariance)) * basis).sum(1), 0.0))
+    columns = (gauge_kpa, curve_n(tile, gauge_kpa), mean_n, 1.96 * found.fit_sigma_n[:, 0])
+    return tuple(
+        BandPoint(gauge_kpa=p, force_n=f, mean_n=mean, new_loading_n=new)
+        for p, f, mean, new in zip(*(column.tolist() for column in columns), strict=True)
+    )
+
+
+def _left_out_rms_n(design: Floats, force_n: Floats, weight: Floats, basis: Floats) -> float:
+    """Return the RMS error of the curve at weights that it was not fitted to."""
+    errors = []
+    for i in range(len(force_n)):
+        others = np.arange(len(force_n)) != i
+        found, *_ = np.linalg.lstsq(design[others], (force_n * weight)[others], rcond=None)
+        errors.append(float(basis[i] @ found - force_n[i]))
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def _refuse_too_few(steps: Sequence[Hold], where: str) -> None:
+    levels: list[float] = []
+    for force_n in sorted(step.weight.force_n for step in steps):
+        if not levels or force_n > LEVEL_APART * levels[-1]:
+            levels.append(force_n)
+    if len(steps) < HOLDS_MIN or len(levels) < LEVELS_MIN:
+        raise CalibrationError(
+            f"{len(steps)} weights on the tile, {len(levels)} of them different",
+            where=where,
+            expected=f"{HOLDS_MIN} or more, {LEVELS_MIN} of them different by a tenth or more",
+            remedy="Put more weights on it; two together are a third one",
+        )
+
+
+def _refuse_no_rise(force_n: Floats, gauge_kpa: Floats, steps: Sequence[Hold], where: str) -> None:
+    if not gauge_kpa.max() >= RANGE_MIN_KPA:
+        raise CalibrationError(
+            f"the tile reads {gauge_kpa.max():.2f} kPa at most under {force_n.max():.1f} N",
+            where=where,
+            expected=f"{RANGE_MIN_KPA:g} kPa or more",
+            remedy="Check that the weights stand on this tile's dome, and that it is sealed",
+        )
+    order = np.argsort(force_n)
+    for lighter, heavier in pairwise(order.tolist()):
+        is_apart = force_n[heavier] > 1.2 * force_n[lighter]
+        if is_apart and not gauge_kpa[heavier] > gauge_kpa[lighter]:
+            raise CalibrationError(
+                f"the tile reads {gauge_kpa[heavier]:.2f} kPa under {steps[heavier].text} and "
+                f"{gauge_kpa[lighter]:.2f} kPa under {steps[lighter].text}",
+                where=where,
+                expected="a pressure that rises with the weight",
+                remedy="Check what each weight is; if both are right, the tile's range ends there: "
+                "leave the heavier one out",
+            )
+
+
+def _refuse_contradictions(
+    residual_n: Floats, force_n: Floats, steps: Sequence[Hold], where: str
+) -> None:
+    off = residual_n / np.hypot(force_n, SMALL_N)
+    worst = int(np.argmax(np.abs(off)))
+    if abs(off[worst]) > RESIDUAL_MAX:
+        as_n = force_n[worst] + residual_n[worst]
+        raise CalibrationError(
+            f"the weight of {steps[worst].text} reads like {as_n:.2f} N, and is "
+            f"{force_n[worst]:.2f} N",
+            where=where,
+            expected=f"within {100 * RESIDUAL_MAX:.0f} % of the curve of all weights",
+            remedy="Check what was on the tile, and whether it stood on the middle of the dome",
+        )

@@ -1,0 +1,66 @@
+"""What a new estimate of a session changes in the one that it had."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from devices.arrays import Floats, Ints
+from storage.schema import CONTACT_UNKNOWN
+from storage.sessions.reader import SessionReader
+
+_COLUMNS = ("t_ns", "grf_n", "contact")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """GRF and contact of a session's frames, and the look-ahead that they were estimated with."""
+
+    lag_ms: float
+    t_ns: Ints
+    grf_n: Floats
+    contact: Ints
+
+
+@dataclass(frozen=True)
+class Change:
+    """Difference of two estimates of the same frames."""
+
+    lag_before_ms: float
+    frames: int
+    """Frames in both that have a GRF in both."""
+    grf_rms_n: float
+    grf_most_n: float
+    contact_frames: int
+    """Frames whose contact is another one."""
+
+
+def read_stored(path: Path) -> Stored | None:
+    """Return a session's estimates; None: it has none."""
+    with SessionReader(path) as session:
+        lag_ms = session.notes.get("lag_ms")
+        if not isinstance(lag_ms, int | float) or not session.has(*_COLUMNS):
+            return None
+        pieces = list(session.columns(*_COLUMNS))
+    if not pieces:
+        return None
+    t_ns, grf_n, contact = (np.concatenate([piece[name] for piece in pieces]) for name in _COLUMNS)
+    return Stored(float(lag_ms), t_ns, grf_n, contact)
+
+
+def change_between(before: Stored, after: Stored) -> Change:
+    """Compare the frames that both have."""
+    _, i, j = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
+    apart_n = after.grf_n[j].astype(np.float64) - before.grf_n[i]
+    known_n = apart_n[np.isfinite(apart_n)]
+    contacts = before.contact[i], after.contact[j]
+    is_known = (contacts[0] != CONTACT_UNKNOWN) & (contacts[1] != CONTACT_UNKNOWN)
+    return Change(
+        lag_before_ms=before.lag_ms,
+        frames=len(known_n),
+        grf_rms_n=float(np.sqrt((known_n**2).mean())) if len(known_n) else float("nan"),
+        grf_most_n=float(np.abs(known_n).max()) if len(known_n) else float("nan"),
+        contact_frames=int((is_known & (contacts[0] != contacts[1])).sum()),
+    )

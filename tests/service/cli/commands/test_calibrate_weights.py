@@ -1,0 +1,165 @@
+"""Dead weights on a tile: the interval holds another load, and the command guides to it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+import pytest
+
+from devices.arrays import Floats
+from devices.chips.compensation import Compensation
+from service.cli.commands import calibrate_live
+from service.estimation.calibration import Calibration
+from service.estimation.fitting.bench.indentation import Indentation
+from service.estimation.fitting.bench.weights import STANDARD_GRAVITY_M_S2, parse_weight
+from service.estimation.fitting.weights_fit import fit_weights
+from service.offline import weighing
+from service.offline.weighing import Action, Begin, Withdraw
+from service.sessions.calibration_file import calibration_of, write_calibration
+from storage.sessions.reader import SessionReader
+from tests.service.cli.outcome import Run, scene_text, static_only
+from tests.service.fake_node import FakeNode, Play
+from tests.service.running import Running
+
+pytestmark = pytest.mark.slow
+GRAMS = (200.0, 500.0, 1000.0, 1500.0, 2000.0)
+OTHERS_G = (300.0, 800.0, 1400.0)
+FIVE = "200g,500g,1kg,1.5kg,2kg"
+
+
+def put_on(path: Path, grams: tuple[float, ...]) -> None:
+    """A load that puts masses on the first tile: 8 s without, 9 s with each."""
+    rows = ["time_s,cell1_n"]
+    for number, each in enumerate(grams):
+        begin_s, force_n = 17.0 * number, 1e-3 * each * STANDARD_GRAVITY_M_S2
+        rows += [f"{begin_s},0", f"{begin_s + 8},0", f"{begin_s + 8.4},{force_n}"]
+        rows.append(f"{begin_s + 16.6},{force_n}")
+    path.write_text("\n".join([*rows, f"{17.0 * len(grams)},0", ""]))
+
+
+def follow(path: Path, weights: list[str]) -> Indentation:
+    """Tile T01 of a recording, with the steps that the guide has marked in it."""
+    with SessionReader(path) as session:
+        frames = [frames for frames, _ in session.batches()]
+        compensation = Compensation(session.info.tiles)
+    t_ns = np.concatenate([piece.t_ns for piece in frames])
+    kpa = np.concatenate([compensation.readable_kpa(piece)[:, 0] for piece in frames])
+    guide = weighing.Weighing("T01", weights)
+    phase = np.full(len(t_ns), "", dtype="<U20")
+    begins: list[int] = []
+    for begin in range(0, len(t_ns), 10):
+        rows = slice(begin, begin + 10)
+        for action in guide.push(1e-9 * t_ns[rows], kpa[rows]):
+            match action:
+                case Begin(label):
+                    phase[begin:] = label.removeprefix("T01 ")
+                    begins.append(begin)
+                case Withdraw():
+                    phase[begins.pop() :] = ""
+                case _:
+                    phase[begin:] = ""
+    assert guide.step == "done"
+    return Indentation(
+        serial="T01",
+        where=str(path),
+        t_ns=t_ns,
+        kpa=kpa,
+        reference_n=np.full(len(t_ns), np.nan),
+        phase=phase,
+        under_spindle=phase != "",
+        tadc=np.full(len(t_ns), np.nan),
+    )
+
+
+def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run) -> None:
+    Path("one.toml").write_text(static_only(scene_text("standing", 1)))
+    for name, grams in (("five", GRAMS), ("others", OTHERS_G)):
+        put_on(Path(f"{name}.csv"), grams)
+        asked = ("--scene", "one.toml", "--load", f"{name}.csv", "--truth", "--no-estimates")
+        assert run("simulate", *asked, "--out", f"{name}.parquet").code == 0
+    weights = calibrate_live.read_weights(FIVE, 0.5)
+    tile = fit_weights([follow(Path("five.parquet"), weights)])
+    made = Calibration(name="five", reference="weights", date="2026-11-25", tiles=(tile,))
+    write_calibration(Path("five.json"), made)
+    asked_for = ("--calibration", "five.json", "--out", "estimated.parquet")
+    assert run("estimate", "others.parquet", *asked_for).code == 0
+    table = pq.read_table("estimated.parquet")
+    force_n, sigma_n, true_n = (
+        np.stack(table[name].to_numpy().tolist())[:, 0]
+        for name in ("force_n", "force_sigma_n", "true_force_n")
+    )
+    for mass_g in OTHERS_G:
+        settled = _settled(true_n, 1e-3 * mass_g * STANDARD_GRAVITY_M_S2)
+        error_n, half_n = (force_n - true_n)[settled], 1.96 * sigma_n[settled]
+        assert (np.abs(error_n) <= half_n).mean() > 0.9, mass_g
+        assert half_n.mean() < 0.25 * true_n[settled].mean(), mass_g
+
+
+def _settled(true_n: Floats, force_n: float) -> npt.NDArray[np.intp]:
+    """Rows of a load, from half of its time on."""
+    rows = np.flatnonzero(np.abs(true_n - force_n) < 1e-3 * force_n)
+    return rows[len(rows) // 2 :]
+
+
+def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
+    run: Run, running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(weighing, "HOLD_S", weighing.REST_S)
+
+    class Followed(weighing.Weighing):
+        """A guide whose prompts somebody follows."""
+
+        def push(self, t_s: Floats, kpa: Floats) -> list[Action]:
+            # By now the prompt is there, and the marks before it are made.
+            known = parse_weight(self.weights[self.number]) if self.step == "put on" else None
+            if known is not None:
+                play.force_n = known.force_n
+            elif self.step == "empty":
+                play.force_n = 0.0
+            return super().push(t_s, kpa)
+
+    monkeypatch.setattr(calibrate_live, "Weighing", Followed)
+    monkeypatch.setenv("FOOTTILE_TOKEN", tared.running.shown["Authorization"].split()[-1])
+    asked: tuple[Any, ...] = ("--tile", "T01", "--weights", "10N,20N,40N,60N,80N")
+    with Play(tared, alive=True) as play:
+        outcome = run(
+            *("calibrate", "--live", *asked, "--out", "cal.json", "--yes"),
+            *("--server", running.url),
+        )
+    assert outcome.code == 0, outcome.err
+    found = calibration_of(Path("cal.json").read_bytes(), where="cal.json")
+    facts = found.tiles[0].weights
+    assert facts is not None
+    assert [step.force_n for step in facts.steps] == [10.0, 20.0, 40.0, 60.0, 80.0]
+    assert facts.band_95[-1].force_n == pytest.approx(80.0, abs=1.0)  # a newton a count
+    assert "80N" in outcome.out
+    (session,) = running.http.get("/sessions").json()["items"]
+    assert session["id"] in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--live",), "--live goes with --tile"),
+        (("--tile", "T01"), "no recording is named"),
+        (("x.parquet", "--tile", "T01"), "go with --live"),
+        (("--live", "--tile", "T01", "--weights", "200g,much"), "'much' is no weight"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    run: Run, arguments: tuple[str, ...], says: str
+) -> None:
+    run("calibrate", *arguments, "--out", "cal.json").fails(2, says)
+
+
+def test_a_calibration_that_a_node_cannot_use_is_refused_before_the_weights(
+    run: Run, running: Running, tared: FakeNode
+) -> None:
+    where = ("--out", "cal.json", "--server", running.url)
+    run("calibrate", "--live", "--tile", "T77", *where).fails(2, "no tile T77")
+    refused = run("calibrate", "--live", "--tile", "T01", "--assign", *where)
+    refused.fails(2, "--assign without tile T02")
