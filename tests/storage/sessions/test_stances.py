@@ -17,8 +17,14 @@ from storage.checked_table import write_table
 from storage.sessions.stances import STANCES, read_stances, stances_table, write_stances
 
 NAN = float("nan")
-HOP = Stance(1, 0, 10, 30, 5.0, 20, 0.5, 9e-8, -0.01, 0.02, 0.03, 3, 0, 0, 16, True, True)
-HIDDEN = Stance(2, 1, 50, 90, NAN, None, NAN, NAN, NAN, NAN, NAN, 2, 1, 3, 1, True, False)
+HOP = Stance(
+    *(1, 0, 10, 30, 2e-9, 5.0, 20, 0.5, 9e-8, 8e-9, -0.01, 0.02, 0.03, 0.001),
+    *(3, 0, 0, 16, True, True),
+)
+HIDDEN = Stance(
+    *(2, 1, 50, 90, NAN, NAN, None, NAN, NAN, NAN, NAN, NAN, NAN, NAN),
+    *(2, 1, 3, 1, True, False),
+)
 HASH = "0123456789abcdef" * 4
 
 
