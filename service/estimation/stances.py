@@ -32,6 +32,8 @@ STANCE_COLUMNS = (
 )
 """What is said of a stance, wherever one is written."""
 
+Z95 = 1.96
+"""Sigmas to each side of a 95 % interval."""
 EDGE_NS = 10_000_000
 """The slope of the GRF where a stance begins and ends is that over so long, within the stance."""
 _SLOPE_SIGMAS = 2.0
@@ -62,7 +64,8 @@ class Stance:
         cop_x_first_m: centre of pressure along x where it is first stated, in the foot frame.
         cop_x_last_m: where it is last stated.
         cop_x_range_m: greatest less least.
-        cop_x_range_sigma_m: standard uncertainty of that, for independent errors of the two.
+        cop_x_range_sigma_m: standard uncertainty of that, with errors of least and greatest
+            independent of one another.
         frames: that are there, from the first to the last.
         unknown_frames: of these, without a GRF.
         missing_frames: numbers between the first and the last that are not there.
@@ -298,8 +301,8 @@ class _Open:
     """The last frames, from one that is `EDGE_NS` before the last."""
     cop_x_m: tuple[float, float] | None = None
     """First and last."""
-    extremes_x_m: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """Least and greatest, each with its sigma."""
+    extremes_x_m: Floats | None = None
+    """(3, 2): least and greatest of the 95 % intervals' lower ends, of COP, of their upper ends."""
 
     def add_unsure(self, unsure: _Unsure) -> None:
         """Take frames in between."""
@@ -328,16 +331,15 @@ class _Open:
 
     def _follow(self, x_m: Floats, sigma_m: Floats) -> None:
         """Take centres of pressure that are stated."""
-        lowest, highest = int(np.argmin(x_m)), int(np.argmax(x_m))
-        least = float(x_m[lowest]), float(sigma_m[lowest])
-        greatest = float(x_m[highest]), float(sigma_m[highest])
-        if self.extremes_x_m is not None:
-            before = self.extremes_x_m
-            least = least if least[0] < before[0][0] else before[0]
-            greatest = greatest if greatest[0] > before[1][0] else before[1]
-        self.extremes_x_m = least, greatest
         first = float(x_m[0]) if self.cop_x_m is None else self.cop_x_m[0]
         self.cop_x_m = first, float(x_m[-1])
+        bounds_m = x_m - Z95 * sigma_m, x_m, x_m + Z95 * sigma_m
+        now_m = np.array([(of_m.min(), of_m.max()) for of_m in bounds_m])
+        if self.extremes_x_m is not None:
+            before_m = self.extremes_x_m
+            now_m[:, 0] = np.minimum(now_m[:, 0], before_m[:, 0])
+            now_m[:, 1] = np.maximum(now_m[:, 1], before_m[:, 1])
+        self.extremes_x_m = now_m
 
     def _integrate(self, force: _Force) -> None:
         joined = self.tail.cut(-1, None).followed_by(force)
@@ -379,13 +381,25 @@ class _Open:
         )
         return float(np.hypot(self.integrals[1], edges_n_s))
 
+    def _cop_range_m(self) -> tuple[float, float]:
+        """Return how far the centre of pressure went, and the standard uncertainty of that.
+
+        The greatest of all frames lies between the greatest lower and the greatest upper end of
+        their intervals, the least likewise: a doubtful frame may have gone furthest.
+        """
+        if self.extremes_x_m is None:
+            return np.nan, np.nan
+        low_m, x_m, high_m = self.extremes_x_m
+        sigmas_m = (high_m - low_m) / (2.0 * Z95)
+        return float(x_m[1] - x_m[0]), float(np.hypot(*sigmas_m))
+
     def closed(self, behind: _Frame | None) -> Stance:
         """What it was; `behind` is the next frame of which contact is known."""
         missing = self.last.seq - self.first.seq + 1 - self.frames
         hidden = self.peak is None or self.status & EstimateStatus.SATURATED
         peak_n, peak_t_ns, peak_sigma_n = self.peak or (np.nan, 0, np.nan)
         x_first_m, x_last_m = self.cop_x_m or (np.nan, np.nan)
-        least, greatest = self.extremes_x_m or ((np.nan, np.nan), (np.nan, np.nan))
+        range_m, range_sigma_m = self._cop_range_m()
         ended = self.last.borders(behind)
         gap_behind_s = _gap_s(self.last, behind) if ended else np.nan
         has_impulse = not (missing or self.unknown)
@@ -402,8 +416,8 @@ class _Open:
             impulse_sigma_n_s=self._impulse_sigma_n_s(gap_behind_s) if has_impulse else np.nan,
             cop_x_first_m=x_first_m,
             cop_x_last_m=x_last_m,
-            cop_x_range_m=greatest[0] - least[0],
-            cop_x_range_sigma_m=float(np.hypot(least[1], greatest[1])),
+            cop_x_range_m=range_m,
+            cop_x_range_sigma_m=range_sigma_m,
             frames=self.frames,
             unknown_frames=self.unknown,
             missing_frames=missing,

@@ -11,7 +11,7 @@ import { drawBand, drawBound, drawSeries } from "./series.js";
 
 const AXIS_PX = 26;
 const FOOT_PX = 6;
-const ROOM_PX = 240; // of the window, for what is above and below the plots
+const ROOM_PX = 200; // of the window, for what is above and below the plots
 const RIGHT_PX = 12;
 const FONT = "600 12px system-ui, sans-serif";
 const NAMES = [

@@ -73,6 +73,16 @@ def test_a_stance_has_peak_impulse_and_travel_of_its_frames() -> None:
     assert one.is_whole
 
 
+def test_a_doubtful_frame_may_have_gone_furthest() -> None:
+    x_m = [NAN, 0, 10, 9, NAN]
+    numbers, t_ns, columns = recording([0, 5, 5, 5, 0], [0, 1, 1, 1, 0], cop_x_m=x_m)
+    columns["cop_sigma_x_m"] = np.array([NAN, 0.0, 0.5, 2.0, NAN])
+    (one,) = stances_of(numbers, t_ns, columns)
+    assert one.cop_x_range_m == 10.0
+    greatest_high, greatest_low = 9 + 1.96 * 2.0, 10 - 1.96 * 0.5
+    assert one.cop_x_range_sigma_m == pytest.approx((greatest_high - greatest_low) / (2 * 1.96))
+
+
 def test_the_trapezoids_are_as_wide_as_the_frames_are_apart() -> None:
     (one,) = stances_of(*recording([0, 2, 2, 4, 0], [0, 1, 1, 1, 0], t_ms=[0, 2, 12, 14, 16]))
     assert one.impulse_n_s == pytest.approx(2 * 0.010 + 3 * 0.002, rel=1e-15)
