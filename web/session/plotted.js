@@ -34,6 +34,8 @@ export class Plotted {
     this.view = null;
     this.plots = new Plots();
     this.plots.changed = () => this.draw();
+    this.plots.name = `${session.name || session.id}, ${session.node}`;
+    this.other = null; // beside it
     this.readout = new Readout();
     this.numbers = new Numbers(session.id);
     this.stances = new Stances((index) => { this.goTo(index); this.stances.bringIntoView(); });
@@ -135,6 +137,13 @@ export class Plotted {
     if (!this.plots.stances.length) return;
     const { StanceOverlay } = await loadModule(() => import("./stance_overlay.js"));
     this.overlay = new StanceOverlay(this.session.id, this.plots.stances, (index) => this.goTo(index));
+    quietly(() => this.overlay.layBeside(this.other));
+  }
+
+  /** Another session, whose stances are drawn beside ours; null: none. @param {{id: string, name: string} | null} other */
+  layBeside(other) {
+    this.other = other;
+    quietly(() => this.overlay?.layBeside(other));
   }
 
   listen() {
