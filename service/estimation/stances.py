@@ -145,7 +145,8 @@ class Stances:
         if len(sure) == len(columns["contact"]):
             known = slice(None)  # as nearly always, and nothing is copied
         part = columns["part"][known] if "part" in columns else np.zeros(len(sure), np.uint16)
-        frames = _Frames(seq[known], t_ns[known], part, columns["contact"][known] == 1)
+        loaded = columns["contact"][known] == 1
+        frames = _Frames(seq[known], t_ns[known], part, loaded, columns["grf_n"][known])
         for first, end in frames.runs():
             begin, last = frames.at(first), frames.at(end - 1)
             if first or not begin.goes_on_from(self._seen):
@@ -154,9 +155,8 @@ class Stances:
                 since = int(sure[first])
                 if self._open is None:
                     self._number += 1
-                    begun = begin.borders(self._seen)
-                    gap_s = _gap_s(begin, self._seen) if begun else np.nan
-                    self._open = _Open(self._number, begin, begun=begun, gap_before_s=gap_s)
+                    before = self._seen if begin.borders(self._seen) else None
+                    self._open = _Open(self._number, begin, before)
                 else:
                     self._open.add_unsure(self._unsure)
                     since = 0
@@ -183,6 +183,7 @@ class _Frame:
     t_ns: int
     part: int
     loaded: bool
+    grf_n: float
 
     def is_seen_from(self, other: _Frame | None) -> bool:
         """Can the foot not have been lifted, or put down, between two frames and not be seen?"""
@@ -201,11 +202,6 @@ class _Frame:
         return abs(self.seq - other.seq) == 1
 
 
-def _gap_s(frame: _Frame, other: _Frame | None) -> float:
-    """Return the time between two frames; NaN without another."""
-    return np.nan if other is None else abs(frame.t_ns - other.t_ns) * 1e-9
-
-
 @dataclass(frozen=True)
 class _Frames:
     """Those of a batch, (n,) each."""
@@ -214,10 +210,12 @@ class _Frames:
     t_ns: Times
     part: npt.NDArray[Any]
     loaded: npt.NDArray[np.bool_]
+    grf_n: Floats
 
     def at(self, i: int) -> _Frame:
         """One of them."""
-        return _Frame(int(self.seq[i]), int(self.t_ns[i]), int(self.part[i]), bool(self.loaded[i]))
+        seq, t_ns, part = int(self.seq[i]), int(self.t_ns[i]), int(self.part[i])
+        return _Frame(seq, t_ns, part, bool(self.loaded[i]), float(self.grf_n[i]))
 
     def runs(self) -> Iterator[tuple[int, int]]:
         """First frame of each stance or flight, and the one behind its last."""
@@ -264,17 +262,18 @@ class _Force:
         """Return some of these frames."""
         return _Force(self.t_ns[begin:end], self.grf_n[begin:end], self.sigma_n[begin:end])
 
-    def crossing_sigma_s(self, edge: int, inside: int) -> float:
+    def crossing_sigma_s(self, edge: int, inside: int, outside: _Frame) -> float:
         """Return the uncertainty of the instant of an edge, due to that of the force.
 
         Args:
             edge: index of the stance's first or last frame.
             inside: index of the frame `EDGE_NS` further inside.
+            outside: the frame beside the stance.
         """
-        change_n = self.grf_n[inside] - self.grf_n[edge]
+        change_n = self.grf_n[inside] - outside.grf_n
         if not change_n > _SLOPE_SIGMAS * np.hypot(self.sigma_n[inside], self.sigma_n[edge]):
             return np.nan
-        lasted_s = abs(int(self.t_ns[inside]) - int(self.t_ns[edge])) * 1e-9
+        lasted_s = abs(int(self.t_ns[inside]) - outside.t_ns) * 1e-9
         return float(self.sigma_n[edge] / change_n * lasted_s)
 
 
@@ -284,9 +283,8 @@ class _Open:
 
     number: int
     first: _Frame
-    begun: bool
-    gap_before_s: float
-    """From the frame before it to its first; NaN if it has not begun."""
+    before: _Frame | None
+    """The frame before it, without contact; None if its beginning was not seen."""
     last: _Frame = field(init=False)
     frames: int = 0
     unknown: int = 0
@@ -331,6 +329,7 @@ class _Open:
 
     def _follow(self, x_m: Floats, sigma_m: Floats) -> None:
         """Take centres of pressure that are stated."""
+        x_m, sigma_m = x_m.astype(np.float64), sigma_m.astype(np.float64)
         first = float(x_m[0]) if self.cop_x_m is None else self.cop_x_m[0]
         self.cop_x_m = first, float(x_m[-1])
         bounds_m = x_m - Z95 * sigma_m, x_m, x_m + Z95 * sigma_m
@@ -357,28 +356,33 @@ class _Open:
         begin = int(np.searchsorted(tail.t_ns, tail.t_ns[-1] - EDGE_NS, side="right")) - 1
         self.tail = tail.cut(max(0, begin), None)
 
-    def _duration_sigma_s(self, gap_behind_s: float) -> float:
+    def _duration_sigma_s(self, behind: _Frame | None) -> float:
         """Return what the frames' distance and the force's uncertainty make of the duration.
 
         The foot was put down at any instant between the frame before the stance and its first
         frame, and lifted likewise: half of both gaps is missing in the duration, on average.
         """
         head, tail = self.head, self.tail
-        for force in (head, tail):
-            if force.t_ns[-1] - force.t_ns[0] < EDGE_NS:
-                return np.nan
-        gaps_s = self.gap_before_s, gap_behind_s
+        if self.before is None or behind is None or head.t_ns[-1] - head.t_ns[0] < EDGE_NS:
+            return np.nan
+        gaps_s = self._gaps_s(behind)
         missing_s = 0.5 * sum(gaps_s)
         spread_s = np.hypot(*gaps_s) / np.sqrt(12.0)
         # An offset of the force moves both edges, outwards or inwards: they add up.
-        force_s = head.crossing_sigma_s(0, -1) + tail.crossing_sigma_s(-1, 0)
+        force_s = head.crossing_sigma_s(0, -1, self.before) + tail.crossing_sigma_s(-1, 0, behind)
         return float(np.sqrt(missing_s**2 + spread_s**2 + force_s**2))
 
-    def _impulse_sigma_n_s(self, gap_behind_s: float) -> float:
-        """Return the integral of the force's sigma, with what is cut off at the edges."""
-        edges_n_s = 0.5 * np.nansum(
-            [self.gap_before_s * self.head.grf_n[0], gap_behind_s * self.tail.grf_n[-1]]
+    def _gaps_s(self, behind: _Frame | None) -> tuple[float, float]:
+        """Return the time to the frames beside the stance; 0 where there is none."""
+        return (
+            0.0 if self.before is None else (self.first.t_ns - self.before.t_ns) * 1e-9,
+            0.0 if behind is None else (behind.t_ns - self.last.t_ns) * 1e-9,
         )
+
+    def _impulse_sigma_n_s(self, behind: _Frame | None) -> float:
+        """Return the integral of the force's sigma, with what is cut off at the edges."""
+        before_s, behind_s = self._gaps_s(behind)
+        edges_n_s = 0.5 * (before_s * self.head.grf_n[0] + behind_s * self.tail.grf_n[-1])
         return float(np.hypot(self.integrals[1], edges_n_s))
 
     def _cop_range_m(self) -> tuple[float, float]:
@@ -400,20 +404,19 @@ class _Open:
         peak_n, peak_t_ns, peak_sigma_n = self.peak or (np.nan, 0, np.nan)
         x_first_m, x_last_m = self.cop_x_m or (np.nan, np.nan)
         range_m, range_sigma_m = self._cop_range_m()
-        ended = self.last.borders(behind)
-        gap_behind_s = _gap_s(self.last, behind) if ended else np.nan
+        behind = behind if self.last.borders(behind) else None
         has_impulse = not (missing or self.unknown)
         return Stance(
             number=self.number,
             part=self.first.part,
             begin_t_ns=self.first.t_ns,
             end_t_ns=self.last.t_ns,
-            duration_sigma_s=self._duration_sigma_s(gap_behind_s),
+            duration_sigma_s=self._duration_sigma_s(behind),
             peak_grf_n=np.nan if hidden else peak_n,
             peak_t_ns=None if hidden else peak_t_ns,
             peak_sigma_n=np.nan if hidden else peak_sigma_n,
             impulse_n_s=self.integrals[0] if has_impulse else np.nan,
-            impulse_sigma_n_s=self._impulse_sigma_n_s(gap_behind_s) if has_impulse else np.nan,
+            impulse_sigma_n_s=self._impulse_sigma_n_s(behind) if has_impulse else np.nan,
             cop_x_first_m=x_first_m,
             cop_x_last_m=x_last_m,
             cop_x_range_m=range_m,
@@ -422,6 +425,6 @@ class _Open:
             unknown_frames=self.unknown,
             missing_frames=missing,
             estimate_status=self.status,
-            begun=self.begun,
-            ended=ended,
+            begun=self.before is not None,
+            ended=behind is not None,
         )

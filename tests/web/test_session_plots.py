@@ -178,7 +178,7 @@ def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
     assert set(names) == set(FORMATS) - {"parquet", "arrow", "csv"}
     with page.expect_download() as further:
         page.click("#download-xdf")
-    assert further.value.suggested_filename == f"{walk.id}.xdf"
+    assert further.value.suggested_filename == f"walk_{walk.id}_1.000s-to-1.200s.xdf"
     assert further.value.path().read_bytes().startswith(b"XDF:")
     with page.expect_download() as picture:
         page.click("#picture")

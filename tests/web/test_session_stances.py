@@ -26,6 +26,18 @@ _IN_SIGHT = """([selector, downTo]) => {
   return box.top >= 0 && box.top + downTo <= innerHeight;
 }"""
 _KEYS_SHOWN = "[...document.querySelectorAll('kbd')].filter((key) => key.checkVisibility()).length"
+FIGURES = (
+    ("peak", "peak_grf_n", 1, 1, "N"),
+    ("duration", "duration_s", 1e3, 0, "ms"),
+    ("impulse", "impulse_n_s", 1, 2, "N s"),
+    ("travel", "cop_x_range_m", 1e3, 1, "mm"),
+)
+SIGMAS = {
+    "peak_grf_n": "peak_sigma_n",
+    "duration_s": "duration_sigma_s",
+    "impulse_n_s": "impulse_sigma_n_s",
+    "cop_x_range_m": "cop_x_range_sigma_m",
+}
 FORCE_PX = 200  # from the upper edge of the plots to the foot of the first
 
 
@@ -60,12 +72,14 @@ def opened(open_page: OpenPage, session: Recording, **options: Any) -> Page:
 
 
 def says(page: Page, stance: dict[str, Any]) -> None:
-    """The line above the plots tells of this one, and so does the table."""
-    line = page.locator("#stance-says")
-    expect(line).to_contain_text(f"Stance {stance['number']} of {STANCES}")
-    expect(line).to_contain_text(f"peak {stance['peak_grf_n']:.1f} N ±")
-    expect(line).to_contain_text(f"{1e3 * stance['duration_s']:.0f} ms")
-    expect(line).to_contain_text(f"{stance['impulse_n_s']:.2f} N s")
+    """The headline tells of this one, with its intervals, and so does the table."""
+    says = f"Stance {stance['number']} of {STANCES}"
+    expect(page.locator("#stance-says")).to_contain_text(says)
+    for figure, stem, factor, decimals, unit in FIGURES:
+        value = f"{factor * stance[stem]:.{decimals}f}"
+        half = f"{1.96 * factor * stance[SIGMAS[stem]]:.{decimals}f}"
+        shown = page.locator(f"#stance-figures [data-figure={figure}] dd")
+        expect(shown).to_have_text(f"{value} ± {half} {unit}")
     row = page.locator("#stances-rows [aria-current]")
     expect(row).to_have_attribute("data-stance", str(stance["number"]))
 
@@ -99,7 +113,7 @@ def test_a_stance_is_gone_to_from_its_row_and_by_keys(
     begin_ns = int(hops.column("t_ns")[0])
     rows = page.locator("#stances-rows tr")
     expect(rows).to_have_count(STANCES)
-    expect(rows.nth(11)).to_contain_text(f"{stances[11]['peak_grf_n']:.1f} N")
+    expect(rows.nth(11)).to_contain_text(f"{stances[11]['peak_grf_n']:.1f} ±")
 
     def shows(number: int) -> None:
         says(page, stances[number - 1])
@@ -120,7 +134,9 @@ def test_on_a_phone_the_peak_of_the_third_stance_is_three_taps_away(
     hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
 ) -> None:
     page = opened(open_page, hops, **PHONE)
-    expect(page.locator("#stance-says")).to_have_text(f"Step through {STANCES} stances")
+    expect(page.locator("#stance-says")).to_have_text(
+        f"{STANCES} stances: medians of {STANCES} whole"
+    )
     assert page.evaluate(_IN_SIGHT, ["#stance-line", 44])  # without scrolling
     for stance in stances[:3]:
         page.tap("#stance-next")

@@ -38,7 +38,7 @@ export class CopPaths {
   /**
    * @param {{number: number} | null} chosen
    * @param {{percent: number[], copX: (number | null)[], copY: (number | null)[]} | null} frames of it
-   * @param {{number: number} | null | undefined} hovered
+   * @param {import("./stance_overlay.js").Curve | null | undefined} hovered
    * @param {{percent: number[], overlaid: number, spread: object} | null} beside stances of another session
    */
   draw(colours, chosen, frames, hovered, beside = null) {

@@ -95,9 +95,10 @@ RAMP_N = [0.0, *(10.0 * k for k in range(1, 11)), *(10.0 * k for k in range(10, 
 def test_a_duration_is_as_uncertain_as_its_two_gaps_and_the_force_at_its_edges() -> None:
     t_ms = [0.0, *(6.0 + 2 * k for k in range(20)), 48.0]
     (one,) = stances_of(*recording(RAMP_N, [0, *[1] * 20, 0], t_ms=t_ms))
-    # 6 ms before it and 4 ms behind it; 1 N of sigma at 10 N, where 50 N come and go in 10 ms.
+    # 6 ms before it and 4 ms behind it, and 1 N of sigma at 10 N. From the frame beside it to 10 ms
+    # within, 60 N come in 16 ms and go in 14 ms.
     missing_s, spread_s = 0.5 * (6e-3 + 4e-3), np.hypot(6e-3, 4e-3) / np.sqrt(12.0)
-    force_s = 2 * 1.0 / 50.0 * 10e-3
+    force_s = 1.0 / 60.0 * (16e-3 + 14e-3)
     expected_s = np.sqrt(missing_s**2 + spread_s**2 + force_s**2)
     assert one.duration_sigma_s == pytest.approx(expected_s)
 
@@ -111,7 +112,7 @@ def test_of_an_edge_that_was_not_seen_no_uncertainty_is_stated(contact: list[int
 
 
 def test_of_a_force_that_rises_too_slowly_no_uncertainty_is_stated() -> None:
-    slowly_n = [0.0, *(10.0 + 0.1 * k for k in range(20)), *RAMP_N[11:]]
+    slowly_n = [9.0, *(10.0 + 0.1 * k for k in range(20)), *RAMP_N[11:]]
     (one,) = stances_of(*recording(slowly_n, [0, *[1] * (len(slowly_n) - 2), 0]))
     assert np.isnan(one.duration_sigma_s)
 
