@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -97,6 +98,7 @@ def in_view(page: Page, stance: dict[str, Any], begin_ns: int) -> None:
 
 def middle_of(page: Page, stance: dict[str, Any], hops: Recording) -> tuple[float, float]:
     """Where it is in the plots of a narrow screen, which show everything."""
+    page.evaluate("scrollTo(0, 0)")  # the buttons that zoom are below the plots
     box = settled(page).bounding_box()
     duration_s = float(page.locator("#plots").get_attribute("data-to") or "nan")
     left, right = 40, 12  # axis, and air
@@ -277,3 +279,58 @@ def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(
     })"""
     found = open_page(f"{server.url}/nodes").evaluate(asked)
     assert found == [[2, 1], [0, 1], [0, 2], [2, -1]]  # before it and after it; -1: there is none
+
+
+def test_a_link_that_was_copied_leads_to_the_same_stance_and_cursor(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops)
+    page.context.grant_permissions(["clipboard-read"])
+    page.locator("#stances-rows tr").nth(2).click()
+    says(page, stances[2])
+    page.keyboard.press("ArrowRight")
+    peak_s = (stances[2]["peak_t_ns"] - int(hops.column("t_ns")[0])) * 1e-9
+    readout = page.locator("#readout")
+    expect(readout).to_have_attribute("data-time-s", re.compile(f"^{peak_s + 0.002:.4f}"))
+    page.click("#copy-link")
+    expect(page.locator("#notices")).to_contain_text("Link copied")
+    there = open_page(page.evaluate("navigator.clipboard.readText()"))
+    says(there, stances[2])
+    at_s = readout.get_attribute("data-time-s") or ""
+    expect(there.locator("#readout")).to_have_attribute("data-time-s", at_s)
+    for name in ("data-from", "data-to"):
+        expect(settled(there)).to_have_attribute(name, settled(page).get_attribute(name) or "")
+
+
+def test_the_chosen_stance_is_exported_from_its_first_frame_to_its_last(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops)
+    choice = page.locator("#download-range")
+    expect(choice.locator("option")).to_have_text(["all of it"])
+    page.locator("#stances-rows tr").nth(2).click()
+    says(page, stances[2])
+    page.click("#export")
+    expect(choice).to_be_focused()
+    expect(choice).to_have_value("stance")
+    with page.expect_download() as download:
+        page.click("#download-csv")
+    lines = download.value.path().read_text("utf-8").splitlines()
+    rows = [line for line in lines if not line.startswith("#")][1:]
+    assert len(rows) == stances[2]["frames"]
+    begin_s = (stances[2]["begin_t_ns"] - int(hops.column("t_ns")[0])) * 1e-9
+    assert download.value.suggested_filename.startswith(f"hops_{hops.id}_{begin_s:.3f}s-to-")
+    choice.select_option("view")
+    expect(page.locator("#download-csv")).to_have_attribute("href", re.compile("start_s="))
+
+
+def test_of_an_even_number_of_stances_the_median_is_between_the_two_in_the_middle(
+    server: Running, open_page: OpenPage
+) -> None:
+    asked = """import("/static/session/stances.js").then(({ medianOf }) => {
+      const of = (...peaks) => medianOf(peaks.map((peak) => ({ peak_grf_n: peak, duration_s: null })));
+      return [of(1, 5, 2), of(4, 1, 2, null, 9), of(null), of()]
+        .map((all) => [all.peak_grf_n, all.duration_s]);
+    })"""
+    found = open_page(f"{server.url}/nodes").evaluate(asked)
+    assert found == [[2, None], [3, None], [None, None], [None, None]]

@@ -138,6 +138,7 @@ export class Stances {
     const whole = this.stances.filter((one) => one.is_whole);
     const all = `${many} stance${many === "1" ? "" : "s"}`;
     setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : whole.length > 1 ? `${all}: medians of ${whole.length.toLocaleString("en-GB")} whole` : all);
+    byId("stance-level").hidden = !stance;
     const shown = stance ?? medianOf(whole);
     for (const figure of FIGURES) {
       const [value, interval] = figureOf(shown, figure);
