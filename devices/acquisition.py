@@ -160,7 +160,7 @@ class Acquisition:
                     self.missed_slots += late
                     if late >= STALLED_AFTER:
                         frame_status |= FrameStatus.OVERRUN
-                    # A loop that is a little late in each frame misses slots, too: lateness adds up.
+                    # One that is a little late in each frame misses slots, too: lateness adds up.
                     slot_ns += (late + 1) * self._expected_ns
                     slot_ns = min(slot_ns, now_ns + STALLED_AFTER * self._expected_ns)
                 self._fill(columns, row, self._array.scan(), frame_status)

@@ -60,9 +60,9 @@ def bin_columns(tiles: int, *, estimated: bool) -> dict[str, np.dtype[Any]]:
     """Names and types of what is said of a bin.
 
     `missing` are numbers of frames that are not there, in the bin or just before it.
-    `grf_low_n_min` and `grf_high_n_max` bound the 95 % intervals of all its frames, those of `cop_x`
-    and `cop_y` likewise; `grf_unknown` counts frames without a GRF. Without estimates there are raw counts in place of forces, and of
-    the rest what is known of frames.
+    `grf_low_n_min` and `grf_high_n_max` bound the 95 % intervals of all its frames, those of
+    `cop_x` and `cop_y` likewise; `grf_unknown` counts frames without a GRF. Without estimates there
+    are raw counts in place of forces, and of the rest what is known of frames.
     """
     names = [name for name in _SAME if estimated or not _is_estimate(name)]
     for i in range(tiles):

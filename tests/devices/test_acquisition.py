@@ -309,9 +309,7 @@ def test_a_loop_that_was_stalled_says_how_many_frames_it_missed() -> None:
 def test_a_loop_that_is_a_little_slow_misses_slots_without_a_stall() -> None:
     one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     expected_hz = 1.03e9 / FRAME_NS
-    one.stream = Acquisition(
-        one.array, one.array.tiles, one.clock, ANCHOR, expected_hz=expected_hz
-    )
+    one.stream = Acquisition(one.array, one.array.tiles, one.clock, ANCHOR, expected_hz=expected_hz)
     begin_ns = one.clock.now_ns()
     batch = one.run_for(0.9)
     slots = (one.clock.now_ns() - begin_ns) * 1e-9 * expected_hz

@@ -177,13 +177,14 @@ def test_another_session_is_told_by_its_node_and_has_its_stances_and_tiles(
     expect(page.locator("#legend [data-kind=own]")).to_have_text("hops, left")
     expect(page.locator("#legend [data-kind=beside]")).to_have_text("others, right")
     page.locator("#overlay-card").scroll_into_view_if_needed()
-    expect(page.locator("#overlay-legend [data-kind=beside]")).to_contain_text("others, right: mean")
+    spread = page.locator("#overlay-legend [data-kind=beside]")
+    expect(spread).to_contain_text("others, right: mean")
     page.click("#as-heat")
     panels = page.locator("#plots")
     expect(panels).to_have_attribute("data-panels", re.compile("tiles beside-tiles"))
     page.select_option("#beside", "")
     expect(panels).not_to_have_attribute("data-panels", re.compile("beside-tiles"))
-    expect(page.locator("#overlay-legend [data-kind=beside]")).to_have_count(0)
+    expect(spread).to_have_count(0)
 
 
 def test_tiles_are_compared_by_serial_and_those_of_another_foot_in_their_order(
@@ -191,7 +192,8 @@ def test_tiles_are_compared_by_serial_and_those_of_another_foot_in_their_order(
 ) -> None:
     asked = """import("/static/session/beside.js").then(({ Beside }) => {
       const matched = (own, theirs) => {
-        const beside = new Beside({ name: "", columns: {}, ask: null, onChange: null, onError: null });
+        const nobody = { ask: null, onChange: null, onError: null };
+        const beside = new Beside({ name: "", columns: {}, ...nobody });
         const names = theirs.map((_, i) => [`force_n_${i}_max`, []]);
         beside.answer = { serials: theirs, columns: Object.fromEntries(names) };
         beside.matchTiles(own);

@@ -221,7 +221,8 @@ def test_the_rate_that_was_reached_stands_beside_that_of_the_node(
     expect(page.locator("#about")).to_contain_text(" of 500 frames/s")
     asked = """Promise.all([import("/static/session/header.js"), import("/static/session/bins.js")])
       .then(([{ rateWords }, { Bins }]) => {
-        const rate = (...missed) => rateWords({ missed_slots: missed[0] }, { rateHz: 434.2 }, 449.1);
+        const whole = { rateHz: 434.2 };
+        const rate = (missed) => rateWords({ missed_slots: missed }, whole, 449.1);
         const columns = {
           t_first_s: [0, 1, 10], t_last_s: [0.9, 2, 11], part: [0, 0, 1],
           frames: [90, 71, 101], missing: [0, 40, 0],
@@ -242,8 +243,9 @@ def test_the_rate_that_was_reached_stands_beside_that_of_the_node(
 def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(
     server: Running, open_page: OpenPage
 ) -> None:
-    asked = """Promise.all([import("/static/session/panels.js"), import("/static/session/readout.js"),
-      import("/static/session/bins.js")]).then(([{ panelsOf }, { readingsOf }, { Bins }]) => {
+    asked = """Promise.all(
+      ["panels", "readout", "bins"].map((name) => import(`/static/session/${name}.js`)),
+    ).then(([{ panelsOf }, { readingsOf }, { Bins }]) => {
         const said = (y) => {
           const columns = {
             t_first_s: [0, 1], t_last_s: [0, 1], frames: [1, 1], missing: [0, 0], part: [0, 0],

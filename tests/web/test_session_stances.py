@@ -328,7 +328,8 @@ def test_of_an_even_number_of_stances_the_median_is_between_the_two_in_the_middl
     server: Running, open_page: OpenPage
 ) -> None:
     asked = """import("/static/session/stances.js").then(({ medianOf }) => {
-      const of = (...peaks) => medianOf(peaks.map((peak) => ({ peak_grf_n: peak, duration_s: null })));
+      const of = (...peaks) =>
+        medianOf(peaks.map((peak) => ({ peak_grf_n: peak, duration_s: null })));
       return [of(1, 5, 2), of(4, 1, 2, null, 9), of(null), of()]
         .map((all) => [all.peak_grf_n, all.duration_s]);
     })"""
