@@ -255,7 +255,8 @@ def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(
             for (const end of ["min", "max"]) columns[`${name}_${end}`] = [1, 2];
           }
           for (const axis of ["x", "y"]) {
-            for (const end of ["low_m_min", "high_m_max"]) columns[`cop_${axis}_${end}`] = [1, 2];
+            columns[`cop_${axis}_low_m_min`] = [0.5, 1];
+            columns[`cop_${axis}_high_m_max`] = [1.5, 3];
           }
           columns.cop_y_m_min = columns.cop_y_m_max = y;
           const columnsOf = (name) => ({ [`${name}_min`]: [1, 1], [`${name}_max`]: [1, 1] });
