@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from devices.errors import DamagedFileError
+from devices.errors import DamagedFileError, OtherVersionError
 from service.estimation.stances import STANCE_COLUMNS, Stance
 from storage.checked_table import write_table
 from storage.sessions.stances import STANCES, read_stances, stances_table, write_stances
@@ -84,4 +84,12 @@ def test_another_table_is_refused(tmp_path: Path) -> None:
         read_stances(path)
     pq.write_table(stances_table(()), path)  # without a hash
     with pytest.raises(DamagedFileError, match="no table of stances"):
+        read_stances(path)
+
+
+def test_a_table_of_another_version_is_told_from_a_damaged_one(tmp_path: Path) -> None:
+    path = tmp_path / "stances.parquet"
+    older = written(path).drop_columns(["duration_sigma_s"])
+    write_stances(path, older, frames_sha256=HASH)
+    with pytest.raises(OtherVersionError, match="another version of foottile wrote it"):
         read_stances(path)
