@@ -32,7 +32,10 @@ BATCH_NS = 25_000_000
 """Length of a batch: at 10 ms two fifths of a message would be header (performance.md)."""
 
 STALLED_AFTER = 3
-"""A loop without a set rate was stalled if it takes this many periods longer than usual."""
+"""A loop without a set rate was stalled, which is flagged, if it misses so many slots at once.
+
+By so many periods it may be ahead of its slots, too: that makes up for frames that take longer.
+"""
 
 _BATCH_FRAMES_MAX = 64  # more than any schedule takes in `BATCH_NS`; columns are made for so many
 _AGE_MAX_US = 2**31 - 1  # an int32 holds no more
@@ -85,7 +88,7 @@ class Acquisition:
         clock: virtual or real.
         anchor: the stream's UTC.
         rate_hz: frames a second; 0: as fast as the schedule allows.
-        expected_hz: what rate that is, to tell when the loop was stalled; 0: do not tell.
+        expected_hz: what rate that is, to count slots that were not sampled; 0: do not count.
         servo: its position goes with the frames.
         is_new: the array was identified again in a running node: the first frame says so.
         keeper: keeps frames while their batch is being filled. Readings that are out of range are
@@ -108,7 +111,10 @@ class Acquisition:
         lead_end_ns: int | None = None,
     ) -> None:
         self.missed_slots = 0
-        """Slots without a frame, because the loop was late."""
+        """Slots that were not sampled, because the loop was late.
+
+        Slots follow one another in the set rate, or without one in the expected rate.
+        """
         self._array = array
         self._clock = clock
         self._anchor = anchor
@@ -150,11 +156,13 @@ class Acquisition:
                     slot_ns += self._period_ns
                 elif self._expected_ns:
                     now_ns = self._clock.now_ns()
-                    missed = (now_ns - slot_ns) // self._expected_ns - 1
-                    if missed >= STALLED_AFTER:
-                        self.missed_slots += missed
+                    late = max(0, now_ns - slot_ns) // self._expected_ns
+                    self.missed_slots += late
+                    if late >= STALLED_AFTER:
                         frame_status |= FrameStatus.OVERRUN
-                    slot_ns = now_ns
+                    # One that is a little late in each frame misses slots, too: lateness adds up.
+                    slot_ns += (late + 1) * self._expected_ns
+                    slot_ns = min(slot_ns, now_ns + STALLED_AFTER * self._expected_ns)
                 self._fill(columns, row, self._array.scan(), frame_status)
                 row += 1
             if row:

@@ -223,6 +223,10 @@ class DamagedFileError(FileFormatError):
     """A file is not what was written: its hash is of other bytes, or it is no file at all."""
 
 
+class OtherVersionError(FileFormatError):
+    """A file that is made from others has the columns of another version: it is made again."""
+
+
 class DamagedFramesError(FileFormatError):
     """Frames `seq_first` to `seq_last` on disk do not agree with their checksum."""
 

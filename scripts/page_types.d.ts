@@ -3,7 +3,7 @@
 interface Session {
   id: string; name: string; node: string; state: string; complete: boolean | "lossy"; problem: string | null;
   started_t_ns: number; stopped_t_ns: number | null; duration_s: number; frames: number; pending_frames: number;
-  waits_for: "frames" | "end" | null; lost: Record<string, number>; tail_frames_max: number; marks: number;
+  waits_for: "frames" | "end" | null; lost: Record<string, number>; tail_frames_max: number; missed_slots: number; marks: number;
   bytes: number | null; sha256: string | null; parts: object[]; subject: string; notes: string; tags: string[];
   take: string | null; scene: string; calibration_id: string | null; absolute_scale: "measured" | "assumed" | null;
   said: string;
@@ -49,7 +49,7 @@ interface TilePoint { timeS: number; tiles: Record<string, (number | null)[]> | 
 
 /** Of GET /sessions/ID/array. */
 interface Dressed {
-  node: string; tiles: Tile[]; servo: object | null; calibration: object | null; lag_ms: number | null;
+  node: string; tiles: Tile[]; servo: object | null; nominal_rate_hz: number; calibration: object | null; lag_ms: number | null;
   estimates_problem: string | null;
 }
 

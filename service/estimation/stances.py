@@ -20,17 +20,24 @@ from devices.arrays import Floats, Times
 from service.estimation.estimates import EstimateStatus
 from service.estimation.foot import UNKNOWN, UNSEEN_NS
 
-GATHERED = ("contact", "grf_n", "grf_sigma_n", "cop_x_m", "estimate_status")
+GATHERED = ("contact", "grf_n", "grf_sigma_n", "cop_x_m", "cop_sigma_x_m", "estimate_status")
 """Columns of estimates that stances are made of; of a session of several parts `part` as well."""
 
 STANCE_COLUMNS = (
-    *("number", "part", "begin_t_ns", "end_t_ns", "duration_s"),
-    *("peak_grf_n", "peak_t_ns", "peak_sigma_n", "impulse_n_s"),
-    *("cop_x_first_m", "cop_x_last_m", "cop_x_range_m"),
+    *("number", "part", "begin_t_ns", "end_t_ns", "duration_s", "duration_sigma_s"),
+    *("peak_grf_n", "peak_t_ns", "peak_sigma_n", "impulse_n_s", "impulse_sigma_n_s"),
+    *("cop_x_first_m", "cop_x_last_m", "cop_x_range_m", "cop_x_range_sigma_m"),
     *("frames", "unknown_frames", "missing_frames", "estimate_status"),
     *("begun", "ended", "is_whole"),
 )
 """What is said of a stance, wherever one is written."""
+
+Z95 = 1.96
+"""Sigmas to each side of a 95 % interval."""
+EDGE_NS = 10_000_000
+"""The slope of the GRF where a stance begins and ends is that over so long, within the stance."""
+_SLOPE_SIGMAS = 2.0
+"""A change of the GRF over `EDGE_NS` that is smaller, in sigmas of it, gives no slope."""
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
@@ -44,15 +51,21 @@ class Stance:
         part: of the session, in which it was.
         begin_t_ns: UTC of its first frame.
         end_t_ns: UTC of its last.
+        duration_sigma_s: standard uncertainty of the duration (docs/method.md); NaN if the frame
+            before or behind the stance is missing, or if the GRF rises or falls too slowly there.
         peak_grf_n: greatest GRF of those known; NaN if none is, or if a tile was saturated: the
             peak was in what is not known then.
         peak_t_ns: UTC of the first frame of that GRF; None without a peak.
         peak_sigma_n: standard uncertainty of the GRF in that frame.
         impulse_n_s: integral of the GRF by the trapezoidal rule, in newton seconds; NaN if a frame
             is missing or without a GRF, for no line is drawn across it.
+        impulse_sigma_n_s: standard uncertainty of the impulse, for errors of the GRF that are the
+            same in all frames of the stance.
         cop_x_first_m: centre of pressure along x where it is first stated, in the foot frame.
         cop_x_last_m: where it is last stated.
         cop_x_range_m: greatest less least.
+        cop_x_range_sigma_m: standard uncertainty of that, with errors of least and greatest
+            independent of one another.
         frames: that are there, from the first to the last.
         unknown_frames: of these, without a GRF.
         missing_frames: numbers between the first and the last that are not there.
@@ -65,13 +78,16 @@ class Stance:
     part: int
     begin_t_ns: int
     end_t_ns: int
+    duration_sigma_s: float
     peak_grf_n: float
     peak_t_ns: int | None
     peak_sigma_n: float
     impulse_n_s: float
+    impulse_sigma_n_s: float
     cop_x_first_m: float
     cop_x_last_m: float
     cop_x_range_m: float
+    cop_x_range_sigma_m: float
     frames: int
     unknown_frames: int
     missing_frames: int
@@ -129,7 +145,8 @@ class Stances:
         if len(sure) == len(columns["contact"]):
             known = slice(None)  # as nearly always, and nothing is copied
         part = columns["part"][known] if "part" in columns else np.zeros(len(sure), np.uint16)
-        frames = _Frames(seq[known], t_ns[known], part, columns["contact"][known] == 1)
+        loaded = columns["contact"][known] == 1
+        frames = _Frames(seq[known], t_ns[known], part, loaded, columns["grf_n"][known])
         for first, end in frames.runs():
             begin, last = frames.at(first), frames.at(end - 1)
             if first or not begin.goes_on_from(self._seen):
@@ -138,7 +155,8 @@ class Stances:
                 since = int(sure[first])
                 if self._open is None:
                     self._number += 1
-                    self._open = _Open(self._number, begin, begun=begin.borders(self._seen))
+                    before = self._seen if begin.borders(self._seen) else None
+                    self._open = _Open(self._number, begin, before)
                 else:
                     self._open.add_unsure(self._unsure)
                     since = 0
@@ -165,6 +183,7 @@ class _Frame:
     t_ns: int
     part: int
     loaded: bool
+    grf_n: float
 
     def is_seen_from(self, other: _Frame | None) -> bool:
         """Can the foot not have been lifted, or put down, between two frames and not be seen?"""
@@ -191,10 +210,12 @@ class _Frames:
     t_ns: Times
     part: npt.NDArray[Any]
     loaded: npt.NDArray[np.bool_]
+    grf_n: Floats
 
     def at(self, i: int) -> _Frame:
         """One of them."""
-        return _Frame(int(self.seq[i]), int(self.t_ns[i]), int(self.part[i]), bool(self.loaded[i]))
+        seq, t_ns, part = int(self.seq[i]), int(self.t_ns[i]), int(self.part[i])
+        return _Frame(seq, t_ns, part, bool(self.loaded[i]), float(self.grf_n[i]))
 
     def runs(self) -> Iterator[tuple[int, int]]:
         """First frame of each stance or flight, and the one behind its last."""
@@ -216,24 +237,70 @@ class _Unsure:
         self.status |= int(np.bitwise_or.reduce(status))
 
 
+@dataclass(frozen=True)
+class _Force:
+    """GRF of consecutive frames, (n,) each."""
+
+    t_ns: Times
+    grf_n: Floats
+    sigma_n: Floats
+
+    @classmethod
+    def none(cls) -> _Force:
+        """Return those of no frames."""
+        return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
+
+    def followed_by(self, other: _Force) -> _Force:
+        """Return these frames, then the others."""
+        return _Force(
+            np.append(self.t_ns, other.t_ns),
+            np.append(self.grf_n, other.grf_n),
+            np.append(self.sigma_n, other.sigma_n),
+        )
+
+    def cut(self, begin: int | None, end: int | None) -> _Force:
+        """Return some of these frames."""
+        return _Force(self.t_ns[begin:end], self.grf_n[begin:end], self.sigma_n[begin:end])
+
+    def crossing_sigma_s(self, edge: int, inside: int, outside: _Frame) -> float:
+        """Return the uncertainty of the instant of an edge, due to that of the force.
+
+        Args:
+            edge: index of the stance's first or last frame.
+            inside: index of the frame `EDGE_NS` further inside.
+            outside: the frame beside the stance.
+        """
+        change_n = self.grf_n[inside] - outside.grf_n
+        if not change_n > _SLOPE_SIGMAS * np.hypot(self.sigma_n[inside], self.sigma_n[edge]):
+            return np.nan
+        lasted_s = abs(int(self.t_ns[inside]) - outside.t_ns) * 1e-9
+        return float(self.sigma_n[edge] / change_n * lasted_s)
+
+
 @dataclass
 class _Open:
     """The present stance: what its frames so far come to."""
 
     number: int
     first: _Frame
-    begun: bool
+    before: _Frame | None
+    """The frame before it, without contact; None if its beginning was not seen."""
     last: _Frame = field(init=False)
     frames: int = 0
     unknown: int = 0
     status: int = 0
-    impulse_n_s: float = 0.0
+    integrals: tuple[float, float] = (0.0, 0.0)
+    """Of the GRF and of its sigma over time, in newton seconds."""
     peak: tuple[float, int, float] | None = None
     """GRF, instant and sigma."""
-    end: tuple[Times, Floats] = field(default_factory=lambda: (np.empty(0, np.int64), np.empty(0)))
-    """Instant and GRF of the last frame."""
-    cop_x_m: tuple[float, float, float, float] | None = None
-    """First, last, least and greatest."""
+    head: _Force = field(default_factory=_Force.none)
+    """The first frames, up to one that is `EDGE_NS` behind the first."""
+    tail: _Force = field(default_factory=_Force.none)
+    """The last frames, from one that is `EDGE_NS` before the last."""
+    cop_x_m: tuple[float, float] | None = None
+    """First and last."""
+    extremes_x_m: Floats | None = None
+    """(3, 2): least and greatest of the 95 % intervals' lower ends, of COP, of their upper ends."""
 
     def add_unsure(self, unsure: _Unsure) -> None:
         """Take frames in between."""
@@ -250,50 +317,114 @@ class _Open:
         self.frames += len(grf_n)
         self.unknown += int(np.count_nonzero(~there))
         self.status |= int(np.bitwise_or.reduce(columns["estimate_status"][rows]))
-        self._integrate(t_ns, grf_n)
+        self._integrate(_Force(t_ns, grf_n, columns["grf_sigma_n"][rows].astype(np.float64)))
         if there.any():
             at = int(np.argmax(np.where(there, grf_n, -np.inf)))
             if self.peak is None or grf_n[at] > self.peak[0]:
                 sigma_n = float(columns["grf_sigma_n"][rows][at])
                 self.peak = float(grf_n[at]), int(t_ns[at]), sigma_n
-        x_m = columns["cop_x_m"][rows]
-        x_m = x_m[np.isfinite(x_m) & ~unsure]
-        if len(x_m):
-            first, least, greatest = float(x_m[0]), float(x_m.min()), float(x_m.max())
-            if self.cop_x_m is not None:
-                first = self.cop_x_m[0]
-                least, greatest = min(least, self.cop_x_m[2]), max(greatest, self.cop_x_m[3])
-            self.cop_x_m = first, float(x_m[-1]), least, greatest
+        stated = np.isfinite(columns["cop_x_m"][rows]) & ~unsure
+        if stated.any():
+            self._follow(columns["cop_x_m"][rows][stated], columns["cop_sigma_x_m"][rows][stated])
 
-    def _integrate(self, t_ns: Times, grf_n: Floats) -> None:
-        t_ns, grf_n = np.append(self.end[0], t_ns), np.append(self.end[1], grf_n)
-        trapezoids = (grf_n[1:] + grf_n[:-1]) * 0.5 * (np.diff(t_ns) * 1e-9)
+    def _follow(self, x_m: Floats, sigma_m: Floats) -> None:
+        """Take centres of pressure that are stated."""
+        x_m, sigma_m = x_m.astype(np.float64), sigma_m.astype(np.float64)
+        first = float(x_m[0]) if self.cop_x_m is None else self.cop_x_m[0]
+        self.cop_x_m = first, float(x_m[-1])
+        bounds_m = x_m - Z95 * sigma_m, x_m, x_m + Z95 * sigma_m
+        now_m = np.array([(of_m.min(), of_m.max()) for of_m in bounds_m])
+        if self.extremes_x_m is not None:
+            before_m = self.extremes_x_m
+            now_m[:, 0] = np.minimum(now_m[:, 0], before_m[:, 0])
+            now_m[:, 1] = np.maximum(now_m[:, 1], before_m[:, 1])
+        self.extremes_x_m = now_m
+
+    def _integrate(self, force: _Force) -> None:
+        joined = self.tail.cut(-1, None).followed_by(force)
+        steps_s = np.diff(joined.t_ns) * 1e-9
         # One after the other, so that it does not matter how frames come in batches.
-        self.impulse_n_s = float(np.add.accumulate(np.append(self.impulse_n_s, trapezoids))[-1])
-        self.end = t_ns[-1:], grf_n[-1:]
+        grf_n_s, sigma_n_s = (
+            float(np.add.accumulate(np.append(sum_, (of[1:] + of[:-1]) * 0.5 * steps_s))[-1])
+            for sum_, of in zip(self.integrals, (joined.grf_n, joined.sigma_n), strict=True)
+        )
+        self.integrals = grf_n_s, sigma_n_s
+        if not len(self.head.t_ns) or self.head.t_ns[-1] - self.first.t_ns < EDGE_NS:
+            end = int(np.searchsorted(force.t_ns, self.first.t_ns + EDGE_NS)) + 1
+            self.head = self.head.followed_by(force.cut(0, end))
+        tail = self.tail.followed_by(force)
+        begin = int(np.searchsorted(tail.t_ns, tail.t_ns[-1] - EDGE_NS, side="right")) - 1
+        self.tail = tail.cut(max(0, begin), None)
+
+    def _duration_sigma_s(self, behind: _Frame | None) -> float:
+        """Return what the frames' distance and the force's uncertainty make of the duration.
+
+        The foot was put down at any instant between the frame before the stance and its first
+        frame, and lifted likewise: half of both gaps is missing in the duration, on average.
+        """
+        head, tail = self.head, self.tail
+        if self.before is None or behind is None or head.t_ns[-1] - head.t_ns[0] < EDGE_NS:
+            return np.nan
+        gaps_s = self._gaps_s(behind)
+        missing_s = 0.5 * sum(gaps_s)
+        spread_s = np.hypot(*gaps_s) / np.sqrt(12.0)
+        # An offset of the force moves both edges, outwards or inwards: they add up.
+        force_s = head.crossing_sigma_s(0, -1, self.before) + tail.crossing_sigma_s(-1, 0, behind)
+        return float(np.sqrt(missing_s**2 + spread_s**2 + force_s**2))
+
+    def _gaps_s(self, behind: _Frame | None) -> tuple[float, float]:
+        """Return the time to the frames beside the stance; 0 where there is none."""
+        return (
+            0.0 if self.before is None else (self.first.t_ns - self.before.t_ns) * 1e-9,
+            0.0 if behind is None else (behind.t_ns - self.last.t_ns) * 1e-9,
+        )
+
+    def _impulse_sigma_n_s(self, behind: _Frame | None) -> float:
+        """Return the integral of the force's sigma, with what is cut off at the edges."""
+        before_s, behind_s = self._gaps_s(behind)
+        edges_n_s = 0.5 * (before_s * self.head.grf_n[0] + behind_s * self.tail.grf_n[-1])
+        return float(np.hypot(self.integrals[1], edges_n_s))
+
+    def _cop_range_m(self) -> tuple[float, float]:
+        """Return how far the centre of pressure went, and the standard uncertainty of that.
+
+        The greatest of all frames lies between the greatest lower and the greatest upper end of
+        their intervals, the least likewise: a doubtful frame may have gone furthest.
+        """
+        if self.extremes_x_m is None:
+            return np.nan, np.nan
+        low_m, x_m, high_m = self.extremes_x_m
+        sigmas_m = (high_m - low_m) / (2.0 * Z95)
+        return float(x_m[1] - x_m[0]), float(np.hypot(*sigmas_m))
 
     def closed(self, behind: _Frame | None) -> Stance:
         """What it was; `behind` is the next frame of which contact is known."""
         missing = self.last.seq - self.first.seq + 1 - self.frames
         hidden = self.peak is None or self.status & EstimateStatus.SATURATED
         peak_n, peak_t_ns, peak_sigma_n = self.peak or (np.nan, 0, np.nan)
-        x_first_m, x_last_m, least_m, greatest_m = self.cop_x_m or (np.nan,) * 4
+        x_first_m, x_last_m = self.cop_x_m or (np.nan, np.nan)
+        range_m, range_sigma_m = self._cop_range_m()
+        behind = behind if self.last.borders(behind) else None
+        has_impulse = not (missing or self.unknown)
         return Stance(
             number=self.number,
             part=self.first.part,
             begin_t_ns=self.first.t_ns,
             end_t_ns=self.last.t_ns,
+            duration_sigma_s=self._duration_sigma_s(behind),
             peak_grf_n=np.nan if hidden else peak_n,
             peak_t_ns=None if hidden else peak_t_ns,
             peak_sigma_n=np.nan if hidden else peak_sigma_n,
-            impulse_n_s=np.nan if missing or self.unknown else self.impulse_n_s,
+            impulse_n_s=self.integrals[0] if has_impulse else np.nan,
+            impulse_sigma_n_s=self._impulse_sigma_n_s(behind) if has_impulse else np.nan,
             cop_x_first_m=x_first_m,
             cop_x_last_m=x_last_m,
-            cop_x_range_m=greatest_m - least_m,
+            cop_x_range_m=range_m,
+            cop_x_range_sigma_m=range_sigma_m,
             frames=self.frames,
             unknown_frames=self.unknown,
             missing_frames=missing,
             estimate_status=self.status,
-            begun=self.begun,
-            ended=self.last.borders(behind),
+            begun=self.before is not None,
+            ended=behind is not None,
         )

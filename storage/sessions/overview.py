@@ -20,14 +20,14 @@ from typing import Any, Self
 import numpy as np
 import pyarrow as pa
 
-from devices.errors import DamagedFileError
+from devices.errors import DamagedFileError, OtherVersionError
 from storage.durable import open_own, read_errors, whole_file
 from storage.sessions.pyramid import FACTOR, ROWS, Bins, bin_columns, joined, on_axis
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 OVERVIEW_NAME = "overview.arrow"
 _KEY, _CHECK_KEY = b"foottile.overview", b"foottile.overview_sha256"
-_VERSION = 1
+_VERSION = 2
 Types = Mapping[str, np.dtype[Any]]
 _PIECE = 4096
 """Bins that are read, and proven, at a time."""
@@ -94,11 +94,16 @@ class Index:
         """The same, read.
 
         Raises:
-            ValueError: it is none, or of another version.
+            ValueError: it is none.
+            OtherVersionError: another version wrote it.
         """
         content: dict[str, Any] = json.loads(text)
         if (content["version"], content["rows"], content["factor"]) != (_VERSION, ROWS, FACTOR):
-            raise ValueError(f"version {content['version']}")
+            raise OtherVersionError(
+                f"another version of foottile wrote it: {content['version']}",
+                expected=f"version {_VERSION}",
+                remedy="Nothing: it is made again from the frames",
+            )
         pieces = tuple(Piece(*row) for row in content["pieces"])
         return cls(
             content["frames_sha256"],
@@ -187,6 +192,7 @@ def open_overview(path: Path) -> Overview:
     Raises:
         FileNotFoundError: there is none.
         DamagedFileError: it is not what was written.
+        OtherVersionError: another version wrote it.
         StorageError: it cannot be read now.
     """
     # Not through Python's file: Arrow reads a footer on a thread of its own, and a process that
@@ -205,6 +211,7 @@ class Overview:
 
     Raises:
         DamagedFileError: it is not what was written.
+        OtherVersionError: another version wrote it.
     """
 
     def __init__(self, source: pa.NativeFile, *, where: str) -> None:
@@ -212,6 +219,9 @@ class Overview:
         try:
             self._file = pa.ipc.open_file(source)
             self.index = _index_of(self._file)
+        except OtherVersionError:
+            source.close()
+            raise
         except Exception as error:  # damaged bytes may cause any error
             source.close()
             raise self._damaged(error) from error

@@ -34,6 +34,7 @@ _SAME = (
     *("t_first_ns", "t_last_ns", "part", "frames", "missing", "frame_status"),
     *("grf_n_min", "grf_n_max", "grf_low_n_min", "grf_high_n_max", "grf_at_least_n_max"),
     *("grf_unknown", "cop_x_m_min", "cop_x_m_max", "cop_y_m_min", "cop_y_m_max"),
+    *("cop_x_low_m_min", "cop_x_high_m_max", "cop_y_low_m_min", "cop_y_high_m_max"),
     *("angle_rad_min", "angle_rad_max", "contact", "estimate_status"),
 )
 """What is said of a bin, whatever the array; and of each tile what follows."""
@@ -59,9 +60,9 @@ def bin_columns(tiles: int, *, estimated: bool) -> dict[str, np.dtype[Any]]:
     """Names and types of what is said of a bin.
 
     `missing` are numbers of frames that are not there, in the bin or just before it.
-    `grf_low_n_min` and `grf_high_n_max` bound the 95 % intervals of all its frames, `grf_unknown`
-    counts frames without a GRF. Without estimates there are raw counts in place of forces, and of
-    the rest what is known of frames.
+    `grf_low_n_min` and `grf_high_n_max` bound the 95 % intervals of all its frames, those of
+    `cop_x` and `cop_y` likewise; `grf_unknown` counts frames without a GRF. Without estimates there
+    are raw counts in place of forces, and of the rest what is known of frames.
     """
     names = [name for name in _SAME if estimated or not _is_estimate(name)]
     for i in range(tiles):
@@ -84,7 +85,8 @@ def frame_columns(*, estimated: bool) -> tuple[str, ...]:
         return (*same, "padc")
     return (
         *same,
-        *("grf_n", "grf_sigma_n", "grf_at_least_n", "cop_x_m", "cop_y_m", "angle_rad"),
+        *("grf_n", "grf_sigma_n", "grf_at_least_n", "angle_rad"),
+        *("cop_x_m", "cop_y_m", "cop_sigma_x_m", "cop_sigma_y_m"),
         *("contact", "estimate_status", "force_n"),
     )
 
@@ -112,14 +114,10 @@ def bins_of_frames(frames: Mapping[str, Array], before: int | None = None) -> Bi
     }
     estimated = "grf_n" in frames
     if estimated:
-        grf_n, sigma_n = (frames[name].astype(np.float32) for name in ("grf_n", "grf_sigma_n"))
-        half_n = np.float32(INTERVAL_95) * sigma_n
         contact = frames["contact"]
         bins |= {
-            "grf_low_n_min": grf_n - half_n,
-            "grf_high_n_max": grf_n + half_n,
             "grf_at_least_n_max": frames["grf_at_least_n"].astype(np.float32),
-            "grf_unknown": np.isnan(grf_n).astype(np.uint32),
+            "grf_unknown": np.isnan(frames["grf_n"]).astype(np.uint32),
             "contact": np.select(
                 [contact == CONTACT_UNKNOWN, contact == 0], [UNKNOWN, WITHOUT], WITH
             ).astype(np.uint8),
@@ -127,6 +125,10 @@ def bins_of_frames(frames: Mapping[str, Array], before: int | None = None) -> Bi
         }
         for name in ("grf_n", "cop_x_m", "cop_y_m", "angle_rad"):
             bins |= _extremes(name, frames[name].astype(np.float32))
+        bins |= _interval("grf_{}_n", frames["grf_n"], frames["grf_sigma_n"])
+        for axis in ("x", "y"):
+            place_m, sigma_m = frames[f"cop_{axis}_m"], frames[f"cop_sigma_{axis}_m"]
+            bins |= _interval(f"cop_{axis}_{{}}_m", place_m, sigma_m)
     for i in range(frames["status"].shape[1]):
         bins[f"status_{i}"] = frames["status"][:, i]
         if estimated:
@@ -140,6 +142,13 @@ def bins_of_frames(frames: Mapping[str, Array], before: int | None = None) -> Bi
 
 def _extremes(name: str, values: Array) -> Bins:
     return {f"{name}_min": values, f"{name}_max": values}
+
+
+def _interval(name: str, values: Array, sigmas: Array) -> Bins:
+    """Return the ends of 95 % intervals: `name` has a place for `low` and `high`."""
+    middle = values.astype(np.float32)
+    half = np.float32(INTERVAL_95) * sigmas.astype(np.float32)
+    return {f"{name.format('low')}_min": middle - half, f"{name.format('high')}_max": middle + half}
 
 
 def merged(bins: Bins, count: int) -> Bins:

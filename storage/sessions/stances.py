@@ -13,7 +13,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from devices.errors import DamagedFileError
+from devices.errors import DamagedFileError, OtherVersionError
 from storage.checked_table import read_table, write_table
 from storage.schema import Column
 
@@ -29,13 +29,16 @@ STANCES = (
     Column("begin_t_ns", pa.int64(), "ns", "t_ns of its first frame"),
     Column("end_t_ns", pa.int64(), "ns", "t_ns of its last frame"),
     Column("duration_s", _F64, "s", "from the first frame to the last"),
+    Column("duration_sigma_s", _F64, "s", "its standard uncertainty; null if an edge is not seen"),
     Column("peak_grf_n", _F64, "N", "greatest GRF known; null if none is, or a tile was saturated"),
     Column("peak_t_ns", pa.int64(), "ns", "t_ns of the first frame with that GRF"),
     Column("peak_sigma_n", _F64, "N", "standard uncertainty of the GRF in that frame"),
     Column("impulse_n_s", _F64, "N s", "integral of the GRF; null if a frame or a GRF is missing"),
+    Column("impulse_sigma_n_s", _F64, "N s", "its standard uncertainty"),
     Column("cop_x_first_m", _F64, "m", "cop_x_m where it is first stated"),
     Column("cop_x_last_m", _F64, "m", "cop_x_m where it is last stated"),
     Column("cop_x_range_m", _F64, "m", "greatest cop_x_m less the least"),
+    Column("cop_x_range_sigma_m", _F64, "m", "its standard uncertainty"),
     Column("frames", pa.uint32(), "1", "frames that are there, first and last included"),
     Column("unknown_frames", pa.uint32(), "1", "of these, without a GRF"),
     Column("missing_frames", pa.uint32(), "1", "numbers in between that are not there"),
@@ -104,15 +107,23 @@ def read_stances(path: Path) -> StoredStances:
     Raises:
         FileNotFoundError: there is none.
         DamagedFileError: it is not what was written, or no table of stances.
+        OtherVersionError: its columns are those of another version.
         StorageError: it cannot be read now.
     """
     read = read_table(path)
     said = read.table.schema.metadata or {}
-    if not read.is_proven or FRAMES_HASH_KEY not in said or not read.table.schema.equals(SCHEMA):
+    if not read.is_proven or FRAMES_HASH_KEY not in said:
         raise DamagedFileError(
             "is no table of stances",
             where=str(path),
-            expected="columns " + ", ".join(column.name for column in STANCES) + ", with a hash",
+            expected="a table with the hash of its frames",
             remedy="Delete it: it is made again from the frames",
+        )
+    if not read.table.schema.equals(SCHEMA):
+        raise OtherVersionError(
+            "another version of foottile wrote it, with other columns",
+            where=str(path),
+            expected="columns " + ", ".join(SCHEMA.names),
+            remedy="Nothing: it is made again from the frames",
         )
     return StoredStances(read.table, said[FRAMES_HASH_KEY].decode("ascii", "replace"))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from devices.errors import FileFormatError, StorageError
+from devices.errors import FileFormatError, OtherVersionError, StorageError
 from storage.clock.file import CLOCK_NAME, StoredClock, read_clock
 from storage.file_hash import sha256_of
 from storage.intervals import NO_END, Intervals
@@ -256,6 +256,9 @@ def _check_stances(report: SessionReport, path: Path) -> None:
         stored = read_stances(path)
     except FileNotFoundError:
         return
+    except OtherVersionError as error:
+        report.unproven.append(f"{path.name}: {error.what}; it is made again")
+        return
     except (FileFormatError, StorageError) as error:
         report.problems.append(f"{path.name}: {error.what}; deleted, it is made again")
         return
@@ -271,6 +274,9 @@ def _check_overview(report: SessionReport, path: Path) -> None:
                 overview.bins(level, None, None)
             frames_sha256 = overview.index.frames_sha256
     except FileNotFoundError:
+        return
+    except OtherVersionError as error:
+        report.unproven.append(f"{path.name}: {error.what}; it is made again")
         return
     except (FileFormatError, StorageError) as error:
         report.problems.append(f"{path.name}: {error.what}; deleted, it is made again")

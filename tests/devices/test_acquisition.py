@@ -304,3 +304,15 @@ def test_a_loop_that_was_stalled_says_how_many_frames_it_missed() -> None:
     assert after.frame_status[0] & FrameStatus.OVERRUN
     assert not (after.frame_status[1:] & FrameStatus.OVERRUN).any()
     assert after.seq[0] == before.seq[-1] + 1  # what was not taken never had a number
+
+
+def test_a_loop_that_is_a_little_slow_misses_slots_without_a_stall() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
+    expected_hz = 1.03e9 / FRAME_NS
+    one.stream = Acquisition(one.array, one.array.tiles, one.clock, ANCHOR, expected_hz=expected_hz)
+    begin_ns = one.clock.now_ns()
+    batch = one.run_for(0.9)
+    slots = (one.clock.now_ns() - begin_ns) * 1e-9 * expected_hz
+    assert one.stream.missed_slots == pytest.approx(slots - len(batch), abs=1)
+    assert one.stream.missed_slots > 5
+    assert not (batch.frame_status & FrameStatus.OVERRUN).any()

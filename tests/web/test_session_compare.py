@@ -169,6 +169,50 @@ def test_another_session_is_laid_over_by_start_contact_or_mark_and_says_how_far_
     beside(again)
 
 
+def test_another_session_is_told_by_its_node_and_has_its_stances_and_tiles(
+    compared: Recording, other: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(compared, **{"with": other.id}))
+    beside(page)
+    expect(page.locator("#legend [data-kind=own]")).to_have_text("hops, left")
+    expect(page.locator("#legend [data-kind=beside]")).to_have_text("others, right")
+    page.locator("#overlay-card").scroll_into_view_if_needed()
+    spread = page.locator("#overlay-legend [data-kind=beside]")
+    expect(spread).to_contain_text("others, right: mean")
+    page.click("#as-heat")
+    panels = page.locator("#plots")
+    expect(panels).to_have_attribute("data-panels", re.compile("tiles beside-tiles"))
+    page.select_option("#beside", "")
+    expect(panels).not_to_have_attribute("data-panels", re.compile("beside-tiles"))
+    expect(spread).to_have_count(0)
+
+
+def test_tiles_are_compared_by_serial_and_those_of_another_foot_in_their_order(
+    server: Running, open_page: OpenPage
+) -> None:
+    asked = """import("/static/session/beside.js").then(({ Beside }) => {
+      const matched = (own, theirs) => {
+        const nobody = { ask: null, onChange: null, onError: null };
+        const beside = new Beside({ name: "", columns: {}, ...nobody });
+        const names = theirs.map((_, i) => [`force_n_${i}_max`, []]);
+        beside.answer = { serials: theirs, columns: Object.fromEntries(names) };
+        beside.matchTiles(own);
+        return Object.entries(beside.columns).map(([tile, [least]]) => `${tile}=${least}`);
+      };
+      return [
+        matched(["a", "b"], ["b", "a"]), matched(["a", "b"], ["c", "d"]),
+        matched(["a", "b"], ["c", "a"]), matched(["a", "b"], ["c"]),
+      ];
+    })"""
+    found = open_page(f"{server.url}/nodes").evaluate(asked)
+    assert found == [
+        ["tile-0=force_n_1_min", "tile-1=force_n_0_min"],
+        ["tile-0=force_n_0_min", "tile-1=force_n_1_min"],
+        ["tile-0=force_n_1_min"],
+        [],
+    ]
+
+
 def test_a_damaged_comparison_is_said_to_be_and_the_page_stays(
     compared: Recording, browser: Browser
 ) -> None:

@@ -214,6 +214,67 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
     node.close()
 
 
+def test_the_rate_that_was_reached_stands_beside_that_of_the_node(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk))
+    expect(page.locator("#about")).to_contain_text(" of 500 frames/s")
+    asked = """Promise.all([import("/static/session/header.js"), import("/static/session/bins.js")])
+      .then(([{ rateWords }, { Bins }]) => {
+        const whole = { rateHz: 434.2 };
+        const rate = (missed) => rateWords({ missed_slots: missed }, whole, 449.1);
+        const columns = {
+          t_first_s: [0, 1, 10], t_last_s: [0.9, 2, 11], part: [0, 0, 1],
+          frames: [90, 71, 101], missing: [0, 40, 0],
+        };
+        const bins = new Bins({ columns }, { from: 0, to: 11 });
+        return [rate(292), rate(1), rate(0), bins.rateHz];
+      })"""
+    words = "434 of 449 frames/s"
+    found = page.evaluate(asked)
+    assert found[:3] == [
+        f"{words}, 292 slots not sampled",
+        f"{words}, 1 slot not sampled",
+        words,
+    ]
+    assert found[3] == pytest.approx(100.0)  # 300 periods in two parts of two seconds and of one
+
+
+def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(
+    server: Running, open_page: OpenPage
+) -> None:
+    asked = """Promise.all(
+      ["panels", "readout", "bins"].map((name) => import(`/static/session/${name}.js`)),
+    ).then(([{ panelsOf }, { readingsOf }, { Bins }]) => {
+        const said = (y) => {
+          const columns = {
+            t_first_s: [0, 1], t_last_s: [0, 1], frames: [1, 1], missing: [0, 0], part: [0, 0],
+            contact: [2, 2], grf_at_least_n_max: [0, 0],
+          };
+          for (const name of ["grf_n", "angle_rad", "cop_x_m"]) {
+            for (const end of ["min", "max"]) columns[`${name}_${end}`] = [1, 2];
+          }
+          for (const axis of ["x", "y"]) {
+            columns[`cop_${axis}_low_m_min`] = [0.5, 1];
+            columns[`cop_${axis}_high_m_max`] = [1.5, 3];
+          }
+          columns.cop_y_m_min = columns.cop_y_m_max = y;
+          const columnsOf = (name) => ({ [`${name}_min`]: [1, 1], [`${name}_max`]: [1, 1] });
+          Object.assign(columns, columnsOf("grf_low_n"), columnsOf("grf_high_n"));
+          const bins = new Bins({ columns, serials: [], frames_in_bin: 1 }, { from: 0, to: 1 });
+          const panels = panelsOf(bins, null);
+          const y_read = readingsOf(bins, 0, panels).find(([key]) => key === "cop-y");
+          return [panels.map(({ key }) => key).includes("cop-y"), y_read?.[2] ?? null,
+            panels.find(({ key }) => key === "cop-x").note ?? null];
+        };
+        return [said([null, null]), said([1, 2])];
+      })"""
+    alone, plan = open_page(f"{server.url}/nodes").evaluate(asked)
+    words = "not measured: tiles in one row"
+    assert alone == [False, words, f"COP y {words}"]
+    assert plan == [True, "1000.0 mm ± 500.0", None]
+
+
 def test_a_session_that_is_not_there_is_said_not_to_be(server: Running, browser: Browser) -> None:
     with browser.new_context() as context:  # its console says 404, and is right
         page = context.new_page()

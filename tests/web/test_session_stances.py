@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +27,18 @@ _IN_SIGHT = """([selector, downTo]) => {
   return box.top >= 0 && box.top + downTo <= innerHeight;
 }"""
 _KEYS_SHOWN = "[...document.querySelectorAll('kbd')].filter((key) => key.checkVisibility()).length"
+FIGURES = (
+    ("peak", "peak_grf_n", 1, 1, "N"),
+    ("duration", "duration_s", 1e3, 0, "ms"),
+    ("impulse", "impulse_n_s", 1, 2, "N s"),
+    ("travel", "cop_x_range_m", 1e3, 1, "mm"),
+)
+SIGMAS = {
+    "peak_grf_n": "peak_sigma_n",
+    "duration_s": "duration_sigma_s",
+    "impulse_n_s": "impulse_sigma_n_s",
+    "cop_x_range_m": "cop_x_range_sigma_m",
+}
 FORCE_PX = 200  # from the upper edge of the plots to the foot of the first
 
 
@@ -60,12 +73,14 @@ def opened(open_page: OpenPage, session: Recording, **options: Any) -> Page:
 
 
 def says(page: Page, stance: dict[str, Any]) -> None:
-    """The line above the plots tells of this one, and so does the table."""
-    line = page.locator("#stance-says")
-    expect(line).to_contain_text(f"Stance {stance['number']} of {STANCES}")
-    expect(line).to_contain_text(f"peak {stance['peak_grf_n']:.1f} N ±")
-    expect(line).to_contain_text(f"{1e3 * stance['duration_s']:.0f} ms")
-    expect(line).to_contain_text(f"{stance['impulse_n_s']:.2f} N s")
+    """The headline tells of this one, with its intervals, and so does the table."""
+    says = f"Stance {stance['number']} of {STANCES}"
+    expect(page.locator("#stance-says")).to_contain_text(says)
+    for figure, stem, factor, decimals, unit in FIGURES:
+        value = f"{factor * stance[stem]:.{decimals}f}"
+        half = f"{1.96 * factor * stance[SIGMAS[stem]]:.{decimals}f}"
+        shown = page.locator(f"#stance-figures [data-figure={figure}] dd")
+        expect(shown).to_have_text(f"{value} ± {half} {unit}")
     row = page.locator("#stances-rows [aria-current]")
     expect(row).to_have_attribute("data-stance", str(stance["number"]))
 
@@ -83,6 +98,7 @@ def in_view(page: Page, stance: dict[str, Any], begin_ns: int) -> None:
 
 def middle_of(page: Page, stance: dict[str, Any], hops: Recording) -> tuple[float, float]:
     """Where it is in the plots of a narrow screen, which show everything."""
+    page.evaluate("scrollTo(0, 0)")  # the buttons that zoom are below the plots
     box = settled(page).bounding_box()
     duration_s = float(page.locator("#plots").get_attribute("data-to") or "nan")
     left, right = 40, 12  # axis, and air
@@ -99,7 +115,7 @@ def test_a_stance_is_gone_to_from_its_row_and_by_keys(
     begin_ns = int(hops.column("t_ns")[0])
     rows = page.locator("#stances-rows tr")
     expect(rows).to_have_count(STANCES)
-    expect(rows.nth(11)).to_contain_text(f"{stances[11]['peak_grf_n']:.1f} N")
+    expect(rows.nth(11)).to_contain_text(f"{stances[11]['peak_grf_n']:.1f} ±")
 
     def shows(number: int) -> None:
         says(page, stances[number - 1])
@@ -120,7 +136,8 @@ def test_on_a_phone_the_peak_of_the_third_stance_is_three_taps_away(
     hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
 ) -> None:
     page = opened(open_page, hops, **PHONE)
-    expect(page.locator("#stance-says")).to_have_text(f"Step through {STANCES} stances")
+    which = page.locator("#stance-which")
+    expect(which).to_have_text(f"{STANCES} stances: medians of {STANCES} whole")
     assert page.evaluate(_IN_SIGHT, ["#stance-line", 44])  # without scrolling
     for stance in stances[:3]:
         page.tap("#stance-next")
@@ -261,3 +278,60 @@ def test_the_neighbour_is_that_of_the_cursor_or_the_first_in_view(
     })"""
     found = open_page(f"{server.url}/nodes").evaluate(asked)
     assert found == [[2, 1], [0, 1], [0, 2], [2, -1]]  # before it and after it; -1: there is none
+
+
+def test_a_link_that_was_copied_leads_to_the_same_stance_and_cursor(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops)
+    page.context.grant_permissions(["clipboard-read"])
+    page.locator("#stances-rows tr").nth(2).click()
+    says(page, stances[2])
+    page.focus("#plots")  # in the table the key scrolls
+    page.keyboard.press("ArrowRight")
+    readout = page.locator("#readout")
+    peak_s = (stances[2]["peak_t_ns"] - int(hops.column("t_ns")[0])) * 1e-9
+    until(lambda: float(readout.get_attribute("data-time-s") or 0) == pytest.approx(peak_s + 0.002))
+    page.click("#copy-link")
+    expect(page.locator("#notices")).to_contain_text("Link copied")
+    there = open_page(page.evaluate("navigator.clipboard.readText()"))
+    says(there, stances[2])
+    at_s = readout.get_attribute("data-time-s") or ""
+    expect(there.locator("#readout")).to_have_attribute("data-time-s", at_s)
+    for name in ("data-from", "data-to"):
+        expect(settled(there)).to_have_attribute(name, settled(page).get_attribute(name) or "")
+
+
+def test_the_chosen_stance_is_exported_from_its_first_frame_to_its_last(
+    hops: Recording, stances: list[dict[str, Any]], open_page: OpenPage
+) -> None:
+    page = opened(open_page, hops)
+    choice = page.locator("#download-range")
+    expect(choice.locator("option")).to_have_text(["all of it"])
+    page.locator("#stances-rows tr").nth(2).click()
+    says(page, stances[2])
+    page.click("#export")
+    expect(choice).to_be_focused()
+    expect(choice).to_have_value("stance")
+    with page.expect_download() as download:
+        page.click("#download-csv")
+    lines = download.value.path().read_text("utf-8").splitlines()
+    rows = [line for line in lines if not line.startswith("#")][1:]
+    assert len(rows) == stances[2]["frames"]
+    begin_s = (stances[2]["begin_t_ns"] - int(hops.column("t_ns")[0])) * 1e-9
+    assert download.value.suggested_filename.startswith(f"hops_{hops.id}_{begin_s:.3f}s-to-")
+    choice.select_option("view")
+    expect(page.locator("#download-csv")).to_have_attribute("href", re.compile("start_s="))
+
+
+def test_of_an_even_number_of_stances_the_median_is_between_the_two_in_the_middle(
+    server: Running, open_page: OpenPage
+) -> None:
+    asked = """import("/static/session/stances.js").then(({ medianOf }) => {
+      const of = (...peaks) =>
+        medianOf(peaks.map((peak) => ({ peak_grf_n: peak, duration_s: null })));
+      return [of(1, 5, 2), of(4, 1, 2, null, 9), of(null), of()]
+        .map((all) => [all.peak_grf_n, all.duration_s]);
+    })"""
+    found = open_page(f"{server.url}/nodes").evaluate(asked)
+    assert found == [[2, None], [3, None], [None, None], [None, None]]

@@ -41,16 +41,16 @@ def test_the_others_of_a_take_come_in_the_same_file(take: Take, open_page: OpenP
     assert not Axe().run(page).response["violations"]
     with page.expect_download() as download:
         page.click("#download-mcap")
-    assert download.value.suggested_filename == f"take-{take.id}.mcap"
+    assert download.value.suggested_filename == f"both_take-{take.id}_0.000s-to-0.100s.mcap"
     said = said_in("mcap", download.value.path().read_bytes())
     assert [(each["node"], each["end_s"]) for each in said] == [("left", "0.1"), ("right", "0.1")]
     with page.expect_download() as alone:
         page.click("#download-csv")
-    assert alone.value.suggested_filename == f"{take.sessions[0].id}.csv"
+    assert alone.value.suggested_filename == f"both_{take.sessions[0].id}_0.000s-to-0.100s.csv"
     together.uncheck()
     with page.expect_download() as one:
         page.click("#download-mcap")
-    assert one.value.suggested_filename == f"{take.sessions[0].id}.mcap"
+    assert one.value.suggested_filename == f"both_{take.sessions[0].id}_0.000s-to-0.100s.mcap"
 
 
 def test_a_session_by_itself_offers_no_take(server: Running, open_page: OpenPage) -> None:

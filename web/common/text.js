@@ -133,3 +133,16 @@ export function localTime(date) {
   return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())} `
     + `${two(date.getHours())}:${two(date.getMinutes())}:${two(date.getSeconds())}`;
 }
+
+/** Copy a text to the clipboard; false: the browser does not let us. Its newer way exists in secure contexts only. @param {string} text */
+export function copyText(text) {
+  const before = document.activeElement;
+  const field = el("textarea", { cls: "unseen", "aria-label": "To be copied" });
+  field.value = text;
+  document.body.append(field);
+  field.select();
+  const copied = document.execCommand("copy");
+  field.remove();
+  if (before instanceof HTMLElement) before.focus();
+  return copied;
+}

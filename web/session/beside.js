@@ -24,6 +24,7 @@ export class Beside {
     this.ask = ask;
     this.shiftS = 0; // this session's time less its own
     this.detail = null;
+    this.hasTiles = false;
     this.loader = new Loader((query, stop) => this.asked(query, stop), (bins) => {
       this.detail = bins;
       onChange();
@@ -34,6 +35,21 @@ export class Beside {
     this.answer = await this.ask({ points: Math.max(50, Math.round(widthPx / 2)) });
     this.durationS = this.answer.duration_s;
     this.move(0);
+  }
+
+  /**
+   * Its tiles are drawn over those of this session that have the same serial; if none has, as of another foot with as many
+   * tiles, in their order.
+   * @param {string[]} serials of this session
+   */
+  matchTiles(serials) {
+    const theirs = this.answer.serials;
+    const inOrder = theirs.length === serials.length && !theirs.some((serial) => serials.includes(serial));
+    serials.forEach((serial, i) => {
+      const j = inOrder ? i : theirs.indexOf(serial);
+      if (j >= 0 && `force_n_${j}_max` in this.answer.columns) this.columns[`tile-${i}`] = [`force_n_${j}_min`, `force_n_${j}_max`];
+    });
+    this.hasTiles = "force_n_0_max" in this.answer.columns;
   }
 
   /** Moved by so many seconds against this session. */

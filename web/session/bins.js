@@ -34,6 +34,19 @@ export class Bins {
     this.estimated = "grf_n_min" in overview.columns;
   }
 
+  /** Frames that were taken a second, those that were lost among them; null of too few. */
+  get rateHz() {
+    let [taken, lastedS] = [0, 0];
+    for (let i = 0, begin = 0; i < this.count; i++) {
+      taken += this.columns.frames[i] + this.columns.missing[i];
+      if (i + 1 < this.count && this.columns.part[i + 1] === this.columns.part[i]) continue;
+      lastedS += this.last[i] - this.first[begin];
+      taken -= 1; // a part lasts from its first frame to its last
+      begin = i + 1;
+    }
+    return taken > 0 && lastedS > 0 ? taken / lastedS : null;
+  }
+
   has(name) { return Boolean(this.columns[name]?.some((value) => value !== null)); }
 
   contains(view) { return this.covers.from <= view.from && this.covers.to >= view.to; }

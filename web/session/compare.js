@@ -17,6 +17,13 @@ const REFERENCE = {
   "cop-x": ["reference_cop_x_m_min", "reference_cop_x_m_max"], "cop-y": ["reference_cop_y_m_min", "reference_cop_y_m_max"],
 };
 
+/** "trial 3, right": a name that tells it from this session, whose name may be the same. */
+function nameOf(other, session) {
+  const name = `${other.name || other.id}, ${other.node}`;
+  const isSame = other.name === session.name && other.node === session.node;
+  return isSame ? `${name}, ${localTime(new Date(other.started_t_ns / 1e6))}` : name;
+}
+
 export class Compare {
   /**
    * @param {{id: string}} session
@@ -58,6 +65,7 @@ export class Compare {
   async choose(wanted, align = null) {
     this.wanted = wanted;
     this.show(null);
+    this.page.layBeside(null);
     byId("report-card").hidden = true;
     byId("align-choice").hidden = true;
     this.say("");
@@ -90,9 +98,10 @@ export class Compare {
       api.getSession(id), unlessRefused(api.listStances(id)), unlessRefused(api.listEvents(id)), unlessRefused(api.clockOf(id)),
     ]);
     const columns = Object.fromEntries(SAME.map((key) => [key, [`${STEMS[key]}_min`, `${STEMS[key]}_max`]]));
-    const beside = this.beside(other.name || other.id, columns, (query, stop) => api.overview(id, query, stop));
+    const beside = this.beside(nameOf(other, this.session), columns, (query, stop) => api.overview(id, query, stop));
     await beside.begin(this.page.plots.plotWidth);
     if (wanted !== this.wanted) return;
+    beside.matchTiles(this.page.plots.whole.serials);
     for (const key of SAME) if (!(columns[key][0] in beside.answer.columns)) delete beside.columns[key];
     if (!Object.keys(beside.columns).length) return this.say("It has no estimates: there is nothing to draw beside this one.");
     const { plots } = this.page;
@@ -105,6 +114,7 @@ export class Compare {
     this.align.replaceChildren(...this.ways.map((way) => el("option", { value: way.key, text: way.says })));
     byId("align-choice").hidden = false;
     this.drawn = beside;
+    this.page.layBeside({ id, name: beside.name });
     this.moveTo(this.ways.some((way) => way.key === align) ? align : this.ways[0].key);
     this.show(beside);
   }

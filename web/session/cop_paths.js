@@ -38,15 +38,17 @@ export class CopPaths {
   /**
    * @param {{number: number} | null} chosen
    * @param {{percent: number[], copX: (number | null)[], copY: (number | null)[]} | null} frames of it
+   * @param {import("./stance_overlay.js").Curve | null | undefined} hovered
+   * @param {{percent: number[], overlaid: number, spread: object} | null} beside stances of another session
    */
-  draw(colours, chosen, frames, hovered) {
+  draw(colours, chosen, frames, hovered, beside = null) {
     const width = this.canvas.parentElement.clientWidth;
     if (!this.known || width < 100) return;
     const { plan, place } = this.layOut(width, colours);
     setText(byId("cop-title"), plan ? "Centre of pressure on the foot, from above" : "Centre of pressure along the foot, over each stance");
     setData(this.canvas, "plan", String(plan));
     const { context } = this;
-    const { curves, points, spread } = this.answer;
+    const { curves, points } = this.answer;
     const percent = Array.from({ length: points }, (_, i) => (100 * i) / (points - 1));
     this.drawn = curves.map((curve) => ({ curve, places: placesOf(percent, curve.cop_x_m, curve.cop_y_m, place) }));
     const shade = shadesOf(colours);
@@ -76,15 +78,14 @@ export class CopPaths {
       context.strokeStyle = colours.text;
       drawCurve(context, ...placesOf(percent, hovered.cop_x_m, hovered.cop_y_m, place));
     }
+    if (beside) {
+      context.lineWidth = 3;
+      context.strokeStyle = colours.other;
+      drawCurve(context, ...placesOf(beside.percent, ...meanOf(beside), place));
+    }
     if (frames) bold(placesOf(frames.percent, frames.copX, frames.copY, place), frames.percent, colours.cop);
-    else bold(placesOf(percent, ...this.mean(), place), null, colours.text);
+    else bold(placesOf(percent, ...meanOf(this.answer), place), null, colours.text);
     this.drawLegend(chosen, frames);
-  }
-
-  /** Where half of the stances have a COP at least: of a few it would jump from one to another. */
-  mean() {
-    const { overlaid, spread } = this.answer;
-    return [spread.cop_x_m, spread.cop_y_m].map(({ mean, count }) => mean.map((value, i) => (2 * count[i] >= overlaid ? value : null)));
   }
 
   layOut(width, colours) {
@@ -96,7 +97,7 @@ export class CopPaths {
     if (layout.plan) {
       this.drawTiles(layout.points, layout.radiusPx, colours);
       this.drawScale(layout, width, height, colours);
-      return { plan: true, place: (_, xM, yM) => layout.at(xM, yM) };
+      return { plan: true, place: (_, xM, yM) => (yM === null ? null : layout.at(xM, yM)) };
     }
     // A line of tiles says nothing across it: time is the other axis.
     const radius = Math.min(11, 0.42 * layout.pitch * ((width - 60) / (layout.span + 2 * layout.pitch)));
@@ -218,11 +219,14 @@ export class CopPaths {
   }
 }
 
+/** The mean path where half of the stances have a COP at least: of a few it would jump from one to another. */
+const meanOf = ({ overlaid, spread }) =>
+  [spread.cop_x_m, spread.cop_y_m].map(({ mean, count }) => mean.map((value, i) => (2 * count[i] >= overlaid ? value : null)));
+
 function placesOf(along, xsM, ysM, place) {
   const [xs, ys] = [[], []];
   for (let i = 0; i < along.length; i++) {
-    const known = xsM[i] !== null && ysM[i] !== null;
-    const at = known ? place(along[i], xsM[i], ysM[i]) : null;
+    const at = xsM[i] === null ? null : place(along[i], xsM[i], ysM[i]);
     xs.push(at?.x ?? null);
     ys.push(at?.y ?? null);
   }

@@ -21,7 +21,7 @@ export const KINDS = [
     is: (bins, i) => bins.columns.missing[i] > 0 },
   { key: "restarted", says: "the node was started again", colour: "text", way: "\\", over: "all", before: true,
     is: (bins, i) => i > 0 && bins.columns.part[i] !== bins.columns.part[i - 1] },
-  { key: "late", says: "frames not taken: the node was late", colour: "edge", way: "x", over: "foot", before: true,
+  { key: "late", says: "not sampled: the node was late", colour: "edge", way: "x", over: "foot", before: true,
     is: (bins, i) => Boolean(bins.columns.frame_status[i] & FRAME.OVERRUN) },
   { key: "saturated", says: "a tile is saturated: the force is at least this", colour: "warn-line", way: "/", over: "force",
     is: (bins, i) => Boolean(estimate(bins, i) & SATURATED) || (!bins.estimated && anyTile(bins, i, TILE.OVER_RANGE)) },
@@ -66,7 +66,7 @@ const ESTIMATE_WORDS = [
 /** @type {[bit: number, words: string][]} */
 const FRAME_WORDS = [
   [FRAME.BUS_FAULT, "the bus failed"],
-  [FRAME.OVERRUN, "frames before it not taken"],
+  [FRAME.OVERRUN, "slots before it not sampled"],
   [FRAME.SERVO_STALE, "servo's angle is old"],
   [FRAME.SERVO_TURN_UNKNOWN, "servo's turn is not known"],
   [FRAME.LEAD, "unloaded lead-in"],

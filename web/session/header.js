@@ -1,16 +1,32 @@
 // What a session is: name, node, when, how long, whether it is complete, and what people said of it.
 
-import { byId, duration, el, localTime, setText } from "../common/text.js";
+import { byId, duration, el, localTime, perSecond, setText } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
 
 const WORDS = {
-  complete: "complete: no frame was lost",
+  complete: "complete: all its frames are here",
   lossy: "frames are missing",
   incomplete: "not complete",
 };
 
-/** @param {Session} session */
-export function drawHeader(session) {
+/**
+ * "434 of 449 frames/s, 292 slots not sampled": what the node reached of its rate.
+ * @param {Session} session @param {import("./bins.js").Bins | null} whole @param {number | null} nominalHz
+ */
+export function rateWords(session, whole, nominalHz) {
+  const hz = whole?.rateHz ?? null;
+  if (hz === null || nominalHz === null) return "";
+  const missed = session.missed_slots;
+  const slots = missed ? `, ${missed.toLocaleString("en-GB")} slot${missed === 1 ? "" : "s"} not sampled` : "";
+  return `${perSecond(hz)} of ${perSecond(nominalHz)} frames/s${slots}`;
+}
+
+/**
+ * @param {Session} session
+ * @param {import("./bins.js").Bins | null} whole of all of it, once that is there
+ * @param {number | null} nominalHz rate of its node
+ */
+export function drawHeader(session, whole = null, nominalHz = null) {
   setText(byId("name"), session.name || session.id);
   const [short, long, weight] = plainState(session);
   const state = byId("state");
@@ -22,6 +38,7 @@ export function drawHeader(session) {
     ["Started", localTime(new Date(session.started_t_ns / 1e6))],
     ["Duration", duration(session.duration_s)],
     ["Frames", session.frames.toLocaleString("en-GB")],
+    ["Rate", rateWords(session, whole, nominalHz)],
     ["Parts", session.parts.length > 1 ? String(session.parts.length) : ""],
     ["Scene", session.scene],
     ["Scale", session.absolute_scale === "assumed" ? "assumed: newtons are not to be trusted" : ""],

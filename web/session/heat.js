@@ -10,12 +10,13 @@ const STOPS = ["heat-0", "heat-1", "heat-2", "heat-3"];
 export function drawTiles(plots, context, panel, box, view, x) {
   const { colours, whole } = plots;
   const counts = !whole.estimated;
-  const names = whole.serials.map((_, i) => (counts ? `padc_${i}_min` : `force_n_${i}_max`));
+  const serials = panel.besideOnly ? plots.beside.answer.serials : whole.serials;
+  const names = serials.map((_, i) => (counts ? `padc_${i}_min` : `force_n_${i}_max`));
   plots.heat ??= heatRange(whole, counts);
   const stops = STOPS.map((name) => colours[name]);
   const rows = names.length;
   const rowPx = (box.bottom - box.top) / rows;
-  for (const [bins, from, to] of plots.layers(view)) {
+  for (const [bins, from, to] of panel.besideOnly ? [[plots.beside.best(view), view.from, view.to]] : plots.layers(view)) {
     const [begin, end] = bins.within({ from, to });
     drawHeat(context, bins, begin, end, x, { ...box, left: x(from), right: x(to) }, { names, ...plots.heat, stops });
   }
@@ -26,7 +27,7 @@ export function drawTiles(plots, context, panel, box, view, x) {
   context.textAlign = "right";
   context.textBaseline = "middle";
   const every = Math.max(1, Math.ceil(13 / rowPx));
-  for (let i = 0; i < rows; i += every) context.fillText(printable(whole.serials[i]), box.left - 6, box.top + (i + 0.5) * rowPx);
+  for (let i = 0; i < rows; i += every) context.fillText(printable(serials[i]), box.left - 6, box.top + (i + 0.5) * rowPx);
   // What the colours mean, at the right of the title.
   const bar = { left: box.right - 130, right: box.right - 60, top: box.top - 14, bottom: box.top - 4 };
   const blend = context.createLinearGradient(bar.left, 0, bar.right, 0);

@@ -13,7 +13,7 @@ export function ledgerInWords(ledger, session) {
   if (pending) said.push(`${frames(pending)} more are still with the node.`);
   for (const loss of lossesInWords(session.lost)) said.push(`Lost for good: ${loss}.`);
   if (session.tail_frames_max) said.push(`At most ${frames(session.tail_frames_max)} more may have been taken at an end that the node could not tell.`);
-  if (ledger.missed_slots) said.push(`${ledger.missed_slots.toLocaleString("en-GB")} times the node was late and took no frame: these were never there, and have no number.`);
+  if (ledger.missed_slots) said.push(`${ledger.missed_slots.toLocaleString("en-GB")} slot${ledger.missed_slots === 1 ? " was" : "s were"} not sampled: the node was late. They never were frames, have no number, and are not lost.`);
   if (ledger.parts.length > 1) said.push(`The node was started again: the session has ${ledger.parts.length} parts.`);
   if (ledger.complete) said.push("Every number from the first frame to the last is accounted for, and none is lost.");
   if (session.sha256) {

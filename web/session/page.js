@@ -33,11 +33,11 @@ async function look() {
     return;
   }
   document.title = printable(`${session.name} – FootTile`);
-  drawHeader(session);
   now = session;
+  drawNow();
   byId("edit").hidden = false;
   ledger.show(session);
-  plotted ??= new Plotted(session);
+  plotted ??= new Plotted(session, drawNow);
   if (session.state !== "sealed") {
     say(session.state === "recording" ? "Being recorded" : "Not sealed yet", [WHY[session.state] ?? session.problem ?? "", plainState(session)[1]].join(" ").trim());
     byId("message").dataset.small = "true";
@@ -75,7 +75,12 @@ async function change() {
     now = await api.getSession(id);
   }
   document.title = printable(`${now.name} – FootTile`);
-  drawHeader(now);
+  drawNow();
+}
+
+/** What it is, as far as that is known by now. */
+function drawNow() {
+  drawHeader(now, plotted?.plots.whole ?? null, plotted?.replay.array?.nominal_rate_hz ?? null);
 }
 
 byId("edit").addEventListener("click", () => quietly(change));

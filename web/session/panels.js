@@ -13,6 +13,7 @@ const TITLE_PX = 19; // above a plot; a tile's name is in its own
  * @property {"series" | "heat"} kind
  * @property {[string, string]} [columns] least and greatest
  * @property {[string, string]} [band] an interval around it
+ * @property {string} [note] behind the title
  * @property {string} [bound] what it is at least
  * @property {string} [group] panels of a group have one scale
  * @property {number} [factor] from the column's unit to the one shown
@@ -54,6 +55,13 @@ export function panelsOf(bins, asHeat, beside = null) {
       key: "tiles", title: bins.estimated ? "Force on each tile" : "Raw counts of each tile, fewer under load",
       unit, kind: "heat", force: true, height: Math.min(420, Math.max(90, tiles.length * (tiles.length > 24 ? 7 : 14))), head: TITLE_PX,
     });
+    if (bins.estimated && beside?.hasTiles) {
+      const rows = beside.answer.serials.length;
+      panels.push({
+        key: "beside-tiles", title: `Force on each tile, ${beside.name}`, unit: "N", kind: "heat", besideOnly: true,
+        height: Math.min(420, Math.max(90, rows * (rows > 24 ? 7 : 14))), head: TITLE_PX,
+      });
+    }
   } else {
     const height = Math.max(46, Math.min(FORCE_PX, 220 / known.length)); // alone it has room
     known.forEach((i, at) => panels.push({
@@ -65,7 +73,8 @@ export function panelsOf(bins, asHeat, beside = null) {
     if (!bins.estimated || !moves(bins, `cop_${axis}_m`)) continue;
     panels.push({
       key: `cop-${axis}`, title, unit: "mm", factor: 1e3, kind: "series",
-      columns: [`cop_${axis}_m_min`, `cop_${axis}_m_max`], height: PLACE_PX, head: TITLE_PX,
+      columns: [`cop_${axis}_m_min`, `cop_${axis}_m_max`], band: [`cop_${axis}_low_m_min`, `cop_${axis}_high_m_max`],
+      height: PLACE_PX, head: TITLE_PX, ...(axis === "x" && !measuresY(bins) ? { note: Y_UNMEASURED } : {}),
     });
   }
   if (bins.estimated && bins.has("angle_rad_min")) {
@@ -76,6 +85,11 @@ export function panelsOf(bins, asHeat, beside = null) {
   }
   return panels;
 }
+
+export const Y_UNMEASURED = "COP y not measured: tiles in one row";
+
+/** A row of tiles does not measure across it. */
+export const measuresY = (bins) => bins.has("cop_y_m_max");
 
 /** On a line of tiles one coordinate is always the same: that is no plot. */
 function moves(bins, stem) {

@@ -11,7 +11,7 @@ import { drawBand, drawBound, drawSeries } from "./series.js";
 
 const AXIS_PX = 26;
 const FOOT_PX = 6;
-const ROOM_PX = 240; // of the window, for what is above and below the plots
+const ROOM_PX = 200; // of the window, for what is above and below the plots
 const RIGHT_PX = 12;
 const FONT = "600 12px system-ui, sans-serif";
 const NAMES = [
@@ -30,6 +30,7 @@ export class Plots {
     this.marks = [];
     this.stances = [];
     this.beside = null; // drawn over it
+    this.name = ""; // of the session, beside another
     this.asHeat = null;
     this.heat = null; // least and greatest of its colours
     this.flags = []; // of marks, where they were drawn
@@ -137,8 +138,11 @@ export class Plots {
         // One bin more on both sides, so that lines run to the edges.
         const [b, e] = [Math.max(0, begin - 1), Math.min(bins.count, end + 1)];
         if (panel.key === "grf") this.drawContact(context, bins, b, e, x, box);
-        if (panel.band) drawBand(context, bins, b, e, x, y, panel.band, colours.interval);
-        drawSeries(context, bins, b, e, x, y, panel.columns, panel.key.startsWith("cop") ? colours.cop : colours.series);
+        const isCop = panel.key.startsWith("cop");
+        if (isCop) context.globalAlpha = 0.3;
+        if (panel.band) drawBand(context, bins, b, e, x, y, panel.band, isCop ? colours.cop : colours.interval);
+        context.globalAlpha = 1;
+        drawSeries(context, bins, b, e, x, y, panel.columns, isCop ? colours.cop : colours.series);
         if (panel.bound) drawBound(context, bins, b, e, x, y, panel.bound, colours["warn-line"]);
         context.restore();
       }
@@ -162,7 +166,7 @@ export class Plots {
   drawTitle(context, panel, box) {
     const { colours } = this;
     const inside = panel.tile !== undefined;
-    const text = printable(`${panel.title}, ${panel.unit}`);
+    const text = printable(`${panel.title}, ${panel.unit}${panel.note ? ` (${panel.note})` : ""}`);
     context.textAlign = "left";
     context.textBaseline = "top";
     const [left, top] = inside ? [box.left + 6, box.top + 2] : [box.left, box.top - 15];

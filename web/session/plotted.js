@@ -2,9 +2,9 @@
 
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
-import { quietly, showRefusal } from "../common/notices.js";
+import { notice, quietly, showRefusal } from "../common/notices.js";
 import { loadModule, unlessRefused } from "../common/request.js";
-import { byId, setText } from "../common/text.js";
+import { byId, copyText, setText } from "../common/text.js";
 import { offsetAt } from "./clock.js";
 import { axisWords, clockOn, stancesOn } from "./time_axis.js";
 import { Downloads } from "./downloads.js";
@@ -26,13 +26,16 @@ const SETTLED_MS = 250;
 const COLOURS_AT = 9; // in what is compared to know whether something has to be drawn
 
 export class Plotted {
-  /** @param {Session} session */
-  constructor(session) {
+  /** @param {Session} session @param {() => void} onArray its array is known */
+  constructor(session, onArray) {
     this.session = session;
+    this.onArray = onArray;
     /** @type {import("./view.js").View | null} */
     this.view = null;
     this.plots = new Plots();
     this.plots.changed = () => this.draw();
+    this.plots.name = `${session.name || session.id}, ${session.node}`;
+    this.other = null; // beside it
     this.readout = new Readout();
     this.numbers = new Numbers(session.id);
     this.stances = new Stances((index) => { this.goTo(index); this.stances.bringIntoView(); });
@@ -75,8 +78,10 @@ export class Plotted {
   takeWhole(whole) {
     const all = this.view && views.isWhole(this.view, this.durationS);
     this.durationS = whole.durationS;
-    if (!this.view) this.view = views.fromLink(location.search, this.durationS);
-    else this.view = all ? views.whole(this.durationS) : views.clamped(this.view, this.durationS);
+    if (!this.view) {
+      this.view = views.fromLink(location.search, this.durationS);
+      this.cursorS = views.cursorFromLink(location.search, this.durationS);
+    } else this.view = all ? views.whole(this.durationS) : views.clamped(this.view, this.durationS);
     this.plots.show(whole);
     this.plots.heat = null;
     if (!whole.provisional) { // what was asked for before is of something else
@@ -97,6 +102,7 @@ export class Plotted {
       unlessRefused(api.listEvents(this.session.id)), unlessRefused(api.clockOf(this.session.id)),
     ]);
     if (array) this.replay.dress(array);
+    this.onArray();
     const clock = clockOn(whole.axis, this.session.parts, summary);
     setText(byId("axis-says"), axisWords(whole.axis));
     this.plots.stances = placed(stancesOn(whole.axis, stances ?? []), whole.beginNs);
@@ -131,6 +137,13 @@ export class Plotted {
     if (!this.plots.stances.length) return;
     const { StanceOverlay } = await loadModule(() => import("./stance_overlay.js"));
     this.overlay = new StanceOverlay(this.session.id, this.plots.stances, (index) => this.goTo(index));
+    quietly(() => this.overlay.layBeside(this.other));
+  }
+
+  /** Another session, whose stances are drawn beside ours; null: none. @param {{id: string, name: string} | null} other */
+  layBeside(other) {
+    this.other = other;
+    quietly(() => this.overlay?.layBeside(other));
   }
 
   listen() {
@@ -158,7 +171,8 @@ export class Plotted {
       "zoom-in": () => this.zoom(1 / KEY_ZOOM), "zoom-out": () => this.zoom(KEY_ZOOM), "zoom-all": () => this.showAll(),
       earlier: () => this.move(-0.5), later: () => this.move(0.5),
       "stance-before": () => this.step(-1), "stance-next": () => this.step(1),
-      "as-heat": () => this.toggleHeat(),
+      "as-heat": () => this.toggleHeat(), "copy-link": () => this.copyLink(),
+      export: () => { this.downloads.wantStance(); this.drawLinks(); },
       picture: () => savePicture(plots, this.session),
     };
     for (const [name, act] of Object.entries(buttons)) byId(name).addEventListener("click", act);
@@ -175,12 +189,26 @@ export class Plotted {
   show(view) {
     this.view = views.clamped(view, this.durationS);
     byId("plots").dataset.settled = "false";
-    // Not at every turn of a wheel: browsers allow few changes of the address in some time.
-    clearTimeout(this.linking);
-    this.linking = setTimeout(() => {
-      history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS, location.search));
-    }, SETTLED_MS);
+    this.linkSoon();
     this.draw();
+  }
+
+  /** Not at every turn of a wheel: browsers allow few changes of the address in some time. */
+  linkSoon() {
+    clearTimeout(this.linking);
+    this.linking = setTimeout(() => this.link(), SETTLED_MS);
+  }
+
+  /** The address is that of what is shown. */
+  link() {
+    clearTimeout(this.linking);
+    history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS, location.search, this.cursorS));
+  }
+
+  copyLink() {
+    this.link();
+    const copied = copyText(location.href);
+    notice(copied ? "Link copied: to this view, with stance and cursor." : `Not copied: the link is ${location.href}`, { bad: !copied });
   }
 
   showAll() { this.show(views.whole(this.durationS)); }
@@ -196,6 +224,7 @@ export class Plotted {
 
   point(timeS) {
     this.cursorS = timeS;
+    this.linkSoon();
     this.draw();
   }
 
@@ -205,7 +234,10 @@ export class Plotted {
     const { view } = this;
     const beyond = Math.max(0, timeS - view.to) - Math.max(0, view.from - timeS);
     if (beyond) this.show(views.moved(view, beyond + Math.sign(beyond) * 0.9 * (view.to - view.from), this.durationS));
-    else this.draw();
+    else {
+      this.linkSoon();
+      this.draw();
+    }
   }
 
   step(by) { this.stances.step(by, this.cursorS, this.view); }
@@ -310,9 +342,10 @@ export class Plotted {
     box.setAttribute("aria-valuetext", sentence || byId("summary").textContent);
   }
 
-  /** Downloads of what is in view. */
+  /** Downloads of all, of what is in view, or of the chosen stance. */
   drawLinks() {
     const session = { ...this.session, marks: this.plots.marks.length };
-    this.downloads.draw(session, this.view, views.isWhole(this.view, this.durationS));
+    const stance = this.stances.stances[this.stances.current];
+    this.downloads.draw(session, this.view, views.isWhole(this.view, this.durationS), stance);
   }
 }

@@ -24,6 +24,12 @@ function grfAt(bins, i) {
   return `${value} N (95 %: ${number(low)} to ${number(high)})`;
 }
 
+/** " ± 1.2" of a single frame. */
+function copHalf(bins, i, axis) {
+  const [low, high] = [bins.columns[`cop_${axis}_low_m_min`][i], bins.columns[`cop_${axis}_high_m_max`][i]];
+  return bins.framesInBin > 1 || low === null || high === null ? "" : ` ± ${number(500 * (high - low))}`;
+}
+
 const CONTACT_WORDS = { 1: "no", 2: "yes", 4: "not known", 3: "begins or ends", 5: "no, or not known", 6: "yes, or not known", 7: "begins or ends" };
 
 /**
@@ -42,8 +48,9 @@ export function readingsOf(bins, i, panels) {
     found.push(["contact", "Contact", CONTACT_WORDS[bins.columns.contact[i]] ?? "–"]);
     for (const [axis, name] of [["x", "COP forward"], ["y", "COP left"]]) {
       const place = span(bins, i, [`cop_${axis}_m_min`, `cop_${axis}_m_max`], 1e3);
-      if (shown.has(`cop-${axis}`)) found.push([`cop-${axis}`, name, place === null ? "–" : `${place} mm`]);
+      if (shown.has(`cop-${axis}`)) found.push([`cop-${axis}`, name, place === null ? "–" : `${place} mm${copHalf(bins, i, axis)}`]);
     }
+    if (panels.some((panel) => panel.note)) found.push(["cop-y", "COP y", "not measured: tiles in one row"]);
     if (shown.has("angle")) {
       const angle = span(bins, i, ["angle_rad_min", "angle_rad_max"], 180 / Math.PI);
       found.push(["angle", "Angle", angle === null ? "–" : `${angle}°`]);

@@ -3,6 +3,7 @@
 import * as api from "../common/api.js";
 import { coloursOf, fit, whenColoursChange } from "../common/axes.js";
 import { drawArea, drawCurve, drawFrame, FRAME_COLOURS, roomy } from "../common/frame.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, el, number, setData, setText } from "../common/text.js";
 import { CopPaths } from "./cop_paths.js";
 
@@ -25,6 +26,8 @@ export class StanceOverlay {
     this.onGo = onGo;
     this.canvas = byId("overlay-canvas", HTMLCanvasElement);
     this.resting = 0;
+    this.other = null; // another session, whose stances are asked for
+    this.beside = null; // what came of it
     this.chosen = null; // number of a stance, and its frames
     this.hover = null; // number of a curve, and the percentage
     this.paths = new CopPaths(() => this.draw(), (curve) => this.go(curve.number));
@@ -50,10 +53,22 @@ export class StanceOverlay {
   async load() {
     const [answer, array] = await Promise.all([api.stancesOverlay(this.id), api.arrayOf(this.id)]);
     this.answer = answer;
-    this.percent = Array.from({ length: answer.points }, (_, i) => (100 * i) / (answer.points - 1));
+    this.percent = percentOf(answer.points);
     this.paths.show(array.tiles, answer);
     setText(byId("overlay-says"), this.sentence());
     byId("overlay-plots").hidden = answer.overlaid === 0;
+    this.draw();
+  }
+
+  /** Mean and spread of another session's stances beside ours; null: of none. @param {{id: string, name: string} | null} other */
+  async layBeside(other) {
+    this.other = other;
+    this.beside = null;
+    this.draw();
+    if (!other) return;
+    const answer = await unlessRefused(api.stancesOverlay(other.id));
+    if (this.other !== other || !answer?.overlaid) return;
+    this.beside = { name: other.name, spread: answer.spread, overlaid: answer.overlaid, percent: percentOf(answer.points) };
     this.draw();
   }
 
@@ -121,11 +136,11 @@ export class StanceOverlay {
     canvas.style.height = `${HEIGHT_PX}px`;
     const context = fit(canvas, width, HEIGHT_PX);
     const box = this.box = { left: 46, right: width - 14, top: 24, bottom: HEIGHT_PX - 44 };
-    const { mean, sd } = answer.spread.grf_n;
-    const low = mean.map((value, i) => (value === null || sd[i] === null ? null : value - sd[i]));
-    const high = mean.map((value, i) => (value === null || sd[i] === null ? null : value + sd[i]));
+    const { mean } = answer.spread.grf_n;
+    const [low, high] = bandOf(answer.spread.grf_n);
+    const theirs = this.beside ? bandOf(this.beside.spread.grf_n) : [];
     const frames = this.frames();
-    const range = rangeOf([low, high, mean, ...answer.curves.map((curve) => curve.grf_n), ...(frames ? [frames.low, frames.high] : [])]);
+    const range = rangeOf([low, high, mean, ...theirs, ...answer.curves.map((curve) => curve.grf_n), ...(frames ? [frames.low, frames.high] : [])]);
     const { x, y } = drawFrame(context, box, {
       x: { low: 0, high: 100 }, y: roomy(range), colours, xUnit: "%", xTitle: "of the stance", yTitle: "Ground reaction force, N",
     });
@@ -140,6 +155,15 @@ export class StanceOverlay {
     for (const curve of answer.curves) drawCurve(context, xs, rows(curve.grf_n));
     context.globalAlpha = 1;
     context.lineJoin = "round";
+    if (this.beside) {
+      const at = this.beside.percent.map(x);
+      context.fillStyle = context.strokeStyle = colours.other;
+      context.globalAlpha = 0.25;
+      drawArea(context, at, rows(theirs[0]), rows(theirs[1]));
+      context.globalAlpha = 1;
+      context.lineWidth = 2.5;
+      drawCurve(context, at, rows(this.beside.spread.grf_n.mean));
+    }
     context.strokeStyle = colours.text;
     context.lineWidth = 2.5;
     context.setLineDash([7, 4]);
@@ -163,7 +187,7 @@ export class StanceOverlay {
       const at = x(this.percent[this.hover.at]);
       drawCurve(context, [at, at], [box.top, box.bottom]);
     }
-    this.paths.draw(colours, this.chosen, frames, this.hover?.curve);
+    this.paths.draw(colours, this.chosen, frames, this.hover?.curve, this.beside);
     this.drawWords();
   }
 
@@ -179,6 +203,7 @@ export class StanceOverlay {
     setText(byId("overlay-at"), said);
     const items = [["single", "single stances"], ["mean", "mean"]];
     if (answer.overlaid > 1) items.push(["spread", "± one standard deviation over stances"]);
+    if (this.beside) items.push(["beside", `${this.beside.name}: mean ± one standard deviation over ${this.beside.overlaid.toLocaleString("en-GB")} stances`]);
     if (chosen) {
       const how = !chosen.whole ? " was not seen whole: it has no place here" : chosen.framesInBin > 1 ? ", from least to greatest" : ", frame by frame";
       items.push(["chosen", `stance ${chosen.number}${how}`]);
@@ -220,6 +245,11 @@ export class StanceOverlay {
     this.draw();
   }
 }
+
+const percentOf = (points) => Array.from({ length: points }, (_, i) => (100 * i) / (points - 1));
+
+/** Mean less and plus one standard deviation. */
+const bandOf = ({ mean, sd }) => [-1, 1].map((sign) => mean.map((value, i) => (value === null || sd[i] === null ? null : value + sign * sd[i])));
 
 /** Zero is always in sight: that is where a stance begins. */
 function rangeOf(series) {

@@ -39,19 +39,33 @@ export function neighbour(stances, by, cursorS, view) {
   return stances.findLastIndex((stance) => (cursorS === null ? stance.from <= view.to : stance.to < cursorS));
 }
 
-const known = (value, decimals, unit, factor = 1) => (value === null ? "–" : `${number(value * factor, decimals)} ${unit}`);
+const Z95 = 1.96;
 
-/** What a stance is told by, in the table and above the plots. */
-export const figuresOf = (stance) => ({
-  duration: known(stance.duration_s, 0, "ms", 1e3),
-  peak: known(stance.peak_grf_n, 1, "N") + (stance.peak_sigma_n === null ? "" : ` ± ${number(1.96 * stance.peak_sigma_n)}`),
-  impulse: known(stance.impulse_n_s, 2, "N\u00a0s"), // in one line
-});
+/** What a stance is told by: name, head of its column, value and sigma, factor to the unit shown, decimals. */
+const FIGURES = [
+  { key: "peak", says: "Peak force", value: "peak_grf_n", sigma: "peak_sigma_n", unit: "N", factor: 1, decimals: 1 },
+  { key: "duration", says: "Contact", value: "duration_s", sigma: "duration_sigma_s", unit: "ms", factor: 1e3, decimals: 0 },
+  { key: "impulse", says: "Impulse", value: "impulse_n_s", sigma: "impulse_sigma_n_s", unit: "N\u00a0s", factor: 1, decimals: 2 },
+  { key: "travel", says: "COP travel", value: "cop_x_range_m", sigma: "cop_x_range_sigma_m", unit: "mm", factor: 1e3, decimals: 1 },
+];
 
-function figuresInWords(stance) {
-  const { duration, peak, impulse } = figuresOf(stance);
-  const sure = stance.peak_sigma_n === null ? "" : "\u00a0(95\u00a0%)";
-  return stance.peak_grf_n === null ? `force not known, ${duration}` : `peak ${peak}${sure}, ${duration}, ${impulse}`;
+/** "25.6" and "± 1.0", the half of its 95 % interval; the latter empty where it is not known. */
+function figureOf(stance, { value, sigma, factor, decimals }) {
+  const [of, sigmaOf] = [stance[value] ?? null, stance[sigma] ?? null];
+  return [
+    of === null ? "–" : number(of * factor, decimals),
+    of === null || sigmaOf === null ? "" : `±\u00a0${number(Z95 * sigmaOf * factor, decimals)}`,
+  ];
+}
+
+/** The median of each figure over whole stances, as if it were a stance. */
+export function medianOf(stances) {
+  const middle = (name) => {
+    const values = stances.map((stance) => stance[name]).filter((value) => value !== null).sort((a, b) => a - b);
+    const half = values.length >> 1;
+    return values.length ? (values[half] + values[values.length - 1 - half]) / 2 : null;
+  };
+  return Object.fromEntries(FIGURES.map(({ value }) => [value, middle(value)]));
 }
 
 export class Stances {
@@ -62,6 +76,8 @@ export class Stances {
     this.stances = [];
     this.current = -1;
     this.says = byId("stance-says");
+    this.figures = new Map(FIGURES.map(({ key }) => [key, el("dd")]));
+    byId("stance-figures").replaceChildren(...FIGURES.map(({ key, says }) => el("div", { "data-figure": key }, el("dt", { text: says }), this.figures.get(key))));
     byId("stances-more").addEventListener("click", () => this.add());
   }
 
@@ -70,8 +86,6 @@ export class Stances {
     this.body.replaceChildren();
     this.current = -1;
     for (const id of ["stances-card", "stance-line"]) byId(id).hidden = !stances.length;
-    setData(byId("plots-card"), "stances", String(stances.length > 0)); // for the style: :has() is newer than our browsers
-    byId("stances-legend").textContent = `${stances.length} in all`;
     this.add();
   }
 
@@ -82,15 +96,14 @@ export class Stances {
   }
 
   row(stance, index) {
-    const { duration, peak, impulse } = figuresOf(stance);
     const go = el("button", { type: "button", cls: "small", text: String(stance.number), "aria-label": `${stance.number}: show this stance` });
     const row = el("tr", { role: "row", "data-stance": String(stance.number) },
       el("td", { role: "cell" }, go),
+      ...FIGURES.map((figure) => {
+        const [value, interval] = figureOf(stance, figure);
+        return el("td", { role: "cell" }, `${value} `, el("small", { text: interval }));
+      }),
       el("td", { role: "cell", text: timeWords(stance.from, 0.01) }),
-      el("td", { role: "cell", text: duration }),
-      el("td", { role: "cell", text: peak }),
-      el("td", { role: "cell", text: impulse }),
-      el("td", { role: "cell", text: known(stance.cop_x_range_m, 1, "mm", 1e3), "data-label": "COP travel" }),
       el("td", { role: "cell", cls: "why", text: flagsOf(stance) }));
     row.addEventListener("click", () => this.onGo(index));
     return row;
@@ -122,8 +135,15 @@ export class Stances {
   say(stance, isPlaying) {
     this.says.setAttribute("aria-live", isPlaying ? "off" : "polite"); // at four times the speed nobody can listen
     const many = this.stances.length.toLocaleString("en-GB");
-    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : many === "1" ? "1 stance" : `Step through ${many} stances`);
-    setText(byId("stance-figures"), stance ? figuresInWords(stance) : "");
+    const whole = this.stances.filter((one) => one.is_whole);
+    const all = `${many} stance${many === "1" ? "" : "s"}`;
+    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : whole.length > 1 ? `${all}: medians of ${whole.length.toLocaleString("en-GB")} whole` : all);
+    byId("stance-level").hidden = !stance;
+    const shown = stance ?? medianOf(whole);
+    for (const figure of FIGURES) {
+      const [value, interval] = figureOf(shown, figure);
+      setText(this.figures.get(figure.key), [value, interval && `${interval}`, figure.unit].filter(Boolean).join("\u00a0"));
+    }
     setText(byId("stance-flags"), stance ? flagsOf(stance) : "");
     setData(this.says, "stance", stance ? String(stance.number) : "");
   }

@@ -43,15 +43,26 @@ export function fromLink(search, durationS) {
   return from < to ? clamped({ from, to }, durationS) : whole(durationS);
 }
 
-/** "?from=1.25&to=2.5", or nothing for the whole session; what else the address asks for stays. */
-export function toLink(view, durationS, search = "") {
+/** The cursor that a link states; null if it states none. */
+export function cursorFromLink(search, durationS) {
+  const timeS = Number.parseFloat(new URLSearchParams(search).get("at") ?? "");
+  return timeS >= 0 && timeS <= durationS ? timeS : null;
+}
+
+/**
+ * "?from=1.25&to=2.5&at=1.5", or nothing for the whole session without a cursor; what else the address asks for stays.
+ * The chosen stance is the one that the cursor is in.
+ */
+export function toLink(view, durationS, search = "", cursorS = null) {
   const fields = new URLSearchParams(search);
   fields.delete("from");
   fields.delete("to");
+  fields.delete("at");
   const text = (value) => String(Number(value.toFixed(4)));
   if (!isWhole(view, durationS)) {
     fields.set("from", text(view.from));
     fields.set("to", text(view.to));
   }
+  if (cursorS !== null) fields.set("at", text(cursorS));
   return String(fields) && `?${fields}`;
 }

@@ -208,7 +208,7 @@ class NodeView(View):
     backlog_frames: int = Field(
         description="Frames of this stream that the node still has, and sends behind the newest."
     )
-    missed_slots: int = Field(description="Slots in which no frame was taken.")
+    missed_slots: int = Field(description="Slots that were not sampled in its present stream.")
     troubles: list[str] = Field(
         description="What is wrong with its array, or its disk, now, in words."
     )
@@ -308,6 +308,9 @@ class SessionView(View):
         description="How many more there may have been at an end that the node could not tell: its "
         "power failed, or it was given up."
     )
+    missed_slots: int = Field(
+        description="Slots that the node did not sample, since it was late: no frame was there."
+    )
     marks: int = Field(description="Events that were marked in it.")
     bytes: int | None = Field(description="Size of the sealed file.")
     sha256: str | None = Field(description="Hash of the sealed file.")
@@ -335,7 +338,7 @@ class SessionView(View):
         """Of a session as it is now."""
         ledger = recorder.ledger_of(session)
         made = {"frames", "pending_frames", "lost", "tail_frames_max", "duration_s", "problem"}
-        made |= {"marks", "waits_for", "said"}
+        made |= {"marks", "missed_slots", "waits_for", "said"}
         content = session.model_dump(include=set(cls.model_fields) - made)
         return cls(
             **content | {"complete": ledger.completeness},
@@ -343,6 +346,7 @@ class SessionView(View):
             pending_frames=ledger.pending,
             waits_for=recorder.waits_for(session, ledger),
             lost=ledger.lost,
+            missed_slots=ledger.missed_slots,
             marks=len(session.events),
             said=said_of(session),
             tail_frames_max=ledger.unsynced_tail_max,

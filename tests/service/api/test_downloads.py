@@ -40,7 +40,7 @@ def test_the_whole_file_comes_as_it_is_stored(sealed: Sealed) -> None:
     assert answer.headers["accept-ranges"] == "bytes"
     assert answer.headers["foottile-complete"] == "true"
     assert answer.headers["content-type"] == "application/vnd.apache.parquet"
-    assert f'filename="{sealed.id}.parquet"' in answer.headers["content-disposition"]
+    assert f'filename="trial_{sealed.id}.parquet"' in answer.headers["content-disposition"]
     assert "immutable" in answer.headers["cache-control"]
     assert sealed.session.now()["sha256"] == sealed.sha256
 
@@ -205,6 +205,17 @@ def test_parquet_of_a_recording_session_is_not_there_yet(sealed: Sealed) -> None
         assert_refused(sealed.made(sealed.recording, **query), 409, "csv")
 
 
+def test_a_file_is_named_after_the_trial_and_its_seconds(sealed: Sealed) -> None:
+    changed = {"name": "Ünder/..\\ 3rd trial\r\n"}
+    answer = sealed.session.running.http.patch(
+        sealed.session.url, json=changed, headers={"If-Match": f'"{sealed.session.now()["said"]}"'}
+    )
+    assert answer.status_code == 200, answer.text
+    made = sealed.made(sealed.session, format="csv", start_s=0.25, columns="grf_n")
+    name = f"nder-..-3rd-trial_{sealed.id}_0.250s-to-end.csv"
+    assert made.headers["content-disposition"] == f'attachment; filename="{name}"'
+
+
 @pytest.mark.parametrize("to", ["arrow", "csv"])
 def test_a_recording_session_gives_what_there_is(sealed: Sealed, to: str) -> None:
     answer = sealed.made(sealed.recording, format=to)
@@ -224,7 +235,7 @@ def test_files_of_motion_laboratories_are_of_sealed_and_of_recording_sessions(
         assert answer.status_code == 200, answer.text
         begin = {"c3d": b"\x02\x50", "opensim": b"PK\x03\x04"}[to]
         assert answer.content.startswith(begin)
-        name = f'filename="{session.id}.{ending}"'
+        name = f'filename="trial_{session.id}.{ending}"'
         assert name in answer.headers["content-disposition"]
     for query, said in (
         ({"columns": "grf_n"}, "columns of its own"),

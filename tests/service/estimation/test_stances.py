@@ -43,6 +43,7 @@ def recording(
         "grf_n": np.array(grf_n, dtype=np.float64),
         "grf_sigma_n": np.array(grf_n, dtype=np.float64) / 10,
         "cop_x_m": np.array(cop_x_m or [NAN] * n, dtype=np.float64),
+        "cop_sigma_x_m": np.abs(np.array(cop_x_m or [NAN] * n, dtype=np.float64)) / 10,
         "estimate_status": np.array(status or [0] * n, dtype=np.uint16),
     }
     if part is not None:
@@ -65,16 +66,65 @@ def test_a_stance_has_peak_impulse_and_travel_of_its_frames() -> None:
     assert one.impulse_n_s == pytest.approx(9 * 0.002, rel=1e-15)
     assert (one.cop_x_first_m, one.cop_x_last_m) == (-0.01, 0.015)
     assert one.cop_x_range_m == pytest.approx(0.03)
+    assert one.cop_x_range_sigma_m == pytest.approx(np.hypot(0.001, 0.002))
     assert one.duration_s == pytest.approx(0.006)
     assert (one.frames, one.unknown_frames, one.missing_frames) == (4, 0, 0)
     assert one.estimate_status == 16 | 4
     assert one.is_whole
 
 
+def test_a_doubtful_frame_may_have_gone_furthest() -> None:
+    x_m = [NAN, 0, 10, 9, NAN]
+    numbers, t_ns, columns = recording([0, 5, 5, 5, 0], [0, 1, 1, 1, 0], cop_x_m=x_m)
+    columns["cop_sigma_x_m"] = np.array([NAN, 0.0, 0.5, 2.0, NAN])
+    (one,) = stances_of(numbers, t_ns, columns)
+    assert one.cop_x_range_m == 10.0
+    greatest_high, greatest_low = 9 + 1.96 * 2.0, 10 - 1.96 * 0.5
+    assert one.cop_x_range_sigma_m == pytest.approx((greatest_high - greatest_low) / (2 * 1.96))
+
+
 def test_the_trapezoids_are_as_wide_as_the_frames_are_apart() -> None:
     (one,) = stances_of(*recording([0, 2, 2, 4, 0], [0, 1, 1, 1, 0], t_ms=[0, 2, 12, 14, 16]))
     assert one.impulse_n_s == pytest.approx(2 * 0.010 + 3 * 0.002, rel=1e-15)
     assert one.is_whole
+
+
+RAMP_N = [0.0, *(10.0 * k for k in range(1, 11)), *(10.0 * k for k in range(10, 0, -1)), 0.0]
+
+
+def test_a_duration_is_as_uncertain_as_its_two_gaps_and_the_force_at_its_edges() -> None:
+    t_ms = [0.0, *(6.0 + 2 * k for k in range(20)), 48.0]
+    (one,) = stances_of(*recording(RAMP_N, [0, *[1] * 20, 0], t_ms=t_ms))
+    # 6 ms before it and 4 ms behind it, and 1 N of sigma at 10 N. From the frame beside it to 10 ms
+    # within, 60 N come in 16 ms and go in 14 ms.
+    missing_s, spread_s = 0.5 * (6e-3 + 4e-3), np.hypot(6e-3, 4e-3) / np.sqrt(12.0)
+    force_s = 1.0 / 60.0 * (16e-3 + 14e-3)
+    expected_s = np.sqrt(missing_s**2 + spread_s**2 + force_s**2)
+    assert one.duration_sigma_s == pytest.approx(expected_s)
+
+
+@pytest.mark.parametrize(
+    "contact", [[1, 1, *[1] * 19, 0], [UNKNOWN, *[1] * 20, 0], [0, *[1] * 20, UNKNOWN]]
+)
+def test_of_an_edge_that_was_not_seen_no_uncertainty_is_stated(contact: list[int]) -> None:
+    (one,) = stances_of(*recording(RAMP_N, contact))
+    assert np.isnan(one.duration_sigma_s)
+
+
+def test_of_a_force_that_rises_too_slowly_no_uncertainty_is_stated() -> None:
+    slowly_n = [9.0, *(10.0 + 0.1 * k for k in range(20)), *RAMP_N[11:]]
+    (one,) = stances_of(*recording(slowly_n, [0, *[1] * (len(slowly_n) - 2), 0]))
+    assert np.isnan(one.duration_sigma_s)
+
+
+def test_errors_of_the_force_that_are_the_same_in_all_frames_add_up_in_the_impulse() -> None:
+    (one,) = stances_of(*recording(RAMP_N, [0, *[1] * 20, 0]))
+    edges_n_s = 0.5 * (10.0 + 10.0) * 2e-3  # 10 N first and last, 2 ms before and behind
+    assert one.impulse_sigma_n_s == pytest.approx(np.hypot(one.impulse_n_s / 10, edges_n_s))
+    (cut,) = stances_of(*recording(RAMP_N[1:-1], [1] * 20))
+    assert cut.impulse_sigma_n_s == pytest.approx(cut.impulse_n_s / 10)  # of what is there
+    gone = stances_of(*recording(RAMP_N, [0, *[1] * 20, 0], seq=[*range(15), *range(16, 23)]))
+    assert np.isnan(gone[0].impulse_sigma_n_s)
 
 
 def test_stances_at_the_ends_of_a_recording_say_that_they_are_cut() -> None:

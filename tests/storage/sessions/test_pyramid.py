@@ -45,7 +45,8 @@ def frames(n: int, seed: int = 0, parts: Sequence[int] = ()) -> dict[str, Any]:
         "estimate_status": (2 ** rng.integers(0, 14, n)).astype(np.uint16),
         "force_n": rng.normal(5.0, 3.0, (n, TILES)).astype(np.float32),
     }
-    for name in ("grf_sigma_n", "grf_at_least_n", "cop_x_m", "cop_y_m", "angle_rad"):
+    floats = ("grf_sigma_n", "grf_at_least_n", "cop_x_m", "cop_y_m", "angle_rad")
+    for name in (*floats, "cop_sigma_x_m", "cop_sigma_y_m"):
         some[name] = rng.random(n).astype(np.float32)
     if parts:
         some["part"] = np.repeat(np.arange(len(parts), dtype=np.uint16), parts)
@@ -117,6 +118,8 @@ def check(found: Bins, at: int, some: dict[str, Any], before: Any, part: int) ->
             "grf_unknown": np.isnan(some["grf_n"]).sum(),
             "force_n_1_max": some["force_n"][:, 1].max(),
             "cop_x_m_min": some["cop_x_m"].min(),
+            "cop_x_low_m_min": (some["cop_x_m"] - np.float32(1.96) * some["cop_sigma_x_m"]).min(),
+            "cop_y_high_m_max": (some["cop_y_m"] + np.float32(1.96) * some["cop_sigma_y_m"]).max(),
             "estimate_status": np.bitwise_or.reduce(some["estimate_status"]),
             "status_0": np.bitwise_or.reduce(some["status"][:, 0]),
             "contact": sum(

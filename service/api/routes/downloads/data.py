@@ -15,7 +15,14 @@ from devices.errors import StateError
 from service.api.problems import problem
 from service.api.routes.access import ServerState, file_answer, has_it, present, problems
 from service.api.routes.downloads.data_query import DataQuery
-from service.api.routes.downloads.made import Chunks, known, made, said_of_marks, tag_of_made
+from service.api.routes.downloads.made import (
+    Chunks,
+    file_stem,
+    known,
+    made,
+    said_of_marks,
+    tag_of_made,
+)
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.sessions.frames_so_far import FramesSoFar
@@ -23,6 +30,7 @@ from service.sessions.so_far import SoFar
 from storage.formats.export import Export
 from storage.formats.marks import TIMES, Marks, place
 from storage.formats.sealed import export_of, marks_of
+from storage.formats.slice import Slice
 from storage.formats.written.parquet import PARQUET
 from storage.formats.written.registry import FORMATS
 from storage.sessions.folder import FRAMES_NAME, Session
@@ -110,7 +118,10 @@ def _stored(
                 {"Content-Range": f"bytes */{size}"},
             )
     answer = file_answer(
-        path, headers=headers, media_type=PARQUET.media_type, filename=f"{session.id}.parquet"
+        path,
+        headers=headers,
+        media_type=PARQUET.media_type,
+        filename=f"{file_stem(session.name, session.id, Slice())}.parquet",
     )
     answer.chunk_size = _CHUNK
     return answer
@@ -129,7 +140,8 @@ async def _made(
     if query.has_marks:
         marks = await run_in_threadpool(_marks, session, query, server)
         headers |= said_of_marks([marks])
-    return await made(_chunks(session, query, server, marks), query, session.id, headers)
+    stem = file_stem(session.name, session.id, query.slice)
+    return await made(_chunks(session, query, server, marks), query, stem, headers)
 
 
 def _marks(session: Session, query: DataQuery, server: Server) -> Marks:

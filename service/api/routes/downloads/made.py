@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import AsyncIterator, Generator
 
 import pyarrow as pa
@@ -17,9 +18,12 @@ from service.version import SOFTWARE
 from storage.clock.file import CLOCK_NAME
 from storage.file_hash import sha256_of
 from storage.formats.marks import Marks
+from storage.formats.slice import Slice
 from storage.sessions.folder import Session
 
 Chunks = Generator[bytes, None, None]
+_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9.-]+")
+_NAME_LENGTH = 60
 
 
 def known(session: Session) -> Session:
@@ -54,6 +58,17 @@ def said_of_marks(marks: list[Marks]) -> dict[str, str]:
     total = sum(len(each.all) for each in marks)
     left_out = sum(len(each.left_out) for each in marks)
     return {"Foottile-Marks": f"placed={total - left_out}, left-out={left_out}"}
+
+
+def file_stem(name: str, id_: str, part: Slice) -> str:
+    """Return a file's name without its ending: the trial's name and id, and the seconds in it.
+
+    Letters of the name that are not in every file system's alphabet are dashes.
+    """
+    name = _NOT_IN_NAMES.sub("-", name)[:_NAME_LENGTH].strip("-.")
+    ends = [None if at_s is None else f"{at_s:.3f}s" for at_s in (part.start_s, part.end_s)]
+    seconds = f"{ends[0] or 'begin'}-to-{ends[1] or 'end'}" if any(ends) else ""
+    return "_".join(word for word in (name, id_, seconds) if word)
 
 
 async def made(chunks: Chunks, query: MadeQuery, stem: str, headers: dict[str, str]) -> Response:

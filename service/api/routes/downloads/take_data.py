@@ -13,7 +13,14 @@ from starlette.concurrency import run_in_threadpool
 from devices.errors import StateError
 from service.api.routes.access import ServerState, has_it, problems
 from service.api.routes.downloads.data_query import TakeDataQuery
-from service.api.routes.downloads.made import Chunks, known, made, said_of_marks, tag_of_made
+from service.api.routes.downloads.made import (
+    Chunks,
+    file_stem,
+    known,
+    made,
+    said_of_marks,
+    tag_of_made,
+)
 from service.server.server import Server
 from storage.formats.marks import Marks
 from storage.formats.sealed import export_of, marks_of
@@ -74,7 +81,8 @@ async def take_data(
         marks = [await run_in_threadpool(_marks, each, query, server) for each in sessions]
         headers |= said_of_marks(marks)
     chunks = _chunks(sessions, query, server, marks)
-    return await made(chunks, query, f"take-{take_id}", headers)
+    stem = file_stem(sessions[0].name, f"take-{take_id}", query.slice)
+    return await made(chunks, query, stem, headers)
 
 
 def _marks(session: Session, query: TakeDataQuery, server: Server) -> Marks:

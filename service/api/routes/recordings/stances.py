@@ -40,13 +40,16 @@ class StanceView(BaseModel):
     begin_t_ns: int
     end_t_ns: int
     duration_s: float
+    duration_sigma_s: float | None
     peak_grf_n: float | None
     peak_t_ns: int | None
     peak_sigma_n: float | None
     impulse_n_s: float | None
+    impulse_sigma_n_s: float | None
     cop_x_first_m: float | None
     cop_x_last_m: float | None
     cop_x_range_m: float | None
+    cop_x_range_sigma_m: float | None
     frames: int
     unknown_frames: int
     missing_frames: int
