@@ -198,7 +198,8 @@ def verdict_of(report: Report) -> Verdict:
         return "export"
     verdicts: set[Verdict] = set()
     if isinstance(report, FolderReport):
-        verdicts = {verdict_of(part) for part in (*report.sessions, *report.streams)}
+        parts: list[Report] = [*report.sessions, *report.streams]
+        verdicts = {verdict_of(part) for part in parts}
     elif isinstance(report, SessionReport) and not report.in_trash:
         verdicts = {_of_ledger(report.ledger)}
     if not isinstance(report, SegmentReport) and report.unproven:

@@ -16,7 +16,7 @@ from service.offline.compare.align import Alignment
 from service.offline.compare.blocks import Estimate, mean_of
 from service.offline.compare.signals import Signal
 
-COMPARED = ("seq", "t_ns", *GATHERED, "cop_y_m", "cop_sigma_x_m", "cop_sigma_y_m")
+COMPARED = ("seq", "t_ns", *GATHERED, "cop_y_m", "cop_sigma_y_m")
 """Columns of a session that are compared."""
 
 CONTACT_SIGMA = 5.0
