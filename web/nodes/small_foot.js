@@ -8,6 +8,7 @@ import { FAULT_STATES, readTile } from "../live/tile.js";
 
 const Z95 = 1.96;
 const LEGEND_PX = 40; // beside a foot from above
+const NARROW_PX = 240; // of a card on a phone: the legend would lie on the foot
 const NUMBERS_FROM_PX = 10; // of a tile's radius
 
 export class SmallFoot {
@@ -41,7 +42,7 @@ export class SmallFoot {
     this.ratio = ratio;
     const { widthPx, heightPx } = this;
     const room = isPlan(node.tiles) ? { roomPx: 8 } : { roomPx: 0.4 * heightPx, basePx: 0.4 * heightPx }; // for the COP, below
-    this.leftPx = isPlan(node.tiles) ? LEGEND_PX : 0;
+    this.leftPx = isPlan(node.tiles) ? LEGEND_PX : widthPx < NARROW_PX ? LEGEND_PX / 2 : 0;
     const box = { widthPx: widthPx - 2 * this.leftPx, heightPx, ...room, turns: Boolean(node.servo), toesUp: true };
     this.layout = new FootLayout(node.tiles, box);
     this.sole = !this.layout.plan ? new Path2D(this.layout.sole()) : null;

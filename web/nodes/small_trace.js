@@ -6,7 +6,7 @@ import { Points, runs } from "../live/points.js";
 import { following } from "../live/range.js";
 
 const WINDOW_S = 10;
-const [LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX] = [38, 4, 8, 6];
+const [LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX] = [46, 4, 8, 6];
 
 export class SmallTrace {
   /** @param {HTMLCanvasElement} canvas @param {() => string} stream that is shown now, by its boot_id */
