@@ -3,7 +3,7 @@
 // common/    REST calls, the websocket, dialogs, notices, words and elements
 // live/      panels that draw the newest frame, and the buttons beside them
 // nodes/     the page of all nodes
-// sessions/  the list of recorded sessions, and the trash
+// sessions/  the page of recorded sessions, and the trash
 //
 // A panel is a class that owns one element of index.html; it is made here and handed what the
 // server says. Panels do not know each other. No build step, and nothing from another host.
@@ -21,6 +21,7 @@ import { Foot } from "./live/foot.js";
 import { helpWithKeys } from "./common/help.js";
 import { drawGrf } from "./live/grf.js";
 import { History } from "./live/history.js";
+import { LastSession } from "./live/last_session.js";
 import { Marks } from "./live/marks.js";
 import { Notes } from "./live/notes.js";
 import { Pace, Reading } from "./live/pace.js";
@@ -30,8 +31,6 @@ import { Status } from "./live/status.js";
 import { Tares } from "./live/tares.js";
 import { TileTraces } from "./live/tile_traces.js";
 import { Trace } from "./live/trace.js";
-import { Sessions } from "./sessions/list.js";
-import { Trash } from "./sessions/trash.js";
 
 const NODE_KEY = "foottile.node";
 
@@ -74,8 +73,7 @@ helpWithKeys();
 const notes = new Notes();
 const replacement = new ReplacementWarning();
 byId("replacement-box").append(replacement.element);
-const trash = new Trash(takeSession);
-const sessions = new Sessions({ onSession: takeSession, onDeleted: forgetSession });
+const lastSession = new LastSession();
 const tares = new Tares();
 const marks = new Marks();
 const actions = new Actions(state, marks, takeSession);
@@ -87,11 +85,10 @@ const handlers = {
     state.recordings.clear();
     past.want(); // what came while the link was down
     (message.recording ?? []).forEach(takeSession);
+    lastSession.clear(); // another server may have others
     chooseNode();
-    sessions.reload().then((items) => items.forEach(takeSession));
     marks.send(); // the server is back
     look(); // and may know us no more
-    trash.changed();
   },
   node({ node }) {
     const isNew = !state.nodes.has(node.node);
@@ -157,7 +154,7 @@ function keepSpan(frame, earlier) {
 function takeSession(session) {
   if (session.state === "recording") state.recordings.set(session.id, session);
   else state.recordings.delete(session.id);
-  sessions.take(session);
+  lastSession.take(session);
   actions.draw();
 }
 
@@ -165,13 +162,11 @@ function takeSession(session) {
 function count(id, counted) {
   const session = state.recordings.get(id);
   if (session) state.recordings.set(id, { ...session, ...counted });
-  sessions.count(id, counted);
 }
 
 function forgetSession(id) {
   state.recordings.delete(id);
-  sessions.drop(id);
-  trash.changed();
+  lastSession.drop(id);
   actions.draw();
 }
 
@@ -244,6 +239,7 @@ function tick() {
   byId("calibration-line").hidden = !node;
   setText(byId("calibration-name"), node?.calibration ? `Calibration “${node.calibration.name}”` : "No calibration");
   actions.draw();
+  lastSession.draw(node);
   if (node && !node.connected) past.see(node, null, trace.windowS, nowMs, tileTraces.wants(bars.unit));
 }
 

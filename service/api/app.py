@@ -147,6 +147,10 @@ def make_app(
     async def nodes_page(request: Request) -> Response:
         return await page.get_response("nodes.html", request.scope)
 
+    @app.get("/sessions", include_in_schema=False)
+    async def sessions_page(request: Request) -> Response:
+        return await page.get_response("sessions.html", request.scope)
+
     @app.get("/sessions/{session_id}", include_in_schema=False)
     async def session_page(session_id: str, request: Request) -> Response:  # it asks for it itself
         return await page.get_response("session.html", request.scope)

@@ -14,6 +14,7 @@ from playwright.sync_api import Page, expect
 from tests.service.fake_node import Play
 from tests.service.running import Running
 from tests.web.scripted import Scripted
+from tests.web.session_rows import choose, open_menu
 
 pytestmark = pytest.mark.real_time
 
@@ -66,8 +67,7 @@ def test_live_recording_and_marked(
         page.fill("#mark-label", "a stone")
         page.press("#mark-label", "Enter")
         expect(page.locator("#notices")).to_contain_text("Marked")
-        for card in ("#tares-card", "#trash-card"):
-            page.click(f"{card} summary")
+        page.click("#tares-card summary")
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_be_visible()
         expect(page.locator("#tares li")).not_to_have_count(0)
@@ -84,20 +84,26 @@ def test_with_the_node_away_and_sessions_that_wait_for_it(
     scripted.node.leave()
     page = open_page(scripted.url, *size)
     expect(page.locator("#frozen")).to_contain_text("No data for")
-    expect(page.locator("#sessions [data-state=pending]")).to_have_count(1)
     assert complaints(page) == []
+    page.goto(f"{scripted.url}/sessions")
+    expect(page.locator("#sessions [data-state=pending]")).to_have_count(1)
+    page.click("#trash-card summary")
+    expect(page.locator("#trash-legend")).to_have_text("empty")
+    assert complaints(page) == []
+    assert page.evaluate("document.documentElement.scrollWidth") == size[0]
 
 
-@pytest.mark.parametrize("dialog", ["edit", "seal", "token", "refused", "help"])
+@pytest.mark.parametrize("dialog", ["menu", "edit", "seal", "token", "refused", "help"])
 def test_dialogs_and_refusals(scripted: Scripted, open_page: OpenPage, dialog: str) -> None:
     scripted.pending("waits")
-    page = open_page(scripted.url)
+    page = open_page(scripted.url if dialog == "refused" else f"{scripted.url}/sessions")
     row = page.locator("#sessions .session")
-    expect(row).to_have_count(1)
-    if dialog == "edit":
-        row.get_by_role("button", name="Edit").click()
+    if dialog == "menu":
+        open_menu(page, row)
+    elif dialog == "edit":
+        choose(page, row, "Edit")
     elif dialog == "seal":
-        row.get_by_role("button", name="Seal without them").click()
+        choose(page, row, "Seal without them")
     elif dialog == "help":
         page.keyboard.press("?")
     elif dialog == "token":

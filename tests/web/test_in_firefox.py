@@ -67,6 +67,7 @@ def test_what_stands_on_the_foot_is_watched_recorded_marked_looked_at_and_downlo
         firefox.click("#stop")
         until(lambda: scripted.running.sessions()[0]["state"] == "sealed")
 
+    firefox.click("#to-sessions")
     firefox.click("#sessions a[href^='/sessions/']")
     firefox.wait("document.querySelector('#plots')?.dataset.settled === 'true'")
     firefox.wait(is_drawn("#plots-canvas"))

@@ -165,7 +165,7 @@ def test_the_first_screen_of_a_phone_has_what_matters(
         expect(page.locator("#notes-more")).to_have_text("8 more")
         bar = page.locator("#actions").bounding_box()
         assert bar is not None
-        assert bar["height"] < 70
+        assert bar["height"] < 110  # a line of what is recorded, and the buttons
         assert bar["y"] + bar["height"] <= height
         for part in ("#notes-box", "#grf", "#trace", "#foot", "#record"):
             assert bottom_of(page, part) <= height, part

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
@@ -15,6 +14,7 @@ from tests.service.fake_node import Play
 from tests.service.recording import Recording
 from tests.waiting import until
 from tests.web.scripted import Scripted
+from tests.web.session_rows import choose, open_menu, row_of
 
 pytestmark = pytest.mark.real_time
 
@@ -29,14 +29,11 @@ NOTE_WHAT_IS_FROZEN = """() => {
 """Has the page keep every text of its warning, however short it is there."""
 
 
-def row_of(page: Page, session: Recording) -> Any:
-    return page.locator(f'#sessions [data-session-id="{session.id}"]')
-
-
-def counted(page: Page, session: Recording) -> tuple[int | None, ...]:
-    """Frames of a recording as the page, its list, REST and the ledger say; None: it says none."""
-    said = page.locator("#recordings .recording-text").inner_text()
-    listed = row_of(page, session).locator(".c-frames .taken").inner_text() + " frames"
+def counted(pages: tuple[Page, Page], session: Recording) -> tuple[int | None, ...]:
+    """Frames of a recording as the pages, REST and the ledger have them; None: a page has none."""
+    live, sessions = pages
+    said = live.locator("#recordings .recording-text").inner_text()
+    listed = row_of(sessions, session).locator(".c-frames .taken").inner_text() + " frames"
     found = [re.search(r"([\d,]+) frames", text) for text in (said, listed)]
     here = [int(one[1].replace(",", "")) if one else None for one in found]
     ledger = sum(part["recorded"] for part in session.ledger()["parts"])
@@ -50,6 +47,7 @@ def test_frames_are_counted_once_by_the_ledger_whatever_becomes_of_the_node(
     session = node.record(name="walk")
     with Play(node):
         page = open_page(scripted.url)
+        pages = (page, open_page(f"{scripted.url}/sessions"))
         expect(page.locator(LIVE)).to_have_count(1)
         until(lambda: session.now()["frames"] > 300)
     node.frames(40)  # taken, and not sent before it is killed
@@ -59,10 +57,12 @@ def test_frames_are_counted_once_by_the_ledger_whatever_becomes_of_the_node(
         node.send(20)
     node.leave()
     total = session.now()["frames"]
-    until(lambda: counted(page, session) == (total,) * 4)
-    page.reload()
+    until(lambda: counted(pages, session) == (total,) * 4)
+    for one in pages:
+        one.reload()
     expect(page.locator("#recordings li")).to_have_count(1)
-    until(lambda: counted(page, session) == (total,) * 4)
+    expect(row_of(pages[1], session)).to_have_count(1)
+    until(lambda: counted(pages, session) == (total,) * 4)
 
 
 def test_a_page_opened_after_the_node_died_tells_one_story(
@@ -144,12 +144,13 @@ def test_a_session_whose_end_alone_is_open_says_so_and_completes_when_the_node_i
     session = ends_open(scripted)
     now = session.now()
     assert (now["pending_frames"], now["waits_for"]) == (0, "end")
-    page = open_page(scripted.url)
+    page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
     expect(row).to_contain_text("Only its end is open")
     assert page.evaluate("document.documentElement.scrollWidth") <= 1366
-    expect(row.get_by_role("button", name="Seal as it is")).to_be_visible()
-    expect(row.get_by_role("button", name="Seal without")).to_have_count(0)
+    menu = open_menu(page, row)
+    expect(menu.get_by_role("menuitem", name="Seal as it is")).to_be_visible()
+    expect(menu.get_by_role("menuitem", name="Seal without")).to_have_count(0)
     scripted.node.connect()
     scripted.node.send(10, now=True)
     expect(row.locator(".state")).to_have_text("complete")
@@ -160,9 +161,9 @@ def test_a_session_whose_node_never_comes_back_is_sealed_with_what_is_here(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = ends_open(scripted)
-    page = open_page(scripted.url)
+    page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
-    row.get_by_role("button", name="Seal as it is").click()
+    choose(page, row, "Seal as it is")
     expect(page.locator("#ask-dialog")).to_contain_text("is given up")
     page.get_by_role("button", name="Seal as lossy").click()
     expect(row.locator(".state")).to_have_text("lossy")

@@ -16,6 +16,7 @@ from tests.waiting import until
 from tests.web.conftest import Field, wait_until
 from tests.web.scripted import Scripted
 from tests.web.test_accessible import SIZES, complaints
+from tests.web.test_live_notes import tell
 from tests.web.test_page import PRESSED_N, load_file, scene_file
 
 pytestmark = pytest.mark.real_time
@@ -66,6 +67,7 @@ def test_two_feet_are_recorded_marked_and_stopped_together_and_one_is_lost_in_be
     page.press("#take-name", "Enter")
     expect(page.locator('.node[data-recording="true"]')).to_have_count(2)
     expect(page.locator("#take-running")).to_contain_text("“both feet” on 2 nodes")
+    expect(page.locator("#take-running")).to_contain_text("0 frames lost")
     page.fill("#take-label", "a stone")
     page.press("#take-label", "Enter")
     expect(page.locator("#notices")).to_contain_text("Marked “a stone” on 2 nodes")
@@ -122,6 +124,102 @@ def test_a_node_that_sends_nothing_is_not_recorded_and_its_card_says_why(
             assert len(scripted.running.sessions()) == 1
     finally:
         silent.close()
+
+
+def test_tare_all_tares_who_is_unloaded_says_who_is_not_and_can_be_undone(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    loaded = FakeNode(scripted.running, "loaded")
+    loaded.connect()
+    http = scripted.running.http
+
+    def tares(node: str) -> list[bool]:
+        return [tare["undone"] for tare in http.get(f"/nodes/{node}/tares").json()["items"]]
+
+    before = tares("bench")
+    try:
+        with Play(scripted.node, alive=True), Play(loaded, 20.0, alive=True):
+            page = open_page(f"{scripted.url}/nodes")
+            for name in ("bench", "loaded"):
+                expect(page.locator(live(name))).to_have_count(1)
+            page.wait_for_timeout(600)  # frames to tare from
+            page.keyboard.press("t")
+            expect(page.locator("#notices")).to_contain_text("1 node tared")
+            expect(page.locator(f"{card('loaded')} .refused")).to_contain_text("Not tared: ")
+            expect(page.locator(f"{card('bench')} .refused")).to_have_count(0)
+            assert tares("bench") == [False, *before]
+            page.locator("#notices").get_by_role("button", name="Undo").click()
+            expect(page.locator("#notices")).to_contain_text("Tare undone on 1 node")
+            assert tares("bench") == [True, *before]
+    finally:
+        loaded.close()
+
+
+COLOURS = """async () => {
+  const { SmallFoot } = await import("/static/nodes/small_foot.js");
+  const canvas = document.querySelector(".node-foot").cloneNode();
+  document.querySelector(".node").append(canvas);
+  const foot = new SmallFoot(canvas);
+  const tiles = [0, 1, 2, 3].map((i) => (
+    { serial: `T${i}`, x_m: 0.014 * i, y_m: 0, z_m: -0.15, full_scale_n: 29 }));
+  const node = { node: "n", tiles, tare: {}, calibration: {}, servo: null };
+  foot.draw(node, { status: [0, 0, 0, 0], force_n: [0, 10, 17, 21], saturated: [] });
+  const ratio = canvas.width / canvas.clientWidth;
+  const copy = new OffscreenCanvas(canvas.width, canvas.height)
+    .getContext("2d", { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  const light = foot.layout.points.map(({ x, y }) => {
+    const at = [(x + 0.7 * foot.layout.radiusPx) * ratio, y * ratio, 1, 1];
+    const [r, g, b] = copy.getImageData(...at).data;
+    return (0.2126 * r + 0.7152 * g + 0.0722 * b) / 255;
+  });
+  canvas.remove();
+  return { light, top: foot.range.ofAll };
+}"""
+"""How light tiles of 0, 10, 17 and 21 N are on a card."""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_tiles_of_17_and_21_n_differ_from_each_other_and_are_far_from_white(
+    scripted: Scripted, open_page: OpenPage, scheme: str
+) -> None:
+    with Play(scripted.node, 5.0):
+        page = open_page(f"{scripted.url}/nodes", color_scheme=scheme)
+        expect(page.locator(live("bench"))).to_have_count(1)
+        found = page.evaluate(COLOURS)
+    none, *loaded = found["light"]
+    assert found["top"] == 29
+    assert all(0.04 < light < 0.85 for light in loaded[1:])
+    steps = [abs(a - b) for a, b in zip(found["light"], loaded, strict=False)]
+    assert min(steps) > 0.02
+    assert abs(loaded[-1] - none) > 0.3
+
+
+TRACED = """([name]) => {
+  const { width, height } = document.querySelector(name);
+  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(document.querySelector(name), 0, 0);
+  const { data } = copy.getImageData(width / 2, 0, width / 2, height);
+  let blue = 0;
+  for (let i = 0; i < data.length; i += 4) blue += data[i + 2] - data[i] > 60 && data[i + 3] > 100;
+  return blue > 50;
+}"""
+
+
+def test_a_card_has_the_trace_contact_and_warnings_of_its_node(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node, 15.0) as play:
+        page = open_page(f"{scripted.url}/nodes")
+        bench = page.locator(card("bench"))
+        expect(bench.locator(".contact")).to_have_attribute("data-contact", "true")
+        expect(bench.locator(".contact")).to_have_text("contact")
+        page.wait_for_function(TRACED, arg=[".node-trace"])
+        tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer")
+        expect(bench.locator(".node-notes")).to_contain_text("Tile S0 (mux 0x70 channel 0)")
+        play.force_n = 0.0
+        expect(bench.locator(".contact")).to_have_text("flight")
+        assert complaints(page) == []
 
 
 def test_the_page_says_that_a_node_or_the_server_is_away_and_goes_on_by_itself(

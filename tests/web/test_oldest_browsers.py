@@ -96,6 +96,7 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
         until(lambda: scripted.running.sessions()[0]["frames"] > 600)
         page.click("#stop")
         until(lambda: scripted.running.sessions()[0]["state"] == "sealed")
+        page.click("#to-sessions")
         page.click("#sessions .session-name")
         settled(page)
         page.click("#zoom-in")

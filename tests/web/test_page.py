@@ -13,6 +13,7 @@ from playwright.sync_api import Page, expect
 
 from tests.web.conftest import Field, wait_until
 from tests.web.login import log_in
+from tests.web.session_rows import choose
 
 pytestmark = pytest.mark.real_time
 
@@ -99,10 +100,12 @@ def test_record_mark_stop_download(known: Field, open_page: OpenPage, tmp_path: 
     page.click("#stop")
     wait_until(lambda: known.get("/sessions")["items"][0]["state"] == "sealed", "the sealed file")
     session = known.get("/sessions")["items"][0]
+    expect(page.locator("#last-session")).to_contain_text("complete")
+    page.click("#to-sessions")
     row = page.locator(f'#sessions [data-session-id="{session["id"]}"]')
     expect(row).to_contain_text("mud & <b>stones</b>")
     with page.expect_download() as download:
-        row.get_by_role("link", name="Parquet").click()
+        choose(page, row, "Download Parquet")
     path = tmp_path / "session.parquet"
     download.value.save_as(path)
     table = pq.read_table(path)

@@ -53,10 +53,13 @@ def test_hostile_names_are_spelt_out_wherever_they_are_shown(
     with Play(scripted.node, 5.0):
         page = open_page(scripted.url, first=first)
         expect(page.locator("body[data-live=true]")).to_have_count(1)
-        expect(page.locator("#sessions .session-name")).to_have_text(SHOWN)
+        expect(page.locator("#last-session a")).to_have_text(SHOWN)
         expect(page.locator("#bars .serial").first).to_have_text(SHOWN)
         assert unprintable(page) == []
         page.click("#as-traces")
+        page.goto(f"{scripted.url}/sessions")
+        expect(page.locator("#sessions .session-name")).to_have_text(SHOWN)
+        assert unprintable(page) == []
         page.goto(f"{scripted.url}/nodes")
         expect(page.locator(".node[data-live=true]")).to_have_count(1)
         assert unprintable(page) == []

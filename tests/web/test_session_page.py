@@ -149,7 +149,7 @@ def test_a_session_is_shown_while_it_is_recorded_and_as_it_was_sealed_afterwards
 ) -> None:
     with Play(scripted.node):
         session = scripted.node.record(name="now")
-        page = open_page(scripted.url)
+        page = open_page(f"{scripted.url}/sessions")
         page.click('#sessions [data-part="open"]')
         expect(page.locator("#message")).to_contain_text("still being recorded")
         expect(page.locator("#message")).to_contain_text("provisional")
@@ -205,7 +205,7 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         received = Received(page)
         page.goto(walk.running.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
-        expect(page.locator("#sessions")).to_contain_text("walk")
+        expect(page.locator("#last-session")).to_contain_text("Not recording")
         received.wait_for("/recent")
         assert received.bytes_in_all < 120_000, received.bytes_of
         more = {url: size for url, size in of_page.items() if url not in received.bytes_of}

@@ -73,7 +73,7 @@ def names(page: Page) -> list[str]:
 def test_a_thousand_sessions_come_as_one_scrolls_each_once_and_in_order(
     archive: Running, open_page: OpenPage
 ) -> None:
-    page = open_page(archive.url, *LOW)
+    page = open_page(f"{archive.url}/sessions", *LOW)
     rows = page.locator("#sessions .session")
     expect(rows).to_have_count(20)
     expect(page.locator("#sessions-more")).to_be_visible()
@@ -99,14 +99,14 @@ def test_the_first_load_with_a_thousand_sessions_is_small(
     page = open_page("about:blank", 390, 844)
     log_in(page.context, archive.url)
     received = Received(page)
-    page.goto(archive.url)
+    page.goto(f"{archive.url}/sessions")
     expect(page.locator("#sessions .session")).to_have_count(20)
     received.wait_for("/sessions?")
     assert received.bytes_in_all < 120_000, received.bytes_of
 
 
 def test_what_is_searched_for_is_found_by_the_server(archive: Running, open_page: OpenPage) -> None:
-    page = open_page(archive.url, *LOW)
+    page = open_page(f"{archive.url}/sessions", *LOW)
     rows = page.locator("#sessions .session")
     expect(rows).to_have_count(20)
     page.fill("#sessions-search", "MUD")
@@ -124,7 +124,7 @@ def test_what_is_searched_for_is_found_by_the_server(archive: Running, open_page
 def test_sessions_with_missing_frames_are_found_among_all(
     archive: Running, open_page: OpenPage
 ) -> None:
-    page = open_page(archive.url, *LOW)
+    page = open_page(f"{archive.url}/sessions", *LOW)
     rows = page.locator("#sessions .session")
     expect(rows).to_have_count(20)
     page.select_option("#sessions-complete", label="Frames missing")
@@ -144,12 +144,12 @@ def searched(page: Page) -> None:
 def test_several_are_chosen_and_come_as_one_zip_file(
     archive: Running, open_page: OpenPage, tmp_path: Path
 ) -> None:
-    page = open_page(archive.url, *LOW)
+    page = open_page(f"{archive.url}/sessions", *LOW)
     searched(page)
     expect(page.locator("#chosen")).to_be_hidden()
     for name in ("mud 7", "mud 107"):
-        page.get_by_role("checkbox", name=f"Choose {name}", exact=True).check()
-    expect(page.locator("#chosen-text")).to_have_text("2 chosen")
+        page.get_by_role("checkbox", name=f"Select {name}", exact=True).check()
+    expect(page.locator("#chosen-text")).to_have_text("2 selected")
     expect(page.locator("#chosen-zip")).to_contain_text("Download 2 sessions as zip")
     assert complaints(page) == []
     with page.expect_download() as download:
@@ -162,18 +162,18 @@ def test_several_are_chosen_and_come_as_one_zip_file(
         assert folders == {f"20200101T000000Z-{i:06x}" for i in (7, 107)}
         for name in file.namelist():
             assert file.read(name) == (archive.data / "sessions" / name).read_bytes()
-    page.get_by_role("checkbox", name="Choose all").check()
-    expect(page.locator("#chosen-text")).to_have_text("10 chosen")
+    page.get_by_role("checkbox", name="Select all").check()
+    expect(page.locator("#chosen-text")).to_have_text("10 selected")
     page.click("#chosen-none")
     expect(page.locator("#chosen")).to_be_hidden()
 
 
 def test_several_are_deleted_and_had_back(archive: Running, open_page: OpenPage) -> None:
-    page = open_page(archive.url, 390, 844)
+    page = open_page(f"{archive.url}/sessions", 390, 844)
     searched(page)
     chosen = ["mud 107", "mud 207", "mud 307"]
     for name in chosen:
-        page.get_by_role("checkbox", name=f"Choose {name}", exact=True).check()
+        page.get_by_role("checkbox", name=f"Select {name}", exact=True).check()
     page.click("#chosen-delete")
     expect(page.locator("#ask-dialog")).to_contain_text("Move 3 sessions to the trash?")
     page.click("#ask-yes")

@@ -6,23 +6,19 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.service.fake_node import Play
-from tests.service.recording import Recording
+from tests.service.fake_node import FakeNode, Play
 from tests.web.conftest import wait_until
 from tests.web.scripted import Scripted
+from tests.web.session_rows import choose, open_menu, row_of
+from tests.web.test_accessible import SIZES, complaints
 
 pytestmark = pytest.mark.real_time
 
 OpenPage = Callable[..., Page]
-
-
-def row_of(page: Page, session: Recording) -> Any:
-    return page.locator(f'#sessions [data-session-id="{session.id}"]')
 
 
 def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one(
@@ -65,7 +61,7 @@ def test_a_mark_that_is_set_while_the_server_is_away_has_the_instant_of_the_pres
     page.fill("#mark-label", "a stone")
     pressed_ns = time.time_ns()
     page.click("#mark")
-    expect(page.locator("#waiting-marks")).to_contain_text("1 mark waits")
+    expect(page.locator("#waiting-marks")).to_contain_text("1 marker waits")
     expect(page.locator("#waiting-marks")).to_contain_text("a stone")
     expect(page.locator("#waiting-marks")).to_contain_text("closing it loses it")
     time.sleep(1.5)
@@ -80,13 +76,13 @@ def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.recorded("walk")
-    page = open_page(scripted.url)
+    page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
-    row.get_by_role("button", name="Delete").click()
+    choose(page, row, "Delete")
     expect(row).to_have_count(0)
     page.locator("#notices").get_by_role("button", name="Undo").click()
     expect(row).to_have_count(1)
-    row.get_by_role("button", name="Delete").click()
+    choose(page, row, "Delete")
     expect(row).to_have_count(0)
     page.locator("#trash-card summary").click()
     trashed = page.locator(f'#trash [data-session-id="{session.id}"]')
@@ -94,7 +90,7 @@ def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is
     trashed.get_by_role("button", name="Restore").click()
     expect(trashed).to_have_count(0)
     expect(row).to_have_count(1)
-    row.get_by_role("button", name="Delete").click()
+    choose(page, row, "Delete")
     expect(trashed).to_have_count(1)
     page.click("#trash-empty")
     page.get_by_role("button", name="Cancel").click()
@@ -109,15 +105,15 @@ def test_a_pending_session_says_what_it_waits_for_and_can_be_sealed_without_it(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.pending("walk")
-    page = open_page(scripted.url)
+    page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
     expect(row).to_contain_text("100 frames are still with the node")
-    row.get_by_role("button", name="Seal without").click()
+    choose(page, row, "Seal without")
     expect(page.locator("#ask-dialog")).to_contain_text("100 frames will be missing for good")
     page.get_by_role("button", name="Seal as lossy").click()
     expect(row.locator(".state")).to_have_text("lossy")
     expect(row).to_contain_text("100 frames: sealed without them")
-    expect(row.get_by_role("button", name="Seal without")).to_have_count(0)
+    expect(open_menu(page, row).get_by_role("menuitem", name="Seal")).to_have_count(0)
 
 
 def test_losses_troubles_and_what_is_behind_are_said_in_words(
@@ -132,7 +128,7 @@ def test_losses_troubles_and_what_is_behind_are_said_in_words(
         node.socket.send(json.dumps(status))
         page = open_page(scripted.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
-        expect(page.locator("#lost")).to_have_text("102, 3 not taken")
+        expect(page.locator("#lost")).to_have_text("102, 3 slots not sampled")
         expect(page.locator("#behind")).to_have_text("898 frames, catching up")
         notes = page.locator("#notes")
         expect(notes).to_contain_text("Lost 2 frames: the node's disk was full.")
@@ -142,16 +138,17 @@ def test_losses_troubles_and_what_is_behind_are_said_in_words(
 
 def test_what_is_said_of_a_session_can_be_changed(scripted: Scripted, open_page: OpenPage) -> None:
     session = scripted.recorded("walk")
-    page = open_page(scripted.url)
+    page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
-    row.get_by_role("button", name="Edit").click()
+    choose(page, row, "Edit")
     page.fill("#edit-name", "mud & <b>stones</b>")
     page.fill("#edit-subject", "leg 2")
     page.fill("#edit-tags", "wet,  slow ,")
     page.fill("#edit-notes", "first line\nsecond")
     page.get_by_role("button", name="Save").click()
     expect(row).to_contain_text("mud & <b>stones</b>")
-    expect(row).to_contain_text("leg 2 · #wet · #slow")
+    expect(row.locator(".subject")).to_have_text("leg 2")
+    expect(row.locator(".tag")).to_have_text(["#wet", "#slow"])
     found = session.now()
     assert (found["subject"], found["tags"]) == ("leg 2", ["wet", "slow"])
     assert found["notes"] == "first line\nsecond"
@@ -176,7 +173,7 @@ def test_a_session_shows_how_many_marks_it_has_and_its_downloads_have_them(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.recorded("walk")
-    page = open_page(scripted.url)
+    page = open_page(f"{scripted.url}/sessions")
     marks = row_of(page, session).locator(".c-marks")
     expect(marks).to_have_text("0")
     t_ns = int(session.column("t_ns")[3])
@@ -185,7 +182,57 @@ def test_a_session_shows_how_many_marks_it_has_and_its_downloads_have_them(
     expect(marks).to_have_text("1")
     for kind in ("parquet", "arrow", "csv"):
         with page.expect_download() as download:
-            row_of(page, session).locator(f'[data-part="{kind}"]').click()
+            open_menu(page, row_of(page, session)).locator(f'[data-part="{kind}"]').click()
         content = Path(download.value.path()).read_bytes()
         assert content == session.data(format=kind, marks="true").content
         assert b"a stone" in content
+
+
+@SIZES
+def test_sessions_of_a_take_are_listed_together_and_compared_from_the_menu(
+    scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
+) -> None:
+    other = FakeNode(scripted.running, "other")
+    other.connect()
+    other.tared()
+    with Play(scripted.node), Play(other):
+        take = scripted.running.http.post("/takes", json={"name": "both"}).json()
+        time.sleep(0.3)
+        scripted.node.record(name="alone").stop()
+        scripted.running.http.post(f"/takes/{take['id']}/stop")
+        sessions = scripted.running.sessions
+        wait_until(lambda: {s["state"] for s in sessions()} == {"sealed"}, "all sealed")
+    first, second = (one["id"] for one in sorted(take["sessions"], key=lambda one: one["node"]))
+    fields = {"subject": "leg 2", "tags": ["wet"], "notes": "slow"}
+    assert scripted.running.http.patch(f"/sessions/{first}", json=fields).status_code == 200
+    page = open_page(f"{scripted.url}/sessions", *size)
+    expect(page.locator("#sessions .session")).to_have_count(3)
+    expect(page.locator("#sessions .take")).to_contain_text("2 nodes: bench, other")
+    order = "rows => rows.map((row) => row.dataset.take ?? row.dataset.sessionId)"
+    lines = page.locator("#sessions :is(.take, .session)").evaluate_all(order)
+    at = lines.index(take["id"])
+    assert lines[at : at + 3] == [take["id"], first, second]
+    assert complaints(page) == []
+    page.get_by_role("checkbox", name="Select the take both").check()
+    expect(page.locator("#chosen-text")).to_have_text("2 selected")
+    page.locator(f'[data-session-id="{second}"] input').uncheck()
+    expect(page.locator("#chosen-text")).to_have_text("1 selected")
+    assert page.locator(".take input").evaluate("box => box.indeterminate")
+    row = page.locator(f'#sessions [data-session-id="{first}"]')
+    menu = open_menu(page, row)
+    box = menu.bounding_box()
+    assert box is not None
+    assert box["x"] >= 0
+    assert box["x"] + box["width"] <= size[0]
+    expect(menu.get_by_role("menuitem").first).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(menu).to_have_count(0)
+    expect(row.get_by_role("button", name="Actions")).to_be_focused()
+    page.click(f'[data-session-id="{first}"] .tag')
+    expect(page.locator("#sessions .session")).to_have_count(1)
+    assert page.input_value("#sessions-search") == "wet"
+    page.fill("#sessions-search", "")
+    expect(page.locator("#sessions .take")).to_have_count(1)
+    choose(page, row, "Compare with other")
+    expect(page).to_have_url(f"{scripted.url}/sessions/{first}?with={second}")
+    other.close()

@@ -103,7 +103,7 @@ export const listTrash = () => call("GET", "/trash");
 /** @type {(session: string) => Promise<Session>} */
 export const restoreSession = (session) => call("POST", `/trash/${id(session)}/restore`);
 export const emptyTrash = () => call("DELETE", "/trash");
-/** @type {(query: {limit: number, cursor?: string, q?: string, complete?: string}) => Promise<{items: Session[], next_cursor: string | null}>} */
+/** @type {(query: {limit: number, cursor?: string, q?: string, complete?: string, node?: string}) => Promise<{items: Session[], next_cursor: string | null}>} */
 export const listSessions = (query) => call("GET", `/sessions?${asked(query)}`);
 export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).join(",")}`;
 export const listFormats = () => call("GET", "/formats");

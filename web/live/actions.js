@@ -1,9 +1,9 @@
-// Tare, Record, Stop, Mark: buttons, fields and shortcuts.
+// Tare, Record, Stop, Marker: buttons, fields and shortcuts; what is being recorded.
 
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
 import { notice, showRefusal } from "../common/notices.js";
-import { byId, duration, el, isInside, localTime, setText } from "../common/text.js";
+import { byId, duration, el, isInside, localTime, setData, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
 
@@ -64,7 +64,7 @@ export class Actions {
       return;
     }
     if (button.disabled || button.hidden || this.busy.has(name)) {
-      if (name === "mark" && !this.running().length) notice("Marks belong to a recording: press Record first.", { bad: true });
+      if (name === "mark" && !this.running().length) notice("Markers belong to a recording: press Record first.", { bad: true });
       else if (["record", "tare"].includes(name) && this.state.cannotRecord) notice(this.state.cannotRecord, { bad: true });
       return;
     }
@@ -165,6 +165,11 @@ export class Actions {
   drawRecordings(running) {
     const box = byId("recordings");
     box.hidden = !running.length;
+    byId("last-session").hidden = Boolean(running.length || this.state.cannotRecord);
+    setData(byId("actions"), "running", String(Boolean(running.length)));
+    // One button stands out: what comes next.
+    byId("record").classList.toggle("primary", !running.length);
+    byId("stop").classList.toggle("primary", Boolean(running.length));
     box.dataset.several = String(running.length > 1);
     const rows = new Map(running.map((session) => [session.id, this.rows.get(session.id) ?? this.row(session)]));
     this.rows = rows;
@@ -172,8 +177,14 @@ export class Actions {
     if (wanted.length !== box.children.length || wanted.some((row, i) => row !== box.children[i])) box.replaceChildren(...wanted);
     for (const session of running) {
       const elapsedS = Math.max(0, (this.state.serverNowMs() - session.started_t_ns / 1e6) / 1000);
-      const frames = session.frames.toLocaleString("en-GB");
-      setText(rows.get(session.id).querySelector(".recording-text"), `“${session.name}” ${duration(elapsedS)}, ${frames} frames`);
+      const lost = Object.values(session.lost ?? {}).reduce((sum, count) => sum + count, 0);
+      const row = rows.get(session.id);
+      setText(row.querySelector(".recording-name"), `“${session.name}”`);
+      setText(row.querySelector(".recording-time"), duration(elapsedS));
+      setText(row.querySelector(".recording-frames"), `${session.frames.toLocaleString("en-GB")} frames`);
+      const losses = row.querySelector(".recording-lost");
+      setText(losses, `${lost.toLocaleString("en-GB")} lost`);
+      setData(losses, "bad", String(lost > 0));
     }
   }
 
@@ -191,6 +202,7 @@ export class Actions {
     });
     return el("li", { "data-session-id": session.id },
       el("span", { cls: "rec-dot", "aria-hidden": "true" }), el("span", { cls: "unseen", text: "Recording: " }),
-      el("span", { cls: "recording-text" }), stop);
+      el("span", { cls: "recording-text" }, el("strong", { cls: "recording-name" }), " ", el("strong", { cls: "recording-time" }), " ",
+        el("span", { cls: "recording-frames" }), " ", el("span", { cls: "recording-lost" })), stop);
   }
 }

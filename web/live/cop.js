@@ -8,26 +8,26 @@ import { whyNot } from "./grf.js";
 const Z95 = 1.96;
 const MM = 1000;
 const TRAIL_S = 2;
-/** A picture that is lower has little room under the foot. */
-export const LOW_PX = 220;
-const PARTS = 4; // of the trail, each paler than the one after it
+const PARTS = 8; // of the trail, each paler than the one after it
 const GAP_S = 0.25; // the trail is not drawn across a longer one
 const TRAIL_EVERY_S = 0.06; // it is long, and what is new in it is next to the mark
 
 export class Cop {
-  /** @param {import("../common/foot_layout.js").FootLayout} layout */
-  constructor(layout) {
+  /**
+   * @param {import("../common/foot_layout.js").FootLayout} layout
+   * @param {{timeS: number, x: number | null, y: number}[]} past of the last seconds, oldest first: as of a picture of another size
+   */
+  constructor(layout, past = []) {
     this.layout = layout;
+    this.past = past;
     this.span = svg("path", { class: "cop-span" });
     this.area = svg("ellipse", { class: "cop-area" });
     this.mark = svg("path", { class: "cop-mark" });
     this.halo = svg("path", { class: "cop-halo" });
     this.trail = Array.from({ length: PARTS }, (_, i) => svg("path", { class: "cop-trail", opacity: ((i + 1) / PARTS).toFixed(2) }));
+    if (!layout.plan) this.trail.forEach((part) => part.classList.add("on-sole"));
     this.parts = [...this.trail, this.halo, this.area, this.span, this.mark];
-    this.past = [];
     this.trailS = -Infinity; // of the frame that it was drawn with
-    /** From the side the past lies below the present. */
-    this.fallsPx = layout.heightPx < LOW_PX ? 8 : 22;
   }
 
   draw(node, frame, isRead) {
@@ -39,7 +39,7 @@ export class Cop {
     const sigma = frame?.cop_sigma_x_m ?? null;
     setData(note, "xM", shown ? x.toFixed(6) : "");
     setData(note, "sigmaM", shown && sigma !== null ? sigma.toFixed(6) : "");
-    if (isRead) setText(note, shown ? this.words(frame) : `no COP: ${whyNoCop(node, frame)}`);
+    if (isRead) setText(note, shown ? this.words(frame) : `no COP: ${whyNoCop(node, frame)}${frame?.contact === false ? this.lastInWords() : ""}`);
     if (!shown) return;
     if (this.layout.plan) this.drawPlan(frame);
     else this.drawSide(frame);
@@ -48,6 +48,13 @@ export class Cop {
   words({ cop_x_m: x, cop_y_m: y, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null }) {
     const across = this.layout.plan ? `, ${say("y", y ?? 0, sigmaY)}` : "";
     return `COP ${say("x", x, sigmaX)}${across} (95 %)`;
+  }
+
+  /** In flight: where it was last. */
+  lastInWords() {
+    const last = this.past.findLast((one) => one.x !== null);
+    if (!last) return "";
+    return `, last x ${number(last.x * MM)}${this.layout.plan ? `, y ${number(last.y * MM)}` : ""} mm`;
   }
 
   drawPlan(frame) {
@@ -99,14 +106,15 @@ export class Cop {
       const before = past[i - 1];
       if (one.x === null || !before || before.x === null || one.timeS - before.timeS > GAP_S) return;
       const age = (nowS - one.timeS) / TRAIL_S;
-      paths[Math.min(PARTS - 1, Math.floor((1 - age) * PARTS))].push(`M${this.placeOf(before, nowS)}L${this.placeOf(one, nowS)}`);
+      paths[Math.min(PARTS - 1, Math.floor((1 - age) * PARTS))].push(`M${this.placeOf(before)}L${this.placeOf(one)}`);
     });
     this.trail.forEach((part, i) => place(part, { d: paths[i].join("") }));
   }
 
-  placeOf(one, nowS) {
+  /** From above where it was; from the side along the sole, under the tiles. */
+  placeOf(one) {
     const at = this.layout.at(one.x, one.y);
-    const y = this.layout.plan ? at.y : this.below(at.x) + 30 + ((nowS - one.timeS) / TRAIL_S) * this.fallsPx;
+    const y = this.layout.plan ? at.y : this.layout.lineAt(at.x) + this.layout.radiusPx;
     return `${at.x.toFixed(1)} ${y.toFixed(1)}`;
   }
 }

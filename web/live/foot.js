@@ -6,11 +6,13 @@ import { FootLayout, isGrid, isPlan } from "../common/foot_layout.js";
 import { shadeOf, shadesOf } from "../common/heat.js";
 import { place, svg } from "../common/svg.js";
 import { byId, number, setData, setText } from "../common/text.js";
-import { Cop, LOW_PX } from "./cop.js";
+import { Cop } from "./cop.js";
 import { Range } from "./range.js";
 import { FAULT_STATES, readTile } from "./tile.js";
 
 const SIDE_PX = 42; // beside a foot from above: the legend to its left, where the toes are to its right
+const LOW_PX = 220; // a picture that is lower has little room under the foot
+const LIFT_PX = 12; // of the foot over the ground, in flight
 const NUMBERS_FROM_PX = 26; // of a square, for a number in it
 
 export class Foot {
@@ -38,6 +40,8 @@ export class Foot {
     this.tiles = node?.tiles ?? [];
     if (key === this.key) return;
     this.key = key;
+    if (node?.node !== this.shown) this.cop = null; // its trail is of another foot
+    this.shown = node?.node;
     this.plan = isPlan(this.tiles);
     this.grid = isGrid(this.tiles);
     setData(this.root, "grid", String(this.grid));
@@ -52,11 +56,11 @@ export class Foot {
     this.shades = shadesOf(this.root);
     this.layout = new FootLayout(this.tiles, this.plan
       ? { widthPx: widthPx - 2 * SIDE_PX, heightPx, roomPx: 6, toesUp: true, margin: this.grid ? 0.56 : 0.75 }
-      : { widthPx, heightPx, turns, ...(heightPx < LOW_PX ? { roomPx: 88, basePx: 66 } : { roomPx: 128, basePx: 98 }) });
+      : { widthPx, heightPx, turns, ...(heightPx < LOW_PX ? { roomPx: 76, basePx: 58 } : { roomPx: 108, basePx: 76 }) });
     this.turning = svg("g", this.plan ? { transform: `translate(${SIDE_PX} 0)` } : {});
     this.turning.append(this.plan ? this.outline() : svg("path", { class: "sole", d: this.layout.sole() }));
     this.marks = this.tiles.map((tile, i) => this.mark(tile, i));
-    this.cop = new Cop(this.layout);
+    this.cop = new Cop(this.layout, this.cop?.past);
     this.turning.append(...this.cop.parts);
     this.ground = svg("line", { class: "ground", x1: 0, x2: widthPx });
     const hint = this.plan
@@ -165,6 +169,7 @@ export class Foot {
     const { x: cx, y: cy } = layout.at(0, 0); // the ankle
     place(this.turning, { transform: `rotate(${((turn * 180) / Math.PI).toFixed(2)} ${cx.toFixed(2)} ${cy.toFixed(2)})` });
     const lowest = Math.max(...layout.points.map((p) => cy + (p.x - cx) * Math.sin(turn) + (p.y - cy) * Math.cos(turn)));
-    place(this.ground, { y1: lowest + layout.radiusPx, y2: lowest + layout.radiusPx });
+    const y = lowest + layout.radiusPx + (frame?.contact === false ? LIFT_PX : 0);
+    place(this.ground, { y1: y, y2: y });
   }
 }

@@ -16,8 +16,12 @@ export function drawGrf(node, frame) {
   setText(byId("grf-sigma"), value === null ? (atLeast === null ? whyNot(node, frame) : `(${whyNot(node, frame)})`)
     : Number.isFinite(frame.grf_sigma_n) ? `±\u00a0${number(1.96 * frame.grf_sigma_n)}\u00a0N (95\u00a0%)${assumed ? " assumed\u00a0scale" : ""}` : "");
 
+  drawContact(byId("contact"), frame);
+}
+
+/** Contact, flight or neither, in words and by the style of `.contact`. */
+export function drawContact(element, frame) {
   const contact = frame?.contact ?? null;
-  const element = byId("contact");
   setData(element, "contact", contact === null ? "" : String(contact));
   setText(element, contact === null ? "contact unknown" : contact ? "contact" : "flight");
 }

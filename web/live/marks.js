@@ -44,7 +44,7 @@ export class Marks {
         } catch (error) {
           if (!(error instanceof api.Refusal)) throw error;
           if (error.status === 0 || error.status === 401 || error.status >= 500) break; // later
-          notice(`Mark “${mark.event.label}”: ${error.message}`, { bad: true });
+          notice(`Marker “${mark.event.label}”: ${error.message}`, { bad: true });
         }
         this.waiting.shift();
       }
@@ -62,7 +62,7 @@ export class Marks {
     box.hidden = !count;
     const labels = [...presses.values()].map((label) => `“${label}”`).join(", ");
     setText(box, count
-      ? `${count === 1 ? "1 mark waits" : `${count} marks wait`} for the server, with the time of the press: ${labels}. Keep this page open, closing it loses ${count === 1 ? "it" : "them"}.`
+      ? `${count === 1 ? "1 marker waits" : `${count} markers wait`} for the server, with the time of the press: ${labels}. Keep this page open, closing it loses ${count === 1 ? "it" : "them"}.`
       : "");
   }
 }

@@ -23,29 +23,19 @@ const FROM_ESTIMATE = [
 /** @type {[bit: number, text: string][]} */
 const FROM_FRAME = [
   [FRAME.BUS_FAULT, "Bus fault: the node cannot read all tiles. Check its cable and supply."],
-  [FRAME.OVERRUN, "The node is late: some frames are not taken."],
+  [FRAME.OVERRUN, "The node is late: some slots are not sampled."],
 ];
 
-export class Notes {
+/** Texts of what is doubtful about a node and its frames, held long enough to be read. */
+export class Warnings {
   constructor() {
-    this.list = byId("notes");
     this.seenMs = new Map(); // text of a flag -> when it was last set
-    this.items = new Map(); // of what is said -> its element
-    this.more = byId("notes-more");
-    this.unfolded = false;
-    this.more.addEventListener("click", () => {
-      this.unfolded = !this.unfolded;
-      this.fold();
-    });
-    this.beganMs = performance.now(); // what is there at first may have been there before
     this.belowShare = 0; // of the last half second's messages
   }
 
   clear() {
     this.belowShare = 0;
     this.seenMs.clear();
-    this.items.clear();
-    this.beganMs = performance.now();
   }
 
   /** Called per message, so that a flag between two drawings counts. */
@@ -61,14 +51,47 @@ export class Notes {
     });
   }
 
-  /** `problems`: what the server found damaged; said without a node, too. */
-  draw(node, frame, nowMs, serverNowMs, problems = []) {
-    const notes = node ? standing(node, frame, serverNowMs) : [];
-    for (const problem of problems) notes.push(sentence(`damaged on the server: ${problem}`));
+  /** Those that stand now. @returns {string[]} */
+  list(node, frame, nowMs, serverNowMs) {
+    const texts = standing(node, frame, serverNowMs);
     for (const [text, seenMs] of this.seenMs) {
       if (nowMs - seenMs > HOLD_MS) this.seenMs.delete(text);
-      else notes.push(text);
+      else texts.push(text);
     }
+    return texts;
+  }
+}
+
+export class Notes {
+  constructor() {
+    this.list = byId("notes");
+    this.warnings = new Warnings();
+    this.items = new Map(); // of what is said -> its element
+    this.more = byId("notes-more");
+    this.unfolded = false;
+    this.more.addEventListener("click", () => {
+      this.unfolded = !this.unfolded;
+      this.fold();
+    });
+    this.beganMs = performance.now(); // what is there at first may have been there before
+  }
+
+  clear() {
+    this.warnings.clear();
+    this.items.clear();
+    this.beganMs = performance.now();
+  }
+
+  see(node, frame, nowMs) {
+    this.warnings.see(node, frame, nowMs);
+  }
+
+  /** `problems`: what the server found damaged; said without a node, too. */
+  draw(node, frame, nowMs, serverNowMs, problems = []) {
+    const notes = [
+      ...(node ? this.warnings.list(node, frame, nowMs, serverNowMs) : []),
+      ...problems.map((problem) => sentence(`damaged on the server: ${problem}`)),
+    ];
     const items = new Map();
     for (const text of notes) {
       const same = items.has(kindOf(text)) ? text : kindOf(text);
@@ -85,10 +108,11 @@ export class Notes {
     setText(byId("facts"), node ? facts(node, frame, serverNowMs) : "");
   }
 
-  /** Many in one line with a count: what is measured stays where it is. */
+  /** The first in one line, and a count of the others: what is measured stays where it is. */
   fold() {
     const more = this.items.size - 1;
-    setData(this.list, "folded", String(more > 0 && !this.unfolded));
+    if (more < 1) this.unfolded = false;
+    setData(this.list, "folded", String(!this.unfolded));
     this.more.hidden = more < 1;
     this.more.setAttribute("aria-expanded", String(this.unfolded));
     setText(this.more, this.unfolded ? "Only the first" : `${more} more`);
@@ -98,17 +122,16 @@ export class Notes {
 /** What counts up is still the same note. */
 const kindOf = (text) => (/^(Lost|Tare) /.test(text) ? text.replace(/\d[\d,.]*/g, "#") : text);
 
-/** A note with the time since when it stands; "why?" opens two sentences. */
+/** A note with the time since when it stands; opened, it is shown in full, with two sentences on why. */
 function item(text, mayBeOlder) {
   const clock = localTime(new Date()).slice(11);
   const since = el("time", { text: mayBeOlder ? ` since ${clock} or before` : ` since ${clock}` });
   const why = whyOf(text);
   const says = el("span", { cls: "note-text", text });
-  if (!why) return el("li", {}, says, since);
   const help = helpOf(text);
   const link = help ? el("a", { href: help, target: "_blank", text: "What to do" }) : "";
-  return el("li", {}, el("details", {},
-    el("summary", {}, says, since, " ", el("span", { cls: "ask", text: "why?" })), el("p", {}, `${why} `, link)));
+  const [ask, answer] = why ? [[el("span", { cls: "ask", text: "why?" })], [el("p", {}, `${why} `, link)]] : [[], []];
+  return el("li", {}, el("details", {}, el("summary", {}, says, since, " ", ...ask), ...answer));
 }
 
 function standing(node, frame, serverNowMs) {
@@ -143,7 +166,7 @@ const sentence = (text) => `${text[0]?.toUpperCase() ?? ""}${text.slice(1)}${/[.
 
 const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);
 
-const SOURCES = { lead: "in the lead-in", unloaded: "by hand", recognised: "recognised in flight", flight: "by itself in flight" };
+const SOURCES = { lead: "at the start", unloaded: "by hand", recognised: "recognised in flight", flight: "by itself in flight" };
 const FOLLOWS = { paused: "no automatic tare, one was undone: press Tare to allow it again", off: "automatic tare off" };
 
 function facts(node, frame, serverNowMs) {
@@ -153,7 +176,7 @@ function facts(node, frame, serverNowMs) {
   const perHour = node.drift?.grf_n_per_hour;
   if (Number.isFinite(perHour) && Math.abs(perHour) >= 0.1) parts.push(`zero drifts ${number(perHour)} N/h`);
   if (FOLLOWS[node.auto_tare]) parts.push(FOLLOWS[node.auto_tare]);
-  if (node.calibration) parts.push(`calibration “${node.calibration.name}”, scale ${node.calibration.absolute_scale}`);
+  if (node.calibration) parts.push(`calibration “${node.calibration.name}”${node.calibration.absolute_scale === "measured" ? ", in newtons" : ", scale assumed"}`);
   if (!node.clock) parts.push("clock offset not measured yet");
   if (frame && frame.frame_status & FRAME.LEAD) parts.push("unloaded lead-in of the scene");
   return parts.join(" · ");

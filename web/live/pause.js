@@ -16,7 +16,7 @@ export class Pause {
     const frame = this.newest?.();
     if (!frame) return; // there is no picture
     this.held = { frame, nowMs: performance.now() };
-    setText(byId("paused-text"), `Paused at ${localTime(new Date()).slice(11)}. Data and recordings go on; the picture does not.`);
+    setText(byId("paused-text"), `Paused at ${localTime(new Date()).slice(11)}. The picture stands still; data and recordings go on.`);
     this.show();
   }
 
@@ -30,6 +30,7 @@ export class Pause {
 
   show() {
     byId("paused").hidden = !this.held;
+    document.body.dataset.paused = String(Boolean(this.held));
     byId("pause").setAttribute("aria-pressed", String(Boolean(this.held)));
     this.onChange();
   }

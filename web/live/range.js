@@ -49,8 +49,8 @@ export class Range {
   }
 }
 
-/** Up at once, down only after a while. */
-function following() {
+/** The top of a scale: up at once, down only after a while. */
+export function following() {
   return {
     value: STEPS[0],
     smallerSinceMs: null,

@@ -4,9 +4,11 @@ import { quietly } from "../common/notices.js";
 import { ReplacementWarning } from "../common/replacement.js";
 import { loadModule } from "../common/request.js";
 import { duration, el, number, perSecond, plain, roughly, setData, setText } from "../common/text.js";
-import { whyNot } from "../live/grf.js";
+import { drawContact, whyNot } from "../live/grf.js";
+import { Warnings } from "../live/notes.js";
 import { plainState } from "../sessions/state.js";
 import { SmallFoot } from "./small_foot.js";
+import { SmallTrace } from "./small_trace.js";
 
 const FROZEN_AFTER_MS = 600;
 const BEHIND_S = 0.5; // what is on its way in good order is not behind
@@ -21,7 +23,8 @@ export class Card {
     this.frameMs = null;
     this.beat = null;
     this.fresh = false;
-    this.refused = ""; // why the last take does not have it
+    this.refused = ""; // what was not done on it, and why
+    this.warnings = new Warnings();
     this.session = null; // the newest that is, or was, recorded on it while this page is open
     const link = el("a", { href: "/", text: name, title: "Show this node by itself" });
     link.addEventListener("click", () => {
@@ -36,6 +39,8 @@ export class Card {
     this.contact = part("span", "contact");
     const canvas = el("canvas", { cls: "node-foot", role: "img", "aria-label": `Tiles of ${name} shaded by force, and the centre of pressure` });
     this.foot = new SmallFoot(canvas);
+    const strip = el("canvas", { cls: "node-trace", role: "img", "aria-label": `Ground reaction force of ${name} over the last 10 seconds` });
+    this.trace = new SmallTrace(strip, () => this.node.boot_id);
     const facts = el("dl", { cls: "node-facts" });
     this.facts = Object.fromEntries(["Frames/s", "Lost", "Behind"].map((title) => {
       const value = el("dd");
@@ -54,11 +59,15 @@ export class Card {
     this.element = el("li", { cls: "node", "data-node": name },
       el("div", { cls: "node-head" }, el("h2", {}, link), this.state),
       el("div", { cls: "node-grf" }, el("p", {}, this.bound, this.value, " ", this.unit), this.contact, this.sigma),
-      canvas, el("div", { cls: "node-more" }, facts, this.calibration, this.replacement.element, this.notes, this.told));
+      canvas, strip, el("div", { cls: "node-more" }, facts, this.calibration, this.replacement.element, this.notes, this.told));
   }
 
   take(node) {
-    if (this.node && this.node.boot_id !== node.boot_id) this.frame = this.frameMs = this.beat = null; // it restarted
+    if (this.node && this.node.boot_id !== node.boot_id) { // it restarted
+      this.frame = this.frameMs = this.beat = null;
+      this.warnings.clear();
+      this.trace.clear();
+    }
     this.node = node;
     this.fresh = true;
   }
@@ -66,6 +75,8 @@ export class Card {
   see(frame) {
     this.frame = frame;
     this.frameMs = performance.now();
+    this.warnings.see(this.node, frame, this.frameMs);
+    this.trace.add(this.node, frame, this.frameMs);
     this.fresh = true;
   }
 
@@ -73,11 +84,18 @@ export class Card {
     return this.frameMs !== null && nowMs - this.frameMs <= FROZEN_AFTER_MS;
   }
 
-  /** The foot, when there is something new of it. */
+  recolour() {
+    this.foot.recolour();
+    this.trace.recolour();
+    this.fresh = true;
+  }
+
+  /** Foot and trace, when there is something new of them. */
   draw() {
     if (!this.fresh || !this.node) return;
     this.fresh = false;
     this.foot.draw(this.node, this.frame);
+    this.trace.draw(performance.now());
   }
 
   /** All that is text; `linkOpen`: is the server there? */
@@ -98,12 +116,11 @@ export class Card {
     const assumed = node.calibration?.absolute_scale === "assumed" ? ", assumed scale" : "";
     setText(this.sigma, grf === null ? whyNot(node, frame)
       : Number.isFinite(frame.grf_sigma_n) ? `± ${number(1.96 * frame.grf_sigma_n)} N (95 %)${assumed}` : "");
-    const contact = frame?.contact ?? null;
-    setText(this.contact, contact === null ? "" : contact ? "contact" : "flight");
+    drawContact(this.contact, frame);
 
     this.writeFacts(node);
     this.replacement.draw(node);
-    this.writeNotes(node);
+    this.writeNotes(this.warnings.list(node, frame, nowMs, serverNowMs));
     this.writeSession();
   }
 
@@ -123,26 +140,25 @@ export class Card {
     };
     const rateHz = node.connected ? beat.rate_hz ?? node.rate_hz : null;
     const of = rateHz !== null && rateHz <= node.nominal_rate_hz ? ` of ${perSecond(node.nominal_rate_hz)}` : "";
-    fact("Frames/s", `${perSecond(rateHz ?? NaN)}${of}`, rateHz !== null && rateHz < SLOW * node.nominal_rate_hz);
+    const slow = rateHz !== null && rateHz < SLOW * node.nominal_rate_hz;
+    fact("Frames/s", `${perSecond(rateHz ?? NaN)}${of}`, slow);
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;
-    fact("Lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} not taken`, lost > 0 || missed > 0);
+    fact("Lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} slots not sampled`, lost > 0 || slow);
     const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;
     this.facts.Behind.row.hidden = behind < BEHIND_S * (node.nominal_rate_hz || 400);
     fact("Behind", `${behind.toLocaleString("en-GB")} frames`, false);
   }
 
-  writeNotes(node) {
-    const all = [
-      node.storage_problem, node.calibration_problem, node.tare_problem, ...(node.tare_warnings ?? []), ...(node.troubles ?? []),
-    ].filter(Boolean);
+  /** @param {string[]} all */
+  writeNotes(all) {
     const shown = all.slice(0, NOTES_MOST);
     if (all.length > NOTES_MOST) shown.push(`and ${all.length - NOTES_MOST} more: they are on its own page`);
     const key = JSON.stringify([this.refused, shown]);
     if (key === this.notesKey) return;
     this.notesKey = key;
     const items = shown.map((text) => el("li", { text }));
-    if (this.refused) items.unshift(el("li", { cls: "refused", text: `Not recorded: ${this.refused}` }));
+    if (this.refused) items.unshift(el("li", { cls: "refused", text: this.refused }));
     this.notes.replaceChildren(...items);
   }
 

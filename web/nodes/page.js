@@ -20,7 +20,8 @@ const takes = new Takes({
   cannotRecord: () => (!link.open ? "The link to the server is down." : [...cards.values()].some(({ node }) => node.connected) ? "" : "No node is connected."),
   serverNowMs: () => Date.now() + serverAheadMs,
   onSession: takeSession,
-  onRefused: (failed) => cards.forEach((card, name) => { card.refused = failed[name] ?? ""; }),
+  connected: () => [...cards.values()].map(({ node }) => node).filter((node) => node.connected).map((node) => node.node),
+  onRefused: (what, failed) => cards.forEach((card, name) => { card.refused = failed[name] ? `${what}: ${failed[name]}` : ""; }),
 });
 
 const handlers = {
@@ -105,10 +106,7 @@ function draw() {
 }
 
 function recolour() {
-  for (const card of cards.values()) {
-    card.foot.recolour();
-    card.fresh = true;
-  }
+  for (const card of cards.values()) card.recolour();
 }
 document.addEventListener("foottile-colours", recolour);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);

@@ -2,9 +2,14 @@
 
 import { FootLayout, isPlan } from "../common/foot_layout.js";
 import { shadeOf, shadesOf } from "../common/heat.js";
+import { number } from "../common/text.js";
+import { Range } from "../live/range.js";
 import { FAULT_STATES, readTile } from "../live/tile.js";
 
 const Z95 = 1.96;
+const LEGEND_PX = 40; // beside a foot from above
+const NARROW_PX = 240; // of a card on a phone: the legend would lie on the foot
+const NUMBERS_FROM_PX = 10; // of a tile's radius
 
 export class SmallFoot {
   /** @param {HTMLCanvasElement} canvas */
@@ -14,6 +19,7 @@ export class SmallFoot {
     this.key = "";
     this.colours = null;
     this.layout = null;
+    this.range = new Range(); // fixed: up to the rated load
     new ResizeObserver(() => { this.key = ""; }).observe(canvas);
   }
 
@@ -36,7 +42,8 @@ export class SmallFoot {
     this.ratio = ratio;
     const { widthPx, heightPx } = this;
     const room = isPlan(node.tiles) ? { roomPx: 8 } : { roomPx: 0.4 * heightPx, basePx: 0.4 * heightPx }; // for the COP, below
-    const box = { widthPx, heightPx, ...room, turns: Boolean(node.servo), toesUp: true };
+    this.leftPx = isPlan(node.tiles) ? LEGEND_PX : widthPx < NARROW_PX ? LEGEND_PX / 2 : 0;
+    const box = { widthPx: widthPx - 2 * this.leftPx, heightPx, ...room, turns: Boolean(node.servo), toesUp: true };
     this.layout = new FootLayout(node.tiles, box);
     this.sole = !this.layout.plan ? new Path2D(this.layout.sole()) : null;
   }
@@ -58,7 +65,10 @@ export class SmallFoot {
     if (!this.colours) this.readColours();
     context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     context.clearRect(0, 0, this.widthPx, this.heightPx);
+    this.range.see(node, frame, performance.now());
+    this.drawLegend();
     context.save();
+    context.translate(this.leftPx, 0);
     if (!layout.plan && node.servo && Number.isFinite(frame?.angle_rad)) {
       const ankle = layout.at(0, 0);
       context.translate(ankle.x, ankle.y);
@@ -71,15 +81,36 @@ export class SmallFoot {
     context.restore();
   }
 
+  /** Which colour is which force: a fixed scale, up to the rated load. */
+  drawLegend() {
+    const { context, colours } = this;
+    const [top, long] = [18, Math.min(70, 0.5 * this.heightPx)];
+    const step = long / colours.shades.length;
+    colours.shades.forEach(({ fill }, i) => {
+      context.fillStyle = fill;
+      context.fillRect(1, top + long - (i + 1) * step, 9, step + 0.5);
+    });
+    context.strokeStyle = colours.edge;
+    context.lineWidth = 1;
+    context.strokeRect(0.5, top + 0.5, 10, long);
+    context.fillStyle = colours.text;
+    context.font = "600 12px system-ui, sans-serif";
+    context.textAlign = "left";
+    context.textBaseline = "alphabetic";
+    context.fillText(`${number(this.range.ofAll, 0)} N`, 0, 12);
+    context.fillText("0", 14, top + long);
+  }
+
   drawTile(node, tile, i, frame) {
     const { context, colours } = this;
     const { x, y } = this.layout.points[i];
     const r = Math.max(3, this.layout.radiusPx);
     const { state, value } = readTile(node, i, frame, "N");
     const fault = FAULT_STATES.has(state);
-    const full = tile.full_scale_n > 0 ? tile.full_scale_n : 30;
-    const share = state === "saturated" ? 1 : tile.reference || value === null ? 0 : value / full;
-    context.fillStyle = fault ? colours.badFill : shadeOf(colours.shades, share).fill;
+    const isKnown = value !== null && !tile.reference;
+    const share = state === "saturated" ? 1 : isKnown ? value / this.range.ofAll : 0;
+    const shade = shadeOf(colours.shades, share);
+    context.fillStyle = fault ? colours.badFill : shade.fill;
     context.strokeStyle = fault ? colours.bad : state === "saturated" ? colours.warn : colours.text;
     context.lineWidth = state === "saturated" ? 3 : r < 8 ? 0.75 : 1.5; // small ones would be all line
     context.setLineDash(tile.reference || !["ok", "saturated"].includes(state) ? [3, 3] : []);
@@ -88,6 +119,13 @@ export class SmallFoot {
     context.fill();
     context.stroke();
     context.setLineDash([]);
+    if (isKnown && r >= NUMBERS_FROM_PX) {
+      context.fillStyle = shade.ink;
+      context.font = `800 ${r < 14 ? 11 : 13}px system-ui, sans-serif`;
+      context.textAlign = "center";
+      context.textBaseline = "middle";
+      context.fillText(number(Math.max(0, value), 0), x, y + 0.5);
+    }
     if (!fault) return;
     context.beginPath();
     for (const side of [-1, 1]) {

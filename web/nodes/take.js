@@ -1,12 +1,12 @@
-// Record, mark and stop all: one request to the server, which says of each node what became of it.
+// Record, mark and stop all: one request to the server, which answers for each node. Tare all: one request a node.
 
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
-import { notice, showRefusal } from "../common/notices.js";
+import { notice, quietly, showRefusal } from "../common/notices.js";
 import { byId, duration, isInside, localTime, setData, setText } from "../common/text.js";
 import { Marks } from "../live/marks.js";
 
-const KEYS = { r: "record-all", m: "mark-all", s: "stop-all" };
+const KEYS = { r: "record-all", m: "mark-all", s: "stop-all", t: "tare-all" };
 
 export class Takes {
   /**
@@ -15,7 +15,8 @@ export class Takes {
    * @param {() => string} page.cannotRecord why not now, or nothing
    * @param {() => number} page.serverNowMs
    * @param {(session: Session) => void} page.onSession takes every session an answer brings
-   * @param {(failed: Object<string, string>) => void} page.onRefused takes what nodes a take lacks, and why
+   * @param {() => string[]} page.connected names of the nodes that are connected
+   * @param {(what: string, failed: Object<string, string>) => void} page.onRefused takes what was not done on which nodes, and why
    */
   constructor(page) {
     this.page = page;
@@ -25,7 +26,7 @@ export class Takes {
       const take = await api.markTake(id, event);
       this.markedOn = this.told(take, "not marked") ? take.sessions.length : 0;
     });
-    this.does = { "record-all": () => this.record(), "mark-all": () => this.mark(), "stop-all": () => this.stop() };
+    this.does = { "record-all": () => this.record(), "mark-all": () => this.mark(), "stop-all": () => this.stop(), "tare-all": () => this.tare() };
     for (const id of Object.keys(this.does)) byId(id).addEventListener("click", () => this.run(id));
     for (const [field, id] of [["take-name", "record-all"], ["take-label", "mark-all"]]) {
       const input = byId(field, HTMLInputElement);
@@ -42,7 +43,7 @@ export class Takes {
       event.preventDefault();
       this.run(KEYS[event.key]);
     });
-    const bar = byId("take-bar");
+    const bar = byId("actions");
     new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
   }
 
@@ -62,7 +63,8 @@ export class Takes {
       return;
     }
     if (button.disabled || this.busy.has(id)) {
-      if (id === "record-all") notice(this.running() ? "Stop what is being recorded first." : this.page.cannotRecord(), { bad: true });
+      if (id === "tare-all") notice(this.page.cannotRecord(), { bad: true });
+      else if (id === "record-all") notice(this.running() ? "Stop what is being recorded first." : this.page.cannotRecord(), { bad: true });
       else notice("Nothing is being recorded on all nodes: press Record all first.", { bad: true });
       return;
     }
@@ -84,7 +86,7 @@ export class Takes {
     const name = field.value.trim() || localTime(new Date());
     const take = await api.startTake(name);
     field.value = "";
-    this.page.onRefused(take.failed);
+    this.page.onRefused("Not recorded", take.failed);
     if (this.told(take, "not recorded")) notice(`Recording “${name}” on ${nodes(take.sessions.length)}.`);
     if (document.activeElement === document.body) byId("stop-all").focus();
   }
@@ -100,11 +102,33 @@ export class Takes {
 
   async stop() {
     const take = await api.stopTake(this.running().id);
-    this.page.onRefused({}); // what was said of this take is over
+    this.page.onRefused("", {}); // what was said of this take is over
     if (!this.told(take, "not stopped")) return;
     const open = take.sessions.filter((session) => session.state === "pending").length;
     notice(`Stopped on ${nodes(take.sessions.length)}.${open ? ` ${open === 1 ? "One completes" : `${open} complete`} when the last frames have come.` : ""}`);
     if (document.activeElement === document.body) byId("record-all").focus();
+  }
+
+  /** Each node by itself: one that is loaded is refused, and the others are tared. */
+  async tare() {
+    const names = this.page.connected();
+    const answers = await Promise.allSettled(names.map((name) => api.tareNow(name)));
+    const tared = names.flatMap((name, i) => (answers[i].status === "fulfilled" ? [{ name, id: answers[i].value.id }] : []));
+    const failed = {};
+    answers.forEach((answer, i) => {
+      if (answer.status === "fulfilled") return;
+      if (!(answer.reason instanceof api.Refusal)) throw answer.reason;
+      failed[names[i]] = answer.reason.message;
+    });
+    this.page.onRefused("Not tared", failed);
+    const undo = () => quietly(async () => {
+      for (const { name, id } of tared) await api.undoTare(name, id);
+      notice(`Tare undone on ${nodes(tared.length)}.`);
+    });
+    const press = /** @type {[string, () => unknown] | null} */ (tared.length ? ["Undo", undo] : null);
+    const why = Object.entries(failed).map(([name, text]) => `${name} is not tared: ${text}`).join(". ");
+    if (why) notice(`${why}${tared.length ? ` ${nodes(tared.length)} tared.` : ""}`, { bad: true, press });
+    else notice(`Tared ${nodes(tared.length)}.`, { press });
   }
 
   /** Take over what an answer brings; says where it was not done. Returns whether it was done everywhere. */
@@ -119,15 +143,18 @@ export class Takes {
     const take = this.running();
     const why = take ? "" : this.page.cannotRecord();
     byId("record-all", HTMLButtonElement).disabled = Boolean(take || why);
+    byId("tare-all", HTMLButtonElement).disabled = Boolean(this.page.cannotRecord());
     byId("stop-all", HTMLButtonElement).disabled = byId("mark-all", HTMLButtonElement).disabled = !take;
-    setData(byId("take-bar"), "running", String(Boolean(take)));
+    setData(byId("actions"), "running", String(Boolean(take)));
+    byId("record-all").classList.toggle("primary", !take);
+    byId("stop-all").classList.toggle("primary", Boolean(take));
     byId("take-text").hidden = !take;
     if (take) {
       const longest = Math.max(...take.sessions.map((session) => session.duration_s));
-      setText(byId("take-running"), `“${take.name}” on ${nodes(take.sessions.length)}, ${duration(Math.floor(longest))}`);
+      const lost = take.sessions.flatMap((session) => Object.values(session.lost ?? {})).reduce((sum, count) => sum + count, 0);
+      setText(byId("take-running"), `“${take.name}” on ${nodes(take.sessions.length)}, ${duration(Math.floor(longest))}, ${lost.toLocaleString("en-GB")} frames lost`);
     }
-    byId("take-why").hidden = !why;
-    setText(byId("take-why"), why ? `Record all waits: ${why[0].toLowerCase()}${why.slice(1)}` : "");
+    setText(byId("take-why"), take ? "" : why ? `Record all waits: ${why[0].toLowerCase()}${why.slice(1)}` : "Not recording");
   }
 }
 

@@ -25,7 +25,7 @@ export class Chosen {
     this.onDeleted = onDeleted;
     all.addEventListener("change", () => {
       this.ids = new Set(all.checked ? shown().map(({ id }) => id) : []);
-      for (const box of /** @type {NodeListOf<HTMLInputElement>} */ (document.querySelectorAll("#sessions .session .c-pick input"))) box.checked = all.checked;
+      for (const box of /** @type {NodeListOf<HTMLInputElement>} */ (document.querySelectorAll("#sessions .c-pick input"))) box.checked = all.checked;
       this.draw();
     });
     byId("chosen-delete").addEventListener("click", () => quietly(() => this.delete()));
@@ -38,11 +38,25 @@ export class Chosen {
 
   /** The box in a session's row. @param {Session} session */
   pick(session) {
-    const box = el("input", { type: "checkbox", "data-part": "pick", "aria-label": `Choose ${session.name || session.id}` });
+    const box = el("input", { type: "checkbox", "data-part": "pick", "aria-label": `Select ${session.name || session.id}` });
     box.checked = this.ids.has(session.id);
     box.addEventListener("change", () => {
       if (box.checked) this.ids.add(session.id);
       else this.ids.delete(session.id);
+      this.draw();
+    });
+    return box;
+  }
+
+  /** The box of a take. @param {Session[]} sessions */
+  pickAll(sessions) {
+    const box = el("input", { type: "checkbox", "data-part": "pick-take", "aria-label": `Select the take ${sessions[0].name}` });
+    box.addEventListener("change", () => {
+      for (const { id } of sessions) {
+        /** @type {HTMLInputElement} */ (document.querySelector(`#sessions [data-session-id="${CSS.escape(id)}"] .c-pick input`)).checked = box.checked;
+        if (box.checked) this.ids.add(id);
+        else this.ids.delete(id);
+      }
       this.draw();
     });
     return box;
@@ -58,11 +72,18 @@ export class Chosen {
     const listed = this.shown().length;
     this.all.checked = listed > 0 && chosen.length === listed;
     this.all.indeterminate = chosen.length > 0 && chosen.length < listed;
+    for (const row of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll("#sessions .take"))) {
+      const box = row.querySelector("input");
+      const of = this.shown().filter(({ take }) => take === row.dataset.take);
+      const count = of.filter(({ id }) => this.ids.has(id)).length;
+      box.checked = count === of.length;
+      box.indeterminate = count > 0 && count < of.length;
+    }
     byId("chosen").hidden = !chosen.length;
     const sealed = chosen.filter(({ state }) => state === "sealed");
     const size = sealed.reduce((sum, session) => sum + (session.bytes ?? 0), 0);
     const left = chosen.length - sealed.length;
-    setText(byId("chosen-text"), `${chosen.length} chosen${left ? `, ${left} not sealed yet and not in a zip file` : ""}`);
+    setText(byId("chosen-text"), `${chosen.length} selected${left ? `, ${left} not sealed yet and not in a zip file` : ""}`);
     const zip = byId("chosen-zip", HTMLAnchorElement);
     const can = sealed.length > 0 && sealed.length <= ZIP_MOST;
     setText(zip, can ? `Download ${many(sealed.length)} as zip, ${bytes(size)}` : sealed.length ? `At most ${ZIP_MOST} in a zip file` : "Nothing to download");
@@ -75,7 +96,7 @@ export class Chosen {
     const left = this.sessions.length - chosen.length;
     if (!chosen.length) return notice("What is being recorded cannot be deleted: stop it first.", { bad: true });
     const sure = await ask(`Move ${many(chosen.length)} to the trash?`,
-      `They can be had back from there until it is emptied.${left ? ` ${many(left)} that ${left === 1 ? "is" : "are"} being recorded stay${left === 1 ? "s" : ""}.` : ""}`,
+      `They can be restored until it is emptied.${left ? ` ${many(left)} that ${left === 1 ? "is" : "are"} being recorded stay${left === 1 ? "s" : ""}.` : ""}`,
       `Delete ${many(chosen.length)}`);
     if (!sure) return null;
     const gone = [];

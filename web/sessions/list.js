@@ -1,18 +1,21 @@
-// The list of sessions: newest first or as searched for, kept up to date by the link, more as one scrolls.
+// The list of sessions: newest first or as searched for, those of a take together, more as one scrolls.
 
 import * as api from "../common/api.js";
 import { ask, edit } from "../common/dialogs.js";
 import { frames } from "../common/losses.js";
+import { mayPress } from "../common/login.js";
+import { menuButton } from "../common/menu.js";
 import { notice, quietly } from "../common/notices.js";
-import { byId, el, setText } from "../common/text.js";
+import { byId, el, setData, setText } from "../common/text.js";
 import { Chosen } from "./chosen.js";
-import { counts, head, makeRow } from "./row.js";
+import { counts, head, makeRow, makeTakeRow } from "./row.js";
 import { plainState } from "./state.js";
 
 const MOST = 5000; // a page left open for weeks must not grow without end
 const [FIRST, MORE] = [20, 100]; // in an answer
 const AHEAD_PX = 800; // of the end of the list the next are asked for
 const TYPING_MS = 200;
+const COMPARED_MOST = 6; // in a menu
 
 export class Sessions {
   /** `onSession(session)` takes what an answer brings, `onDeleted(id)` what was moved to the trash. */
@@ -29,7 +32,8 @@ export class Sessions {
     this.since = null; // what was told of sessions while the newest are asked for: id -> session or null
     /** @type {{q?: string, complete?: string}} */
     this.wanted = {}; // as the server is asked
-    this.all = el("input", { type: "checkbox", "aria-label": "Choose all that are listed" });
+    this.takeRows = new Map(); // id of a take -> its row and what it shows
+    this.all = el("input", { type: "checkbox", "aria-label": "Select all that are listed" });
     this.head = head(this.all);
     this.chosen = new Chosen({ all: this.all, onSession, onDeleted, shown: () => [...this.sessions.values()] });
     this.more.addEventListener("click", () => this.load(this.cursor));
@@ -42,6 +46,11 @@ export class Sessions {
     });
     const whole = byId("sessions-complete", HTMLSelectElement);
     whole.addEventListener("change", () => this.want("complete", whole.value));
+    const asked = new URLSearchParams(location.search);
+    field.value = asked.get("q")?.trim() ?? "";
+    whole.value = asked.get("complete") ?? "";
+    if (whole.selectedIndex < 0) whole.value = "";
+    for (const [what, value] of [["q", field.value], ["complete", whole.value]]) if (value) this.wanted[what] = value;
   }
 
   /** List only what has this; with an empty value whatever it is. */
@@ -49,6 +58,8 @@ export class Sessions {
     if (value === (this.wanted[what] ?? "")) return;
     if (value) this.wanted[what] = value;
     else delete this.wanted[what];
+    const query = String(new URLSearchParams(this.wanted));
+    history.replaceState(null, "", location.pathname + (query ? `?${query}` : ""));
     this.reload();
   }
 
@@ -107,7 +118,7 @@ export class Sessions {
     const shown = this.rows.get(id);
     if (plainState(now)[1] !== plainState(session)[1] || !shown) return this.take(now);
     this.sessions.set(id, now);
-    shown.key = this.keyOf(now);
+    shown.key = shown.key.replace(this.keyOf(session), this.keyOf(now));
     for (const [cls, text] of Object.entries(counts(now))) setText(shown.row.querySelector(`.${cls}`), text);
   }
 
@@ -127,25 +138,46 @@ export class Sessions {
     const sorted = [...this.sessions.values()].sort((a, b) => b.started_t_ns - a.started_t_ns).slice(0, MOST);
     this.sessions = new Map(sorted.map((session) => [session.id, session]));
     this.more.hidden = this.cursor === null || sorted.length >= MOST;
-    this.chosen.draw();
     if (!sorted.length) {
       this.rows.clear();
       this.box.setAttribute("role", "group"); // a table has rows
       this.box.replaceChildren(el("p", { cls: "none", text: none(this.wanted) }));
+      this.chosen.draw();
       return;
     }
     this.box.setAttribute("role", "table");
     const rows = new Map();
-    for (const session of sorted) {
-      const key = this.keyOf(session);
-      const old = this.rows.get(session.id);
-      rows.set(session.id, old?.key === key ? old : { key, row: makeRow(session, this.chosen.pick(session), this.buttons(session)) });
+    const lines = [this.head];
+    const takeRows = new Map();
+    for (const group of grouped(sorted)) {
+      if (group.length > 1) lines.push(this.takeRow(group, takeRows));
+      const nodes = group.map(({ node }) => node).join(" "); // its menu names them
+      for (const session of group) {
+        const key = `${nodes} ${this.keyOf(session)}`;
+        const old = this.rows.get(session.id);
+        const shown = old?.key === key ? old : { key, row: makeRow(session, this.chosen.pick(session), this.menu(session)) };
+        setData(shown.row, "taken", String(group.length > 1));
+        rows.set(session.id, shown);
+        lines.push(shown.row);
+      }
     }
     const focused = /** @type {HTMLElement | null} */ (document.activeElement);
     const inside = this.box.contains(focused) ? [focused.closest("[data-session-id]")?.getAttribute("data-session-id"), focused.dataset.part] : null;
     this.rows = rows;
-    this.place([this.head, ...[...rows.values()].map(({ row }) => row)]);
+    this.takeRows = takeRows;
+    this.place(lines);
+    this.chosen.draw();
     if (inside?.[0] && !focused.isConnected) rows.get(inside[0])?.row.querySelector(`[data-part="${inside[1]}"]`)?.focus();
+  }
+
+  /** The row above the sessions of a take, the one that is there if it shows the same. */
+  takeRow(group, takeRows) {
+    const { take } = group[0];
+    const key = JSON.stringify(group.map(({ id, name, node }) => [id, name, node]));
+    const old = this.takeRows.get(take);
+    const shown = old?.key === key ? old : { key, row: makeTakeRow(group, this.chosen.pickAll(group)) };
+    takeRows.set(take, shown);
+    return shown.row;
   }
 
   /** Only what is new or gone is touched: a thousand rows are not laid out again for one. */
@@ -156,16 +188,28 @@ export class Sessions {
   }
 
   /** What can be done with a session in its present state. @param {Session} session */
+  menu(session) {
+    return menuButton(`Actions: ${session.name || session.id}`, () => {
+      const now = this.sessions.get(session.id) ?? session;
+      return [...links(now, this.others(now)), ...(mayPress() ? this.buttons(now) : [])];
+    });
+  }
+
+  /** The other sessions of its take that are listed. @param {Session} session */
+  others({ id, take }) {
+    return take ? [...this.sessions.values()].filter((other) => other.take === take && other.id !== id) : [];
+  }
+
+  /** @param {Session} session */
   buttons(session) {
     const made = [];
     const add = (part, text, action) => {
-      // Its name begins with what is seen: who speaks to the page says that.
-      const button = el("button", { type: "button", cls: "small", text, "data-part": part, "aria-label": `${text}: ${session.name}` });
+      const button = el("button", { type: "button", text, "data-part": part });
       button.addEventListener("click", () => quietly(() => action(this.sessions.get(session.id) ?? session)));
       made.push(button);
     };
-    add("edit", "Edit", (now) => this.edit(now));
-    if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal as it is" : "Seal without them", (now) => this.seal(now));
+    add("edit", "Edit …", (now) => this.edit(now));
+    if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal as it is …" : "Seal without them …", (now) => this.seal(now));
     if (session.state === "sealed" || session.state === "pending") add("delete", "Delete", (now) => this.delete(now));
     return made;
   }
@@ -200,12 +244,36 @@ export class Sessions {
   }
 }
 
-const MISSING = { true: "complete", lossy: "lacking frames", false: "not whole yet" };
+/** Downloads, and comparisons with the others of its take. @param {Session} session @param {Session[]} others */
+function links(session, others) {
+  const link = (part, text, attributes) => el("a", { text, "data-part": part, ...attributes });
+  const formats = [["parquet", "Parquet"], ["arrow", "Arrow"], ["csv", "CSV"]]
+    .filter(([format]) => format !== "parquet" || session.state === "sealed"); // it exists only once sealed
+  return [
+    ...formats.map(([format, text]) => link(format, `Download ${text}`, { href: api.dataAddress(session, format), download: "" })),
+    ...others.filter(({ state }) => state === "sealed" && session.state === "sealed").slice(0, COMPARED_MOST)
+      .map((other) => link("compare", `Compare with ${other.node}`, { href: `/sessions/${encodeURIComponent(session.id)}?with=${encodeURIComponent(other.id)}` })),
+  ];
+}
+
+/** Sessions that are newest first, those of a take together and in the order of their nodes. @param {Session[]} sessions */
+function grouped(sessions) {
+  const groups = new Map();
+  for (const session of sessions) {
+    const key = session.take ?? session.id;
+    if (groups.has(key)) groups.get(key).push(session);
+    else groups.set(key, [session]);
+  }
+  const byNode = (a, b) => a.node.localeCompare(b.node, "en", { numeric: true });
+  return [...groups.values()].map((group) => group.sort(byNode));
+}
+
+const MISSING = { true: "complete", lossy: "lacking frames", false: "incomplete" };
 
 /** @param {{q?: string, complete?: string}} wanted */
 function none({ q, complete }) {
   if (q) return `No session${complete ? ` that is ${MISSING[complete]}` : ""} mentions “${q}”.`;
-  return complete ? `No session is ${MISSING[complete]}.` : "No sessions yet. Press Record to start one.";
+  return complete ? `No session is ${MISSING[complete]}.` : "No sessions yet. Press Record on the live page to start one.";
 }
 
 /** As the server chooses. @param {Session} session @param {{q?: string, complete?: string}} wanted */

@@ -1,28 +1,24 @@
-// One session as a row of the list: what it is, what has become of it, and what can be done with it.
+// A session, or a take, as a row of the list.
 
-import * as api from "../common/api.js";
 import { frames } from "../common/losses.js";
 import { bytes, duration, el, localTime } from "../common/text.js";
 import { plainState } from "./state.js";
 
-const HEADS = ["Name", "Node", "Started", "Duration", "Frames", "Marks", "Size", "State", "Download", "Actions"];
+const HEADS = ["Name", "Node", "Started", "Duration", "Frames", "Markers", "Size", "State", "Actions"];
 
-/** @param {HTMLInputElement} all chooses every session that is shown */
+/** @param {HTMLInputElement} all selects every session that is shown */
 export function head(all) {
   const row = el("div", { cls: "head", role: "row" }, el("span", { cls: "c-pick", role: "columnheader" }, all));
   for (const text of HEADS) row.append(el("span", { role: "columnheader", text }));
   return row;
 }
 
-/** @param {Session} session @param {HTMLInputElement} pick chooses it @param {HTMLElement[]} buttons */
-export function makeRow(session, pick, buttons) {
+/** @param {Session} session @param {HTMLInputElement} pick selects it @param {HTMLElement} menu */
+export function makeRow(session, pick, menu) {
   const [short, long, weight] = plainState(session);
   const name = el("a", {
     cls: "session-name", text: session.name || session.id, "data-part": "open", href: `/sessions/${encodeURIComponent(session.id)}`,
   });
-  const about = [session.subject, ...(session.tags ?? []).map((tag) => `#${tag}`), session.notes].filter(Boolean).join(" · ");
-  const nameCell = el("div", { cls: "c-name", role: "cell" }, name);
-  if (about) nameCell.append(el("span", { cls: "why about", text: about }));
   const state = el("div", { cls: "c-state", role: "cell" }, el("span", { cls: `state ${weight}`, text: short }));
   if (long) state.append(" ", el("span", { cls: "why", text: long }));
   if (session.absolute_scale === "assumed") state.append(" ", el("span", { cls: "why", text: "Scale assumed." }));
@@ -32,16 +28,37 @@ export function makeRow(session, pick, buttons) {
   taken.append(el("span", { cls: "taken", text: now.taken }), el("span", { cls: "missed", text: now.missed }));
   return el("div", { cls: "session", role: "row", "data-session-id": session.id, "data-state": session.state, "data-complete": String(session.complete) },
     el("div", { cls: "c-pick", role: "cell" }, pick),
-    nameCell,
+    el("div", { cls: "c-name", role: "cell" }, name, ...about(session)),
     cell("c-node", "Node", session.node),
     cell("c-start", "Started", localTime(new Date(session.started_t_ns / 1e6)).slice(0, 16)),
     cell("c-duration", "Duration", now["c-duration"]),
     taken,
-    cell("c-marks", "Marks", Number.isFinite(session.marks) ? String(session.marks) : "–"),
+    cell("c-marks", "Markers", Number.isFinite(session.marks) ? String(session.marks) : "–"),
     cell("c-size", "Size", bytes(session.bytes)),
     state,
-    downloads(session),
-    el("div", { cls: "c-do", role: "cell" }, ...buttons));
+    el("div", { cls: "c-do", role: "cell" }, menu));
+}
+
+/** Subject and tags in a line, a tag leads to all sessions that have it; under them the notes. @param {Session} session */
+function about({ subject, tags, notes }) {
+  const parts = [
+    ...(subject ? [el("span", { cls: "subject", text: subject })] : []),
+    ...(tags ?? []).map((tag) => el("a", { cls: "tag", text: `#${tag}`, href: `/sessions?${new URLSearchParams({ q: tag })}` })),
+  ];
+  const lines = parts.length ? [el("span", { cls: "labels" }, ...parts)] : [];
+  if (notes) lines.push(el("span", { cls: "why about", text: notes }));
+  return lines;
+}
+
+/** The row above the sessions of a take. @param {Session[]} sessions @param {HTMLInputElement} pick selects them all */
+export function makeTakeRow(sessions, pick) {
+  const names = [...new Set(sessions.map(({ name }) => name))];
+  const started = localTime(new Date(Math.min(...sessions.map(({ started_t_ns: t_ns }) => t_ns)) / 1e6)).slice(0, 16);
+  return el("div", { cls: "take", role: "row", "data-take": sessions[0].take },
+    el("div", { cls: "c-pick", role: "cell" }, pick),
+    el("div", { cls: "c-take", role: "cell", "aria-colspan": String(HEADS.length) },
+      el("span", { cls: "take-word", text: "Take" }), " ", el("strong", { text: names.join(", ") }),
+      el("span", { cls: "why", text: ` ${started}, ${sessions.length} nodes: ${sessions.map(({ node }) => node).join(", ")}` })));
 }
 
 /** What changes while a session grows, by the class of its element. @param {Session} session */
@@ -52,17 +69,4 @@ export function counts(session) {
     taken: Number.isFinite(session.frames) ? session.frames.toLocaleString("en-GB") : "–",
     missed: lost ? `${lost.toLocaleString("en-GB")} missing` : session.pending_frames ? `${frames(session.pending_frames).split(" ")[0]} to come` : "",
   };
-}
-
-/** @param {Session} session */
-function downloads(session) {
-  const box = el("div", { cls: "c-data", role: "cell" });
-  for (const [format, text] of [["parquet", "Parquet"], ["arrow", "Arrow"], ["csv", "CSV"]]) {
-    if (format === "parquet" && session.state !== "sealed") continue; // it exists only once sealed
-    box.append(el("a", {
-      href: api.dataAddress(session, format), download: "", text, "data-part": format,
-      "aria-label": `Download ${session.name} as ${text}`,
-    }));
-  }
-  return box;
 }

@@ -1,4 +1,4 @@
-// The trash: what was deleted, to be had back or deleted for good. Loaded when it is opened.
+// The trash: what was deleted, to be restored or deleted for good. Loaded when it is opened.
 
 import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
@@ -25,7 +25,7 @@ export class Trash {
       this.items = items;
       byId("trash").replaceChildren(...items.map((session) => this.row(session)));
       byId("trash-empty").hidden = !items.length;
-      setText(byId("trash-legend"), items.length ? "deleted sessions, which can be had back" : "empty");
+      setText(byId("trash-legend"), items.length ? "deleted sessions, which can be restored" : "empty");
     });
   }
 

@@ -361,6 +361,7 @@ class Counted(View):
     frames: int
     pending_frames: int
     waits_for: Literal["frames", "end"] | None
+    lost: dict[str, int]
     duration_s: float
 
     @classmethod
@@ -371,6 +372,7 @@ class Counted(View):
             frames=ledger.recorded,
             pending_frames=ledger.pending,
             waits_for=recorder.waits_for(session, ledger),
+            lost=ledger.lost,
             duration_s=round(recorder.duration_s(session, ledger.recorded), 1),
         )
 

@@ -18,7 +18,15 @@ from tests.service.running import Running
 from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S, until
 
-_PAGES = ("/", "/nodes", "/docs", "/docs/swagger-ui.css", "/static/app.js", "/no-such-page")
+_PAGES = (
+    "/",
+    "/nodes",
+    "/sessions",
+    "/docs",
+    "/docs/swagger-ui.css",
+    "/static/app.js",
+    "/no-such-page",
+)
 BEARER = SHARED_BEARER["Authorization"]
 _OF_NOW = {"date", "content-length"}
 """Headers of answers that tell the time, and so differ from one to the next."""

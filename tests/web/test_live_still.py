@@ -1,0 +1,146 @@
+"""What comes and goes by itself neither moves the live page nor covers what is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.service.fake_node import FakeNode, Play
+from tests.web.scripted import Scripted
+from tests.web.test_accessible import SIZES
+from tests.web.test_live_notes import tell
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+LIVE = "body[data-live=true]"
+PLACES = """() => Object.fromEntries(
+  ["grf-card", "trace-card", "pause", "foot-card", "foot", "bars-card", "bars", "actions", "record"]
+    .map((id) => [id, document.getElementById(id).getBoundingClientRect().toJSON()]))"""
+COVERED = """() => {
+  const at = document.querySelector("#notices .notice:last-child").getBoundingClientRect();
+  const parts = "#pause #foot #grf #trace #bars #record #stop #mark #tare".split(" ");
+  return parts.filter((name) => {
+    const { left, right, top, bottom } = document.querySelector(name).getBoundingClientRect();
+    return left < at.right && right > at.left && top < at.bottom && bottom > at.top;
+  });
+}"""
+"""What the newest message lies over."""
+TRAIL = """() => [...document.querySelectorAll("#foot .cop-trail")]
+  .flatMap((part) => [...part.getAttribute("d").matchAll(/[ML]([-\\d.]+) ([-\\d.]+)/g)]
+  .map(([, x, y]) => [Number(x), Number(y)]))"""
+
+
+def places(page: Page) -> Any:
+    return page.evaluate(PLACES)
+
+
+@SIZES
+def test_warnings_pauses_messages_and_recordings_leave_everything_where_it_is(
+    scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
+) -> None:
+    with Play(scripted.node, 15.0):
+        page = open_page(scripted.url, *size)
+        expect(page.locator(LIVE)).to_have_count(1)
+        expect(page.locator("#last-session")).to_have_text("Not recording")
+        before = places(page)
+        tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer", "another trouble " * 9)
+        expect(page.locator("#notes-more")).to_have_text("1 more")
+        assert places(page) == before
+        page.keyboard.press("p")
+        expect(page.locator("#paused")).to_be_visible()
+        assert places(page) == before
+        page.keyboard.press("p")
+        scripted.node.record(name="by another one")
+        expect(page.locator("#recordings")).to_contain_text("by another one")
+        still = ("grf-card", "trace-card", "pause", "foot-card", "foot", "bars-card", "bars")
+        now = places(page)
+        assert {name: now[name] for name in still} == {name: before[name] for name in still}
+        assert now["actions"] == before["actions"]
+        page.keyboard.press("m")
+        expect(page.locator("#notices")).to_contain_text("Marked")
+        assert places(page)["actions"] == before["actions"]
+        assert page.evaluate(COVERED) == []
+        assert page.evaluate("document.documentElement.scrollWidth") == size[0]
+
+
+def test_a_recording_has_a_row_with_its_name_time_and_lost_frames(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    node = scripted.node
+    with Play(node):
+        page = open_page(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
+        expect(page.locator("#actions .primary")).to_have_attribute("id", "record")
+        session = node.record(name="walk")
+        row = page.locator("#recordings li")
+        expect(row.locator(".recording-name")).to_have_text("“walk”")
+        expect(row.locator(".recording-time")).to_contain_text("s")
+        expect(row.locator(".recording-lost")).to_have_text("0 lost")
+        expect(page.locator("#actions .primary")).to_have_attribute("id", "stop")
+    first = node.seq
+    node.frames(12)
+    node.say_lost(evicted=[[first, first + 11]])
+    node.deliver(20, now=True)
+    expect(row.locator(".recording-lost")).to_have_text("12 lost")
+    node.finish(session)
+    last = page.locator("#last-session")
+    expect(last).to_contain_text("lossy")
+    last.get_by_role("link", name="walk").click()
+    expect(page.locator("#name")).to_have_text("walk")
+
+
+def test_in_flight_the_trail_of_the_last_contact_stays_on_the_sole(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node, 15.0) as play:
+        page = open_page(scripted.url)
+        expect(page.locator("#contact")).to_have_attribute("data-contact", "true")
+        page.wait_for_function(f"() => ({TRAIL})().length > 30")
+        # Another size of the picture keeps it.
+        page.set_viewport_size({"width": 1300, "height": 800})
+        page.wait_for_timeout(150)
+        assert len(page.evaluate(TRAIL)) > 20
+        sole = page.locator("#foot .dome").first.evaluate(
+            "(dome) => Number(dome.getAttribute('cy')) + Number(dome.getAttribute('r'))"
+        )
+        assert all(y == pytest.approx(sole, abs=1.0) for _, y in page.evaluate(TRAIL))
+        play.force_n = 0.0
+        expect(page.locator("#contact")).to_have_attribute("data-contact", "false")
+        expect(page.locator("#cop")).to_contain_text("no COP: no contact, last x")
+        assert len(page.evaluate(TRAIL)) > 5
+
+
+def test_the_force_is_the_largest_text_and_the_foot_no_longer_the_largest_panel(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node):
+        page = open_page(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
+        at = places(page)
+        assert at["foot-card"]["width"] < 0.4 * 1366
+        assert at["foot-card"]["width"] < at["bars-card"]["width"]
+        sizes = page.evaluate(
+            """() => [...document.querySelectorAll("body *")].filter((one) => one.offsetParent)
+              .map((one) => [one.id, Number.parseFloat(getComputedStyle(one).fontSize)])"""
+        )
+        assert max(sizes, key=lambda one: one[1])[0] == "grf"
+        assert max(size for _, size in sizes) > 80
+
+
+def test_the_last_session_is_that_of_the_node_that_is_shown(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    scripted.recorded("mud")
+    other = FakeNode(scripted.running, "other")
+    other.connect()
+    page = open_page(scripted.url)
+    page.select_option("#node-select", "bench")
+    expect(page.locator("#last-session")).to_contain_text("mud")
+    with Play(other):
+        page.select_option("#node-select", "other")
+        expect(page.locator("#last-session")).to_have_text("Not recording")
+    other.close()
