@@ -128,7 +128,7 @@ def test_losses_troubles_and_what_is_behind_are_said_in_words(
         node.socket.send(json.dumps(status))
         page = open_page(scripted.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
-        expect(page.locator("#lost")).to_have_text("102, 3 slots not sampled")
+        expect(page.locator("#lost")).to_have_text("102, 3 not sampled")
         expect(page.locator("#behind")).to_have_text("898 frames, catching up")
         notes = page.locator("#notes")
         expect(notes).to_contain_text("Lost 2 frames: the node's disk was full.")

@@ -23,7 +23,7 @@ const FROM_ESTIMATE = [
 /** @type {[bit: number, text: string][]} */
 const FROM_FRAME = [
   [FRAME.BUS_FAULT, "Bus fault: the node cannot read all tiles. Check its cable and supply."],
-  [FRAME.OVERRUN, "The node is late: some slots are not sampled."],
+  [FRAME.OVERRUN, "The node is late: some frames are not sampled."],
 ];
 
 /** Texts of what is doubtful about a node and its frames, held long enough to be read. */

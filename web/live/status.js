@@ -80,7 +80,7 @@ export class Status {
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;
-    write("lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} slots not sampled`, lost > 0 || slow);
+    write("lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} not sampled`, lost > 0 || slow);
     byId("behind-box").hidden = behind < SHOWN_BEHIND_S * (nominalHz || 400);
     write("behind", `${behind.toLocaleString("en-GB")} frames, catching up`, false);
     write("latency", this.delayMs === null ? "unknown" : `${number(this.delayMs, 0)} ms`, this.delayMs > 250);

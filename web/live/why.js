@@ -11,7 +11,7 @@ const WHY = [
   [/^Below the calibrated/, "The pressure is lower than any that was calibrated. Mud may suck at the foot, or the zero is old: lift the foot and press Tare."],
   [/out of the chip's range/, "The chip measures 50 to 115 kPa of absolute pressure, and this is beyond. Its readings there are shown, but the maker promises nothing for them."],
   [/^Bus fault/, "The wires between the node and the tiles are held or disturbed. Frames are incomplete until that ends; plugs, cable and supply are the usual causes."],
-  [/^The node is late/, "The computer on the robot could not ask the tiles in time. Some slots are not sampled, and the frames of the others have true times; less other work on it helps."],
+  [/^The node is late/, "The computer on the robot could not ask the tiles in time. Some frames are not sampled, and the others have true times; less other work on it helps."],
   [/^No calibration/, "Pressure becomes force only by what was measured of each tile on a bench. Without that pressures are true, and newtons are not made up."],
   [/^Scale assumed/, "Shape and course of the calibration are measured, its newtons are taken from a typical tile. Compare forces with each other, not with a scale."],
   [/^The models are being compiled/, "The server's models become machine code when it first runs on a machine, which takes most of a minute. Nothing is lost by that: what is recorded meanwhile has its forces when it is sealed."],

@@ -144,7 +144,7 @@ export class Card {
     fact("Frames/s", `${perSecond(rateHz ?? NaN)}${of}`, slow);
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;
-    fact("Lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} slots not sampled`, lost > 0 || slow);
+    fact("Lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} not sampled`, lost > 0 || slow);
     const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;
     this.facts.Behind.row.hidden = behind < BEHIND_S * (node.nominal_rate_hz || 400);
     fact("Behind", `${behind.toLocaleString("en-GB")} frames`, false);

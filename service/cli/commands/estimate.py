@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -165,7 +166,7 @@ def estimate_command(
 
 def _with_ending(out: Path) -> Path:
     """Return where a session is written: programs tell a file's format by its ending."""
-    return out if out.suffix or out.exists() else out.with_name(f"{out.name}.parquet")
+    return out if out.suffix or os.path.lexists(out) else out.with_name(f"{out.name}.parquet")
 
 
 def _describe(change: Change | None) -> str:

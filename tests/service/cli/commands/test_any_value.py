@@ -190,6 +190,10 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("verify", "targets"): ("{}",),
     ("verify", "manifest"): ("--manifest", "{}"),
     ("accept-node", "ca"): ("bench", "--server", "https://127.0.0.1:1", "--ca", "{}"),
+    ("calibrate", "ca"): (
+        *("--live", "--tile", "T01", "--out", "cal.json"),
+        *("--server", "https://127.0.0.1:1", "--ca", "{}"),
+    ),
     ("node", "ca"): ("--scene", "standing", "--server", "https://127.0.0.1:1", "--ca", "{}"),
     ("pull", "ca"): (
         *("20200101T000000Z-000000", "--out", "x", "--server", "https://127.0.0.1:1"),

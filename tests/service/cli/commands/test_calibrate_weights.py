@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow.parquet as pq
 import pytest
 
 from devices.arrays import Floats
@@ -87,10 +86,11 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
     write_calibration(Path("five.json"), made)
     asked_for = ("--calibration", "five.json", "--out", "estimated.parquet")
     assert run("estimate", "others.parquet", *asked_for).code == 0
-    table = pq.read_table("estimated.parquet")
+    names = ("force_n", "force_sigma_n", "true_force_n")
+    with SessionReader(Path("estimated.parquet")) as session:
+        pieces = list(session.columns(*names))
     force_n, sigma_n, true_n = (
-        np.stack(table[name].to_numpy().tolist())[:, 0]
-        for name in ("force_n", "force_sigma_n", "true_force_n")
+        np.concatenate([piece[name] for piece in pieces])[:, 0] for name in names
     )
     for mass_g in OTHERS_G:
         settled = _settled(true_n, 1e-3 * mass_g * STANDARD_GRAVITY_M_S2)
