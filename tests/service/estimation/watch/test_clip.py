@@ -25,22 +25,19 @@ def steps(count: int, *, scatter: float, top_kpa: float = 11.0, seed: int = 0) -
     )
 
 
-def ends(kpa: Floats, is_taken: Bools | None = None, *, others_kpa: Floats | float = 0.0) -> Floats:
+def ends(kpa: Floats, is_taken: Bools | None = None) -> Floats:
     """After each reading; `is_taken`: but for those of frames that are lost."""
     t_ns = np.round(1e9 / RATE_HZ * np.arange(1, len(kpa) + 1)).astype(np.int64)
     taken = np.full(len(kpa), True) if is_taken is None else is_taken
     out = np.empty(np.count_nonzero(taken))
-    others = np.broadcast_to(others_kpa, kpa.shape)[taken]
-    _judge(at_rest(1), t_ns[taken], kpa[taken], others, out)
+    _judge(at_rest(1), t_ns[taken], kpa[taken], out)
     return out
 
 
 @compiled
-def _judge(state: Records, t_ns: Times, kpa: Floats, others: Floats, out: Floats) -> None:
+def _judge(state: Records, t_ns: Times, kpa: Floats, out: Floats) -> None:
     for i in range(len(kpa)):
-        out[i] = end_of_range(
-            state[0], kpa[i], t_ns[i], 100.0, 4.0 * NOISE_KPA, NOISE_KPA, others[i]
-        )
+        out[i] = end_of_range(state[0], kpa[i], t_ns[i], 100.0, 4.0 * NOISE_KPA, NOISE_KPA)
 
 
 def noise(n: int, seed: int = 1) -> Floats:
@@ -48,9 +45,7 @@ def noise(n: int, seed: int = 1) -> Floats:
 
 
 @pytest.mark.parametrize("where", ["behind it", "before it"])
-def test_a_clip_of_a_lone_tile_is_found_within_thirty_steps_wherever_the_noise_is(
-    where: str,
-) -> None:
+def test_a_clip_is_found_within_a_dozen_steps_wherever_the_noise_is(where: str) -> None:
     whole = steps(30, scatter=0.12)
     n = len(whole)
     clipped = (
@@ -60,6 +55,7 @@ def test_a_clip_of_a_lone_tile_is_found_within_thirty_steps_wherever_the_noise_i
     )
     end_kpa = ends(clipped)
     first = int(np.flatnonzero(np.isfinite(end_kpa))[0])
+    assert first < 12 * 1.2 * RATE_HZ
     assert np.isfinite(end_kpa[first:]).all()
     assert CLIP_KPA - 5 * NOISE_KPA < end_kpa[-1] < CLIP_KPA - 2 * NOISE_KPA
 
@@ -83,14 +79,6 @@ def test_the_same_load_again_and_again_has_no_edge_even_if_its_top_is_flat() -> 
     assert np.isinf(ends(whole + noise(len(whole)))).all()
 
 
-def test_three_loads_with_one_flat_top_again_and_again_have_no_edge() -> None:
-    # As a robot that stands as heavily, but not as long, at each of three places.
-    shape = [np.interp(np.arange(0, 1.2, 1 / RATE_HZ), [0, 0.1, s, s + 0.1], [0, 7, 7, 0])
-             for s in (0.4, 0.6, 0.8)]  # fmt: skip
-    whole = np.tile(100.0 + np.concatenate(shape), 500)
-    assert np.isinf(ends(whole + noise(len(whole)))).all()
-
-
 @pytest.mark.parametrize(("share", "at_a_time"), [(0.1, 1), (0.1, 9), (0.1, 90), (0.1, 900)])
 def test_frames_that_are_lost_make_the_same_load_no_edge(share: float, at_a_time: int) -> None:
     # As a plate that rolls over a foot, taken by a machine that is busy: a demo of ten minutes.
@@ -101,12 +89,10 @@ def test_frames_that_are_lost_make_the_same_load_no_edge(share: float, at_a_time
     assert np.isinf(ends(whole + noise(len(whole)), ~lost)).all()
 
 
-def test_a_clip_is_found_sooner_beside_other_tiles_even_at_90_frames_a_second() -> None:
-    whole = np.minimum(steps(20, scatter=0.12), CLIP_KPA)
-    others_kpa = steps(20, scatter=0.12, seed=5) - 100.0 + noise(len(whole), seed=6)
+def test_a_clip_is_found_at_90_frames_a_second() -> None:
+    whole = np.minimum(steps(30, scatter=0.12), CLIP_KPA)
     every_fifth = np.arange(len(whole)) % 5 == 0
-    end_kpa = ends(whole + noise(len(whole)), every_fifth, others_kpa=others_kpa)
-    assert np.isfinite(end_kpa[-1])
+    assert np.isfinite(ends(whole + noise(len(whole)), every_fifth)[-1])
 
 
 def test_a_clip_is_found_where_a_frame_in_ten_is_lost() -> None:
@@ -116,7 +102,7 @@ def test_a_clip_is_found_where_a_frame_in_ten_is_lost() -> None:
 
 
 def test_an_edge_that_is_exceeded_was_none() -> None:
-    whole = steps(60, scatter=0.12)
+    whole = steps(40, scatter=0.05)
     clipped = np.minimum(whole, CLIP_KPA)
     begin = len(whole) // 2
     clipped[begin:] = whole[begin:]
