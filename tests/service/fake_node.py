@@ -412,7 +412,8 @@ class Play:
 
     def _run(self) -> None:
         try:
-            while not self._stop.wait(0.02):
+            # Alive, enough at once that some of them move.
+            while not self._stop.wait(0.05 if self.alive else 0.02):
                 due = (time.monotonic_ns() - self.node.next_t_mono_ns) // PERIOD_NS
                 if due > 0:
                     self.node.send(int(due), self.force_n, alive=self.alive)
