@@ -47,6 +47,11 @@ class FormatOptions(BaseModel):
         description="Messages of MCAP: Foxglove's, with every column of every frame, or those of "
         "ROS 2.",
     )
+    rate: Literal["constant"] | None = Field(
+        default=None,
+        description="XDF at a constant rate, for programs that refuse instants without one, as "
+        "mnelab does: samples on straight lines between frames, empty where frames are missing.",
+    )
 
     @property
     def set_names(self) -> list[str]:

@@ -4,7 +4,8 @@ The layout is that of https://github.com/sccn/xdf/wiki/Specifications. Of each p
 there is a stream of 32-bit floats, with all estimates and counts, and one of 64-bit floats, with
 numbers that need them; of all together a stream of marks. Instants are the node's, in seconds since
 1970, and with the server's clock every few seconds a clock offset leads from them to the server's,
-as LSL's own recorder has it. No rate is stated, so that readers leave every instant as it is.
+as LSL's own recorder has it. No rate is stated, so that readers leave every instant as it is; with
+the option `rate` samples are at a constant rate that is stated, in one stream for all parts.
 Several sessions are one after the other, with streams of their own; readers join them by the
 offsets.
 """
@@ -20,8 +21,10 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 import numpy as np
 import pyarrow as pa
 
+from devices.errors import UsageError
 from storage.formats.export import Export
 from storage.formats.written.format import Format
+from storage.formats.written.steady import axis_of, steady
 from storage.formats.written.together import distinct, instants_of
 from storage.formats.written.xml_text import xml_text
 from storage.schema import KNOWN, NO_INSTANT, SERVER_TIME, Array
@@ -34,6 +37,8 @@ _COUNTERS = ("seq", "servo_counts", "servo_age_us")
 """Beyond what 32-bit floats count exactly."""
 _TIMES = ("time_s", "time_utc", "t_ns", "t_mono_ns", "t_server_ns")
 """Every sample has its instant."""
+_SAMPLES_MAX = 5_000_000
+"""At a constant rate, which is worked out in memory: hours of four tiles."""
 _BOUND = SERVER_TIME[1].name
 """Of each sample's time by the server's clock: a channel, whatever columns were chosen."""
 
@@ -123,6 +128,9 @@ class _Session:
         self._parts: dict[int, list[_Stream]] = {}
         self._marks: _Stream | None = None
         self._next_offset_ns: dict[int, int] = {}
+        self._rate_hz = 0.0
+        """Of its samples; 0: each has its own instant."""
+        self._marked_rows: Mapping[str, Array] | None = None
 
     def pieces(self, *, is_alone: bool) -> Iterator[Mapping[str, Array]]:
         """Its frames. Beside others it has to have the server's time: it is all they share."""
@@ -131,10 +139,49 @@ class _Session:
         asked += ["part"] if "part" in export.content.names else []
         asked += ["t_server_ns"] if export.clock is not None else []
         asked += ["event"] if export.marks is not None else []
+        if export.options.rate is not None:
+            yield self._at_constant_rate(asked, is_alone=is_alone)
+            return
         for piece in export.pieces(asked):
             if not is_alone:
                 instants_of(export, piece)
             yield piece
+
+    def _at_constant_rate(self, asked: Sequence[str], *, is_alone: bool) -> Mapping[str, Array]:
+        """All of it as samples: numbers between frames, counts and flags of the nearer one."""
+        export = self._export
+        flat = export.whole(list(dict.fromkeys([*asked, "seq"])), frames_max=_SAMPLES_MAX)
+        if not is_alone:
+            instants_of(export, flat)
+        t_ns = export.at_ns(flat)
+        if not len(t_ns):
+            raise UsageError(
+                "no frame is in this slice",
+                where=export.called,
+                expected="a slice with frames, of which a rate can be told",
+            )
+        axis = axis_of([(t_ns, export.info.nominal_rate_hz)], _SAMPLES_MAX)
+        placed = steady(axis, t_ns, flat["seq"], flat.get("part"))
+        self._rate_hz = axis.rate_hz
+        samples: dict[str, Array] = {
+            "t_ns": axis.begin_ns + np.rint(placed.time_s * 1e9).astype(np.int64)
+        }
+        for name, of in self._chosen.items():
+            values = _numbers(flat[name], of)
+            is_whole = pa.types.is_integer(KNOWN[of].type) or pa.types.is_boolean(KNOWN[of].type)
+            samples[name] = placed.nearest(values) if is_whole else placed.between(values)
+        if "t_server_ns" in flat:
+            is_known = flat["t_server_ns"] != NO_INSTANT
+            offset_ns = placed.nearest(np.where(is_known, flat["t_server_ns"] - t_ns, np.nan))
+            known = np.isfinite(offset_ns)
+            samples["t_server_ns"] = np.where(
+                known,
+                samples["t_ns"] + np.where(known, offset_ns, 0.0).astype(np.int64),
+                NO_INSTANT,
+            )
+        if self._export.marks is not None:
+            self._marked_rows = {"t_ns": t_ns, "event": flat["event"]}
+        return samples
 
     def begin(self) -> bytes:
         """The header of its marks."""
@@ -146,7 +193,9 @@ class _Session:
     def piece(self, piece: Mapping[str, Array]) -> bytes:
         """Chunks of some frames."""
         content = bytearray()
-        parts = piece.get("part", np.zeros(len(piece["t_ns"]), dtype=np.uint16))
+        parts = np.zeros(len(piece["t_ns"]), dtype=np.uint16)
+        if not self._rate_hz:
+            parts = piece.get("part", parts)
         # A stream for what has no frame, too, so that its channels are said.
         for part in np.unique(parts).tolist() or [0]:
             rows = parts == part
@@ -172,25 +221,26 @@ class _Session:
                     stream, header = self._opened(name + of_part, "Force", columns, format_)
                     self._parts[part].append(stream)
                     content += header
-        at_s = self._export.at_ns(flat) * 1e-9
+        at_s = self._at_ns(flat) * 1e-9
         if len(at_s):
             content += self._offsets(part, flat)
             for stream in self._parts[part]:
                 stream.count(at_s)
                 content += stream.chunk(_SAMPLES, self._samples(stream, at_s, flat))
-            content += self._marked(at_s, flat)
+            marked = self._marked_rows or flat
+            content += self._marked(self._at_ns(marked) * 1e-9, marked)
         return bytes(content)
+
+    def _at_ns(self, flat: Mapping[str, Array]) -> Array:
+        """(n,), on the session's time axis; samples at a constant rate are there already."""
+        return flat["t_ns"] if self._rate_hz else self._export.at_ns(flat)
 
     def _samples(self, stream: _Stream, at_s: Array, flat: Mapping[str, Array]) -> bytes:
         row = np.dtype([("bytes", "u1"), ("s", "<f8"), ("v", stream.dtype, len(stream.columns))])
         rows = np.zeros(len(at_s), dtype=row)
         rows["bytes"], rows["s"] = 8, at_s
         for i, name in enumerate(stream.columns):
-            missing = KNOWN[self._chosen[name]].missing
-            values = flat[name].astype(np.float64)
-            if missing is not None:
-                values[flat[name] == missing] = np.nan
-            rows["v"][:, i] = values
+            rows["v"][:, i] = _numbers(flat[name], self._chosen[name])
         return struct.pack("<BI", 4, len(at_s)) + rows.tobytes()
 
     def _offsets(self, part: int, flat: Mapping[str, Array]) -> bytes:
@@ -198,7 +248,7 @@ class _Session:
         if "t_server_ns" not in flat:
             return b""
         known = np.flatnonzero(flat["t_server_ns"] != NO_INSTANT)
-        t_ns, t_server_ns = self._export.at_ns(flat)[known], flat["t_server_ns"][known]
+        t_ns, t_server_ns = self._at_ns(flat)[known], flat["t_server_ns"][known]
         if not len(t_ns):
             return b""
         begin_ns = self._next_offset_ns.get(part, int(t_ns[0]))
@@ -233,7 +283,8 @@ class _Session:
         node = self._export.info.node
         info = Element("info")
         said = {"name": f"{self._name} {name}", "type": kind, "channel_count": str(len(columns))}
-        said |= {"nominal_srate": "0", "channel_format": format_}
+        rate = repr(self._rate_hz) if self._rate_hz and format_ != "string" else "0"
+        said |= {"nominal_srate": rate, "channel_format": format_}
         source = f"{node} {self._export.about.get('session') or ''} {name}"
         _texts(info, {**said, "source_id": source, "version": "1.1", "hostname": node})
         desc = SubElement(info, "desc")
@@ -248,6 +299,15 @@ class _Session:
                 channel["serial"] = tile.serial
             _texts(SubElement(channels, "channel"), channel)
         return stream, stream.chunk(_STREAM_HEADER, tostring(info, xml_declaration=True))
+
+
+def _numbers(values: Array, column: str) -> Array:
+    """A column as numbers; NaN where there is none."""
+    missing = KNOWN[column].missing
+    numbers = values.astype(np.float64)
+    if missing is not None:
+        numbers[values == missing] = np.nan
+    return numbers
 
 
 def _chunk(tag: int, content: bytes) -> bytes:
@@ -266,4 +326,5 @@ XDF = Format(
     "application/x-xdf",
     _write,
     write_together=_write_together,
+    options=("rate",),
 )

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 import pyxdf
 
+from devices.arrays import Bools
 from devices.frames import NO_SERVO_COUNTS, NOT_READ
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
 from storage.formats.export import content_of
-from storage.formats.options import NO_OPTIONS
+from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
 from storage.schema import Array
-from tests.builders.arrays import make_array
+from tests.builders.arrays import PERIOD_NS, make_array
 from tests.storage.formats.exports import NOTES, ROWS, cut, export, extra, frames
 from tests.storage.formats.walks import lines_of_documents
 from tests.storage.formats.written.test_mcap import LABEL, marks
@@ -32,10 +33,13 @@ def written(
     clock: ClockTable | None = None,
     *,
     every: int = 20,
+    options: FormatOptions = NO_OPTIONS,
+    taken: Bools | None = None,
 ) -> bytes:
-    content = content_of(cut(frames(), extra() if columns is None else columns, every))
+    rows = np.flatnonzero(np.full(ROWS, True) if taken is None else taken)
+    of_rows = {name: v[rows] for name, v in (extra() if columns is None else columns).items()}
+    content = content_of(cut(frames().select(rows), of_rows, every))
     source = {"session": "s <&> 🦶"}
-    options = NO_OPTIONS
     chunks = export(
         content,
         make_array(node="left"),
@@ -183,3 +187,34 @@ def test_what_xml_cannot_hold_is_an_escape_and_the_file_is_read(odd: str) -> Non
     shown = odd.encode("unicode_escape").decode()
     assert header["session"] == [shown]
     assert repr(f"T{shown}1")[1:-1] in str(streams)
+
+
+@pytest.mark.parametrize("every", [7, ROWS])
+def test_at_a_constant_rate_samples_are_even_in_one_stream_and_empty_where_frames_are_lost(
+    every: int,
+) -> None:
+    columns = extra()
+    columns["part"][30:] = 1
+    taken = (np.arange(ROWS) < 15) | (np.arange(ROWS) >= 22)
+    content = written(
+        columns=columns, every=every, taken=taken, options=FormatOptions(rate="constant")
+    )
+    streams, _ = read(content)
+    assert set(streams) == {"left frames", "left counters", "left marks"}
+    stream = streams["left frames"]
+    rate_hz = float(stream["info"]["nominal_srate"][0])
+    assert rate_hz == pytest.approx(1e9 / PERIOD_NS)
+    assert len(stream["time_stamps"]) == ROWS
+    np.testing.assert_allclose(np.diff(stream["time_stamps"]), 1.0 / rate_hz, atol=5e-7)
+    force_n = np.where(taken, columns["force_n"][:, 0], np.nan).astype(np.float32)
+    np.testing.assert_array_equal(series(stream, "force_n_0"), force_n)
+    assert streams["left marks"]["time_series"] == [[LABEL]]
+
+
+def test_a_constant_rate_keeps_the_clock_offset() -> None:
+    ahead = Rows(np.array([0, 60_000_000]), np.array([90 * 10**9] * 2), np.array([100] * 2))
+    clock = ClockTable({BOOTS[0]: ahead}, [StreamFacts(BOOTS[0], 10**18, True)], BOOTS[:1])
+    content = written(clock=clock, options=FormatOptions(rate="constant"))
+    raw, set_ = read(content)[0], read(content, synchronize_clocks=True)[0]
+    ahead_s = set_["left frames"]["time_stamps"] - raw["left frames"]["time_stamps"]
+    np.testing.assert_allclose(ahead_s, 90.0, atol=1e-5)
