@@ -1,6 +1,7 @@
 // The newest session of the chosen node while none is recorded: a link to it, and its state.
 
 import * as api from "../common/api.js";
+import { unlessRefused } from "../common/request.js";
 import { byId, duration, el } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
 
@@ -31,12 +32,12 @@ export class LastSession {
 
   async load(node) {
     this.newest.set(node, null);
-    const { items } = await api.listSessions({ limit: 1, node });
-    items.forEach((session) => this.take(session));
+    const answer = await unlessRefused(api.listSessions({ limit: 1, node })); // the page shows that the server is away
+    answer?.items.forEach((session) => this.take(session));
   }
 
   draw(node) {
-    if (node && !this.newest.has(node.node)) this.load(node.node).catch(() => {}); // the page shows that the server is away
+    if (node && !this.newest.has(node.node)) this.load(node.node);
     const session = this.newest.get(node?.node) ?? null;
     const key = JSON.stringify(session);
     if (key === this.key) return;

@@ -118,7 +118,7 @@ export class Sessions {
     const shown = this.rows.get(id);
     if (plainState(now)[1] !== plainState(session)[1] || !shown) return this.take(now);
     this.sessions.set(id, now);
-    shown.key = shown.key.replace(this.keyOf(session), this.keyOf(now));
+    shown.key = this.keyOf(now);
     for (const [cls, text] of Object.entries(counts(now))) setText(shown.row.querySelector(`.${cls}`), text);
   }
 
@@ -153,9 +153,9 @@ export class Sessions {
       if (group.length > 1) lines.push(this.takeRow(group, takeRows));
       const nodes = group.map(({ node }) => node).join(" "); // its menu names them
       for (const session of group) {
-        const key = `${nodes} ${this.keyOf(session)}`;
+        const key = this.keyOf(session);
         const old = this.rows.get(session.id);
-        const shown = old?.key === key ? old : { key, row: makeRow(session, this.chosen.pick(session), this.menu(session)) };
+        const shown = old?.key === key && old.nodes === nodes ? old : { key, nodes, row: makeRow(session, this.chosen.pick(session), this.menu(session)) };
         setData(shown.row, "taken", String(group.length > 1));
         rows.set(session.id, shown);
         lines.push(shown.row);

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from devices.arrays import Floats, Ints
+from devices.errors import FileFormatError
 from storage.schema import CONTACT_UNKNOWN
 from storage.sessions.reader import SessionReader
 
@@ -38,12 +39,18 @@ class Change:
 
 
 def read_stored(path: Path) -> Stored | None:
-    """Return a session's estimates; None: it has none."""
-    with SessionReader(path) as session:
-        lag_ms = session.notes.get("lag_ms")
-        if not isinstance(lag_ms, int | float) or not session.has(*_COLUMNS):
-            return None
-        pieces = list(session.columns(*_COLUMNS))
+    """Return a session's estimates; None: it has none, or they are damaged.
+
+    A session whose estimates are damaged can be estimated again: it needs the counts only.
+    """
+    try:
+        with SessionReader(path, only_slices=True) as session:
+            lag_ms = session.notes.get("lag_ms")
+            if not isinstance(lag_ms, int | float) or not session.has(*_COLUMNS):
+                return None
+            pieces = list(session.columns(*_COLUMNS))
+    except FileFormatError:
+        return None
     if not pieces:
         return None
     t_ns, grf_n, contact = (np.concatenate([piece[name] for piece in pieces]) for name in _COLUMNS)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from storage.sessions.reader import SessionReader
 from tests.service.cli.outcome import Run, scene_text, static_only
 
 pytestmark = pytest.mark.slow
@@ -28,3 +29,19 @@ def test_another_look_ahead_is_stated_with_what_it_changes(run: Run) -> None:
     assert other["lag_before_ms"] == 0.0
     assert other["grf_rms_n"] > 0.0 or other["contact_frames"] > 0
     assert pq.read_metadata("other.parquet").num_rows == same["frames"]
+
+
+def test_a_part_whose_stored_estimates_are_damaged_is_estimated_again(run: Run) -> None:
+    preset = 'calibration = "paper-eq2-shape"\n'
+    Path("small.toml").write_text(preset + static_only(scene_text("standing", 1)))
+    assert run("simulate", "--scene", "small.toml", "--seconds", 3, "--out", "s.parquet").code == 0
+    group = pq.read_metadata("s.parquet").row_group(0)
+    (grf,) = (c for c in map(group.column, range(group.num_columns)) if c.path_in_schema == "grf_n")
+    content = bytearray(Path("s.parquet").read_bytes())
+    content[grf.data_page_offset + grf.total_compressed_size // 2] ^= 0xFF
+    Path("s.parquet").write_bytes(content)
+    outcome = run("estimate", "s.parquet", "--end-s", 2, "--out", "part.parquet", "--json")
+    assert outcome.code == 0, outcome.err
+    assert outcome.printed()["change"] is None
+    with SessionReader(Path("part.parquet")) as part:
+        assert part.has("grf_n")
