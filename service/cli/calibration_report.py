@@ -12,10 +12,9 @@ from rich.table import Table
 from service.cli.report import ASSUMED_SCALE
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import Effects, Parameter
+from service.estimation.estimates import INTERVAL_95
 from service.estimation.fitting.confidence import student_t_95
 from service.estimation.models.hysteresis import WIDTHS_N
-
-INTERVAL_95 = 1.96
 
 
 def calibration_tables(calibration: Calibration) -> list[Table]:

@@ -10,6 +10,9 @@ import numpy.typing as npt
 
 from devices.arrays import Arrays, Floats, Times
 
+INTERVAL_95 = 1.96
+"""Sigmas to each side of a 95 % interval."""
+
 
 class EstimateStatus(IntFlag):
     """Bits of `Estimates.estimate_status`, one value per frame."""

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Times
-from service.estimation.estimates import EstimateStatus
+from service.estimation.estimates import INTERVAL_95, EstimateStatus
 from service.estimation.foot import UNKNOWN, UNSEEN_NS
 
 GATHERED = ("contact", "grf_n", "grf_sigma_n", "cop_x_m", "cop_sigma_x_m", "estimate_status")
@@ -32,8 +32,6 @@ STANCE_COLUMNS = (
 )
 """What is said of a stance, wherever one is written."""
 
-Z95 = 1.96
-"""Sigmas to each side of a 95 % interval."""
 EDGE_NS = 10_000_000
 """The slope of the GRF where a stance begins and ends is that over so long, within the stance."""
 _SLOPE_SIGMAS = 2.0
@@ -332,7 +330,7 @@ class _Open:
         x_m, sigma_m = x_m.astype(np.float64), sigma_m.astype(np.float64)
         first = float(x_m[0]) if self.cop_x_m is None else self.cop_x_m[0]
         self.cop_x_m = first, float(x_m[-1])
-        bounds_m = x_m - Z95 * sigma_m, x_m, x_m + Z95 * sigma_m
+        bounds_m = x_m - INTERVAL_95 * sigma_m, x_m, x_m + INTERVAL_95 * sigma_m
         now_m = np.array([(of_m.min(), of_m.max()) for of_m in bounds_m])
         if self.extremes_x_m is not None:
             before_m = self.extremes_x_m
@@ -394,7 +392,7 @@ class _Open:
         if self.extremes_x_m is None:
             return np.nan, np.nan
         low_m, x_m, high_m = self.extremes_x_m
-        sigmas_m = (high_m - low_m) / (2.0 * Z95)
+        sigmas_m = (high_m - low_m) / (2.0 * INTERVAL_95)
         return float(x_m[1] - x_m[0]), float(np.hypot(*sigmas_m))
 
     def closed(self, behind: _Frame | None) -> Stance:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
-from service.estimation.estimates import EstimateStatus
+from service.estimation.estimates import INTERVAL_95, EstimateStatus
 
 COMPARED = (
     "t_ns",
@@ -35,7 +35,6 @@ COMPARED = (
 GRF_FROM_N = 0.5
 COP_FROM_N = 3.0
 STANCE_MIN_NS = 50_000_000
-INTERVAL_95 = 1.96
 STEEP = 2.0
 """Of a foot that bears load, loading and unloading are where the true force changes by more than so
 many peaks of that load per its duration: of half a sine the outer 28 % each."""

@@ -25,6 +25,7 @@ from service.estimation.calibration import (
     WeightStep,
 )
 from service.estimation.effects import EffectName, Effects
+from service.estimation.estimates import INTERVAL_95
 from service.estimation.fitting.bench.indentation import Indentation, place
 from service.estimation.fitting.bench.weights import Hold, holds
 from service.estimation.fitting.confidence import cubic_basis, curve_n
@@ -88,7 +89,7 @@ def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     _refuse_contradictions(residual_n, force_n, steps, where)
     freedom = len(steps) - TERMS
     variance = float(((residual_n * weight) ** 2).sum() / freedom)
-    widened = float(stdtrit(freedom, 0.975)) / 1.96
+    widened = float(stdtrit(freedom, 0.975)) / INTERVAL_95
     scatter = widened * float(np.sqrt(variance))
     if not min(c1, c1 + 2.0 * c2) > 0.0:
         raise CalibrationError(
@@ -154,8 +155,10 @@ def _band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], _BAND_STEPS + 1)
     found = StaticCurves([tile]).force(gauge_kpa[:, None])
     basis = cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
-    mean_n = 1.96 * np.sqrt(np.maximum(((basis @ np.array(tile.covariance)) * basis).sum(1), 0.0))
-    columns = (gauge_kpa, curve_n(tile, gauge_kpa), mean_n, 1.96 * found.fit_sigma_n[:, 0])
+    mean_n = INTERVAL_95 * np.sqrt(
+        np.maximum(((basis @ np.array(tile.covariance)) * basis).sum(1), 0.0)
+    )
+    columns = (gauge_kpa, curve_n(tile, gauge_kpa), mean_n, INTERVAL_95 * found.fit_sigma_n[:, 0])
     return tuple(
         BandPoint(gauge_kpa=p, force_n=f, mean_n=mean, new_loading_n=new)
         for p, f, mean, new in zip(*(column.tolist() for column in columns), strict=True)

@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
 from devices.errors import ComparisonError
+from service.estimation.estimates import INTERVAL_95
 from service.estimation.stances import Stance, stances_of
-from service.offline.accuracy import INTERVAL_95, PHASES, Covered, phases_of
+from service.offline.accuracy import PHASES, Covered, phases_of
 from service.offline.compare.pairs import Pairs
 from service.offline.compare.trials import OverTrials, Trial, over_trials
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from service.offline.accuracy import INTERVAL_95
+from service.estimation.estimates import INTERVAL_95
 from service.offline.compare.errors import Errors
 from service.offline.compare.pairs import Pairs
 from service.offline.plots import new_figure, png_of

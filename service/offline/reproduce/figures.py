@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.arrays import Bools, Floats
+from service.estimation.estimates import INTERVAL_95
 from service.estimation.fitting.confidence import curve_n, mean_band_n
-from service.offline.accuracy import INTERVAL_95
 from service.offline.compare.plot import OURS, THEIRS, TILES
 from service.offline.plots import new_figure, png_of
 from service.offline.reproduce import paper

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 from devices.emulation.world import World
-from service.estimation.estimates import EstimateStatus
-from service.offline.accuracy import COMPARED, INTERVAL_95, PHASES, accuracy_of, phases_of
+from service.estimation.estimates import INTERVAL_95, EstimateStatus
+from service.offline.accuracy import COMPARED, PHASES, accuracy_of, phases_of
 from service.offline.benchmark.broad.results import Judged, Phase
 from service.offline.benchmark.draws import Recording
 
