@@ -112,7 +112,7 @@ def test_what_is_of_another_plan_is_refused_before_compiled_code_reads_it() -> N
     estimator = Estimator(plan)
     estimator.step(wild_frames(50, 4, 1))
     kept = estimator.kept()
-    with pytest.raises(ValueError, match="tiles is uint8"):
+    with pytest.raises(ValueError, match="tile_states is uint8"):
         Estimator.going_on(wider, kept)
     with pytest.raises(ValueError, match="rows is uint8"):
         Estimator.going_on(plan, kept | {"rows": kept["rows"][:-1]})
