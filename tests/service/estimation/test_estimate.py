@@ -116,10 +116,10 @@ def test_what_is_of_another_plan_is_refused_before_compiled_code_reads_it() -> N
         Estimator.going_on(wider, kept)
     with pytest.raises(ValueError, match="rows is uint8"):
         Estimator.going_on(plan, kept | {"rows": kept["rows"][:-1]})
-    scene = np.zeros_like(kept["scene"])
-    scene[:] = 0xFF
+    foot_state = np.zeros_like(kept["foot_state"])
+    foot_state[:] = 0xFF
     with pytest.raises(ValueError, match="its rows are -1"):
-        Estimator.going_on(plan, kept | {"scene": scene})
+        Estimator.going_on(plan, kept | {"foot_state": foot_state})
 
 
 # --- steps and states -----------------------------------------------------------------------------
