@@ -230,7 +230,7 @@ def loop_share(force_n: Floats) -> Floats:
 
 
 def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:
-    """Return whether the cubic rises all over `range_u`: its slope at both ends and at the vertex."""
+    """Return whether the cubic rises all over `range_u`, by its slope at ends and vertex."""
     _, c1, c2, c3 = coefficients
     places = list(range_u)
     if c3 != 0.0 and range_u[0] < (vertex := -c2 / (3 * c3)) < range_u[1]:

@@ -131,8 +131,8 @@ class DomeRange:
 def range_of(dome: Dome) -> DomeRange:
     """Return the saturation load: the paper's for its dome, else scaled by modulus and area.
 
-    The scaling assumes the same shape and strain at full scale. It agrees with the paper in direction
-    only: stiffer and larger domes shift the curve to higher force (PAPER Fig. 5).
+    The scaling assumes the same shape and strain at full scale. It agrees with the paper in
+    direction only: stiffer and larger domes shift the curve to higher force (PAPER Fig. 5).
     """
     if dome == PAPER_DOME:
         return DomeRange(dome, *PAPER_RANGE_N, "paper")

@@ -1,9 +1,9 @@
-"""Frames in, estimates out: one code path for ten rows live and ten million offline.
+"""Estimator: frames to estimates, with one code path for ten rows live and ten million offline.
 
-`step` takes the next frames and gives the estimates that are now due, `finish` those that are left.
-Estimates come `lag` later than their frames, in order, exactly one per frame. Any way of cutting a
-recording into batches gives the same bits: everything is done frame by frame, tile by tile, in one
-compiled function, and what is remembered stays in records that it writes to.
+`process_frames` returns the estimates that are due, `finish` the remaining ones. Estimates come a
+look-ahead later than their frames, in order, exactly one per frame. Any batches of a recording give
+the same bits: one compiled function works frame by frame and tile by tile, and its state is in
+records.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _COLUMNS = (
     "status",
     "frame_status",
 )
-"""Of frames, in the order in which `_step` takes them."""
+"""Columns of frames, in the order of the parameters of `_step`."""
 _ROWS = ("release_row", "sample_row", "end_row")
 """Rows of the buffer in `FootState`."""
 Answers = tuple[
@@ -66,10 +66,10 @@ Answers = tuple[
 
 
 class Estimator:
-    """Estimates of consecutive frames of one stream, with one tare.
+    """Estimator of consecutive frames of one stream, with one tare.
 
     Args:
-        plan: constants of the estimate.
+        plan: parameters of the estimate.
     """
 
     def __init__(self, plan: EstimationPlan) -> None:
@@ -80,7 +80,7 @@ class Estimator:
         self._buffer = make_room(ROWS_LEAST, tiles)
 
     def step(self, frames: FrameBatch) -> Estimates:
-        """Take the next frames, in order; return the estimates that are due.
+        """Process the next frames, in order; return the estimates that are due.
 
         Args:
             frames: n frames with rising `seq` and `t_mono_ns`.
@@ -89,8 +89,8 @@ class Estimator:
             The estimates due; any number, possibly none.
 
         Raises:
-            ValueError: the frames are not of as many tiles as the plan; compiled code would read
-                beside them.
+            ValueError: frames and plan differ in the number of tiles; compiled code would read
+                beyond their memory.
         """
         n = len(frames)
         tiles = len(self._tile_states)
@@ -103,26 +103,26 @@ class Estimator:
         return _estimates(estimates)
 
     def finish(self) -> Estimates | None:
-        """The estimates that still wait for their look-ahead, at the end; None if none wait."""
+        """Return the estimates that wait for their look-ahead, at the end; None if there are none."""
         if self._foot_state["release_row"][0] == self._foot_state["end_row"][0]:
             return None
         return _estimates(_finish(self._params, self._foot_state, self._tile_states, self._buffer))
 
     def kept(self) -> Columns:
-        """All that it remembers, for another one to go on with; records as their bytes."""
-        self._make_room(0)  # rows that nothing reaches back to any more are not worth keeping
+        """Return a copy of its state for `from_state`; records as their bytes."""
+        self._make_room(0)  # drops rows that nothing reaches back to
         return {name: as_bytes(column).copy() for name, column in self._memory().items()}
 
     @classmethod
     def going_on(cls, plan: EstimationPlan, kept: Columns) -> Self:
-        """One that goes on with what another has kept: both together give the bits of one.
+        """Make an estimator that continues from a state, with the bits of an uninterrupted one.
 
         Args:
-            plan: the other's.
-            kept: by it, in this very version.
+            plan: plan of the estimator that the state comes from.
+            kept: answer of `state_dict`, of the same version.
 
         Raises:
-            ValueError: it is of another plan; compiled code would read beside it.
+            ValueError: the state is of another plan; compiled code would read beyond its memory.
         """
         new = cls(plan)
         rows = len(kept["t_mono_ns"])
@@ -159,7 +159,7 @@ class Estimator:
 
 
 def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """In row order, aligned and read-only, as frames of a message are: compiled once, for that."""
+    """Return a column in row order, aligned and read-only, as in messages: compiled for that only."""
     if column.flags.num & _LAYOUT == _COMPILED_LAYOUT:
         return column
     column = np.array(column, order="C")
