@@ -103,7 +103,7 @@ class Estimator:
         return _estimates(estimates)
 
     def finish(self) -> Estimates | None:
-        """Return the estimates that wait for their look-ahead, at the end; None if there are none."""
+        """Return the estimates that still wait for their look-ahead; None if there are none."""
         if self._foot_state["release_row"][0] == self._foot_state["end_row"][0]:
             return None
         return _estimates(_finish(self._params, self._foot_state, self._tile_states, self._buffer))
@@ -159,7 +159,7 @@ class Estimator:
 
 
 def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return a column in row order, aligned and read-only, as in messages: compiled for that only."""
+    """Return a column in row order, aligned and read-only: compiled for that only."""
     if column.flags.num & _LAYOUT == _COMPILED_LAYOUT:
         return column
     column = np.array(column, order="C")

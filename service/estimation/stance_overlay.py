@@ -2,7 +2,7 @@
 
 The only definition of this normalization. A stance lasts from its first frame to its last
 (`service.estimation.stances`). A value between two frames lies on the straight line between them,
-and is NaN if one of them is.
+and is NaN if either frame is.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ class Stance:
 
     @property
     def is_whole(self) -> bool:
-        """Whether both edges exist, no frame is missing, and every GRF is known."""
+        """True if both edges exist, no frame is missing, and every GRF is known."""
         return self.begun and self.ended and not self.missing_frames and not self.unknown_frames
 
     def as_dict(self) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def warming() -> Iterator[None]:
 
 
 def load_kept() -> bool:
-    """Load machine code of another process; return whether all of it is there."""
+    """Load machine code of another process; return whether it is complete."""
     try:
         with only_kept():
             warm_up()

@@ -1,7 +1,7 @@
 """Unknowns of a tile's fit, with their priors and bounds.
 
 Priors separate effects that look alike, such as a cooling gas and a fast creep: every unknown has a
-likely value and a standard deviation of it. Informative readings outweigh the prior; without them
+likely value with a standard deviation. Informative readings outweigh the prior; without them
 the prior is the result, with its uncertainty.
 """
 
@@ -25,8 +25,8 @@ _STEPS_MIN = 3.0  # readings within the shortest time of a creep
 
 
 LATE_S = 0.00025
-"""Prior standard deviation of a tile's sample delay: it samples in the first part, assumed a quarter,
-of a conversion of 1.6 ms (DS table 7)."""
+"""Prior standard deviation of a tile's sample delay: it samples in the first quarter of a
+conversion of 1.6 ms (DS table 7), by assumption."""
 _LATE_MOST = 2.4  # bound of the delay, in standard deviations
 
 

@@ -1,7 +1,7 @@
 """Contact: a Schmitt trigger on the GRF with debounce.
 
-A change is accepted if it lasts `min_ns`, and is then dated back to its beginning as far as the
-look-ahead allows: with a lag of at least `min_ns` contact begins with the first loaded frame.
+A change is accepted if it lasts `min_ns`, and is then dated back to its beginning within the
+look-ahead: with a lag of at least `min_ns` contact begins with the first loaded frame.
 """
 
 from __future__ import annotations

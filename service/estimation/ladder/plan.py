@@ -102,7 +102,7 @@ class EstimationPlan:
 
     @property
     def waits(self) -> bool:
-        """Whether every frame waits for the next one, for outlier replacement."""
+        """True if every frame waits for the next one, for outlier replacement."""
         return self.ladder.denoise and self.lag_ns > 0
 
     @property

@@ -24,8 +24,8 @@ MOST = 2.0
 25 to 35 N and its leg weighs 8.9 N: this is six to eight legs on a single tile. An assumption;
 where loads are greater the dome is the wrong one (`foottile domes`)."""
 EVENLY = 1.0 / 3.0**0.5
-"""Standard deviation of a uniform distribution over its half width. 1.96 of it reach a little
-farther."""
+"""Standard deviation of a uniform distribution over its half width: 1.96 standard deviations
+reach a little farther."""
 
 
 class SaturationParams(KernelRecord):

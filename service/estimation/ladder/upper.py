@@ -62,7 +62,7 @@ def bear(
     Args:
         params: of the estimate.
         tile_states: (tiles,), updated.
-        buffer: with this row, those that windows reach back to, and those within the look-ahead.
+        buffer: with all rows that windows reach.
         i: row.
         rows: oldest and newest that windows may reach.
         windows: scratch of `denoise`.

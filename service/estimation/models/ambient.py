@@ -1,8 +1,8 @@
 """`ambient`: weather and water around the domes, measured by bare reference tiles.
 
 A dome's wall transmits a part of the surrounding pressure, c p/(1 + c p) with the wall's compliance
-c (hardware.md 9: a tenth). A bare chip reads all of it. Its noise is averaged over 30 ms, because
-it would enter the forces of all tiles at once.
+c (hardware.md 9: a tenth). A bare chip reads the whole pressure. Its noise is averaged over 30 ms,
+because it would enter the forces of all tiles at once.
 """
 
 from __future__ import annotations

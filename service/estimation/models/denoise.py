@@ -25,8 +25,8 @@ REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
 AVERAGED_MAX = 2 * int(REACHES[-1]) + 2
 """Number of readings in the longest window, plus one."""
 AGREE = 2.25
-"""Largest difference of two windows' values, in standard uncertainties of it: chance exceeds it in
-one of forty. A compromise between noise in quiet stance and lag at an impact."""
+"""Largest difference of two windows' values, in standard uncertainties; chance exceeds it in one of
+forty. A compromise between noise in quiet stance and lag at an impact."""
 SAME = 1e-6
 """Relative reduction of variance below which a longer window differs by rounding only."""
 SINGULAR = 1e-5
@@ -42,7 +42,7 @@ Columns = tuple[Floats, Floats, Times, Ints]
 """Values (n, columns), NaN where there is none; standard deviation of each and its instant, both
 (n, columns); and (n,) the number of the gapless run that a frame belongs to."""
 Scratch = tuple[Floats, Floats, Floats]
-"""Work arrays of `averaged`, from `scratch_of_windows`: of all windows so far the values, their
+"""Work arrays of `averaged`, from `scratch_of_windows`: values of all smaller windows, their
 variances, and 1 for a parabola."""
 KEPT_MAX = 4 * len(REACHES) + 1
 """Largest number of windows around a sample."""
@@ -204,7 +204,7 @@ def averaged(
 def share_bend(tiles: RecordArray[TileBend]) -> None:
     """Write the part of the tiles' window differences that exceeds noise into `smoothing_error_n`.
 
-    Tiles bear the same load: a window smooths it in all of them, to the same side. The noise of one
+    Tiles bear the same load: a window smooths it in every tile, to the same side. The noise of one
     tile hides that; in their sum it may show.
 
     Args:

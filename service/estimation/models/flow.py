@@ -24,7 +24,7 @@ from service.estimation.foot import UNSEEN_NS
 from service.estimation.records import KernelRecord, RecordArray
 
 STROKE_N_PER_S = 10.0
-"""R: about that of a rig's slow stroke, so that the fitted value is what the stroke shows."""
+"""R: about that of a rig's slow stroke, so that the stroke determines the fitted value."""
 _ITERATIONS = 50  # a bound; three to five are the rule
 _CLOSE = 1e-14  # of the force, or of a newton
 
@@ -88,8 +88,8 @@ def compensated(
         t_ns: instant.
         state_force_n: force that updates the state instead of the returned one; NaN: that one.
         gap_force_n: force that the dome may have borne during more than `UNSEEN_NS` without a
-            reading: this force or none, whichever is farther from a straight line; NaN: the
-            straight line.
+            reading: the farther of this force and none from a straight line; NaN: the straight
+            line.
     """
     if not math.isfinite(apparent_n):
         return math.nan

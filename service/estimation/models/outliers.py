@@ -1,4 +1,4 @@
-"""Outlier replacement: 1.2 % of a real chip's readings are far off, most of them low.
+"""Outlier replacement: 1.2 % of a real chip's readings are far off, mostly low.
 
 See hardware.md 1.3. Part of the model `denoise`, before every model with a state. A reading is an
 outlier if it lies far from the mean of its two neighbours, which lie near each other; that mean

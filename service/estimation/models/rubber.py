@@ -80,8 +80,8 @@ def compensated(
         t_ns: instant.
         state_force_n: force that updates the state instead of the returned one; NaN: that one.
         gap_force_n: force that the dome may have borne during more than `UNSEEN_NS` without a
-            reading: this force or none, whichever is farther from a straight line; NaN: the
-            straight line.
+            reading: the farther of this force and none from a straight line; NaN: the straight
+            line.
     """
     if not math.isfinite(apparent_n):
         return math.nan

@@ -64,7 +64,7 @@ class Tare:
 
     @property
     def is_lost(self) -> bool:
-        """Whether it stands for a lost tare."""
+        """True for the stand-in of a lost tare."""
         return self.source == "lost"
 
     def as_dict(self) -> dict[str, Any]:
@@ -140,7 +140,7 @@ def has_warmed(tare: Tare, tadc_counts: npt.ArrayLike) -> Bools:
     """Return a mask of tiles whose temperature since the tare invalidates the baseline.
 
     Args:
-        tare: in force; False for tiles of which it has no temperature.
+        tare: in force; False for tiles without a temperature.
         tadc_counts: (..., tiles), NaN where unknown.
     """
     moved_counts = np.abs(np.asarray(tadc_counts, dtype=np.float64) - tare.tadc_counts)

@@ -89,7 +89,7 @@ class TareFrames:
 
     @property
     def has_bench(self) -> bool:
-        """Whether the calibration has the unloaded baselines of all tiles."""
+        """True if the calibration has the unloaded baselines of all tiles."""
         known = np.isfinite(self.bench_kpa) & np.isfinite(self.bench_noise_kpa)
         return bool(self.calibrated.any() and known[self.calibrated].all())
 

@@ -26,7 +26,7 @@ from devices.compiled import compiled
 from service.estimation.records import KernelRecord, RecordArray
 
 HOURS = 100.0
-"""Mean time between false alarms of a healthy array that repeats as often as it has so far."""
+"""Mean time between false alarms of a healthy array with the learnt share of repeats."""
 CORRELATED_S = 0.010
 """Correlation time of the noise that is assumed at first."""
 PRIOR_PAIRS = 50
@@ -196,7 +196,7 @@ def is_stuck(
         above_kpa: pressure above the baseline; NaN where none was readable, or where it is so great
             that a healthy chip may stand still.
         unloaded_band_kpa: distance from the baseline within which a tile counts as unloaded.
-        load_toggles: number of loadings and unloadings of all tiles so far.
+        load_toggles: number of loadings and unloadings of all tiles before.
         tiles: number of tiles.
     """
     if math.isnan(above_kpa):

@@ -24,7 +24,7 @@ UNLOADED_SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class Watch:
-    """Limits over an array's tiles; the last two over those that bear load.
+    """Limits over an array's tiles; the last two over load-bearing tiles only.
 
     Attributes:
         end_kpa: absolute pressure above which a healthy chip may stand still.

@@ -41,7 +41,7 @@ they recover as creep does."""
 _FLAT_PART = 0.01
 """Change of a saturated signal, at most this part of its range ..."""
 _MOVING_PART = 0.15
-"""... while the other signal changes by more than this part of its own range."""
+"""... while the other signal changes by more than this part of its range."""
 _FLAT_NOISE = 0.6  # of the noise of a reading: block means scatter by less
 _RAIL_READINGS = 5  # fewer may be missing by chance
 
