@@ -105,7 +105,7 @@ def plan_of(recorded: Recorded, models: Sequence[str], *, blind: bool = False) -
     info, calibration = recorded.info, recorded.calibration
     tare = take_tare(recorded.frames, Compensation(info.tiles), calibration, info.serials)
     plan = make_plan(info, calibration, tare, models=models, lag_ms=LAG_MS)
-    return replace(plan, watch=None) if blind else plan
+    return replace(plan, watch=None) if blind else plan  # ANY: fields of EstimationPlan
 
 
 def walk(seconds: float) -> LoadTrace:

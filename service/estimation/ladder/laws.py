@@ -10,14 +10,14 @@ from devices.arrays import Floats, Ints
 from service.estimation.foot.geometry import rad_per_count
 from service.estimation.ladder.plan import SIGMAS, EstimationPlan
 from service.estimation.ladder.unseen import SaturationParams
-from service.estimation.models.ambient import AmbientParams
+from service.estimation.models.ambient import Ambient, AmbientParams
 from service.estimation.models.denoise import AVERAGED_MAX
-from service.estimation.models.flow import FlowParams
-from service.estimation.models.gas import GasParams
-from service.estimation.models.hysteresis import HysteresisParams
-from service.estimation.models.rubber import RubberParams
+from service.estimation.models.flow import Flow, FlowParams
+from service.estimation.models.gas import Gas, GasParams
+from service.estimation.models.hysteresis import Hysteresis, HysteresisParams
+from service.estimation.models.rubber import Rubber, RubberParams
 from service.estimation.models.static import StaticParams
-from service.estimation.models.temperature import TemperatureParams
+from service.estimation.models.temperature import Temperature, TemperatureParams
 from service.estimation.records import KernelRecord, RecordArray
 from service.estimation.watch.repeats import SHARES, StuckParams
 
@@ -141,6 +141,12 @@ def _foot_params(plan: EstimationPlan) -> RecordArray[FootParams]:
     ladder, servo = plan.ladder, plan.info.servo
     columns: dict[str, Any] = {
         "has_unwrap": ladder.unwrap,
+        "has_temperature": ladder.temperature is not None,
+        "has_ambient": ladder.ambient is not None,
+        "has_gas": ladder.gas is not None,
+        "has_hysteresis": ladder.hysteresis is not None,
+        "has_flow": ladder.flow is not None,
+        "has_rubber": ladder.rubber is not None,
         "has_skew": ladder.skew,
         "has_denoise": ladder.denoise,
         "has_fault_detection": plan.watch is not None,
@@ -166,8 +172,6 @@ def _foot_params(plan: EstimationPlan) -> RecordArray[FootParams]:
         limits = plan.watch.most
         columns["run_max_by_equal"] = limits.run_max_by_equal
         columns["run_max_by_double_step"] = limits.run_max_by_double_step
-    for name in ("temperature", "ambient", "gas", "hysteresis", "flow", "rubber"):
-        columns[f"has_{name}"] = getattr(ladder, name) is not None  # ANY: fields of Ladder
     if plan.shear is not None:
         columns |= {"is_shear_known": 1, "shear": plan.shear.value, "shear_sigma": plan.shear.sigma}
     if servo is not None:
@@ -195,7 +199,7 @@ def _tile_params(plan: EstimationPlan) -> RecordArray[TileParams]:
         tiles["stuck_check_max_kpa"], tiles["unloaded_band_kpa"] = watch.end_kpa, watch.unloaded_kpa
         tiles["stuck"] = watch.most.laws()
     kpa_per_count = 0.0 if watch is None or watch.kpa_per_count is None else watch.kpa_per_count
-    load_bearing = {
+    load_bearing: dict[str, Any] = {
         "is_load_bearing": 1,
         "asymmetry": 0.0 if watch is None else watch.even,
         "thermal_kpa_per_count": kpa_per_count,
@@ -217,10 +221,15 @@ def _tile_params(plan: EstimationPlan) -> RecordArray[TileParams]:
         "variance_inflation": plan.noise_left,
         "static": ladder.curves.laws(),
     }
-    for name in ("temperature", "ambient", "gas", "flow", "hysteresis", "rubber"):
-        model = getattr(ladder, name)  # ANY: fields of Ladder
-        if model is not None:
-            load_bearing[name] = model.laws()  # ANY: laws of Temperature, Ambient, Gas, ...
+    models: dict[str, Temperature | Ambient | Gas | Flow | Hysteresis | Rubber | None] = {
+        "temperature": ladder.temperature,
+        "ambient": ladder.ambient,
+        "gas": ladder.gas,
+        "flow": ladder.flow,
+        "hysteresis": ladder.hysteresis,
+        "rubber": ladder.rubber,
+    }
+    load_bearing |= {name: model.laws() for name, model in models.items() if model is not None}
     if plan.grid is not None:
         load_bearing["grid_index"] = np.column_stack(plan.grid)
     for name, values in load_bearing.items():

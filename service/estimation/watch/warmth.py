@@ -1,7 +1,7 @@
 """Thermal drift: shift of the baseline by warmth that no model corrects.
 
-Without the model `temperature` the whole shift is error, and all tiles err to the same side. The gas
-follows its chip within seconds, so the larger shift counts: the chip's, or that of its low-pass.
+Without the model `temperature` the whole shift is error, and all tiles err to the same side. The
+gas follows its chip within seconds, so the larger shift counts: the chip's, or its low-pass.
 """
 
 from __future__ import annotations

@@ -266,7 +266,9 @@ def test_pressures_are_those_that_tare_and_calibration_work_with_to_the_bit(seed
     plan = newton_plan(array_at(SQUARE), models=("static",))
     kpa = plan.compensation.readable_kpa(hold_temperature(frames)[0])
     kpa[~(kpa >= PRESSURE_MIN_KPA)] = np.nan
-    gauge_kpa = estimate(replace(plan, watch=None), frames).gauge_kpa
+    gauge_kpa = estimate(
+        replace(plan, watch=None), frames
+    ).gauge_kpa  # ANY: fields of EstimationPlan
     assert gauge_kpa.tobytes() == (kpa - plan.tare.baseline_kpa).tobytes()
 
 
