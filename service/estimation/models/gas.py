@@ -82,7 +82,7 @@ def settled(params: GasParams, state: GasState, kpa: float, t_ns: int, gap_kpa: 
         kpa: absolute pressure.
         t_ns: instant of the reading.
         gap_kpa: pressure that the gas may have had until just now, after more than `UNSEEN_NS`
-            without a reading: the farther of this pressure and the baseline from `kpa`; NaN: a straight line
+            without a reading: the farther of this pressure and the baseline; NaN: a straight line
             in between, or cooled gas.
     """
     if not 0.0 < kpa < math.inf:
