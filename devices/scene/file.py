@@ -43,8 +43,8 @@ class Scene(Section):
     """The models that an estimate of this scene needs, in any order."""
     rate_hz: NotNegative = 0.0
     """Frame rate; 0: as fast as the schedule allows."""
-    calibration: str = "bench"
-    """A calibration file, a preset's name, or "bench": run the emulated bench once."""
+    calibration: str = "emulated-rig"
+    """Calibration file, preset, or "emulated-rig": load the tiles on the emulated rig once."""
     auto_tare: bool = True
     """May a server that sees the foot in the air let the baseline follow by itself?"""
     array: ArrayScene = ArrayScene()

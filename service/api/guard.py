@@ -34,10 +34,10 @@ _HERE = "the computer on which `foottile serve` runs"
 _AS_PROGRAM = (
     "A program sends the token as Authorization: Bearer TOKEN, and commands of foottile take it "
     "from FOOTTILE_TOKEN; the server keeps it in the file `token` of its data folder, unless it "
-    "was given one, and `foottile ticket --data` takes it from there"
+    "was given one, and `foottile invite --data` takes it from there"
 )
 _ASKED = (
-    "To change something here the server's token is needed, or a login: `foottile ticket`, on "
+    "To change something here the server's token is needed, or a login: `foottile invite`, on "
     f"{_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
 _PRIVATE = (
@@ -47,10 +47,10 @@ _PRIVATE = (
 _WRONG = f"This is not the server's token. {_AS_PROGRAM}"
 _ENDED = (
     "This login has ended: the server was started again, or 12 hours are over. "
-    f"`foottile ticket` gives a new one, on {_HERE}"
+    f"`foottile invite` gives a new one, on {_HERE}"
 )
 _VIEWER = (
-    "This login may look and not press: it came from a viewer's ticket. `foottile ticket` gives "
+    "This login may look and not press: it came from a viewer's ticket. `foottile invite` gives "
     f"one that may press, on {_HERE}"
 )
 _NO_LOGIN = "For this no login is enough: it needs the server's token"

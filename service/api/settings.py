@@ -40,7 +40,7 @@ class Settings(Bounds):
     names."""
     advertise: str | None = None
     """Address or name that is shown to people, as that of a reverse proxy; None: those found."""
-    exact: bool = False
+    no_quantize: bool = False
     """Are estimates in recorded sessions as computed, and not rounded?"""
 
     @field_validator("data", mode="before")

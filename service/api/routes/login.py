@@ -17,7 +17,7 @@ router = APIRouter(tags=["login"])
 
 _NOT_TAKEN = (
     "This ticket is not taken: each is good once and for five minutes, until the server ends. Get "
-    "a new one with `foottile ticket` on the computer on which `foottile serve` runs"
+    "a new one with `foottile invite` on the computer on which `foottile serve` runs"
 )
 _NOTHING_SHOWN = "A login needs a ticket, or the token as Authorization: Bearer TOKEN"
 

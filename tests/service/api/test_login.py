@@ -79,7 +79,7 @@ def test_a_ticket_that_was_used_is_refused(guarded: Running) -> None:
     with browser(guarded) as first, browser(guarded) as second:
         assert first.post("/login", json={"ticket": one}).status_code == 200
         refused = second.post("/login", json={"ticket": one})
-        assert_refused(refused, 401, "good once", "foottile ticket")
+        assert_refused(refused, 401, "good once", "foottile invite")
         assert "set-cookie" not in refused.headers
         assert second.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
 

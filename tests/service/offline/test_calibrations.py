@@ -139,7 +139,9 @@ def test_a_cached_calibration_that_does_not_prove_itself_is_set_aside_and_made_a
     said: list[str] = []
 
     def found() -> Calibration:
-        return find_calibration("bench", ["A01"], cache=tmp_path / "cache", progress=said.append)
+        return find_calibration(
+            "emulated-rig", ["A01"], cache=tmp_path / "cache", progress=said.append
+        )
 
     first = found()
     assert found() == first
@@ -161,9 +163,11 @@ def test_each_family_of_parts_and_each_repeatability_has_a_bench_of_its_own(
     tmp_path: Path, pressed: list[str]
 ) -> None:
     for _ in range(2):
-        find_calibration("bench", ["A01"], cache=tmp_path)
-        find_calibration("bench", ["A01"], cache=tmp_path, family="broad")
-        find_calibration("bench", ["A01"], cache=tmp_path, family="broad", repeatability=0.01)
+        find_calibration("emulated-rig", ["A01"], cache=tmp_path)
+        find_calibration("emulated-rig", ["A01"], cache=tmp_path, family="broad")
+        find_calibration(
+            "emulated-rig", ["A01"], cache=tmp_path, family="broad", repeatability=0.01
+        )
     assert pressed == ["bench-A01"] * 3
 
 
@@ -174,6 +178,6 @@ def test_a_cache_that_cannot_be_written_is_said_and_no_reason_to_fail(
     said: list[str] = []
     cache = tmp_path / "file" / "cache"
     for _ in range(2):
-        find_calibration("bench", ["A01"], cache=cache, progress=said.append)
+        find_calibration("emulated-rig", ["A01"], cache=cache, progress=said.append)
     assert pressed == ["bench-A01"] * 2
     assert any("is not kept" in line for line in said)
