@@ -282,8 +282,7 @@ class Export:
         }
 
     def _with_tile(self, plain: pa.Field[Any], tile: int | None) -> pa.Field[Any]:
-        """Return the field with tile number and serial as metadata, and the serial in its name if
-        requested."""
+        """Return the field with its tile as metadata, and the serial in its name on request."""
         if tile is None:
             return plain
         serial = self.info.tiles[tile].serial
