@@ -125,7 +125,7 @@ def pull_made(
     options: FormatOptions = NO_OPTIONS,
     clock: ClockName = "node",
 ) -> dict[str, Any]:
-    """Download a session or a slice of it in any format, as one file in the folder `out`.
+    """Download a session or a slice in any format, as one file in the folder `out`.
 
     The server reads and sends only the slice. A slice has no hash: a Parquet file is verified by
     its pages' checksums, and its metadata state the session.
@@ -202,9 +202,7 @@ def _pull_made(
         report = verify_export(partial) if to.name in PROVEN else None
         if to.name in PROVEN and (report is None or report.problems):
             why = "it cannot be read" if report is None else report.problems[0]
-            raise foottile.DamagedError(
-                f"{server.url}: the slice did not come whole: {why}. {_AGAIN}"
-            )
+            raise foottile.DamagedError(f"{server.url}: the slice is incomplete: {why}. {_AGAIN}")
         with storage_errors(path):
             partial.replace(path)
             sync_folder(path.parent)
@@ -217,7 +215,7 @@ def _facts(server: foottile.Server, session_id: str) -> Mapping[str, Any]:
     """Return the session's metadata; refuse an invalid id, which could name another folder."""
     if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
         raise UsageError(
-            f"{session_id!r} is no session id", remedy="List them with `foottile sessions`"
+            f"{session_id!r} is not a session id", remedy="List them with `foottile sessions`"
         )
     return server.session(session_id).facts
 
@@ -249,9 +247,7 @@ def _download(server: foottile.Server, session: Mapping[str, Any], path: Path) -
             raise
     if sha256_of(partial) != session["sha256"]:
         partial.unlink()
-        raise foottile.DamagedError(
-            f"{path}: what was downloaded has not the hash that the server states. {_AGAIN}"
-        )
+        raise foottile.DamagedError(f"{path}: the file differs from the server's hash. {_AGAIN}")
     with storage_errors(path):
         partial.replace(path)
         sync_folder(path.parent)

@@ -1,4 +1,4 @@
-"""Export of a session, or a slice of it: frames in chunks, and metadata.
+"""Export of a session or a slice: frames in chunks, and metadata.
 
 Columns are the flat columns of a sealed file, for every format. Memory is bounded if the format
 writes each chunk before it reads the next. Frames are not resampled here.

@@ -111,7 +111,7 @@ def place(
         pieces: columns `TIMES` of all frames of the session, and `part` if it has parts. Frames
             further than `NEAREST_NS` from every marker may be omitted.
         clock: clock table of the session.
-        part: the requested slice; a marker whose frame is outside of it is left out.
+        part: the requested slice; a marker with a frame outside is left out.
         begin_t_ns: instant of the session's first frame; None: of the first frame in `pieces`.
         axis: time axis of the session.
     """

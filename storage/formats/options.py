@@ -1,4 +1,4 @@
-"""Options of export formats besides the slice: one list; each format supports some of them."""
+"""Options of export formats besides the slice: one list; each format supports a part."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Stated:
         sign: sign of the force under load, "+" or "-".
         rate_hz: sample rate, if the file has no times, or sample numbers instead.
         text: layout of a text file.
-        sole_m: length, and width if known, of an insole whose file states fractions of them, in m.
+        sole_m: length, and width if known, of an insole whose file states fractions, in m.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -202,7 +202,7 @@ def _times(table: Table, stated: Stated, count: int) -> Floats:
     numbers = table.columns.get(stated.columns.get("time_s", ""), np.arange(count))
     if not np.array_equal(numbers, np.rint(numbers)):
         raise UsageError(
-            f"--rate-hz goes with numbers of samples, and {stated.columns['time_s']!r} has others",
+            f"--rate-hz needs sample numbers, and {stated.columns['time_s']!r} has others",
             where=table.where,
             remedy="Leave out --rate-hz, or the time from --map",
         )

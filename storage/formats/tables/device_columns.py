@@ -56,7 +56,7 @@ def group_by_plate(columns: Sequence[DeviceColumn], where: str) -> list[dict[str
     for device, found in groups.items():
         if any(one.keys() != found[0].keys() for one in found):
             raise FileFormatError(
-                f"which of the columns of {device!r} belong together is not clear",
+                f"the columns of {device!r} cannot be assigned to devices",
                 where=where,
                 expected="a name of its own for each device, or the same columns for all",
             )
@@ -89,12 +89,12 @@ def read_columns(
     first = rows.partition("\n")[0]
     if not first.strip():
         raise FileFormatError(
-            "no lines of numbers stand below its names", where=where, expected="a whole file"
+            "there are no numbers below the names", where=where, expected="a whole file"
         )
     width = len(split_line(first, delimiter))
     if len(split_cells(first, delimiter)) > len(columns) or width <= max(indices):
         raise FileFormatError(
-            f"{len(columns)} names stand over {width} columns of numbers",
+            f"there are {len(columns)} names for {width} columns of numbers",
             where=where,
             expected="a name over each column",
         )

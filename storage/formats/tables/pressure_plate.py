@@ -50,7 +50,7 @@ def read_pressure_plate(path: Path, is_needed: IsNeeded, numbers_max: int) -> Ta
     is_placed = pitch_m is not None and pitch_m.shape == origin_m.shape == (2,)
     if pitch_m is None or not is_placed or not (np.isfinite(pitch_m) & (pitch_m > 0.0)).all():
         raise FileFormatError(
-            "nothing says where its cells are",
+            "the positions of its cells are missing",
             where=where,
             expected="pitch_m with two numbers above 0, and origin_m with two or not at all",
         )
@@ -85,7 +85,7 @@ def _arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
             size = sum(member.file_size for member in archive.infolist())
         if size > bytes_max:
             raise FileFormatError(
-                f"{size} bytes are too many to be held in memory",
+                f"{size} bytes are too many for memory",
                 where=where,
                 expected=f"up to {bytes_max}",
             )

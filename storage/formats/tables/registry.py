@@ -122,7 +122,7 @@ def check_nothing_stated(path: Path, stated: StatedText | None) -> None:
     """
     if stated is not None and stated != StatedText():
         raise UsageError(
-            "--skip-rows, --units-row, --decimal and --encoding go with tables in text",
+            "--skip-rows, --units-row, --decimal and --encoding apply only to text tables",
             where=str(path),
             remedy="Leave them out",
         )

@@ -127,7 +127,7 @@ def check_size(rows: int, columns: int, numbers_max: int, where: str) -> None:
     """
     if rows * columns > numbers_max:
         raise FileFormatError(
-            f"{rows} rows of {columns} columns are too many to be held in memory",
+            f"{rows} rows of {columns} columns are too many for memory",
             where=where,
             expected=f"up to {numbers_max} numbers",
             remedy="Cut out the part that is needed",

@@ -111,7 +111,7 @@ def read_text_table(
         skip -= stated.units_row <= skip
     text = text[_begin_of_line(text, skip) :]
     if skip and not text.strip():
-        raise FileFormatError(f"nothing stands below {stated.skip_rows} lines", where=where)
+        raise FileFormatError(f"there is no text below {stated.skip_rows} lines", where=where)
     layout = find_layout(text, where, stated)
     if units is not None:
         cells = split_cells(units, layout.delimiter)
@@ -180,10 +180,10 @@ def find_layout(text: str, where: str, stated: StatedText | None = None) -> Layo
     ]
     if not found:
         raise FileFormatError(
-            "no line of names stands above lines of numbers",
+            "no line of names precedes the numbers",
             where=where,
             expected=FORM,
-            remedy="State how many lines stand above it: --skip-rows N",
+            remedy="State the number of lines above it: --skip-rows N",
         )
     best = max(found, key=lambda layout: layout.score)
     if stated.decimal is None and best.delimiter == "," and best.score > 1 and len(found) > 1:

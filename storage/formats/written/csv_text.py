@@ -56,7 +56,7 @@ class _CommaWriter:
             self._sink.write("".join(f"{line}\n" for line in lines.to_pylist()).encode())
 
     def close(self) -> None:
-        """Do nothing: rows are written at once."""
+        """Return at once: all rows are written already."""
 
 
 def _cells(column: pa.Array[Any]) -> pa.Array[Any]:

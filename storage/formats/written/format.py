@@ -112,7 +112,7 @@ class Format:
                 )
         if export.part.columns and not self.takes_columns:
             raise UsageError(
-                f"{self.name} has columns of its own, and none can be chosen",
+                f"{self.name} has fixed columns, and none can be selected",
                 remedy="Leave columns out, or ask for Parquet, Arrow or CSV",
             )
         if self.needs_forces and not export.has_forces:

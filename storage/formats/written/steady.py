@@ -116,8 +116,8 @@ def axis_of(streams: Sequence[tuple[Times, float]], samples_max: int) -> Axis:
     count = int((end_ns - begin_ns) * 1e-9 * rate_hz + SAME_PERIODS) + 1
     if count > samples_max:
         raise UsageError(
-            f"from the first frame to the last there are {count} samples at {rate_hz:.6g} Hz, with "
-            f"what lies between; the limit here is {samples_max}",
+            f"from the first frame to the last there are {count} samples at {rate_hz:.6g} Hz, "
+            f"gaps included; the limit is {samples_max}",
             expected=f"a slice of {(samples_max - 1) / rate_hz:.3f} s at most",
         )
     return Axis(rate_hz, begin_ns, count)

@@ -36,7 +36,7 @@ def instants_of(export: Export, columns: Mapping[str, Array]) -> Times:
     unknown = int((t_ns == NO_INSTANT).sum())
     if unknown:
         raise UsageError(
-            f"of {unknown} frames the server's time is not known",
+            f"the server's time is not known for {unknown} frames",
             where=export.called,
             remedy="Ask for the node's clock, or a slice of a part whose clock was compared",
         )

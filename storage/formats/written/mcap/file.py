@@ -44,7 +44,7 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
     is_ros2 = exports[0].options.messages == "ros2"
     if is_ros2 and exports[0].part.columns:
         raise UsageError(
-            "messages of ROS 2 have fields of their own, and no columns can be chosen",
+            "messages of ROS 2 have fixed fields, and no columns can be selected",
             remedy="Leave columns out, or ask for messages=foxglove",
         )
     needed = ros2.needed if is_ros2 else foxglove.needed
