@@ -74,22 +74,6 @@ class Reaction:
         return np.where(self.is_unloaded, 0.0, self.columns["grf_n"].astype(np.float64))
 
 
-def reaction_of(export: Export, further: Sequence[str], frames_max: int) -> Reaction:
-    """Read the frames of an export, and resample them to a constant rate.
-
-    Args:
-        export: export of a session with estimates.
-        further: further columns, read if the session has them.
-        frames_max: limit of frames, and of samples.
-
-    Raises:
-        UsageError: as for `Export.read_all` and `make_sample_axis`; there is no frame, or no frame
-            has a force.
-    """
-    (found,) = reactions_of([export], further, frames_max)
-    return found
-
-
 def reactions_of(
     exports: Sequence[Export], further: Sequence[str], frames_max: int
 ) -> list[Reaction]:
