@@ -176,7 +176,7 @@ def _parse(content: bytes, where: str) -> C3dFile:
     if analog_hz > 0.0 and abs(rate_hz - analog_hz) > RATE_TOLERANCE * rate_hz:
         notes.append(
             f"ANALOG:RATE states {analog_hz:g} Hz, and {samples_a_frame} samples in each frame at "
-            f"{point_hz:g} Hz are {rate_hz:g} Hz, which is taken"
+            f"{point_hz:g} Hz are {rate_hz:g} Hz: this rate is used"
         )
     return C3dFile(
         where,

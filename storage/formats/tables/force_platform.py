@@ -98,8 +98,8 @@ def _zero_notes(file: C3dFile, plates: list[Plate]) -> list[str]:
     read = [plate.fz[window] for plate in plates]
     means = ", ".join(f"{fz.mean():.3f}" for fz in read if len(fz))
     return [
-        f"frames {first} to {last} are to be its zero, in which plates read {means}: nothing is "
-        "taken off"
+        f"ZERO states frames {first} to {last}, in which plates read {means}: no offset is "
+        "subtracted"
     ]
 
 
@@ -179,7 +179,7 @@ def _is_other_unit(fz: Floats, local: Floats, other: Floats, pose: Pose) -> bool
         fz: force, (n,).
         local: centre of pressure in the unit that the file states.
         other: centre of pressure in the unit of the corners. If this unit is the smaller one, both
-            are on the plate, one of them very near to its middle.
+            are on the plate, one very near to its middle.
         pose: pose of the plate.
     """
     off, off_other = (

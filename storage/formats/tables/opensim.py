@@ -51,7 +51,7 @@ def read_opensim(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
         names = [*names[:1], *(f"{name}{axis}" for name in vectors for axis in "xyz")]
     if len(names) < 2 or (first and len(first) != len(names)):
         raise FileFormatError(
-            f"{len(names)} names stand over {len(first)} columns of numbers",
+            f"there are {len(names)} names for {len(first)} columns of numbers",
             where=where,
             expected=FORM,
         )

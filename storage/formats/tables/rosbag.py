@@ -161,7 +161,7 @@ def _sensors(bag: _Bag, topics: list[str], where: str, numbers_max: int) -> dict
         notes = [f"forces are along the axes of its frame {frame!r}, COP in the plane z = 0 of it"]
         stamp_ns, logged_ns = np.array(stamps[topic], dtype=np.int64).T
         if not stamp_ns.any():
-            notes.append("its headers have no stamps: times are those of recording")
+            notes.append("its headers have no stamps: recording times are used")
             stamp_ns = logged_ns
         order = np.argsort(stamp_ns, kind="stable")
         wrench = np.array(rows[topic], dtype=np.float64).T[:, order]

@@ -238,7 +238,7 @@ def test_files_of_motion_laboratories_are_of_sealed_and_of_recording_sessions(
         name = f'filename="trial_{session.id}.{ending}"'
         assert name in answer.headers["content-disposition"]
     for query, said in (
-        ({"columns": "grf_n"}, "columns of its own"),
+        ({"columns": "grf_n"}, "fixed columns"),
         ({"start_s": 100}, "starts at 100 s"),
         ({"decimal": "comma"}, "no option"),
     ):

@@ -204,7 +204,7 @@ def test_a_slice_that_is_damaged_on_its_way_is_refused(
     for to in ("parquet", "arrow"):
         with (
             foottile.connect(sealed.running.url) as server,
-            pytest.raises(foottile.DamagedError, match="did not come whole"),
+            pytest.raises(foottile.DamagedError, match="the slice is incomplete"),
         ):
             pull_made(server, sealed.id, out, Slice(0.25, 0.5), format_named(to))
     assert list(out.iterdir()) == []
