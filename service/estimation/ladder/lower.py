@@ -18,6 +18,7 @@ from service.estimation.ladder.room import Room
 from service.estimation.ladder.unseen import EVENLY, farthest, guess_n, was_away
 from service.estimation.models import gas
 from service.estimation.models.ambient import around
+from service.estimation.models.denoise import AVERAGED_MAX
 from service.estimation.models.outliers import is_spike
 from service.estimation.models.skew import at_frame
 from service.estimation.models.static import curve
@@ -62,12 +63,16 @@ def feel(laws: Laws, scene: Record, tiles: Records, room: Room, i: int) -> None:
     after = room.rows[i + 1] if i + 1 < scene.end else row
     has_after = i + 1 < scene.end and after.broken == 0
     head_kpa, outside_kpa, outside = 0.0, 0.0, 0
+    all_kpa = 0.0
+    for j in range(n):
+        if laws.tiles[j].bears == 1:
+            all_kpa += room.cells[i, j].kpa - laws.tiles[j].baseline_kpa
     for j in range(n):
         of_tile, cell = laws.tiles[j], room.cells[i, j]
         if judges_warmth and _has_warmed(of_tile, cell):
             row.status |= _TARE_OLD
         after_kpa = room.cells[i + 1, j].kpa if has_after else math.nan
-        _judge(law, of_tile, scene, tiles[j], row, cell, after_kpa, n)
+        _judge(law, of_tile, scene, tiles[j], row, cell, after_kpa, all_kpa, n)
         gauge_kpa = cell.kpa - of_tile.baseline_kpa
         # A bare tile beyond the chip's range shows a fault of its own, not the surroundings.
         if of_tile.bears == 0 and cell.over_range == 0 and math.isfinite(gauge_kpa):
@@ -129,6 +134,7 @@ def _judge(
     row: Record,
     cell: Record,
     after_kpa: float,
+    all_kpa: float,
     tiles: int,
 ) -> None:
     """What a tile's own readings show to be wrong: repeats, an edge, a single reading far off."""
@@ -136,8 +142,9 @@ def _judge(
     if scene_law.watched == 1:
         if law.bears == 1:
             end_of_range(
-                tile.clip, as_read, row.t_ns, law.baseline_kpa, law.unloaded_kpa, law.noise_kpa
-            )
+                tile.clip, as_read, row.t_ns, law.baseline_kpa, law.unloaded_kpa, law.noise_kpa,
+                law.noise_left[AVERAGED_MAX], all_kpa - (as_read - law.baseline_kpa),
+            )  # fmt: skip
         above_kpa = math.nan if as_read >= law.end_kpa else as_read - law.baseline_kpa
         stuck, scene.toggles = is_stuck(
             scene_law, law.repeats, tile.repeats, cell.padc, above_kpa, law.unloaded_kpa,
