@@ -262,7 +262,7 @@ class StreamSummary(_Fact):
 
     boot_id: str
     state: State = Field(
-        description="unmeasured: offset unknown; unsynchronised: the node's clock was not set, either."
+        description="unmeasured: offset unknown; unsynchronised: the node's clock was unset, too."
     )
     rows: int = Field(description="Measurements of the offset.")
     stretches: tuple[StretchSummary, ...]
