@@ -109,7 +109,7 @@ def check_hash(hashes: tuple[str, str] | None, said: Mapping[bytes, bytes], *, w
         )
     if hashes is not None and hashes[0] != hashes[1]:
         raise DamagedFileError(
-            "its bytes have changed since it was written, by the hash in its footer",
+            "its bytes have changed since it was sealed, by the hash in its footer",
             where=where,
             expected="the bytes as they were written",
             remedy=_REMEDY,
@@ -159,7 +159,7 @@ def check_footer(hashes: tuple[str, str], *, where: str) -> None:
     """
     if hashes[0] != hashes[1]:
         raise DamagedFileError(
-            "the bytes of its footer have changed since it was written, by the footer's hash",
+            "the bytes of its footer have changed since it was sealed, by the footer's hash",
             where=where,
             expected="the bytes as they were written",
             remedy=_REMEDY,
