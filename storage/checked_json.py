@@ -70,7 +70,7 @@ def checked(text: bytes, *, where: str) -> Checked:
     found = is_unchanged(text)
     if found is False:
         raise DamagedFileError(
-            "it was changed: its text is not what its hash is of",
+            "it was changed: its text does not match its hash",
             where=where,
             expected="the bytes as they were written",
         )
@@ -90,13 +90,13 @@ def _check_json(text: bytes, *, where: str) -> None:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise DamagedFileError(
-            f"it is not whole: it states no hash and is no JSON ({error})",
+            f"it is incomplete: it has no hash and is no JSON ({error})",
             where=where,
             expected="a JSON object",
         ) from error
     if not isinstance(content, dict | list):
         raise DamagedFileError(
-            f"it states no hash and holds {text[:40]!r}", where=where, expected="a JSON object"
+            f"it has no hash and holds {text[:40]!r}", where=where, expected="a JSON object"
         )
 
 

@@ -56,7 +56,7 @@ def claims_in(
     try:
         if unchanged is None:
             unproven.append(
-                f"name, subject, notes and tags in {SESSION_NAME}: it states no hash of itself"
+                f"name, subject, notes and tags in {SESSION_NAME}: it has no hash"
             )
         body = without_check(text)
         try:
@@ -93,7 +93,7 @@ def _beside(path: Path, problems: list[str], unproven: list[str]) -> bytes | Non
         problems.append(f"{path.name}: {error.what}")
         return None
     if not read.is_proven:
-        unproven.append(f"{path.name}: it states no hash of itself")
+        unproven.append(f"{path.name}: it has no hash")
     return read.text
 
 
