@@ -166,7 +166,7 @@ class Journal:
         """Append a message that this machine has encoded, without decoding it.
 
         Raises:
-            StorageError: as for `append`.
+            StorageError: as for `append_new_frames`.
         """
         if self.held.missing(message.seq_first, message.seq_last) == message.numbers:
             self._write(message)
@@ -182,7 +182,7 @@ class Journal:
         self._open.sync()
 
     def disown(self, doubtful: Intervals) -> None:
-        """Remove batches within `doubtful` from the stored ones: unsynced or damaged frames.
+        """Remove batches within `doubtful_numbers`, unsynced or damaged, from the stored ones.
 
         In a closed segment they are removed from the index on disk, so that a later copy is the
         valid one after a restart.

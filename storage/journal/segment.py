@@ -82,7 +82,7 @@ class Segment:
             self.size_bytes += int(records["length"].sum()) + records.nbytes
 
     def note(self, message: EncodedBatch) -> None:
-        """Add the numbers, times and size of one written batch; faster than `add_records`."""
+        """Add the numbers, times and size of one written batch; faster than `register_records`."""
         self.held.add(message.seq_first, message.seq_last)
         fresh = not self.size_bytes
         begin, end = message.t_ns_first, message.t_ns_last

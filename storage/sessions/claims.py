@@ -55,9 +55,7 @@ def claims_in(
         problems.append(f"{SESSION_NAME} was changed: its text does not match its hash")
     try:
         if unchanged is None:
-            unproven.append(
-                f"name, subject, notes and tags in {SESSION_NAME}: it has no hash"
-            )
+            unproven.append(f"name, subject, notes and tags in {SESSION_NAME}: it has no hash")
         body = without_check(text)
         try:
             return claims_of(Session.model_validate_json(body))

@@ -6,7 +6,7 @@ byte-stream-split: DuckDB before 2.0 and pyarrow before 16 do not read that. A r
 minute, in sessions of more than an hour up to five: each row group costs a reader of the footer
 some time. The file appears completely or not at all: it is written under a temporary name, synced,
 and renamed. Its footer has hashes of its content, of its bytes and of itself
-(`storage.sessions.content_hash`, `storage.file_hash`).
+(`storage.sessions.content_hash`, `storage.parquet_hash`).
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class SessionWriter:
 
         Raises:
             FileFormatError: no frame was appended.
-            StorageError: the disk is full or not writable; raises as `atomic_file`.
+            StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
         """
         self._end_piece()
         self._write_group()

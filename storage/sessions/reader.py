@@ -38,7 +38,7 @@ class SessionReader:
     Attributes:
         path: the file.
         footer: its footer; `info`, `notes`, `format`, `content`, `content_sha256`, `column_names`
-            and `frame_count` are those of `storage.sessions.footer.Footer`.
+            and `frame_count` are those of `storage.sessions.footer.SealedFileFooter`.
     """
 
     def __init__(
@@ -174,7 +174,9 @@ class SessionReader:
             ]
             self.footer.span_ns = shifted[0][0], max(last for _, last in shifted)
             return self.footer.span_ns
-        first, *_ = self._tables(0, ["t_ns"])  # all pages: Arrow may skip one
+        first, *_ = self._tables(
+            0, ["t_ns"]
+        )  # all pieces: a page that Arrow skips shows in their row count
         with self._damage(0):
             begin = int(flat_values(KNOWN["t_ns"], "t_ns", first)[0])
         latest = self.extremes("t_ns")

@@ -62,7 +62,7 @@ def stances_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
     """Convert stances to a table; NaN and None become null.
 
     Args:
-        rows: values by the names of `STANCE_COLUMNS`.
+        rows: values by the names of `STORED_STANCE_COLUMNS`.
     """
     content = list(rows)
     arrays = [
@@ -93,7 +93,7 @@ class StoredStances:
     """Content of `stances.parquet`.
 
     Attributes:
-        table: table with the columns of `STANCE_COLUMNS`.
+        table: table with the columns of `STORED_STANCE_COLUMNS`.
         frames_sha256: file hash of the frames it was made from.
     """
 

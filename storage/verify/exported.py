@@ -102,7 +102,7 @@ def _arrow(path: Path) -> ExportReport | None:
                         whole.get_batch(i).validate()
             except Exception as error:  # damaged bytes may cause any error
                 report.problems.append(f"it cannot be read: {error}")
-    except Exception:  # the same
+    except Exception:  # damaged bytes may cause any error
         return None
     return report
 
