@@ -51,8 +51,8 @@ def write_table(
     Raises:
         StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
     """
-    said = {**(table.schema.metadata or {}), FORMAT_KEY: FORMAT}
-    table = table.replace_schema_metadata(said)
+    metadata = {**(table.schema.metadata or {}), FORMAT_KEY: FORMAT}
+    table = table.replace_schema_metadata(metadata)
     sink = io.BytesIO()
     compression = "none" if is_plain else "zstd"
     options: dict[str, Any] = {"compression": compression, "use_dictionary": not is_plain}
@@ -88,10 +88,10 @@ def table_of(content: bytes, *, where: str) -> CheckedTable:
             # the process would abort.
             table = file.read(use_threads=False)
             table.validate(full=True)
-            said = table.schema.metadata or {}
+            metadata = table.schema.metadata or {}
     except Exception as error:  # damaged bytes may cause any error
         raise DamagedFileError(
             f"cannot be read as a table: {' '.join(str(error).split())[:300]}", where=where
         ) from error
-    check_hash(hashes, said, where=where)
+    check_hash(hashes, metadata, where=where)
     return CheckedTable(table, is_proven=hashes is not None)

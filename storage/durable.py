@@ -377,9 +377,9 @@ def set_aside(path: Path) -> Path:
         StorageError: it cannot be renamed, and has its old name.
     """
     with storage_errors(path, "Move it away by hand"):
-        taken = {each.name for each in path.parent.iterdir()}
+        existing = {each.name for each in path.parent.iterdir()}
         free = (f"{path.name}{ASIDE}-{number}" for number in count(1))
-        aside = path.with_name(next(name for name in free if name not in taken))
+        aside = path.with_name(next(name for name in free if name not in existing))
         path.rename(aside)
         sync_folder(path.parent)
     return aside

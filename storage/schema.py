@@ -258,15 +258,15 @@ def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
     Raises:
         FileFormatError: there is none, it is of another version, or it was changed.
     """
-    said = schema.metadata or {}
-    text = said.get(ARRAY_INFO_KEY)
+    metadata = schema.metadata or {}
+    text = metadata.get(ARRAY_INFO_KEY)
     if text is None:
         raise FileFormatError(
             "no description of the tile array in it",
             where=where,
             expected="a file written by foottile",
         )
-    if said.get(ARRAY_HASH_KEY, _digits(text)) != _digits(text):
+    if metadata.get(ARRAY_HASH_KEY, _digits(text)) != _digits(text):
         raise DamagedFileError(
             "its description of the tile array was changed: its checksum is wrong",
             where=where,

@@ -59,9 +59,9 @@ class Scratch:
             raise StorageError(
                 f"cannot be written: {error.strerror}", where=str(self._folder), errno=error.errno
             ) from error
-        kept = Kept(self._end, len(stored), len(content))
+        block = Kept(self._end, len(stored), len(content))
         self._end += len(stored)
-        return kept
+        return block
 
     def get(self, kept: Kept) -> bytes:
         """Read and decompress a block.

@@ -90,8 +90,8 @@ def read_clock(path: Path) -> StoredClock:
     try:
         table = read.table.select(_SCHEMA.names).cast(_SCHEMA)
         table.validate(full=True)
-        said = read.table.schema.metadata or {}
-        facts = _STREAMS.validate_json(said.get(STREAMS_KEY, b"[]"))
+        metadata = read.table.schema.metadata or {}
+        facts = _STREAMS.validate_json(metadata.get(STREAMS_KEY, b"[]"))
         boot_ids = np.asarray(table.column("boot_id").to_pylist(), dtype=object)
         arrays = [table.column(name).to_numpy() for name in _NUMBERS]
     except Exception as error:  # unproven bytes may cause any error

@@ -34,15 +34,15 @@ class Instants:
 
     def note(self, message: EncodedBatch, held: Intervals) -> None:
         """Update the cache with a written message that is among the stored ones."""
-        known, first, last = self._known, message.seq_first, message.seq_last
-        known[first, False], known[last, True] = message.t_ns_first, message.t_ns_last
+        t_ns_by_end, first, last = self._known, message.seq_first, message.seq_last
+        t_ns_by_end[first, False], t_ns_by_end[last, True] = message.t_ns_first, message.t_ns_last
         before, after = held.neighbours(first, last)
         if before == first - 1:  # joined to it: the two numbers are no ends any more
-            known.pop((first - 1, True), None)
-            known.pop((first, False), None)
+            t_ns_by_end.pop((first - 1, True), None)
+            t_ns_by_end.pop((first, False), None)
         if after == last + 1:
-            known.pop((last + 1, False), None)
-            known.pop((last, True), None)
+            t_ns_by_end.pop((last + 1, False), None)
+            t_ns_by_end.pop((last, True), None)
 
     def forget(self) -> None:
         """Clear the cache: numbers are no longer stored."""

@@ -108,8 +108,8 @@ class Journal:
             notes = StreamNotes.load_whole(folder, problems)
             info = notes.array_info if notes is not None else _described(folder)
         if info is None:
-            said = "; ".join(("no readable journal segment", *problems))
-            raise DamagedFileError(said, where=str(folder))
+            what = "; ".join(("no readable journal segment", *problems))
+            raise DamagedFileError(what, where=str(folder))
         journal = cls(folder, info, writes_later=writes_later)
         journal.problems[:0] = problems
         if notes is not None:

@@ -134,10 +134,10 @@ class OpenSegments:
             self._retire(self._open[0])
         # After a failed write the name may be taken.
         path = self._folder / f"{seq_first:020d}{SUFFIX}"
-        taken = 1
+        suffix_number = 1
         while path.exists():
-            path = self._folder / f"{seq_first:020d}-{taken}{SUFFIX}"
-            taken += 1
+            path = self._folder / f"{seq_first:020d}-{suffix_number}{SUFFIX}"
+            suffix_number += 1
         check_held(path)
         with storage_errors(path):
             writer = SegmentWriter(path, self._header, writes_later=self._writes_later)

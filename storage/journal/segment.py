@@ -110,10 +110,10 @@ class Segment:
 
         The file under its name may be a copy that was made before they were written.
         """
-        known: Records | tuple[()] = ()
+        records: Records | tuple[()] = ()
         with suppress(StorageError):  # gone, or no descriptor is left
-            known = self.records()
-        batches = [Intervals([numbers(record)]) for record in known]
+            records = self.records()
+        batches = [Intervals([numbers(record)]) for record in records]
         self.held = (self.held - doubtful) | union(b for b in batches if b - doubtful)
 
     def rewrite_index(self) -> None:
@@ -152,9 +152,9 @@ def set_aside_no_files(folder: Path) -> list[str]:
 
 def unread_of(path: Path) -> Path:
     """Return a free path beside a segment for its unreadable bytes."""
-    taken = {each.name for each in path.parent.iterdir()}
+    existing = {each.name for each in path.parent.iterdir()}
     names = (f"{path.stem}{f'.{n}' if n > 1 else ''}{UNREAD_SUFFIX}" for n in count(1))
-    return path.with_name(next(name for name in names if name not in taken))
+    return path.with_name(next(name for name in names if name not in existing))
 
 
 def had_records(path: Path, schema: pa.Schema) -> bool:

@@ -57,6 +57,6 @@ class CheckedFiles:
                 del self._whole[next(iter(self._whole))]
             self._whole[stamps] = None
         self._footers[stamps] = footer
-        size_bytes = sum(kept.size_bytes for kept in self._footers.values())
+        size_bytes = sum(cached.size_bytes for cached in self._footers.values())
         while size_bytes > _FOOTERS_MAX_BYTES or len(self._footers) > _KNOWN_MAX:
             size_bytes -= self._footers.pop(next(iter(self._footers))).size_bytes

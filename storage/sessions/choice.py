@@ -92,10 +92,10 @@ def completeness_of(said: str, *, where: str) -> Completeness:
     Raises:
         UsageError: it is none of these.
     """
-    known: dict[str, Completeness] = {"true": True, "false": False, "lossy": "lossy"}
-    if said not in known:
+    values: dict[str, Completeness] = {"true": True, "false": False, "lossy": "lossy"}
+    if said not in values:
         raise UsageError(f"{where} {said[:40]!r}", expected="true, false or lossy")
-    return known[said]
+    return values[said]
 
 
 def _mentions(session: Session, q: str) -> bool:

@@ -204,9 +204,9 @@ def series_within(
 def _groups_within(footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None) -> list[int]:
     found = []
     for group in range(footer.num_row_groups):
-        said: Any = footer.row_group(group).column(0).statistics
-        is_after = begin_ns is None or said.max >= begin_ns
-        if is_after and (end_ns is None or said.min < end_ns):
+        statistics: Any = footer.row_group(group).column(0).statistics
+        is_after = begin_ns is None or statistics.max >= begin_ns
+        if is_after and (end_ns is None or statistics.min < end_ns):
             found.append(group)
     return found
 

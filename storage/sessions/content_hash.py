@@ -75,8 +75,8 @@ def column_values(name: str, column: pa.ChunkedArray[Any] | pa.Array[Any]) -> by
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
         return b"".join((text or "").encode() + b"\0" for text in column.to_pylist())
     if column.null_count:
-        known = KNOWN.get(_TILE_NUMBER.sub("", name))
-        missing = known.missing if known is not None else None
+        quantity = KNOWN.get(_TILE_NUMBER.sub("", name))
+        missing = quantity.missing if quantity is not None else None
         if pa.types.is_floating(column.type):
             missing = float("nan")  # type: ignore[assignment]  # of this column's own type
         column = column.fill_null(pa.scalar(missing if missing is not None else 0, column.type))

@@ -166,8 +166,8 @@ class Session(_Record):
 
     def with_clock(self, rows: Iterable[ClockOffset]) -> Session:
         """Return the session with newer clock measurements of one of its streams."""
-        known = sorted(self.clock, key=lambda row: row.t_mono_ns)
-        newest = {row.boot_id: row.t_mono_ns for row in known}
+        sorted_rows = sorted(self.clock, key=lambda row: row.t_mono_ns)
+        newest = {row.boot_id: row.t_mono_ns for row in sorted_rows}
         further = [row for row in rows if row.t_mono_ns > newest.get(row.boot_id, -1)]
         return self.model_copy(update={"clock": (*self.clock, *further)})
 

@@ -163,10 +163,10 @@ class Footer:
         if name not in self.column_names:
             return None
         column = self.metadata.row_group(group).column(self.schema.get_field_index(name))
-        said: Any = column.statistics if column.is_stats_set else None
-        if said is None or not said.has_min_max or not isinstance(said.min, int):
+        statistics: Any = column.statistics if column.is_stats_set else None
+        if statistics is None or not statistics.has_min_max or not isinstance(statistics.min, int):
             return None
-        return said.min, said.max
+        return statistics.min, statistics.max
 
     def _format(self) -> bytes:
         version = self.said.get(FORMAT_KEY)
@@ -181,8 +181,8 @@ class Footer:
 
     def _content(self) -> tuple[str | None, dict[str, Any] | None]:
         """Return the content's hash and description; None if another program wrote it last."""
-        said = self.metadata.metadata or {}
-        content, stated = said.get(CONTENT_KEY), said.get(CONTENT_HASH_KEY)
+        metadata = self.metadata.metadata or {}
+        content, stated = metadata.get(CONTENT_KEY), metadata.get(CONTENT_HASH_KEY)
         if content is None or stated is None:
             return None, None
         found = content_hash(self.said[ARRAY_INFO_KEY], self.said[NOTES_KEY], content)

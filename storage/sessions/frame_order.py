@@ -69,7 +69,7 @@ class FrameOrder:
         """Messages about all disorder."""
         found = list(self.disorder)
         for part in self.parts:
-            found += [f"part {part.part}: {said}" for said in part.disorder]
+            found += [f"part {part.part}: {message}" for message in part.disorder]
             if part.disorders > len(part.disorder):
                 more = part.disorders - len(part.disorder)
                 found.append(f"part {part.part}: and {more} more of the kind")
@@ -120,13 +120,13 @@ class FrameOrder:
             _say(part, f"time runs back by {late_ns} ns before frame {seq[at + 1]}")
         beyond = out_of_range(t_mono_ns, t_ns)
         shifted = (t_ns - t_mono_ns != part.offset_ns) & ~beyond  # beyond, a difference may wrap
-        for wrong, said in (
+        for wrong, problem in (
             (beyond, "is in no possible year"),
             (shifted, "is not t_mono_ns plus the part's offset"),
         ):
             if wrong.any():
                 first = int(seq[len(seq) - len(t_ns) + int(np.argmax(wrong))])
-                _say(part, f"t_ns of frame {first} {said}")
+                _say(part, f"t_ns of frame {first} {problem}")
         breaks = np.flatnonzero((seq[1:] - seq[:-1] != 1) | falls) + 1
         cuts = [0, *breaks.tolist(), len(seq)]
         for begin, end in pairwise(cuts):

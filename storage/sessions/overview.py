@@ -292,8 +292,8 @@ class Overview:
             bins = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in names}
         except Exception as error:  # damaged bytes may cause any error
             raise self._damaged(f"piece {i}: {error}") from error
-        said = self.index.pieces[i]
-        if len(batch) != said.bins or _crc(bins) != said.crc:
+        entry = self.index.pieces[i]
+        if len(batch) != entry.bins or _crc(bins) != entry.crc:
             raise self._damaged(f"the checksum of piece {i} is wrong")
         return bins
 
@@ -312,9 +312,9 @@ def _index_of(file: pa.ipc.RecordBatchFileReader) -> Index:
         ValueError: its hash is wrong, or it is of another file.
         KeyError: there is none.
     """
-    said = file.schema.metadata or {}
-    text = said[_KEY]
-    if hashlib.sha256(text).hexdigest().encode() != said[_CHECK_KEY]:
+    metadata = file.schema.metadata or {}
+    text = metadata[_KEY]
+    if hashlib.sha256(text).hexdigest().encode() != metadata[_CHECK_KEY]:
         raise ValueError("its index does not match its hash")
     index = Index.from_json(text)
     if file.num_record_batches != len(index.pieces):

@@ -85,12 +85,12 @@ class SessionReader:
     @property
     def identity(self) -> dict[str, object]:
         """Source reference for derived files: session id, content hash, stated file hash."""
-        said = self.footer.metadata.metadata or {}
+        metadata = self.footer.metadata.metadata or {}
         session = self.notes.get("session")
         return {
             "session": session.get("id") if isinstance(session, dict) else None,
             "content_sha256": self.content_sha256,
-            "file_sha256": said.get(FILE_HASH_KEY, b"").decode("ascii", "replace") or None,
+            "file_sha256": metadata.get(FILE_HASH_KEY, b"").decode("ascii", "replace") or None,
         }
 
     def close(self) -> None:
@@ -174,15 +174,13 @@ class SessionReader:
             ]
             self.footer.span_ns = shifted[0][0], max(last for _, last in shifted)
             return self.footer.span_ns
-        first, *_ = self._tables(
-            0, ["t_ns"]
-        )  # all pieces: a page that Arrow skips shows in their row count
+        first, *_ = self._tables(0, ["t_ns"])  # all: their row count shows a skipped page
         with self._damage(0):
             begin = int(flat_values(KNOWN["t_ns"], "t_ns", first)[0])
         latest = self.extremes("t_ns")
-        unsaid = [group for group, said in enumerate(latest) if said is None]
-        ends = [int(piece["t_ns"].max()) for piece in self.columns("t_ns", groups=unsaid)]
-        end = max([*ends, *(said[1] for said in latest if said is not None)])
+        unknown_groups = [group for group, min_max in enumerate(latest) if min_max is None]
+        ends = [int(piece["t_ns"].max()) for piece in self.columns("t_ns", groups=unknown_groups)]
+        end = max([*ends, *(min_max[1] for min_max in latest if min_max is not None)])
         self.footer.span_ns = begin, end
         return begin, end
 
@@ -226,8 +224,8 @@ class SessionReader:
             return list(range(len(self.footer.group_rows)))
         return [
             group
-            for group, said in enumerate(self.extremes("t_ns"))
-            if said is None or self.axis.may_overlap(*said, begin_t_ns, end_t_ns)
+            for group, min_max in enumerate(self.extremes("t_ns"))
+            if min_max is None or self.axis.may_overlap(*min_max, begin_t_ns, end_t_ns)
         ]
 
     def frames(self) -> FrameBatch:
@@ -264,14 +262,14 @@ class SessionReader:
         """Return first and last frame of every part with frames, by the footer where possible."""
         names, ids = ("part", "t_mono_ns", "t_ns"), stream_ids(self)
         found: dict[int, list[tuple[int, int]]] = {}
-        unsaid: list[int] = []
-        for group, said in enumerate(zip(*(self.extremes(name) for name in names), strict=True)):
-            part, t_mono_ns, t_ns = said
+        unknown_groups: list[int] = []
+        for group, min_max in enumerate(zip(*(self.extremes(name) for name in names), strict=True)):
+            part, t_mono_ns, t_ns = min_max
             if part is None or t_mono_ns is None or t_ns is None or part[0] != part[1]:
-                unsaid.append(group)
+                unknown_groups.append(group)
             else:
                 found.setdefault(part[0], []).extend(zip(t_mono_ns, t_ns, strict=True))
-        for piece in self.columns(*names, groups=unsaid):
+        for piece in self.columns(*names, groups=unknown_groups):
             for number in np.unique(piece["part"]).tolist():
                 here = piece["part"] == number
                 ends = [[int(v.min()), int(v.max())] for v in (piece[n][here] for n in names[1:])]

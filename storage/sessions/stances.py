@@ -84,8 +84,8 @@ def write_stances(path: Path, table: pa.Table, *, frames_sha256: str) -> None:
     Raises:
         StorageError: the disk is full or not writable; the old file is unchanged.
     """
-    said = {FRAMES_HASH_KEY: frames_sha256.encode()}
-    write_table(path, table.replace_schema_metadata(said), is_plain=True)
+    metadata = {FRAMES_HASH_KEY: frames_sha256.encode()}
+    write_table(path, table.replace_schema_metadata(metadata), is_plain=True)
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,8 @@ def read_stances(path: Path) -> StoredStances:
         StorageError: it cannot be read now.
     """
     read = read_table(path)
-    said = read.table.schema.metadata or {}
-    if not read.is_proven or FRAMES_HASH_KEY not in said:
+    metadata = read.table.schema.metadata or {}
+    if not read.is_proven or FRAMES_HASH_KEY not in metadata:
         raise DamagedFileError(
             "is no table of stances",
             where=str(path),
@@ -126,4 +126,4 @@ def read_stances(path: Path) -> StoredStances:
             expected="columns " + ", ".join(SCHEMA.names),
             remedy="None needed: it is made again from the frames",
         )
-    return StoredStances(read.table, said[FRAMES_HASH_KEY].decode("ascii", "replace"))
+    return StoredStances(read.table, metadata[FRAMES_HASH_KEY].decode("ascii", "replace"))

@@ -57,13 +57,29 @@ class FolderReport:
         sessions, streams = self.sessions, self.streams
         everything = [
             *self.problems,
-            *(f"session {s.id or s.path.name}: {said}" for s in sessions for said in s.problems),
-            *(f"journal {j.node}/{j.boot_id}: {said}" for j in streams for said in j.problems),
+            *(
+                f"session {s.id or s.path.name}: {message}"
+                for s in sessions
+                for message in s.problems
+            ),
+            *(
+                f"journal {j.node}/{j.boot_id}: {message}"
+                for j in streams
+                for message in j.problems
+            ),
         ]
         unproven = [
             *self.unproven,
-            *(f"session {s.id or s.path.name}: {said}" for s in sessions for said in s.unproven),
-            *(f"journal {j.node}/{j.boot_id}: {said}" for j in streams for said in j.unproven),
+            *(
+                f"session {s.id or s.path.name}: {message}"
+                for s in sessions
+                for message in s.unproven
+            ),
+            *(
+                f"journal {j.node}/{j.boot_id}: {message}"
+                for j in streams
+                for message in j.unproven
+            ),
         ]
         return {
             "sessions": [session.as_dict() for session in sessions],
@@ -124,19 +140,19 @@ def verify_folder(path: Path) -> FolderReport:
     """
     data = path.absolute()
     report = FolderReport(path)
-    known = cache(verify_stream)
+    verify_once = cache(verify_stream)
     proven: set[Path] = set()
     for folder in _folders(data, "journal/*", _STREAM_NAME, report):
         proven.add(folder)
         with _told(report, folder, data):
-            report.streams.append(known(folder))
+            report.streams.append(verify_once(folder))
     for place in ("sessions", "trash"):
         for folder in _folders(data, place, SESSION_ID, report):
             proven.add(folder)
             with _told(report, folder, data):
                 # The folder of a session that was never saved is empty.
                 if any(not inside.name.startswith(".") for inside in folder.iterdir()):
-                    session = verify_session(folder, data=data, streams=known)
+                    session = verify_session(folder, data=data, streams=verify_once)
                     if session.id not in (None, folder.name):
                         session.problems.append(f"it lies in the folder of {folder.name}")
                     report.sessions.append(session)
@@ -144,7 +160,7 @@ def verify_folder(path: Path) -> FolderReport:
             folder = data / place / stray.name
             proven.add(folder)
             with _told(report, folder, data):
-                session = verify_session(folder, data=data, streams=known)
+                session = verify_session(folder, data=data, streams=verify_once)
                 session.problems.append(f"{place}/{stray.name}: {stray.error.what}")
                 report.sessions.append(session)
     others = verify_others(data, proven)

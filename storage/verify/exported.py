@@ -70,15 +70,17 @@ def verify_export(path: Path) -> ExportReport | None:
 def _parquet(path: Path) -> ExportReport | None:
     try:
         file = pq.ParquetFile(path, page_checksum_verification=True)
-        said, footer = file.schema_arrow.metadata or {}, file.metadata.metadata or {}
+        metadata, footer = file.schema_arrow.metadata or {}, file.metadata.metadata or {}
     except Exception:  # damaged bytes may cause any error
         return None
     with file:
         # Exports of older versions have no key; they lack the entries of a sealed file.
-        is_older = ARRAY_INFO_KEY in said and FORMAT_KEY not in said and CONTENT_KEY not in footer
-        if EXPORT_KEY not in said and not is_older:
+        is_older = (
+            ARRAY_INFO_KEY in metadata and FORMAT_KEY not in metadata and CONTENT_KEY not in footer
+        )
+        if EXPORT_KEY not in metadata and not is_older:
             return None
-        report = ExportReport(path, "parquet", _source(said))
+        report = ExportReport(path, "parquet", _source(metadata))
         try:
             for group in range(file.num_row_groups):
                 file.read_row_group(group)
@@ -92,10 +94,10 @@ def _arrow(path: Path) -> ExportReport | None:
         with pa.OSFile(str(path), "r") as file:
             file.seek(len(_ARROW_BEGIN))  # a stream begins there, which needs no footer
             with pa.ipc.open_stream(file) as stream:
-                said = stream.schema.metadata or {}
-            if EXPORT_KEY not in said and ARRAY_INFO_KEY not in said:
+                metadata = stream.schema.metadata or {}
+            if EXPORT_KEY not in metadata and ARRAY_INFO_KEY not in metadata:
                 return None
-            report = ExportReport(path, "arrow", _source(said))
+            report = ExportReport(path, "arrow", _source(metadata))
             try:
                 with pa.ipc.open_file(file) as whole:
                     for i in range(whole.num_record_batches):
@@ -116,15 +118,15 @@ def _csv(path: Path) -> ExportReport | None:
         names, *cells = csv.reader([header, row] if row else [header], delimiter=between)
     except (UnicodeDecodeError, ValueError, csv.Error):
         return None
-    known = {*KNOWN, EXPORT_COLUMN}
-    if not names or not all(name in known or _OF_A_TILE.match(name) for name in names):
+    known_names = {*KNOWN, EXPORT_COLUMN}
+    if not names or not all(name in known_names or _OF_A_TILE.match(name) for name in names):
         return None
     first = dict(zip(names, *cells, strict=False)) if cells else {}
     return ExportReport(path, "csv", _json(first.get(EXPORT_COLUMN, "")))
 
 
-def _source(said: dict[bytes, bytes]) -> dict[str, Any]:
-    return _json(said.get(EXPORT_KEY, b""))
+def _source(metadata: dict[bytes, bytes]) -> dict[str, Any]:
+    return _json(metadata.get(EXPORT_KEY, b""))
 
 
 def _json(text: str | bytes) -> dict[str, Any]:

@@ -52,8 +52,8 @@ class FileReport:
     @property
     def session(self) -> dict[str, Any]:
         """Facts about the session in the file's notes."""
-        said = self.notes.get("session")
-        return said if isinstance(said, dict) else {}
+        content = self.notes.get("session")
+        return content if isinstance(content, dict) else {}
 
 
 def verify_file(path: Path) -> FileReport:
@@ -102,30 +102,30 @@ def part_problems(parts: list[PartFrames], ledger: Ledger, lost: dict[str, Losse
     by_number = {part.part: part for part in parts}
     for strange in sorted(set(by_number) - set(range(len(ledger.parts)))):
         problems.append(f"there are frames of part {strange}, which is not in the ledger")
-    for number, said in enumerate(ledger.parts):
+    for number, stated in enumerate(ledger.parts):
         found = by_number.get(number)
         frames = found.frames if found is not None else 0
         name = f"part {number}"
-        if frames != said.recorded:
-            problems.append(f"{name}: {frames} frames, and the ledger has {said.recorded}")
+        if frames != stated.recorded:
+            problems.append(f"{name}: {frames} frames, and the ledger has {stated.recorded}")
         held = found.held if found is not None else Intervals()
-        beyond = held - Intervals([(said.seq_first, said.seq_last)] if _length(said) else [])
+        beyond = held - Intervals([(stated.seq_first, stated.seq_last)] if _length(stated) else [])
         if beyond:
             first, last = next(iter(beyond))
             problems.append(
-                f"{name}: frames {first} to {last} are outside of its range {said.seq_first} to "
-                f"{said.seq_last}"
+                f"{name}: frames {first} to {last} are outside of its range {stated.seq_first} to "
+                f"{stated.seq_last}"
             )
-        gaps = held.missing(said.seq_first, said.seq_last) if _length(said) else Intervals()
-        accounted = sum(said.lost.values()) + said.pending
+        gaps = held.missing(stated.seq_first, stated.seq_last) if _length(stated) else Intervals()
+        accounted = sum(stated.lost.values()) + stated.pending
         if gaps.count != accounted:
             problems.append(
                 f"{name}: {gaps.count} frames are missing ({_named(gaps)}), and the ledger "
                 f"accounts for {accounted}"
             )
-        if said.boot_id in lost:
-            unnamed = gaps - lost[said.boot_id].all
-            if unnamed and not said.pending:
+        if stated.boot_id in lost:
+            unnamed = gaps - lost[stated.boot_id].all
+            if unnamed and not stated.pending:
                 problems.append(f"{name}: frames {_named(unnamed)} are missing and not named lost")
     return problems
 
@@ -212,14 +212,19 @@ def _content_problems(stated: dict[str, Any], found: dict[str, Any]) -> list[str
         problems.append(f"{found['frames']} frames, and {stated.get('frames')} were sealed")
     if stated.get("parts") != found["parts"]:
         problems.append("the ranges of its parts have changed since it was sealed")
-    said, has = stated.get("columns", {}), found["columns"]
-    if list(said) != list(has):
-        added, gone = sorted(set(has) - set(said)), sorted(set(said) - set(has))
+    stated_columns, found_columns = stated.get("columns", {}), found["columns"]
+    if list(stated_columns) != list(found_columns):
+        added = sorted(set(found_columns) - set(stated_columns))
+        gone = sorted(set(stated_columns) - set(found_columns))
         changes = [f"added: {', '.join(added)}"] * bool(added) + [
             f"gone: {', '.join(gone)}"
         ] * bool(gone)
         problems.append(f"its columns have changed since it was sealed ({'; '.join(changes)})")
-    changed = [name for name in has if name in said and has[name] != said[name]]
+    changed = [
+        name
+        for name in found_columns
+        if name in stated_columns and found_columns[name] != stated_columns[name]
+    ]
     if changed:
         shown = ", ".join(changed[:6]) + (" ..." if len(changed) > 6 else "")
         problems.append(f"the values of {shown} have changed since it was sealed")
@@ -237,8 +242,8 @@ def _check_offset(report: FileReport, utc_offset_ns: int) -> None:
 
 def _check_ledger(report: FileReport) -> None:
     """Check the frames against the ledger in the notes, or count a ledger from the frames."""
-    said = report.notes.get("ledger")
-    if said is None:
+    stated = report.notes.get("ledger")
+    if stated is None:
         gaps = union(part.gaps for part in report.parts)
         if gaps:
             report.problems.append(
@@ -263,7 +268,7 @@ def _check_ledger(report: FileReport) -> None:
         report.unproven.append("begin and end of its recording: it is of no recorded session")
         return
     try:
-        report.ledger = Ledger.model_validate(said)
+        report.ledger = Ledger.model_validate(stated)
         lost = named_losses(report.notes)
         parts = _PARTS.validate_python(report.session.get("parts", ()))
     except (ValidationError, FileFormatError) as error:

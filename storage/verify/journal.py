@@ -59,12 +59,12 @@ class StreamReport:
             may_come: numbers that its node may still send, unless they are lost.
         """
         notes = self.notes
-        told = Losses(notes.lost if notes is not None else None)
+        recorded_losses = Losses(notes.lost if notes is not None else None)
         return StreamState(
             held=self.held,
-            lost=told,
-            damaged=self.lost.all - told.all,
-            may_come=may_come - told.all,
+            lost=recorded_losses,
+            damaged=self.lost.all - recorded_losses.all,
+            may_come=may_come - recorded_losses.all,
             next_seq=notes.next_seq if notes is not None else None,
             unsynced_tail_max=notes.unsynced_tail_max if notes is not None else 0,
             missed_slots=notes.missed_slots if notes is not None else 0,
@@ -201,11 +201,11 @@ def _check_clock(report: StreamReport, folder: Path) -> None:
 def _segments(folder: Path) -> list[SegmentReport]:
     """Verify every segment; damaged ones twice, since the file may just have been deleted."""
     first_look = [_if_there(path) for path in _names(folder, SUFFIX)]
-    looked = [
+    second_look = [
         _if_there(report.path) if report is not None and report.problems else report
         for report in first_look
     ]
-    return [report for report in looked if report is not None]
+    return [report for report in second_look if report is not None]
 
 
 def _if_there(path: Path) -> SegmentReport | None:

@@ -164,19 +164,19 @@ class _Batches:
 
     def check(self, index: Records) -> None:
         """Verify all batches of the index."""
-        report, good = self._report, [np.zeros(0, RECORD)]
+        report, undamaged = self._report, [np.zeros(0, RECORD)]
         if report.is_closed:
             index = index[:-1]
         with report.path.open("rb") as file:
             for begin in range(0, len(index), _RUN_BATCHES):
                 records = index[begin : begin + _RUN_BATCHES]
                 if self._is_right(file.fileno(), records):
-                    good.append(records)
+                    undamaged.append(records)
                     continue
                 for at, record in enumerate(records):
                     if self._is_good(file.fileno(), record, begin + at):
-                        good.append(records[at : at + 1])
-        report.index = np.concatenate(good)
+                        undamaged.append(records[at : at + 1])
+        report.index = np.concatenate(undamaged)
         if report.is_closed:
             report.damaged = report.damaged | self._doubtful
             report.problems += self._said

@@ -131,36 +131,39 @@ def _once(
     folder: Path, data: Path, session: Session | None, text: bytes | None, streams: Streams
 ) -> SessionReport:
     report = SessionReport(folder, in_trash=folder.absolute().parent.name == "trash")
-    said = (
+    metadata = (
         claims_of(session)
         if session is not None
         else claims_in(folder, text, report.problems, report.unproven)
     )
-    if said is None:
+    if metadata is None:
         if (folder / FRAMES_NAME).is_file():
             _add_file(report, folder)
         return report
-    report.id, report.name = str(said.content["id"]), str(said.content.get("name", ""))
-    report.node, report.state = str(said.content.get("node", "")), str(said.content.get("state"))
-    report.ledger = said.ledger
+    report.id, report.name = str(metadata.content["id"]), str(metadata.content.get("name", ""))
+    report.node, report.state = (
+        str(metadata.content.get("node", "")),
+        str(metadata.content.get("state")),
+    )
+    report.ledger = metadata.ledger
     if report.state == "sealed":
-        _check_sealed(report, folder, said)
-    elif said.whole is not None:
-        _count(report, data, said.whole, streams)
+        _check_sealed(report, folder, metadata)
+    elif metadata.whole is not None:
+        _count(report, data, metadata.whole, streams)
     return report
 
 
-def _check_sealed(report: SessionReport, folder: Path, said: Claims) -> None:
-    problems, content = report.problems, said.content
-    if said.ledger is None:
+def _check_sealed(report: SessionReport, folder: Path, metadata: Claims) -> None:
+    problems, content = report.problems, metadata.content
+    if metadata.ledger is None:
         problems.append("it is sealed, but its ledger is missing")
-    elif any(part.pending for part in said.ledger.parts):
+    elif any(part.pending for part in metadata.ledger.parts):
         problems.append("it is sealed, but frames are still to come")
     path = folder / FRAMES_NAME
-    if said.ledger is not None and not any(part.recorded for part in said.ledger.parts):
+    if metadata.ledger is not None and not any(part.recorded for part in metadata.ledger.parts):
         if path.is_file():
             problems.append(f"{FRAMES_NAME} exists, but the ledger has no frame recorded")
-        problems += ledger_problems(said.ledger)
+        problems += ledger_problems(metadata.ledger)
         return
     if not path.is_file():
         problems.append(f"{FRAMES_NAME} is missing")
@@ -172,15 +175,15 @@ def _check_sealed(report: SessionReport, folder: Path, said: Claims) -> None:
             f"{report.sha256}, not {content.get('sha256')}"
         )
     _compare(problems, content, file, path.stat().st_size)
-    if said.ledger is not None:
-        report.ledger = said.ledger
-        if file.ledger is not None and file.ledger != said.ledger:
+    if metadata.ledger is not None:
+        report.ledger = metadata.ledger
+        if file.ledger is not None and file.ledger != metadata.ledger:
             problems.append(f"the ledgers of {SESSION_NAME} and {FRAMES_NAME} are not the same")
-    if file.session and file.session.get("parts") != [p.model_dump() for p in said.parts]:
+    if file.session and file.session.get("parts") != [p.model_dump() for p in metadata.parts]:
         problems.append(f"{SESSION_NAME} and {FRAMES_NAME} are not of the same parts")
-    whole = said.whole
-    _check_events(report, folder / EVENTS_NAME, whole.events if whole is not None else None)
-    _check_clock(report, folder / CLOCK_NAME, whole)
+    session = metadata.whole
+    _check_events(report, folder / EVENTS_NAME, session.events if session is not None else None)
+    _check_clock(report, folder / CLOCK_NAME, session)
     _check_stances(report, folder / STANCES_NAME)
     _check_overview(report, folder / OVERVIEW_NAME)
 

@@ -72,8 +72,8 @@ class NodeStream:
             for reason, numbers in journal.lost.by_reason.items():
                 self._lost.add(numbers, reason)
         last = (self.stored | self._lost.all).last
-        known = 0 if last is None else last + 1
-        self.next_seq = known if notes.next_seq is None else notes.next_seq
+        recovered_seq = 0 if last is None else last + 1
+        self.next_seq = recovered_seq if notes.next_seq is None else notes.next_seq
         """Number of the next frame."""
 
     # --- state ------------------------------------------------------------------------------------
@@ -211,8 +211,8 @@ class NodeStream:
                 for batch in self._waiting.batches
                 if batch.seq_first <= seq_last and batch.seq_last >= seq_first
             ]
-        asked = Intervals([(seq_first, seq_last)])
-        on_disk = asked - Intervals((batch.seq_first, batch.seq_last) for batch in memory)
+        requested = Intervals([(seq_first, seq_last)])
+        on_disk = requested - Intervals((batch.seq_first, batch.seq_last) for batch in memory)
         at = 0
         for first, last in on_disk:
             while at < len(memory) and memory[at].seq_first < first:
