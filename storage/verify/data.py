@@ -126,7 +126,7 @@ def verify(path: Path, *, data: Path | None = None) -> Report:
     if any(path.glob("*.json")):
         return verify_folder(path)
     raise FileFormatError(
-        "it has no file of foottile",
+        "foottile wrote none of its files",
         where=str(path),
         expected="a data folder, a session's or a stream's folder, or one of their files",
     )
