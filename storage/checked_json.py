@@ -90,7 +90,7 @@ def _check_json(text: bytes, *, where: str) -> None:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise DamagedFileError(
-            f"it is incomplete: it has no hash and is no JSON ({error})",
+            f"it is not whole: it has no hash and is no JSON ({error})",
             where=where,
             expected="a JSON object",
         ) from error

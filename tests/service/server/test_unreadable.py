@@ -110,7 +110,7 @@ def test_a_file_that_cannot_be_read_stays_as_it_is(
         if use is _stream:
             use(tmp_path)
         else:
-            with pytest.raises(StorageError, match="let this user read it, or try again") as caught:
+            with pytest.raises(StorageError, match="Let this user read it, or try again") as caught:
                 use(tmp_path)
             assert caught.value.errno == number
     assert contents(tmp_path) == before
