@@ -114,7 +114,7 @@ class TimeAxis:
 
     @classmethod
     def from_dicts(cls, stated: object, *, where: str) -> TimeAxis:
-        """Return the axis from a file's notes, as `to_json` made them.
+        """Return the axis from a file's notes, as `to_json_list` made them.
 
         Raises:
             FileFormatError: it is none.
