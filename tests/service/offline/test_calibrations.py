@@ -49,7 +49,7 @@ def test_verify_proves_it_and_a_folder_of_them(path: Path, tmp_path: Path) -> No
     _flipped(path)
     assert [verdict_of(verify(each)) for each in (path, tmp_path)] == ["damaged"] * 2
     path.write_text(CALIBRATION.to_json())
-    assert verify(path).as_dict()["unproven"] == ["toe.json: it states no hash of itself"]
+    assert verify(path).as_dict()["unproven"] == ["toe.json: it has no hash"]
 
 
 def test_one_of_an_older_version_is_proven_by_its_id(path: Path) -> None:

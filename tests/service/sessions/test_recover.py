@@ -309,7 +309,7 @@ def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
     monkeypatch.setattr(recover_module, "seal", careless)
     (one,) = recover(tmp_path).sessions
     assert one.outcome == "failed"
-    assert "not those that were sealed" in one.problem
+    assert "changed since it was sealed" in one.problem
     assert loaded(tmp_path).state == "sealing"
     monkeypatch.undo()
     assert outcomes(recover(tmp_path)) == ["sealed"]
