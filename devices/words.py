@@ -22,7 +22,6 @@ def printable(text: str, *, keeps_lines: bool = False) -> str:
         text: untrusted text.
         keeps_lines: keep line breaks, tabs and runs of spaces; else join all to one line.
     """
-
     if not keeps_lines:
         text = " ".join(text.split())
     elif text.isascii() and text.replace("\n", "").isprintable():
