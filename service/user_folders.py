@@ -45,7 +45,7 @@ def user_folder(kind: Kind, given: Path | None, option: str) -> Path:
 
 
 def _default(kind: Kind) -> Path | None:
-    """Return the user's default folder; None without a home, which platformdirs shows in two ways."""
+    """Return the user's default folder; None without a home."""
     import platformdirs
 
     default_of = {
