@@ -1,7 +1,7 @@
 """Memory allocation that returns freed memory to the system.
 
 By default the allocators of Arrow and glibc retain each thread's peak: a server that had answered
-400 zooms into ten hours of 8 tiles held 80 MB of it.
+400 zooms into ten hours of 8 tiles held 80 MB.
 """
 
 from __future__ import annotations

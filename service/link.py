@@ -171,7 +171,7 @@ class Proof(Facts):
 
 
 class EarlierStream(Facts):
-    """Ended stream of a node that still has frames of it, or has lost some."""
+    """Ended stream of which the node still stores frames, or has lost some."""
 
     array_info: ArrayInfo
     held: Pairs

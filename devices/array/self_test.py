@@ -35,8 +35,8 @@ _SAME_MAX = 8
 """Unchanged readings from which a conversion counts as unfinished. Two readings of a healthy part
 are equal by chance in one of nine cases, eight in one of 10^7."""
 _TEMPERATURE_SAME_MAX = 20
-"""As `_SAME_MAX`, for the temperature alone, which is equal by chance in every second reading. It
-is loaded last."""
+"""Limit like `_SAME_MAX`, for the temperature alone, which is equal by chance in every second
+reading. It is loaded last."""
 _MARGIN = 1.004
 """Allowance for the drift of a part's clock; a larger drift is detected while running."""
 

@@ -65,7 +65,7 @@ class _Smbus(SMBus):
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
         """Run the messages as one transaction.
 
-        The ioctl returns how many of them were transferred, which smbus2 ignores: an adapter that
+        The ioctl returns the number of transferred messages, which smbus2 ignores: an adapter that
         stops early without an errno leaves the read buffer as it was.
 
         Raises:

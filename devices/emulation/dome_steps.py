@@ -34,7 +34,7 @@ _ROUNDS_END_K = 1e-9  # 3e-10 kPa
 def crept_n(
     force_n: Floats, last_n: Floats, parts: Floats, decay: Floats, mean: Floats, slow_n: Floats
 ) -> Floats:
-    """Apply creep: each term's part of the force appears with a delay, in the end all of it.
+    """Apply creep: each term's part of the force appears with a delay, finally in full.
 
     Args:
         force_n: (times, domes).

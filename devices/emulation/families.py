@@ -89,7 +89,7 @@ def _broad_dome(rng: np.random.Generator) -> DomePart:
     """Draw a dome of varied rubber and gas that reaches the chip's full scale at 20 to 40 N.
 
     Creep has one to four terms from 10 ms to 10 s, 2 to 15 % in sum. The loop of a slow stroke is
-    1 to 5 % of full scale from branch to branch, any part of it viscous: flow with the third to
+    1 to 5 % of full scale from branch to branch, with any viscous part: flow with the third to
     sixth power of the stress; Bergstrom and Boyce (1998) found about the fourth.
     """
     seal_kpa = rng.uniform(98.0, 102.5)

@@ -3,7 +3,7 @@
 On hardware a transfer ends with its last bit. In an emulation the same thread first computes the
 chips and is then woken a little late. The driver's clock excludes that time: it continues from the
 instant at which the transfer ended on the wire. The next wait of the driver or the wires is shorter
-by that lag, so that the clock returns to CLOCK_MONOTONIC; it is never ahead of it. Time of the
+by that lag, so that the clock returns to CLOCK_MONOTONIC, and is never ahead. Time of the
 driver itself (code, wake-ups, missing CPU) passes as on any other clock.
 """
 
@@ -20,7 +20,7 @@ class HostedClock:
     """Clock of the driver.
 
     Args:
-        host: clock of the machine; this clock is never ahead of it.
+        host: clock of the machine, which this clock never overtakes.
     """
 
     def __init__(self, host: Clock) -> None:

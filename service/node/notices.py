@@ -21,7 +21,7 @@ class Notices:
         return tuple(self._told.values())
 
     def since(self, troubles: Mapping[str, str]) -> tuple[str, ...]:
-        """Update with the present warnings; return messages about those that began or ended.
+        """Update with the present warnings; return messages about begun and ended ones.
 
         Args:
             troubles: texts of the present warnings, by faulty part.

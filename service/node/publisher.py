@@ -1,6 +1,6 @@
 """Publisher of a node's frames: connects to the server, with endless retries.
 
-The journal stores all frames, and the next connection continues with those that the server misses.
+The journal stores all frames, and the next connection continues with the server's missing ones.
 """
 
 from __future__ import annotations

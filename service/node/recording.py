@@ -120,7 +120,7 @@ class NodeRecording:
         return sealed.id, sealed.ledger is None or not sealed.ledger.complete
 
     def seal_what_was_left(self) -> None:
-        """Seal sessions of earlier runs; report those that fail and leave them."""
+        """Seal sessions of earlier runs; report failures and leave these sessions."""
         with self._sealing:
             for session in list(self._left_over):
                 try:

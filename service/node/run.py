@@ -38,7 +38,7 @@ _DRAIN_S = 3.0
 _AWAY_LOOKS = 50
 """Polls without a link, a second in all, that end the wait for delivery."""
 _PROBLEMS_MAX, _PROBLEM_LENGTH = 20, 400
-"""Limits of the journal's problems in a status message; the node reports all of them locally."""
+"""Limits of the journal's problems in a status message; the node reports all problems locally."""
 _TROUBLES_S = 0.5
 """Interval of checks for changed warnings."""
 _SILENT_S = 2.0
@@ -51,7 +51,7 @@ class Outcome:
 
     Attributes:
         undelivered_frames: frames on the node's disk that the server has not acknowledged.
-        lost_frames: frames on no disk of node or server, without those that no session needed.
+        lost_frames: frames of sessions that are on no disk of node or server.
         recorded: id of the local session; None: no recording, or not sealed.
         is_lossy: True if that session is not complete.
     """

@@ -219,7 +219,7 @@ class EmulatedI2cAdapter:
         self._clock.sleep_until_ns(begin_ns + round(bits * self._ns_per_bit))
 
     def close(self) -> None:
-        """Do nothing."""
+        """Close the adapter; it has no resources."""
 
     def _devices_by_address(self) -> dict[int, list[I2cDevice]]:
         routing = tuple([mux.mask for mux in self._muxes])

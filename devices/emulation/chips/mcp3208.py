@@ -1,4 +1,4 @@
-"""Emulated MCP3208 at bit level, with the amplifier in front of it.
+"""Emulated MCP3208 at bit level, with its input amplifier.
 
 Source: data sheet DS21298E section 5 (figures 5-1 and 5-2, table 5-2). The chip ignores byte
 boundaries: it waits for the first high bit of a transfer, and counts clocks from there.
@@ -66,7 +66,7 @@ class EmulatedMcp3208:
         return data
 
     def close(self) -> None:
-        """Do nothing."""
+        """Close the device; it has no resources."""
 
     def _answer(self, sent: list[int], begin_ns: int) -> list[int]:
         start = sent.index(1) if 1 in sent else len(sent)
