@@ -118,7 +118,7 @@ def _rise(pairs: tuple[tuple[int, int | None], ...]) -> tuple[tuple[int, int | N
     end: int | None = -1
     for first, last in pairs:
         if end is None or first <= end or (last is not None and last < first):
-            raise ValueError("intervals have to rise, and none may be empty")
+            raise ValueError("intervals must be rising and not empty")
         end = last
     return pairs
 

@@ -88,9 +88,9 @@ class BusWatch:
             return ""
         if not self._router.bus.is_open:
             why = f": {self._router.bus.problem}" if self._router.bus.problem else ""
-            return f"the adapter of the bus is away, and is opened again every second{why}"
-        unhelped = f" and could not be helped: {self.problem}" if self.problem else ""
-        return f"the bus is stuck or cut{unhelped}"
+            return f"the adapter of the bus is missing; retry every second{why}"
+        failure = f"; recovery failed: {self.problem}" if self.problem else ""
+        return f"the bus is stuck or cut{failure}"
 
     def comes_back(self) -> bool:
         """Return whether a bus that was down works again; reopen or recover it if due."""

@@ -116,7 +116,7 @@ def find_tiles(bus: I2cBus) -> tuple[Plug, ...]:
     router = MuxRouter(bus, muxes)
     if muxes and not router.echoes():
         raise BusFaultError(
-            f"{len(muxes)} multiplexers acknowledge, and none keeps what is written to it",
+            f"{len(muxes)} multiplexers acknowledge, but none stores a mask",
             where=bus.name,
             remedy="SDA is stuck low: pull the tiles' plugs one by one, or cycle their supply",
         )

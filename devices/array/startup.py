@@ -98,7 +98,7 @@ def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
             if router.echoes() or router.refused is not None:
                 return True
             fault = BusFaultError(
-                "the multiplexers acknowledge, and none keeps what is written to it",
+                "the multiplexers acknowledge, but none stores a mask",
                 where=bus.name,
                 remedy="SDA is stuck low: pull the tiles' plugs one by one, cycle their supply, or "
                 "wire [recovery]",

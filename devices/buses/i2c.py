@@ -217,9 +217,9 @@ def _classified(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cE
             errno=number,
         )
     return BusLostError(
-        f"the adapter is not there any more ({name})",
+        f"the adapter is missing ({name})",
         where=where,
-        remedy="Check its plug and its supply; it is opened again when it is back",
+        remedy="Check its plug and its supply; it is reopened automatically",
         errno=number,
     )
 

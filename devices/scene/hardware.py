@@ -98,7 +98,7 @@ class ServoScene(Section):
         highest = FIRMWARES[protocol].protocol.highest_id
         if servo_id > highest:
             raise ValueError(
-                f"{servo_id} is no id of a servo with protocol {protocol}, which are 0 to {highest}"
+                f"{servo_id} is no servo id of protocol {protocol}; expected 0 to {highest}"
             )
         return servo_id
 

@@ -157,7 +157,7 @@ class AcquisitionProcess:
 
 def _how_ended(code: int | None) -> str:
     if code is None:
-        return "says nothing more"
+        return "does not respond any more"
     if code >= 0:
         return f"ended with code {code}"
     with suppress(ValueError):  # a signal without a name

@@ -90,7 +90,7 @@ class Connection:
                 case Probe():
                     self._probes.answered(message)
                 case Challenge() | Welcome():
-                    raise LinkError(f"{message.type} was said before")
+                    raise LinkError(f"the server sent {message.type} a second time")
 
     def _take_wanted(self, wanted: Wanted) -> None:
         earlier = (stream.array_info.boot_id for stream in self._link.hello.earlier)
@@ -120,9 +120,9 @@ def parse(message: str | bytes) -> SaidByServer:
         return understood(FromServer, heard(message))
     except LinkError as error:
         raise LinkError(
-            f"the server said something that is no message: {error}",
+            f"the server sent an invalid message: {error}",
             expected=f"{SUBPROTOCOL} messages",
-            remedy="Is it a foottile server of this version?",
+            remedy="Check that it is a foottile server of the same version",
         ) from error
 
 

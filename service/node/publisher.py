@@ -171,7 +171,7 @@ async def _answer(socket: ClientConnection, kind: type[_Kind]) -> _Kind:
         answer: SaidByServer = parse(await socket.recv())
     if not isinstance(answer, kind):
         expected = kind.model_fields["type"].default
-        raise LinkError(f"the server said {answer.type!r}", expected=expected)
+        raise LinkError(f"the server sent {answer.type!r}", expected=expected)
     return answer
 
 

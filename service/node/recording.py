@@ -147,7 +147,7 @@ class NodeRecording:
         try:
             self._folder.save(session)
         except StorageError as error:  # its frames are retained nevertheless
-            self._report(f"session {session.id} cannot be noted: {error}")
+            self._report(f"session {session.id} cannot be saved: {error}")
 
     def _seal(self, session: Session) -> Session:
         # Imported here, because scipy would delay a node's first frame.

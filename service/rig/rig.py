@@ -120,7 +120,7 @@ class Rig:
         self.remarks = [f"schedule {self._ready.choice.schedule}: {self._ready.choice.reason}"]
         """Start-up messages for the user."""
         self.remarks += [
-            f"the conversion time of tile {serial} could not be measured: it is given 3 ms"
+            f"the conversion time of tile {serial} could not be measured; 3 ms is assumed"
             for serial in self._ready.unmeasured
         ]
         self._servo_source = (

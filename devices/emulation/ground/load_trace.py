@@ -71,7 +71,7 @@ class CopTransform:
         match = re.fullmatch(r"([+-]?)([xy])([+-]?)([xy])", self.axes)
         if match is None or match[2] == match[4]:
             raise UsageError(
-                f"--cop-axes {self.axes!r} names no two axes",
+                f"--cop-axes {self.axes!r} does not name two different axes",
                 expected="xy, yx, or one of these with signs such as -yx",
             )
         rows = np.zeros((2, 2))
