@@ -1,10 +1,10 @@
-"""Sessions of a node that comes and goes: where in its streams they begin, go on and end.
+"""Parts of sessions on a server: where they begin, go on in another stream, and end.
 
-A session is a list of intervals of streams. A node that is switched on again adds a part, and so
-does every stream that it took meanwhile and brings home. Where a part ends is decided in
-`service.sessions.ends`.
+A session is a list of intervals of streams. A node that restarts adds a part, and so does every
+stream that it recorded offline and sends later. Where a part ends is decided in
+`service.sessions.part_end`.
 
-What is known of a session as of now follows from them: its ledger, and what it is made from.
+The present ledger and inputs of a session follow from its parts.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from storage.sessions.folder import Ledger, Part, Session
 from storage.sessions.ledger import ledger_of, numbers_of, states_of
 
 _UNHEARD_NS = 1_000_000_000
-"""How long after a hello frames may come of which it did not know."""
+"""Time after a hello within which frames may come that the hello did not count."""
 
 
 def streams_of(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
-    """What is known of a session's streams, by boot_id."""
+    """Return the facts of a session's streams, by stream id."""
     found = {}
     for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
         stream = node.streams.get(boot_id) if node is not None else None
         if stream is not None:
             found[boot_id] = stream.for_session(_offset_ns(session, node, boot_id))
-        else:  # until the node has spoken, it may have all of it
+        else:  # before its first hello the node may have all frames
             is_gone = node is not None and node.has_spoken
             found[boot_id] = SessionStream(may_come=Intervals(() if is_gone else [(0, NO_END)]))
     return found
 
 
 def first_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: float) -> Part:
-    """The part of a session that starts now, or earlier if a journal reaches back so far.
+    """Return the first part of a session that starts now, or a pre-roll earlier if stored.
 
-    What the node still has and is to send counts as if it were here.
+    Frames that the node still has and will send count as stored.
     """
     seq_first, journal = last_seq + 1, node.journal
     if pre_roll_s > 0 and journal is not None:
@@ -60,22 +60,22 @@ def first_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: floa
 
 
 def stopped(session: Session, node: ServerNode | None) -> Session:
-    """The session, stopped at this instant; its end is open until the stream has passed it."""
+    """Return the session, stopped now; its end is open until the stream has passed this time."""
     update: dict[str, object] = {"stopped_t_ns": utc_ns(), "state": "pending", "problem": None}
     if node is not None and node.connected:
         update["missed_slots_at_stop"] = {node.boot_id: node.present.missed_slots}
     session = session.model_copy(update=update)
     if node is None or node.clock is not None or not node.connected or node.last_seq is None:
         return session
-    # Its instants cannot be compared with ours: end with the newest frame there is.
+    # Its clock cannot be compared with ours: end with the newest frame.
     return ended(session, session.parts[-1], node.last_seq)
 
 
 def followed(session: Session, node: ServerNode) -> list[Session]:
-    """The session as far as its node's streams are known to go by now.
+    """Extend the session's parts to the present end of its node's streams.
 
     Returns:
-        The session, and those that take it up where the node came back with other tiles.
+        The session, and further ones that continue it where the node came back with other tiles.
     """
     found = [reattach(session, node)]
     while found[-1].parts[-1].seq_last is None:
@@ -87,11 +87,11 @@ def followed(session: Session, node: ServerNode) -> list[Session]:
 
 
 def reattach(session: Session, node: ServerNode) -> Session:
-    """Return the session with its open end in the stream that came back, if it left it too early.
+    """Return the session with its open end in an earlier stream that was resumed.
 
-    A part is closed when its node announces another stream. If that one is gone, and the earlier
-    one goes on after all, as where a copy of a node's card was in its place for a while, then the
-    recording goes on in the earlier one, with all frames that it has had meanwhile.
+    A part is closed when its node announces another stream. If that stream is gone and the earlier
+    one goes on, as when a copy of a node's card was in use for a while, the recording goes on in
+    the earlier one, with all frames that it has had meanwhile.
     """
     left = session.parts[-1]
     stream = node.streams.get(left.boot_id)
@@ -109,7 +109,7 @@ def reattach(session: Session, node: ServerNode) -> Session:
 
 
 def _go_on_in(session: Session, node: ServerNode, part: Part) -> Session:
-    """Return the session with its open part ended and another one open."""
+    """Return the session with its open part closed and another one open."""
     *before, left = at_end(session, streams_of(session, node), utc_ns()).parts
     tails = {name: n for name, n in session.unsynced_tail_max.items() if name != part.boot_id}
     parts = before if left.seq_last is None or left.seq_last < left.seq_first else [*before, left]
@@ -119,7 +119,7 @@ def _go_on_in(session: Session, node: ServerNode, part: Part) -> Session:
 
 
 def given_up(session: Session, node: ServerNode | None) -> Session:
-    """The session without what has not come: an open end is closed at what is here."""
+    """Return the session without its missing frames: its open end is closed."""
     if node is not None:
         session = reattach(session, node)
     closed = broken_off(session, streams_of(session, node), utc_ns())
@@ -127,16 +127,16 @@ def given_up(session: Session, node: ServerNode | None) -> Session:
 
 
 def parts_needed(session: Session, node: ServerNode | None) -> Iterator[Part]:
-    """Parts of streams that a session, not sealed yet, needs in the journals."""
+    """Yield the parts that an unsealed session needs in the journals."""
     yield from session.parts
     if session.parts[-1].seq_last is None and node is not None:
-        # It is not known yet which stream it was stopped in.
+        # The stream in which the session was stopped is not known yet.
         for boot_id in _following(session, node):
             yield Part(boot_id=boot_id, seq_first=0)
 
 
 def clock_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
-    """Measurements of a node's clock from the beginning of a part on, and the last before it."""
+    """Return the clock measurements from the beginning of a part on, and the last before it."""
     begin_t_ns = (
         journal.t_ns_near(part.seq_first, newest=False) if (journal := node.journal) else None
     )
@@ -149,7 +149,7 @@ def clock_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
 
 
 def _step(session: Session, node: ServerNode) -> list[Session]:
-    """The session with its open part ended, and what follows; nothing if that is not known yet."""
+    """Close the open part and return the session with the next one; empty if undecided."""
     boot_id = session.parts[-1].boot_id
     if boot_id in node.unread and not session.given_up:
         return []
@@ -188,7 +188,7 @@ def _step(session: Session, node: ServerNode) -> list[Session]:
 
 
 def _following(session: Session, node: ServerNode) -> Iterable[str]:
-    """Streams that began after that of the session's open part, oldest first."""
+    """Return streams that began after the one of the session's open part, oldest first."""
     boot_id, order = session.parts[-1].boot_id, node.order
     if boot_id in order:
         return order[order.index(boot_id) + 1 :]
@@ -204,7 +204,7 @@ def _following(session: Session, node: ServerNode) -> Iterable[str]:
 
 
 def _offset_ns(session: Session, node: ServerNode | None, boot_id: str) -> int | None:
-    """What to add to a stream's instants for the server's UTC; None if it was never measured."""
+    """Return the offset from a stream's time to the server's UTC; None without a measurement."""
     stream = node.streams.get(boot_id) if node is not None else None
     if stream is not None and stream.clock is not None:
         return stream.clock.server_minus_node_ns
@@ -216,16 +216,16 @@ def _offset_ns(session: Session, node: ServerNode | None, boot_id: str) -> int |
 
 
 def _begin_t_ns(session: Session, node: ServerNode, boot_id: str) -> int:
-    """When a stream began, server's UTC; now, if that is not known."""
+    """Return the begin of a stream, server's UTC; the present time if unknown."""
     begin_t_ns, offset_ns = node.streams[boot_id].t_ns_first, _offset_ns(session, node, boot_id)
     return utc_ns() if begin_t_ns is None or offset_ns is None else begin_t_ns + offset_ns
 
 
 def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
-    """Had a stream begun when the session was stopped? None: not known yet.
+    """Return whether a stream began before the session was stopped; None: not known yet.
 
-    The node says when the oldest frame that it has was taken. That is when the stream began, unless
-    older ones are gone: then only the frames themselves say so.
+    The node states the time of its oldest frame. That is the begin of the stream, unless older
+    frames are gone: then only the frames themselves show it.
     """
     stream, rate_hz = node.streams[boot_id], node.streams[boot_id].info.nominal_rate_hz
     stop_t_ns = session.stopped_t_ns or utc_ns()
@@ -235,7 +235,7 @@ def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
         return _begin_t_ns(session, node, boot_id) <= stop_t_ns if known else None
     said = node.hello
     if node.greeted_t_ns is not None and not said.next_seq and not stream.held:
-        # Of frames that it has just taken it may not know yet; then they come at once.
+        # Hello may not count the newest frames; these come at once.
         is_settled = stop_t_ns < node.greeted_t_ns < utc_ns() - _UNHEARD_NS
         return False if is_settled else None
     if said.t_ns_first and said.held and offset_ns is not None:
@@ -258,7 +258,7 @@ def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
 
 
 def ledger_now(session: Session, node: ServerNode | None) -> Ledger:
-    """What became of every frame of a session."""
+    """Return the session's present ledger: the fate of every frame."""
     if session.state == "sealed" and session.ledger is not None:
         return session.ledger
     finished = session.stopped_t_ns is not None and session.parts[-1].seq_last is not None
@@ -267,7 +267,7 @@ def ledger_now(session: Session, node: ServerNode | None) -> Ledger:
 
 
 def sources_now(session: Session, node: ServerNode, *, exact: bool = False) -> Sources:
-    """Sources that a session can be sealed or exported from; `exact`: estimates not rounded."""
+    """Return the inputs from which a session can be sealed or exported now."""
     session, streams = _provisional(session, node)
     return sources_of(
         session,
@@ -280,14 +280,14 @@ def sources_now(session: Session, node: ServerNode, *, exact: bool = False) -> S
 
 
 def is_unread(session: Session, node: ServerNode | None) -> bool:
-    """Is any of its journals here, and cannot be read now? Then what is lost is not known."""
+    """Return whether a journal of the session cannot be read now: its losses are then unknown."""
     if node is None or session.given_up:
         return False
     return any(part.boot_id in node.unread for part in session.parts)
 
 
 def is_all_here(session: Session, node: ServerNode | None) -> bool:
-    """Have all frames come, and are they on the disk?"""
+    """Return whether all obtainable frames are stored and synced."""
     if session.parts[-1].seq_last is None or is_unread(session, node):
         return False
     for boot_id, numbers in numbers_of(session.parts).items():
@@ -300,8 +300,8 @@ def is_all_here(session: Session, node: ServerNode | None) -> bool:
 def _provisional(
     session: Session, node: ServerNode | None
 ) -> tuple[Session, dict[str, SessionStream]]:
-    """A session with its likely end, and its streams."""
+    """Return a session with its likely end, and its streams."""
     streams = streams_of(session, node)
-    with suppress(FootTileError):  # the frames that tell are damaged
+    with suppress(FootTileError):  # the frames at the stop are damaged
         session = at_stop(session, streams)
     return session, streams
