@@ -55,8 +55,7 @@ class ServerNode:
         self.streams: dict[str, ServerStream] = {}
         """Streams by id: stored here, or listed in hello."""
         self.unread: set[str] = set()
-        """Ids of streams whose journals are here and cannot be read now: their frames are unknown.
-        """
+        """Ids of streams whose journals cannot be read now: their frames are unknown."""
         self.has_words = False
         """True if hello is not saved yet; `save` saves it before its frames are acknowledged."""
         self.has_spoken = False
@@ -306,6 +305,9 @@ class ServerNode:
 
     def prune(self, keep: Mapping[str, Intervals]) -> bool:
         """Delete frames older than the ring and not in `keep`, at most one whole journal per call.
+
+        Args:
+            keep: frames to keep, by stream id.
 
         Returns:
             True if a whole journal was deleted: call again. A node that was switched on a thousand

@@ -179,7 +179,8 @@ class ServerStream:
         The result is cached: callers repeat the query while frames are missing. The journal's index
         is read again only when frames between the two have come.
 
-        Args, result and errors: as `find_seqs_around`, and
+        Args, result and errors as for the function `find_seqs_around`; with `wait_for_missing` the
+        cached result is kept until all frames between have come or are lost.
         """
         if self.journal is None:
             return None

@@ -1,7 +1,7 @@
-"""What comes next for one who is to have every frame once, in order: a rule without any I/O.
+"""Position of a reader that receives every frame once, in order; no I/O.
 
-What is still to come is waited for; what will not come is said. Who has fallen out of memory by his
-own slowness is told the position to resume from.
+The reader waits for frames that may still come; lost ones are reported. A reader too slow for the
+buffer is disconnected with the position to resume from.
 """
 
 from __future__ import annotations
@@ -16,33 +16,37 @@ from service.server.full_rate.memory import NodeMemory, Piece
 from storage.intervals import NO_END, Intervals
 
 NOT_KEPT = "not_kept"
-"""Why a frame is lost that this server has had, or could have had, and nobody has reserved."""
+"""Loss reason of frames that this server did not keep, since no session needs them."""
 
 
 @dataclass(frozen=True)
 class Again:
-    """Frames to be estimated again from the journal, whose next one is held.
+    """Request to estimate frames again from the journal, which has the next one.
 
     Attributes:
-        at: the first of them.
-        last: the greatest number that is held.
-        ends: will no more frames of this stream come?
-        until: from this number on memory has them; None: it has none.
+        position: first frame.
+        last_seq: greatest stored number.
+        is_final: True: no more frames of this stream will come.
+        until_seq: first number in the buffer; None: the buffer has none.
     """
 
     at: Position
+    """first frame."""
     last: int
+    """greatest stored number."""
     ends: bool
+    """True: no more frames of this stream will come."""
     until: int | None
+    """first number in the buffer; None: the buffer has none."""
 
 
 class Lossless:
-    """A reader's position.
+    """Position of a reader that receives every frame.
 
     Args:
-        memory: of the node.
-        look: what is known of a stream; None: nothing, or not any more.
-        position: the frame that is wanted first; None: the next that comes.
+        buffer: buffer of the node.
+        find_stream: returns the present state of a stream; None: unknown, or no longer known.
+        position: first frame to send; None: the next one.
     """
 
     def __init__(
@@ -55,13 +59,13 @@ class Lossless:
         self._memory = memory
         self._look = look
         self._number: int | None = memory.next_number if position is None else None
-        """Of the piece that comes next, for one who reads from memory."""
+        """Number of the next batch, while the reader is served from the buffer."""
 
     def next(self) -> Item | Again | None:
-        """What comes next; None: nothing yet.
+        """Return the next event; None: nothing yet.
 
         Raises:
-            HangUp: it cannot go on; the reason says from where to resume.
+            HangUp: the reader cannot go on; the reason has the position to resume from.
         """
         memory = self._memory
         if (at := self.position) is None:
@@ -82,7 +86,7 @@ class Lossless:
         ahead = memory.after(at.boot_id, at.seq)
         held = stream.held
         if held.within(at.seq, at.seq):
-            # Frames that wait for their look-ahead come from the live estimates, in a moment.
+            # The live estimator still holds these frames for their look-ahead.
             if ahead is None and not stream.is_over and memory.last(at.boot_id) is not None:
                 return None
             until = None if ahead is None else ahead.first
@@ -90,11 +94,11 @@ class Lossless:
         return self._gap(at, stream, ahead)
 
     def had(self, rows: Rows) -> None:
-        """Frames that were estimated again have been given."""
+        """Move the position behind recomputed frames."""
         self.position = Position(rows.boot_id, rows.to_seq + 1)
 
     def _piece(self, at: Position) -> Piece | None:
-        """The piece in memory with this frame, if there is one."""
+        """Return the buffered batch with this frame, if there is one."""
         memory, number = self._memory, self._number
         if number is None:
             return memory.find(at.boot_id, at.seq)
@@ -108,7 +112,7 @@ class Lossless:
         return None
 
     def _gap(self, at: Position, stream: Known, ahead: Piece | None) -> Item | None:
-        """The frame is not here: is it still to come, lost, or behind the stream's end?"""
+        """Return the event for a frame that is not stored: none yet, a gap, or the next stream."""
         comes = stream.to_come().within(at.seq, NO_END).first
         if comes == at.seq:
             return None
@@ -132,7 +136,7 @@ class Lossless:
 
 
 def _reason(stream: Known, first: int, last: int) -> tuple[str, int]:
-    """Why frames are lost, and up to which of them that is the reason."""
+    """Return the reason why frames are lost, and the last frame with this reason."""
     known = stream.lost.within(Intervals([(first, last)]))
     for reason, numbers in known.items():
         for begin, end in numbers:

@@ -1,10 +1,10 @@
-"""What comes next for one who would rather have what is new than everything: without any I/O.
+"""Position of a reader that prefers new frames over all frames; no I/O.
 
-- `drop_oldest`: what is older than `QUEUE_NS` when its turn comes is left out.
-- `latest`: of what has come, the newest piece only.
+- `drop_oldest`: frames older than `QUEUE_NS` at their turn are dropped.
+- `latest`: of the buffered batches, only the newest is sent.
 
-Nothing is waited for, and all that is left out is said: from a reader's first frame on, what he had
-and what he was told add up to every frame that is known of.
+The reader waits for nothing, and every dropped frame is reported: from a reader's first frame on,
+frames sent and frames reported add up to every known frame.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from service.server.full_rate.known import Known
 from service.server.full_rate.memory import NodeMemory, Piece
 
 QUEUE_NS = 2_000_000_000
-"""Frames that `drop_oldest` lets wait, as time."""
+"""Age limit of waiting frames for `drop_oldest`."""
 SLOW, LATE = "slow", "late"
 
 
 class Newest:
-    """A reader's position.
+    """Position of a reader that drops old frames.
 
     Args:
-        memory: of the node.
-        look: what is known of a stream; None: nothing, or not any more.
-        position: the frame that is wanted first; None: the next that comes.
-        queue_ns: frames that may wait, as time; None: none but the newest piece.
+        buffer: buffer of the node.
+        find_stream: returns the present state of a stream; None: unknown, or no longer known.
+        position: first frame to send; None: the next one.
+        queue_ns: age limit of waiting frames; None: only the newest batch is sent.
     """
 
     def __init__(
@@ -42,14 +42,14 @@ class Newest:
         self._look = look
         self._queue_ns = queue_ns
         self._number = memory.next_number
-        """Of the piece that comes next."""
+        """Number of the next batch to send."""
         if position is not None:
             at = position.boot_id, position.seq
             found = memory.find(*at) or memory.after(*at)
             self._number = self._number if found is None else found.number
 
     def next(self) -> Item | None:
-        """What comes next; None: nothing yet."""
+        """Return the next event; None: nothing yet."""
         while self._number < self._memory.next_number:
             piece, at = self._wanted(), self.position
             reason = SLOW if piece.number > self._number else LATE
@@ -71,10 +71,10 @@ class Newest:
         return None
 
     def had(self, rows: Rows) -> None:
-        """Nothing is estimated again for this reader."""
+        """Do nothing: frames are never recomputed for this reader."""
 
     def _wanted(self) -> Piece:
-        """The oldest piece that is not to be left out."""
+        """Return the oldest batch that is not to be dropped."""
         memory = self._memory
         newest = memory[memory.next_number - 1]
         if self._queue_ns is None:
@@ -86,12 +86,12 @@ class Newest:
         return memory[number]
 
     def _end(self, boot_id: str) -> int:
-        """Number after the last frame that is known of a stream which is over."""
+        """Return the number after the last known frame of an ended stream."""
         stream, last = self._look(boot_id), self._memory.last(boot_id)
         return max(0 if stream is None else stream.end, 0 if last is None else last + 1)
 
     def _onward(self, boot_id: str, aim: str) -> str:
-        """The stream after this one, on the way to that of a piece."""
+        """Return the stream after this one, on the way to the stream of a batch."""
         first, seen = aim, {boot_id}
         at: str | None = boot_id
         while at is not None and at != aim:
