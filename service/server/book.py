@@ -350,7 +350,7 @@ def _hash(text: str) -> str:
 
 
 def expect(wanted: str | None, found: str, what: str) -> None:
-    """Refuse a change if the revision is not the one that the client has seen.
+    """Refuse a change if the client has seen another revision.
 
     Args:
         expected: revision that the client has seen; None: any.

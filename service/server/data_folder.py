@@ -81,11 +81,6 @@ class DataFolder:
 
         Files that are open in the former folder are lost: the caller has closed them all.
 
-        Files that are open in the former folder are lost: the caller has closed them all.
-
-        What is open in the one before takes what is written and keeps it for nobody: the caller has
-        closed all of that.
-
         Raises:
             FolderGoneError: no folder with its id is there.
             StorageError: another server has locked it.

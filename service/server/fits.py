@@ -1,6 +1,6 @@
 """Jobs that fit a calibration on the server from its sessions, as `foottile calibrate` does.
 
-A job runs in a process of its own at low priority, one at a time, so that recording goes on. Its
+A job runs in a separate process at low priority, one at a time, so that recording goes on. Its
 calibration is stored whole or not at all; the process ends with the server.
 """
 
@@ -59,14 +59,14 @@ class Fit:
     state: FitState = "running"
     ended_t_ns: int | None = None
     said: deque[str] = field(default_factory=lambda: deque(maxlen=_SAID_KEPT))
-    """Log of the job so far, a line per tile."""
+    """Log of the job up to now, a line per tile."""
     calibration_id: str | None = None
     problem: str | None = None
     """Reason of a failure."""
 
 
 class Fits:
-    """Calibration jobs of a server, of which at most one is running.
+    """Calibration jobs of a server; at most one is running.
 
     Args:
         sessions: store of the sessions to fit.

@@ -200,7 +200,7 @@ class ServerNode:
         self.has_words = True
 
     def lacks(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
-        """Return the frames to request: those that sessions need, then the rest of the stream.
+        """Return the frames to request: first those needed by sessions, then the others.
 
         Args:
             needed: frames that sessions need, by stream id.

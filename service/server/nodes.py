@@ -35,15 +35,6 @@ class ServerNodes:
     A node whose description is damaged is unknown until its next hello; its journals, sessions and
     tares stay on the disk until then.
 
-    A node whose description is damaged is unknown until its next hello; its journals, sessions and
-    tares stay on the disk until then.
-
-    A node whose description is damaged is unknown until its next hello; its journals, sessions and
-    tares stay on the disk until then.
-
-    A node whose description is damaged is not known until it says hello again; all that is kept of
-    it, journals, sessions and tares, waits for that.
-
     Args:
         data: the server's data folder.
 

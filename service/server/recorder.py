@@ -75,7 +75,7 @@ class Recorder:
         take: str | None = None,
         asked: Asked | None = None,
     ) -> Session:
-        """Start a session with the next frame, or `pre_roll_s` earlier if the ring reaches so far.
+        """Start a session with the next frame, or `pre_roll_s` earlier if still stored.
 
         Several sessions may be recorded on one node at a time. The caller looks up an earlier
         sending of the same request: `SessionStore.find_by_idempotency_key`.

@@ -152,7 +152,7 @@ class Server:
     async def _prune(self) -> bool:
         """Delete unneeded journals; return False if the time budget ended before the work.
 
-        One journal after the other, and other tasks run between two of them.
+        One journal after the other, and other tasks run in between.
         """
         until_s = time.monotonic() + _PRUNE_MOST_S
         for node in list(self.nodes):

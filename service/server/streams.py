@@ -1,4 +1,4 @@
-"""One stream of a node as stored on the server: its journal and the node's report of it.
+"""One stream of a node as stored on the server: its journal and the node's report.
 
 The report is stored in `stream.json` beside the journal: a restarted server still has the reasons
 of losses and the stream's end. `sync` writes it.
@@ -27,7 +27,7 @@ from storage.wire import Decoder
 log = logging.getLogger("foottile.streams")
 
 CLOCK_ROWS = 128
-"""Clock measurements kept in memory for a pre-roll; the log has all of them."""
+"""Clock measurements kept in memory for a pre-roll; the log has all."""
 _AROUND_MAX = 32
 
 
@@ -250,7 +250,7 @@ class ServerStream:
         self._said(lost, next_seq=notes.next_seq, unsynced_tail_max=notes.unsynced_tail_max)
 
     def check(self, frames: FrameBatch, now_t_ns: int) -> str:
-        """Check received frames; those that break a rule are never requested again.
+        """Check received frames; frames that break a rule are never requested again.
 
         Args:
             frames: of one message.

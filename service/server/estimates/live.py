@@ -131,11 +131,6 @@ class LiveEstimates:
 
         Its recent frames are copied, and its frames that wait for their look-ahead are flushed
         first.
-
-        Its recent frames are copied, and its frames that wait for their look-ahead are flushed
-        first.
-
-        Its last seconds are known here, too, and the frames that it still holds leave first.
         """
         before.use(None)
         self._recent, self._left = before._recent, before._left

@@ -63,10 +63,6 @@ class NodeEstimates:
         """Calibration to use for its tiles: the assigned one, else the node's own.
 
         It may not fit them; the calibration in use is `live.calibration`.
-
-        It may not fit them; the calibration in use is `live.calibration`.
-
-        It may not fit them; what is in use is `live.calibration`.
         """
         if self.assignment.problem is not None:
             return None
@@ -95,10 +91,6 @@ class NodeEstimates:
         """Assign a calibration, used from the next frame on.
 
         Sessions that are being recorded keep theirs.
-
-        Sessions that are being recorded keep theirs.
-
-        What is being recorded keeps the one that it began with.
 
         Args:
             calibration: calibration to use; None: the node's own again.

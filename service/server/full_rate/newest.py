@@ -71,7 +71,7 @@ class Newest:
         return None
 
     def had(self, rows: Rows) -> None:
-        """Do nothing: frames are never recomputed for this reader."""
+        """Ignore recomputed frames: this reader never gets any."""
 
     def _wanted(self) -> Piece:
         """Return the oldest batch that is not to be dropped."""

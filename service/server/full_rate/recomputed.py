@@ -32,7 +32,7 @@ ROWS_AT_ONCE = 1024
 
 @dataclass(frozen=True)
 class Change:
-    """Change of calibration or tare; without one of them frames are not estimated.
+    """Change of calibration or tare; without both, frames are not estimated.
 
     Attributes:
         calibration: calibration in use from here on.
@@ -106,10 +106,6 @@ class Recomputed:
     """Recomputed frames of one stream from one number on, up to the journal's present end.
 
     Created on the event loop; `next_rows` may run in another thread.
-
-    Created on the event loop; `next_rows` may run in another thread.
-
-    Made in the server's loop; `next_rows` may run in another thread.
 
     Args:
         node: node of the stream.

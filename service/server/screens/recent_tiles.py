@@ -1,7 +1,7 @@
-"""Each tile over the last minute, for a screen that is opened now, by tenths of a second.
+"""Force and pressure of each tile over the last minute, per tenth of a second.
 
-Least and greatest of each, so that no peak hides; in half precision, to 0.05 % of the value, which
-no picture shows: 5 kB a tile and 20 kB for the numbers of the frames, whatever comes.
+Minimum and maximum, so that no peak hides; in half precision, to 0.05 % of the value, which no plot
+shows. Memory: 5 kB per tile and 20 kB for the frames' numbers.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Halves = npt.NDArray[np.float16]
 
 
 class RecentTiles:
-    """The last minute of a node's tiles.
+    """Tile extremes over the last minute of a node.
 
     Args:
-        boot_id: the stream that they are of.
-        tiles: how many there are.
+        boot_id: stream of the frames.
+        tile_count: number of tiles.
     """
 
     def __init__(self, boot_id: str, tiles: int) -> None:
@@ -37,11 +37,11 @@ class RecentTiles:
         self._rows = np.zeros(_MOST, _ROW)
         self._extremes: Halves = np.zeros((_MOST, 2, len(UNITS), tiles), np.float16)
         self._count = 0
-        """How many were ever begun; both are rings."""
+        """Number of spans ever started in the two rings."""
         self._begun_ns = 0
 
     def add(self, span: Span, columns: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Frames that are told now, newer than those before, with their estimates."""
+        """Merge published frames into each tile's minimum and maximum."""
         unknown = np.full((1, self.tiles), np.nan)
         given = [columns.get(unit, unknown).clip(-_GREATEST, _GREATEST) for unit in UNITS]
         least, greatest = (
@@ -63,15 +63,15 @@ class RecentTiles:
     def rows(
         self, seconds: float, unit: str, before_seq: int | None = None
     ) -> tuple[npt.NDArray[np.void], Halves, Halves]:
-        """The newest seconds, oldest first.
+        """Return the newest seconds, oldest first.
 
         Args:
             seconds: counted back from the newest frame.
-            unit: of `UNITS`.
+            unit: one of `UNITS`.
             before_seq: only spans that begin before this number.
 
         Returns:
-            Numbers (n,) with the fields of `Span`, least and greatest (n, tiles).
+            Numbers (n,) with the fields of `ForceSpan`, minimum and maximum (n, tiles).
         """
         at = np.arange(max(0, self._count - _MOST), self._count) % _MOST
         rows = self._rows[at]
