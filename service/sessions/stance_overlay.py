@@ -1,4 +1,4 @@
-"""Stances of a sealed session one upon another, from its file."""
+"""Overlay of a sealed session's stances, from its file."""
 
 from __future__ import annotations
 
@@ -13,43 +13,47 @@ from service.estimation.stance_overlay import OVERLAID, Overlay, StanceOverlay, 
 from storage.sessions.reader import SessionReader
 
 STANCES_MAX = 4000
-"""Of more stances than this so many are overlaid, evenly over the session: two seconds of work."""
+"""Limit of overlaid stances, evenly spread over the session: two seconds of work."""
 
 
 @dataclass(frozen=True)
 class SessionOverlay:
-    """The whole stances of a session, one upon another.
+    """Overlay of the whole stances of a session.
 
     Attributes:
-        overlay: them.
-        numbers: of the stances that are there one by one, in the order of its rows.
-        whole: how many stances could be overlaid.
-        overlaid: how many of them mean and spread are of: all, or `STANCES_MAX`.
-        not_whole: how many are left out since they were not seen whole.
-        too_short: how many are left out since they are one frame, and last no time.
+        overlay: curves, mean and spread.
+        numbers: numbers of the stances with single curves, in the order of its rows.
+        whole_count: number of stances that could be overlaid.
+        overlaid_count: number of stances in mean and spread: all, or `STANCES_MAX`.
+        partial_count: number of stances left out as incomplete.
+        too_short_count: number of stances left out as single frames without duration.
     """
 
     overlay: Overlay
     numbers: tuple[int, ...]
     whole: int
+    """number of stances that could be overlaid."""
     overlaid: int
+    """number of stances in mean and spread: all, or `STANCES_MAX`."""
     not_whole: int
+    """number of stances left out as incomplete."""
     too_short: int
+    """number of stances left out as single frames without duration."""
 
 
 def overlay_of_session(
     session: SessionReader, stances: pa.Table, *, points: int, curves: int
 ) -> SessionOverlay:
-    """Lay the stances of a sealed session one upon another.
+    """Overlay the stances of a sealed session.
 
     Args:
-        session: its frames, open for slices.
-        stances: of `service.sessions.stances.stances_of_session`.
-        points: percentages of the duration, from 0 to 100.
-        curves: how many stances are there one by one at the most, evenly over the session.
+        session: frames of the session, open for slices.
+        stances: table of `service.sessions.stances.load_stances`.
+        points: number of percentages of the duration, from 0 to 100.
+        curves: limit of single curves, evenly spread over the session.
 
     Raises:
-        UnknownError: it has no estimates of all that is overlaid.
+        UnknownError: it lacks estimates of an overlaid quantity.
         FileFormatError: it is damaged.
     """
     if absent := [name for name in OVERLAID if not session.has(name)]:

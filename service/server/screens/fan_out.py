@@ -36,7 +36,7 @@ class Outlet(Protocol):
 
     @property
     def is_ready(self) -> bool:
-        """True if all earlier writes are sent, except what the transport buffers (64 KiB)."""
+        """True if all earlier writes are sent, up to the transport buffer (64 KiB)."""
 
     def write(self, framed: bytes) -> None:
         """Write whole frames of the websocket protocol; nothing if it is closed."""

@@ -195,8 +195,8 @@ class NodeView(View):
         description="Reason why there is none, or why the one in force is of another stream."
     )
     tare_warnings: list[str] = Field(
-        description="Reasons why the tare in force may no longer fit, as text: age, temperature, or "
-        "a baseline that does not fit the foot in the air."
+        description="Reasons why the tare in force may no longer fit, as text: age, temperature, "
+        "or a baseline that does not fit the foot in the air."
     )
     auto_tare: AutoTare = Field(
         description="State of automatic tares in flight. paused: one was undone, and there was no "
@@ -222,8 +222,8 @@ class NodeView(View):
     last_seen_t_ns: int | None = Field(description="Arrival time of its last frame, server's UTC.")
     recording: list[str] = Field(description="Ids of sessions that are being recorded.")
     replacement: ReplacementView | None = Field(
-        description="Machine that was refused because another one has this name. A person may accept "
-        "it with `accept-replacement`."
+        description="Machine that was refused because another one has this name. A person may "
+        "accept it with `accept-replacement`."
     )
 
     @classmethod
