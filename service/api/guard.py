@@ -1,8 +1,8 @@
-"""Who may ask: Host and Origin are checked, and a right for every change.
+"""Access control: checks of Host and Origin, and a role for every change.
 
 A web page of another site can make a browser send requests here; it cannot choose the Host header
-nor hide its Origin. The address of a peer is no proof of identity: through a reverse proxy,
-`ssh -L` or a container's port everybody comes from loopback. What a request shows of who asks is in
+nor hide its Origin. The address of a peer is no proof of identity: through a reverse proxy, `ssh
+-L` or a container's port everybody comes from loopback. Credentials of a request are read in
 `service.api.logins`.
 """
 
@@ -24,7 +24,7 @@ from service.link import LIVE_PATH
 from service.server.calibrations import CONTENT_BYTES_MAX
 
 BODY_BYTES_MAX = 64 << 10
-"""Longest body of a request: names and notes."""
+"""Size limit of a request's body: names and notes."""
 CALIBRATIONS_PATH = "/api/v1/calibrations"
 
 LOGIN_PATH = "/api/v1/login"
@@ -57,16 +57,16 @@ _NO_LOGIN = "For this no login is enough: it needs the server's token"
 _OPEN = re.compile(
     rf"/|/nodes|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
 )
-"""What also a private server shows everybody: pages and files without data, how to get in, and for
-those who watch over its process whether it works."""
+"""Paths that a private server also serves without credentials: pages and files without data, login,
+and the readiness probe."""
 _HOST = re.compile(
     r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)(?P<zone>%[A-Za-z0-9._~%-]{1,40})?\])"
     r"(?::[0-9]{1,5})?"
 )
-"""As browsers write it: a name or an address, and a port; no user, no path.
+"""Host header as browsers write it: a name or an address, and a port; no user, no path.
 
 A link-local address may have a zone, the name of an interface behind `%` or `%25` (RFC 6874): some
-clients send it, and to which interface it leads is decided before it comes here.
+clients send it, and the client has used it before the request arrives here.
 """
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 _DEFAULT_HEADERS = {
@@ -78,12 +78,12 @@ _DEFAULT_HEADERS = {
 
 
 class Guard:
-    """ASGI middleware that lets through what may pass.
+    """ASGI middleware that rejects forbidden requests.
 
     Args:
-        app: what is guarded.
-        hosts: names under which it is reached, in addition to addresses of this machine.
-        logins: what is asked for on every change of state and on ingest, and of whom.
+        app: application behind it.
+        hosts: names of the server, in addition to addresses of this machine.
+        logins: required for every change of state, and for ingest.
     """
 
     def __init__(self, app: ASGIApp, *, hosts: Iterable[str], logins: Logins) -> None:
@@ -136,14 +136,14 @@ class Guard:
             return None
         shown = self._logins.shown_by(HTTPConnection(scope))
         if shown.left_s is not None and changes and "origin" not in headers:
-            # Cookies are browsers', and each of these says from where it changes something.
+            # Cookies come from browsers, which state the Origin of every change.
             shown = Shown(None)
         return _lacking(needed, shown)
 
     def _needed(self, scope: Scope) -> Right | None:
         path, looking = scope["path"], Right.LOOK if self._logins.is_private else None
         if scope["type"] == "websocket":
-            # Every one but the live one, so that no other way of writing a path is a way in.
+            # Every path but the live one, so that no spelling of a path bypasses the check.
             return looking if path == LIVE_PATH else Right.OWN
         if path == LOGIN_PATH:
             return None
@@ -167,13 +167,13 @@ class Guard:
 
 
 def _most(scope: Scope) -> int:
-    """Bytes that its body may have: a whole file comes to one path only."""
+    """Return the limit of the body: a whole file is accepted on one path only."""
     is_file = scope["type"] == "http" and scope["path"] == CALIBRATIONS_PATH
     return CONTENT_BYTES_MAX if is_file else BODY_BYTES_MAX
 
 
 def _lacking(needed: Right, shown: Shown) -> tuple[HTTPStatus, str] | None:
-    """What one who has shown this lacks for what is needed."""
+    """Return the refusal if the credentials lack the required role."""
     if shown.right is None:
         what = _PRIVATE if needed is Right.LOOK else _ASKED
         if shown.has_wrong_token:
@@ -185,7 +185,7 @@ def _lacking(needed: Right, shown: Shown) -> tuple[HTTPStatus, str] | None:
 
 
 class _Limited:
-    """Counts a body that does not state its length."""
+    """ASGI `receive` that limits a body without a stated length."""
 
     def __init__(self, receive: Receive, most: int) -> None:
         self._receive = receive

@@ -150,12 +150,9 @@ def _of_levels(
     points: int,
     axis: TimeAxis,
 ) -> tuple[Bins, int] | int:
-    """Return bins of the coarsest level with enough of them, and the frames per bin.
+    """Return bins of the coarsest level with enough bins, and the frames per bin.
 
     If no level has enough: the approximate number of frames.
-
-    Args:
-        part: -
 
     Raises:
         DamagedFileError: a chunk is damaged, or the overview is of other frames.

@@ -168,8 +168,7 @@ class EstimateStream:
         self._run = EstimateRun.going_on(self.plan_of(self.tare), kept)
 
     def find_tare(self, pieces: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
-        """Find the tare that `estimate_batches` would use; reads no more of the recording than
-        needed.
+        """Find the tare that `estimate_batches` would use; read no more than needed.
 
         Raises:
             TareError: there is none.

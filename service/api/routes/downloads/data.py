@@ -1,4 +1,4 @@
-"""A session's data: the sealed file as it is stored, or what is asked for made on request."""
+"""Data of a session: the sealed file as stored, or a file made on request."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
             "content": {media_type.split(";")[0]: {} for media_type in MEDIA_TYPES},
         },
         206: {"description": "A range of the stored file."},
-        304: {"description": "It is what If-None-Match names."},
+        304: {"description": "Unchanged."},
         **problems(
             _404="No such session, or nothing was recorded.",
-            _409="This format is there only when the session is sealed.",
+            _409="This format needs a sealed session.",
             _416="The range is outside the file.",
-            _422="No such format or column, or a slice that holds no time of the session.",
+            _422="No such format or column, or a slice outside the session.",
         ),
     },
 )
@@ -69,12 +69,12 @@ async def data(
     request: Request,
     server: ServerState,
 ) -> Response:
-    """A session in a format of your choice; `GET /formats` lists them.
+    """A session in a selected format; `GET /formats` lists them.
 
     Parquet without slice, columns, server's clock or marks is the stored file: with ranges, a
-    strong ETag that is its SHA-256, and a digest. Everything else is made on request and streamed;
-    while a session is recorded it is what there is so far. `Foottile-Complete` says whether frames
-    are missing, `Foottile-Marks` how many marks are in it and how many could not be placed.
+    strong ETag that is its SHA-256, and a digest. Any other file is made on request and streamed;
+    while a session is recorded it has the present frames. `Foottile-Complete` states whether frames
+    are missing, `Foottile-Marks` the number of markers in it and of markers left out.
     """
     session = known(server.sessions.get(session_id))
     ledger = server.recorder.ledger(session_id)

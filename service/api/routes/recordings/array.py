@@ -1,4 +1,4 @@
-"""The array of a session: which tiles it was recorded with, and how its forces were estimated."""
+"""Route of a session's array: tiles, ranges, look-ahead."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 
 class ArrayView(View):
-    """Tiles of a session, and what is known of its estimates."""
+    """Array of a session, and facts of its estimates."""
 
     session_id: str
     node: str
@@ -31,10 +31,10 @@ class ArrayView(View):
     nominal_rate_hz: float
     calibration: CalibrationView | None
     lag_ms: float | None = Field(
-        description="Look-ahead of the estimates: for so long after a frame its estimate still "
-        "takes notice of what was read; null: there are none."
+        description="Look-ahead of the estimates: each uses readings up to this time after its "
+        "frame; null: no estimates."
     )
-    estimates_problem: ShownText | None = Field(description="Why there are no estimates.")
+    estimates_problem: ShownText | None = Field(description="Reason why there are no estimates.")
 
 
 @router.get(
@@ -44,7 +44,7 @@ class ArrayView(View):
     responses=problems(_404="No such session, or nothing was recorded.", _409="It is damaged."),
 )
 async def array(session_id: str, server: ServerState) -> ArrayView:
-    """Where its tiles are on the foot, their ranges, and the look-ahead of its estimates."""
+    """Positions of the tiles on the foot, their ranges, and the look-ahead of the estimates."""
     session = server.sessions.get(session_id)
     if session.state == "sealed" and session.sha256 is None:
         raise UnknownError(f"session {session_id}: {session.problem}")

@@ -1,4 +1,4 @@
-"""The server's end of the link: takes in what a node sends, and hangs up with a reason."""
+"""Server's end of the link to a node: receives its messages, and closes with a reason."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _Message = TypeVar("_Message", Identify, Proof, Hello)
 
 
 async def ingest(socket: WebSocket, server: Server) -> None:
-    """Serve one node's connection until it ends; whatever is said on it, nothing else ends."""
+    """Serve one node's connection until it ends; an error ends only this connection."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
     try:
@@ -71,7 +71,7 @@ async def ingest(socket: WebSocket, server: Server) -> None:
 
 
 async def _challenge(socket: WebSocket, server: Server, offered: list[str]) -> Claim:
-    """Ask the machine that connects for a proof that it is the node that it names."""
+    """Request a proof that the connecting machine is the node that it names."""
     if SUBPROTOCOL not in offered:
         raise HangUp(
             Close.WRONG_VERSION,
@@ -125,7 +125,7 @@ def _is_proven(server: Server, claim: Claim) -> bool:
             return server.identities.is_proven(claim, utc_ns())
     except HangUp:
         asking, node = server.identities.replacements.get(claim.node), server.nodes.find(claim.node)
-        # It asks again and again: screens are told of each machine once.
+        # A refused machine retries for ever: notify subscribers once per machine.
         is_new = asking is not None and (before is None or before.secret != asking.secret)
         if node is not None and is_new:
             server.tell_node(node)
@@ -142,13 +142,13 @@ def _try_later() -> Iterator[None]:
 
 @contextmanager
 def _joined(server: Server, hello: Hello, claim: Claim) -> Iterator[Link]:
-    """A node's place among those that are connected, for as long as it is."""
+    """Context manager: register a node's connection while the block runs."""
     name, boot_id = hello.array_info.node, hello.array_info.boot_id
     is_proven = _is_proven(server, claim)
     other = server.links.get(name)
     if other is not None:
-        # A node that was switched off and on again knows the stream it had before. The ids of
-        # streams are public, so without a secret they prove nothing.
+        # A node that was restarted lists the stream it had before. The ids of streams are
+        # public, so without a secret they prove nothing.
         known = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
         if not is_proven or other.node.boot_id not in known:
             raise HangUp(
@@ -214,8 +214,8 @@ async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
 async def _take(socket: WebSocket, server: Server, link: Link) -> None:
     node = link.node
     while True:
-        # What has come already is given without waiting: a node that brings home what it took on
-        # its way, or talks without end, would have all others wait until the last of it is done.
+        # Received messages are returned without waiting: without this line a node with a long
+        # backlog would block all others.
         await asyncio.sleep(0)
         message = await _receive(socket)
         if isinstance(message, bytes):
@@ -257,16 +257,16 @@ async def _answer(socket: WebSocket, probe: Probe) -> None:
     try:
         async with asyncio.timeout(SILENCE_S):
             await send(socket, say(probe))
-    except TimeoutError as error:  # else nobody would notice that nothing is heard either
+    except TimeoutError as error:  # else the silence of the node would go unnoticed
         raise HangUp(Close.SILENT, f"nothing was read for {SILENCE_S:g} s") from error
 
 
 async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
-    """Tell the node what is on the disk, and what sessions need whenever that changes."""
+    """Send acknowledgements, and the retention request whenever it changes."""
     while True:
         await link.news.wait()
         link.news.clear()
-        # What the node must keep goes first: it may forget frames once they are acknowledged.
+        # The retention request goes first: a node may drop frames once they are acknowledged.
         wanted = server.recorder.wanted(link.node.name)
         if wanted != link.wanted:
             link.wanted = wanted
@@ -312,7 +312,7 @@ def _frames(message: bytes) -> bytes:
 
 
 def _protocol_of(message: str | bytes) -> int | None:
-    """Return the protocol of a first message, whatever else it holds; None without one."""
+    """Return the protocol of a first message, whatever else it has; None without one."""
     try:
         said = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):
@@ -326,7 +326,7 @@ def _protocol_of(message: str | bytes) -> int | None:
 
 async def _close(socket: WebSocket, end: HangUp) -> None:
     reason = close_reason(end.reason)
-    log.warning("link closed: %s", printable(end.reason))  # with paths as they are here
+    log.warning("link closed: %s", printable(end.reason))  # with local paths
     if socket.application_state is not WebSocketState.DISCONNECTED:
         with suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(end.code, reason)

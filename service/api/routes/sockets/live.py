@@ -1,4 +1,4 @@
-"""The live websocket: for screens, and for programs that take every frame."""
+"""Live websocket: summaries for the page, every frame for programs."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from service.version import SOFTWARE
 log = logging.getLogger("foottile.live")
 
 PROTOCOL = 1
-"""Of this socket; the nodes' link counts its own."""
+"""Version of this socket's messages; the nodes' link has another one."""
 RATE_HZ = 30.0
 _PARAMETERS = {"node", "rate_hz", "format", "policy"}
 _TEXT_MAX = 1000
 
 
 async def live(socket: WebSocket, server: Server) -> None:
-    """Serve one screen, or one program, until it leaves."""
+    """Serve one page, or one program, until it disconnects."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
     outlet: Connection = socket.scope["extensions"][OUTLET]["outlet"]
@@ -61,7 +61,7 @@ async def _show(socket: WebSocket, server: Server, outlet: Connection) -> None:
 
 
 async def _first_of(*ends: Awaitable[None]) -> None:
-    """Wait for the first of these, which ends the others, and give its result."""
+    """Run until the first of these ends, cancel the others, and return its result."""
     tasks = [asyncio.ensure_future(end) for end in ends]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

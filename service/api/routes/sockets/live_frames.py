@@ -1,4 +1,4 @@
-"""The live websocket for programs: every frame of a node with its estimates, as Arrow."""
+"""Live websocket for programs: every frame of a node with its estimates, as Arrow."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from service.version import SOFTWARE
 
 PARAMETERS = {"node", "format", "policy", "boot_id", "from_seq", "columns"}
 PROTOCOL = 1
-"""Of these messages."""
+"""Version of these messages."""
 _BOOT_ID = re.compile(r"[0-9a-f]{32}")
 _SEQ = re.compile(r"[0-9]{1,15}")
 
 
 class LiveFrames:
-    """What one connection has asked for.
+    """One connection of the live feed.
 
     Args:
-        socket: the connection.
-        server: of the nodes.
+        socket: websocket of the client.
+        server: server of the nodes.
 
     Raises:
-        HangUp: the query is none, or asks for what is not there.
+        HangUp: the query is invalid, or its stream or columns do not exist.
     """
 
     def __init__(self, socket: WebSocket, server: Server) -> None:
@@ -68,14 +68,14 @@ class LiveFrames:
         )
         self._encoder: Encoder | None = None
         self._at = position
-        """The first frame that was not sent."""
+        """First frame that was not sent."""
 
     async def run(self) -> None:
         """Send frames until the connection ends.
 
         Raises:
-            HangUp: it cannot go on; the reason says from where to resume.
-            WebSocketDisconnect: it has gone.
+            HangUp: it cannot go on; the reason has the position to resume from.
+            WebSocketDisconnect: the client has disconnected.
         """
         hello = {
             "type": "hello",
@@ -114,10 +114,10 @@ class LiveFrames:
                     self._at = Position(item.boot_id, following)
 
     async def _send(self, message: str | bytes) -> None:
-        """Send one message, and wait until there is room for the next.
+        """Send one message, once there is room for it.
 
         Raises:
-            HangUp: nothing was read for too long.
+            HangUp: the client has read nothing for too long.
         """
         try:
             async with asyncio.timeout(TOO_SLOW_S):
