@@ -145,7 +145,6 @@ class SoFar:
         return Seen(found, count * self._bins.frames_in_bin, begin_ns, end_ns, axis)
 
     def _feed(self, frames: FrameBatch, extra: Columns) -> None:
-        """Take the next frames."""
         at = self._at
         pieces = [(frames, extra)]
         due = iter(pieces) if self._stream is None else self._stream.run(pieces, ends=False)

@@ -177,7 +177,7 @@ InUse = Annotated[
 
 @router.get("/calibrations", operation_id="listCalibrations", summary="Calibrations")
 async def list_calibrations(server: ServerState) -> Page[KeptView]:
-    """Calibrations on the server, the newest recordings first."""
+    """Return the calibrations on the server, the newest recordings first."""
     return Page(items=[KeptView.of(kept) for kept in server.calibrations.all()])
 
 
@@ -215,7 +215,7 @@ async def upload(request: Request, server: ServerState, response: Response) -> K
 
 @router.get("/calibrations/fits", operation_id="listFits", summary="Fits")
 async def list_fits(server: ServerState) -> Page[FitView]:
-    """Last jobs since the server was started, newest first."""
+    """Return the last jobs since the server was started, newest first."""
     return Page(items=[FitView.of(fit) for fit in server.fits.all()])
 
 
@@ -251,7 +251,7 @@ async def start_fit(body: StartFit, server: ServerState, response: Response) -> 
     responses=problems(_404="No such fit."),
 )
 async def get_fit(fit_id: str, server: ServerState) -> FitView:
-    """Progress of a job, and the id of the calibration once it is done."""
+    """Return a job's progress, and the id of the calibration once it is done."""
     return FitView.of(server.fits.get(fit_id))
 
 
@@ -278,7 +278,7 @@ async def cancel_fit(fit_id: str, server: ServerState) -> FitView:
     },
 )
 async def get_calibration(calibration_id: str, request: Request, server: ServerState) -> Response:
-    """Whole file, as every command of `foottile` reads it; its id is its entity tag."""
+    """Return the file as every command of `foottile` reads it; its id is its entity tag."""
     calibration = await run_in_threadpool(server.calibrations.get, calibration_id)
     return _file(calibration, request)
 
@@ -303,7 +303,7 @@ async def delete_calibration(calibration_id: str, server: ServerState) -> None:
     responses=_NO_NODE,
 )
 async def node_calibration(node: str, server: ServerState) -> NodeCalibrationView:
-    """Calibration in use, and its origin."""
+    """Return the calibration in use, and its origin."""
     return NodeCalibrationView.of(server.nodes.get(node))
 
 

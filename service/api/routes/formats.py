@@ -35,6 +35,6 @@ class FormatsView(BaseModel):
 
 @router.get("", operation_id="listFormats", summary="Formats of downloads")
 def formats() -> FormatsView:
-    """Formats in the order of menus."""
+    """Return the formats in the order of menus."""
     known = FORMATS.values()
     return FormatsView(items=[FormatView.model_validate(f, from_attributes=True) for f in known])

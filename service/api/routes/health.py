@@ -42,7 +42,7 @@ class Version(View):
 
 @router.get("/health", operation_id="getHealth", summary="Liveness")
 async def health(server: ServerState) -> Health:
-    """Answers while the process runs, with the damage found at the start."""
+    """Return the state of the process, with the damage found at its start."""
     return Health(status="ok", problems=server.problems)
 
 
@@ -53,7 +53,7 @@ async def health(server: ServerState) -> Health:
     responses=problems(_507="The data folder cannot be written."),
 )
 def ready(server: ServerState) -> Ready:
-    """Writes a test file to the data folder, and counts nodes and subscribers."""
+    """Write a test file to the data folder, and count nodes and subscribers."""
     server.check_storage()
     return Ready(
         ready=True,
@@ -64,5 +64,5 @@ def ready(server: ServerState) -> Ready:
 
 @router.get("/version", operation_id="getVersion", summary="Version")
 async def version() -> Version:
-    """Versions of software, API and link protocol."""
+    """Return the versions of software, API and link protocol."""
     return Version(software=SOFTWARE)

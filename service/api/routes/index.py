@@ -37,7 +37,7 @@ class IndexView(View):
 
 
 async def index(request: Request) -> IndexView:
-    """Every route with its address and summary."""
+    """Return every route with its address and summary."""
     app = request.app
     return IndexView(
         software=SOFTWARE,

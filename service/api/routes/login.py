@@ -76,7 +76,7 @@ LoginsState = Annotated[Logins, Depends(_logins)]
 
 @router.get("/login", operation_id="getLogin", summary="Current permissions")
 async def get_login(request: Request, logins: LoginsState) -> LoginView:
-    """Permissions by the cookie or the token of this request."""
+    """Return the permissions by the cookie or the token of this request."""
     shown = logins.shown_by(request)
     return _view(logins, shown.right, shown.left_s, has_ended=shown.has_ended)
 

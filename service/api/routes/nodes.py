@@ -115,13 +115,13 @@ def _expect_in_force(node: ServerNode, if_match: str | None) -> None:
 
 @router.get("", operation_id="listNodes", summary="All nodes")
 async def list_nodes(server: ServerState) -> Page[NodeView]:
-    """Connected and remembered nodes."""
+    """Return connected and remembered nodes."""
     return Page(items=[server.view_node(node) for node in server.nodes])
 
 
 @router.get("/{node}", operation_id="getNode", summary="One node", responses=_UNKNOWN)
 async def get_node(node: str, server: ServerState) -> NodeView:
-    """Array, calibration, tare, clock and counts of a node."""
+    """Return array, calibration, tare, clock and counts of a node."""
     return server.view_node(server.nodes.get(node))
 
 
@@ -129,7 +129,7 @@ async def get_node(node: str, server: ServerState) -> NodeView:
     "/{node}/scene", operation_id="getScene", summary="The node's scene", responses=_UNKNOWN
 )
 async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
-    """Content of the node's scene file, with defaults."""
+    """Return the content of the node's scene file, with defaults."""
     return server.nodes.get(node).hello.scene
 
 
@@ -142,7 +142,7 @@ async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
 async def get_recent(
     node: str, query: Annotated[RecentQuery, Query()], server: ServerState
 ) -> RecentView:
-    """GRF of the last seconds, up to a minute, from the server's memory.
+    """Return the GRF of the last seconds, up to a minute, from the server's memory.
 
     Each span has minimum and maximum, so that no peak hides. Only frames of the present stream that
     came since the server was started; where frames are missing, numbers are missing.
@@ -211,7 +211,7 @@ async def tare(
     "/{node}/tares", operation_id="listTares", summary="History of tares", responses=_UNKNOWN
 )
 async def list_tares(node: str, server: ServerState) -> TaresPage:
-    """Tares, newest first; the first one of the present tiles that is not undone is in force."""
+    """Return the tares, newest first; the first valid one of the present tiles is in force."""
     the_node = server.nodes.get(node)
     items = [TareView.of(t) for t in reversed(the_node.estimates.tares.all)]
     return TaresPage(items=items, drift=DriftView.of(the_node))

@@ -125,7 +125,7 @@ class TareKeeper:
         self._live.use(self._history.to_use(self._info))
 
     def look(self, journal: Journal | None, may_come: Callable[[], Intervals]) -> None:
-        """After new frames: tare from a lead that has ended, or in flight.
+        """Check new frames: tare from a lead that has ended, or in flight.
 
         Args:
             journal: journal of the stream.

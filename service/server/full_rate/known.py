@@ -107,7 +107,7 @@ class KnownStream:
         return node.boot_id
 
     def to_come(self) -> Intervals:
-        """See `StreamView.compute_obtainable`."""
+        """Return the frames as in `StreamView.compute_obtainable`."""
         stream = self._stream
         if stream is None:
             return Intervals([(0, NO_END)])

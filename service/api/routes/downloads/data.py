@@ -69,7 +69,7 @@ async def data(
     request: Request,
     server: ServerState,
 ) -> Response:
-    """A session in a selected format; `GET /formats` lists them.
+    """Return a session in a selected format; `GET /formats` lists them.
 
     Parquet without slice, columns, server's clock or marks is the stored file: with ranges, a
     strong ETag that is its SHA-256, and a digest. Any other file is made on request and streamed;

@@ -51,7 +51,7 @@ router = APIRouter(prefix="/takes", tags=["data"])
 async def take_data(
     take_id: str, query: Annotated[TakeDataQuery, Query()], request: Request, server: ServerState
 ) -> Response:
-    """Sessions of a take on the server's time axis, each with its uncertainty.
+    """Return the sessions of a take on the server's time axis, each with its uncertainty.
 
     They are in the order of their nodes, without those in the trash. Seconds count from each
     session's first frame. `Foottile-Complete` is `lossy` if one of the sessions is.

@@ -42,7 +42,7 @@ async def zip_sessions(
     ],
     server: ServerState,
 ) -> StreamingResponse:
-    """Files of sessions as they are, streamed: a folder each, as for `foottile verify`.
+    """Stream the files of sessions as they are: a folder each, as for `foottile verify`.
 
     A session that is damaged or deleted meanwhile aborts the download; the partial file opens as no
     zip file.

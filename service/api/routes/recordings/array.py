@@ -44,7 +44,7 @@ class ArrayView(View):
     responses=problems(_404="No such session, or nothing was recorded.", _409="It is damaged."),
 )
 async def array(session_id: str, server: ServerState) -> ArrayView:
-    """Positions of the tiles on the foot, their ranges, and the look-ahead of the estimates."""
+    """Return the tiles' positions and ranges, and the look-ahead of the estimates."""
     session = server.sessions.get(session_id)
     if session.state == "sealed" and session.sha256 is None:
         raise UnknownError(f"session {session_id}: {session.problem}")

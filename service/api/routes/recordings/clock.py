@@ -38,7 +38,7 @@ async def clock(
     server: ServerState,
     format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
 ) -> ClockSummary | Response:
-    """Offset and drift of every stream between steps; up to now while recording.
+    """Return offset and drift of every stream between steps; up to now while recording.
 
     `format=parquet` is `clock.parquet`, the stored measurements.
     """

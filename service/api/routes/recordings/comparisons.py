@@ -92,7 +92,7 @@ class SeriesView(BaseModel):
     responses=problems(_404="No such session.", _409="Its files are damaged."),
 )
 async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsView:
-    """Comparisons of the session, made by `foottile compare`, by name."""
+    """Return the session's comparisons, made by `foottile compare`, by name."""
     session = server.sessions.get(session_id)
     return ComparisonsView(items=await run_in_threadpool(_listed, session, server))
 
@@ -104,7 +104,7 @@ async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsV
     responses=_PROBLEMS,
 )
 async def comparison(session_id: str, name: str, server: ServerState) -> ReportView:
-    """Alignment, figures with their intervals, trials and limits."""
+    """Return alignment, figures with their intervals, trials and limits."""
     session = server.sessions.get(session_id)
     return await run_in_threadpool(_clear, partial(_report, session, name, server))
 
@@ -119,7 +119,7 @@ async def comparison(session_id: str, name: str, server: ServerState) -> ReportV
 async def series(
     session_id: str, name: str, query: Annotated[SeriesQuery, Query()], server: ServerState
 ) -> Response:
-    """Minimum and maximum of the reference, and of ours minus the reference, aligned in time."""
+    """Return minimum and maximum of the reference, and of ours minus it, aligned in time."""
     session = server.sessions.get(session_id)
     if session.state != "sealed":
         raise StateError(f"session {session_id} is {session.state}", remedy="Stop it")

@@ -100,7 +100,7 @@ async def overview(
     accept: Annotated[str, Header(description="The Arrow media type for an Arrow stream.")] = "",
     accept_encoding: Annotated[str, Header(description="With gzip, JSON is compressed.")] = "",
 ) -> Response:
-    """Minimum and maximum of every column per bin, so that no peak hides.
+    """Return minimum and maximum of every column per bin, so that no peak hides.
 
     At full zoom each bin is a frame. The cost does not depend on the session's length. An unsealed
     session has its present frames, `provisional`: some ten thousand bins, with more frames each the

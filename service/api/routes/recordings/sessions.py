@@ -228,7 +228,7 @@ async def list_sessions(
         Query(description="Filter by completeness: complete, pending, or lossy."),
     ] = None,
 ) -> SessionPage:
-    """Page of sessions that pass all filters."""
+    """Return a page of the sessions that pass all filters."""
     choice = Choice(
         nodes=node,
         tags=tag,
@@ -262,7 +262,7 @@ async def list_sessions(
     responses=_UNKNOWN,
 )
 async def get_session(session_id: str, server: ServerState) -> SessionView:
-    """Present state of a session."""
+    """Return the present state of a session."""
     return SessionView.of(server.sessions.get(session_id), server.recorder)
 
 
@@ -373,7 +373,7 @@ async def events(
     server: ServerState,
     format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
 ) -> Page[EventView] | Response:
-    """Markers in order of time; `format=parquet` is the stored `events.parquet`."""
+    """Return markers in order of time; `format=parquet` is the stored `events.parquet`."""
     session = server.sessions.get(session_id)
     if format == "parquet":
         return stored_table(session, server.sessions.folder.path(session_id) / EVENTS_NAME)
@@ -383,7 +383,7 @@ async def events(
 
 @router.get("/{session_id}/ledger", operation_id="getLedger", summary="Ledger", responses=_UNKNOWN)
 async def ledger(session_id: str, server: ServerState) -> Ledger:
-    """Fate of every frame: recorded, lost for a reason, or still with the node."""
+    """Return the fate of every frame: recorded, lost for a reason, or still with the node."""
     return server.recorder.ledger(session_id)
 
 

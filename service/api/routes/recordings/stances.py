@@ -77,7 +77,7 @@ async def stances(
     server: ServerState,
     accept: Annotated[str, Header(description="The Arrow media type for an Arrow stream.")] = "",
 ) -> Response | list[dict[str, Any]]:
-    """Stances as JSON, or as an Arrow stream if `Accept` names its media type.
+    """Return stances as JSON, or as an Arrow stream if `Accept` names its media type.
 
     For sessions of versions without stances they are computed from the frames.
     """
@@ -162,7 +162,7 @@ async def stances_overlay(
         str, Header(description="With gzip, the answer is compressed.")
     ] = "",
 ) -> Response:
-    """GRF and COP of the whole stances, normalised to 0 to 100 % of their duration.
+    """Return GRF and COP of the whole stances, normalised to 0 to 100 % of their duration.
 
     Values between two frames are interpolated linearly.
     """

@@ -84,7 +84,7 @@ async def start(
 
 @router.get("/{take_id}", operation_id="getTake", summary="One take", responses=_UNKNOWN)
 async def get_take(take_id: str, server: ServerState) -> TakeView:
-    """Present sessions of a take, without those in the trash."""
+    """Return the present sessions of a take, without those in the trash."""
     return TakeView.of(server.takes.get(take_id), server)
 
 

@@ -20,7 +20,7 @@ class Emptied(View):
 
 @router.get("", operation_id="listTrash", summary="Deleted sessions, newest first")
 async def list_trash(server: ServerState) -> Page[SessionView]:
-    """Deleted sessions, newest first; each can be restored."""
+    """Return deleted sessions, newest first; each can be restored."""
     deleted = server.sessions.trash.all()
     return Page(items=[SessionView.of(session, server.recorder) for session in deleted])
 
