@@ -72,9 +72,9 @@ def _listening(family: int, kind: int, protocol: int, address: Any) -> socket.so
     listening = socket.socket(family, kind, protocol)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if address[0] == "::":  # IPv4, too, whatever the system's usual is
+        if address[0] == "::":  # IPv4, too, whatever the system's default
             listening.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # those that come to it inherit this
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # accepted sockets inherit this
             listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
         listening.bind(address)
         listening.listen(_BACKLOG)
@@ -185,7 +185,7 @@ def token_for(given: str | None, data: Path) -> str:
     except FileNotFoundError:
         pass
     except DamagedFileError as error:
-        log.warning("%s, and a new token is made", put_aside(path, error))
+        log.warning("%s, and a new token is generated", put_aside(path, error))
     with storage_errors(path):
         data.mkdir(parents=True, exist_ok=True)
         kept = secrets.token_urlsafe(18)

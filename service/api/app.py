@@ -81,7 +81,7 @@ def make_app(
         version=SOFTWARE.rsplit(" ", 1)[1],
         description=_DESCRIPTION,
         openapi_url=f"{API}/openapi.json",
-        docs_url=None,  # its page comes from another host, which a field laptop does not reach
+        docs_url=None,  # FastAPI's page needs another host: no network in the field
         redoc_url=None,
         lifespan=lifespan,
     )
@@ -111,7 +111,7 @@ def make_app(
         login,
         nodes,
         calibrations,
-        zips,  # before a session of that name
+        zips,  # before the route with a session's id
         sessions,
         takes,
         trash,
@@ -180,7 +180,7 @@ def page_folder() -> Path:
         FootTileError: the installation lacks it.
     """
     here = Path(__file__).resolve().parent
-    # A wheel carries it as service/web, a checkout has it next to service.
+    # In a wheel it is service/web, in a checkout next to service.
     for folder in (here.parent / "web", here.parents[1] / "web"):
         if (folder / "index.html").is_file():
             return folder

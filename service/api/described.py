@@ -51,7 +51,7 @@ def say_who_may(app: FastAPI) -> None:
         schema["security"] = [{}, {"token": []}]
         return schema
 
-    app.openapi = described  # type: ignore[method-assign]  # as FastAPI has it done
+    app.openapi = described  # type: ignore[method-assign]  # as FastAPI documents
 
 
 def operations(schema: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:

@@ -80,7 +80,7 @@ class Doors:
 
     def __init__(self, bounds: Bounds, files_max: int) -> None:
         self.bounds = bounds
-        # A download has a file of its own beside its connection.
+        # A download needs a descriptor beside its connection.
         self.connections_max = min(bounds.max_connections, max(16, (files_max - OWN_FILES) // 2))
         if self.connections_max < bounds.max_connections:
             log.warning(

@@ -37,23 +37,23 @@ _AS_PROGRAM = (
     "was given one, and `foottile ticket --data` takes it from there"
 )
 _ASKED = (
-    "To change something here the server's token is needed, or a login: `foottile ticket`, on "
+    "A change needs the server's token or a login: `foottile ticket`, on "
     f"{_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
 _PRIVATE = (
-    "This server is private: to look, too, the server's token is needed, or a login: `foottile "
+    "This server is private: reading needs the server's token or a login: `foottile "
     f"ticket`, on {_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
 _WRONG = f"This is not the server's token. {_AS_PROGRAM}"
 _ENDED = (
-    "This login has ended: the server was started again, or 12 hours are over. "
-    f"`foottile ticket` gives a new one, on {_HERE}"
+    "This login has expired: the server was restarted, or 12 hours have passed. "
+    f"`foottile ticket` creates a new one, on {_HERE}"
 )
 _VIEWER = (
-    "This login may look and not press: it came from a viewer's ticket. `foottile ticket` gives "
-    f"one that may press, on {_HERE}"
+    "This login is a viewer's and may not change anything. `foottile ticket` creates "
+    f"an operator's, on {_HERE}"
 )
-_NO_LOGIN = "For this no login is enough: it needs the server's token"
+_NO_LOGIN = "A login is not enough for this: it needs the server's token"
 _OPEN = re.compile(
     rf"/|/nodes|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
 )
@@ -73,7 +73,7 @@ _DEFAULT_HEADERS = {
     "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
-    "cache-control": "no-cache",  # ask again: after an update the page must not be the old one
+    "cache-control": "no-cache",  # revalidate: after an update the page must be new
 }
 
 
@@ -115,7 +115,7 @@ class Guard:
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"
         changes = not websocket and scope["method"] not in SAFE_METHODS
-        # A proxy with TLS that is not trusted to say so makes https of what looks like http here.
+        # Behind an untrusted TLS proxy, https looks like http here.
         is_https = scope["scheme"] in ("https", "wss")
         ours = {f"https://{host}"} if is_https else {f"http://{host}", f"https://{host}"}
         for origin in headers.getlist("origin") if websocket or changes else ():
@@ -127,7 +127,7 @@ class Guard:
                 return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > _most(scope):
-            what = f"A body of {length[:20]} bytes; at most {_most(scope)} are taken"
+            what = f"A body of {length[:20]} bytes; at most {_most(scope)} are accepted"
             return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, what
         if any(ord(character) < ord(" ") for character in scope["path"]):
             return HTTPStatus.BAD_REQUEST, "The path has control characters in it"
@@ -159,7 +159,7 @@ class Guard:
         if name == "localhost" or name in self._hosts:
             return True
         try:
-            # A foreign DNS can point a name here, but not an address.
+            # DNS rebinding can point a name here, but not an address.
             address = ipaddress.ip_address(name)
         except ValueError:
             return False

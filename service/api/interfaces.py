@@ -78,8 +78,8 @@ def list_addresses(*, has_ipv6: bool) -> list[str]:
         )
         for name, addresses in psutil.net_if_addrs().items()
         for each in addresses
-        # `isup` of psutil is that there is a carrier, too: a hotspot may have none before a phone
-        # has joined it.
+        # `isup` of psutil needs a carrier, too: a hotspot may have none before a phone
+        # joins.
         if each.family in families and name in states and "up" in states[name].flags.split(",")
     ]
     return [each.address for each in sort_addresses(found)]

@@ -107,7 +107,7 @@ async def _on_http(request: Request, error: Exception) -> Response:
         allow = {"Allow": ", ".join(_methods_of(request))}
         if request.method == "OPTIONS":
             return Response(status_code=HTTPStatus.NO_CONTENT, headers=allow)
-        what = f"{request.method} is not for this path; {allow['Allow']} are"
+        what = f"{request.method} is not allowed here; {allow['Allow']} are"
         return problem(request.url.path, error.status_code, what, allow)
     return problem(request.url.path, error.status_code, str(error.detail), error.headers)
 
@@ -121,7 +121,7 @@ def _methods_of(request: Request) -> list[str]:
         for route in routes
         if route.matches({**request.scope, "method": method})[0] is Match.FULL
     }
-    found = found or {"GET"}  # what is under a mount is files
+    found = found or {"GET"}  # a mount has files only
     if "GET" in found:
         found.add("HEAD")  # see service.api.head
     return sorted(found | {"OPTIONS"})
@@ -129,5 +129,5 @@ def _methods_of(request: Request) -> list[str]:
 
 async def _on_bug(request: Request, error: Exception) -> JSONResponse:
     log.error("%s %s: this is a bug", request.method, request.url.path, exc_info=error)
-    detail = f"The server made a mistake ({type(error).__name__}); its log says more"
+    detail = f"Internal error ({type(error).__name__}); see the server's log"
     return problem(request.url.path, HTTPStatus.INTERNAL_SERVER_ERROR, detail)

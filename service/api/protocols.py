@@ -185,7 +185,9 @@ class Http(HttpToolsProtocol):
         self._head_bytes += more
         if self._head_bytes > self.config.doors.bounds.max_header_bytes:
             self._is_too_long = True
-            raise ValueError("headers are too long")  # the parser gives up, and 400 is ours above
+            raise ValueError(
+                "headers are too long"
+            )  # the parser stops; `send_400_response` answers
 
     def _expect(self, within_s: float | None) -> None:
         if self._timer is not None:
@@ -303,7 +305,7 @@ class WebSocket(WebSocketsSansIOProtocol):
             self.app = refuse
         super().handle_connect(event)
         if not self.close_sent:
-            # An extension's content is a dict by the specification; its reader is our own route.
+            # ASGI requires a dict; the live route reads it.
             self.scope["extensions"] = {
                 **(self.scope["extensions"] or {}),
                 OUTLET: {"outlet": self},
@@ -339,7 +341,7 @@ class WebSocket(WebSocketsSansIOProtocol):
         event = await super().receive()
         is_word = self._is_node and event["type"] == "websocket.receive"
         if is_word and not self.config.doors.admit_node(self.transport):
-            with suppress(ClientDisconnected, RuntimeError):  # it has gone, or was told why
+            with suppress(ClientDisconnected, RuntimeError):  # it has disconnected, or got a reason
                 await self.send(
                     {"type": "websocket.close", "code": Close.TRY_LATER, "reason": _TOO_MANY}
                 )
@@ -406,9 +408,9 @@ async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors
         try:
             connection, _ = await loop.sock_accept(listening)
         except OSError as error:
-            is_starved = error.errno in _STARVED  # or it has gone already
+            is_starved = error.errno in _STARVED  # or the client has disconnected
             if is_starved:
-                doors.say("starved", f"no connection can be taken in for now: {error}")
+                doors.say("starved", f"no connection can be accepted now: {error}")
                 doors.turn_out()
             await asyncio.sleep(_STARVED_PAUSE_S if is_starved else _PAUSE_S)
             continue
@@ -417,5 +419,5 @@ async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors
             await loop.connect_accepted_socket(make, connection)
         except Exception as error:
             if not isinstance(error, OSError):
-                log.exception("a connection is closed: this is a bug; others are taken in")
+                log.exception("a connection is closed: this is a bug; others are accepted")
             connection.close()

@@ -36,17 +36,17 @@ async def serving(
         app,
         log_level="warning",
         access_log=False,
-        workers=1,  # else uvicorn reads WEB_CONCURRENCY, and ends if that is no number
+        workers=1,  # else uvicorn reads WEB_CONCURRENCY and fails if it is no number
         server_header=False,
         http=Http,
-        ws=WebSocket,  # on websockets' sans-I/O, the fastest that is kept up (performance.md)
+        ws=WebSocket,  # websockets' sans-I/O, the fastest maintained one (performance.md)
         ws_max_size=MESSAGE_BYTES_MAX,
         ws_per_message_deflate=False,
         ws_ping_interval=20.0,
         ws_ping_timeout=20.0,
         timeout_keep_alive=bounds.idle_timeout_s,  # type: ignore[arg-type]  # it takes fractions
         timeout_graceful_shutdown=_GRACE_S,
-        forwarded_allow_ips=bounds.trusted_peers,  # uvicorn trusts loopback by itself
+        forwarded_allow_ips=bounds.trusted_peers,  # uvicorn trusts loopback by default
     )
     config.doors = Doors(bounds, open_files_max())
     config.proxies = ProxyHeadersMiddleware(app, bounds.trusted_peers)  # type: ignore[arg-type]  # Starlette's scope is wider
@@ -82,7 +82,7 @@ async def _compile_aside(of: Server) -> None:
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-c", _COMPILES),
             stdin=asyncio.subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for us
+            start_new_session=True,  # Ctrl-C is for the server
         )
         try:
             with suppress(OSError):

@@ -41,7 +41,7 @@ def load_or_restore(folder: SessionFolder) -> tuple[list[Session], dict[str, str
         try:
             session = restore(folder, session_id)
         except StorageError as refused:
-            log.warning("session %s cannot be made again: %s", session_id, refused)
+            log.warning("session %s cannot be rebuilt: %s", session_id, refused)
             session = None
         if session is None:
             log.warning("session %s is left out, and no frames are dropped: %s", session_id, error)
@@ -223,14 +223,14 @@ class SessionBook:
         for session in found:
             if session.asked != asked:
                 raise UsageError(
-                    "this Idempotency-Key came with another request before, which began session "
+                    "this Idempotency-Key was used by another request, which started session "
                     f"{session.id}",
                     remedy="Make a new key for each recording, and send it again with the same "
                     "request only",
                 )
             if session.id in self.trash:
                 raise StateError(
-                    f"this request began session {session.id} before, which is in the trash",
+                    f"this request has started session {session.id}, which is in the trash",
                     remedy="Restore it, or record with another Idempotency-Key",
                 )
         return found[::-1]
@@ -363,7 +363,7 @@ def expect(wanted: str | None, found: str, what: str) -> None:
     if wanted is not None and wanted != found:
         raise ChangedError(
             f"{what} was changed by another client meanwhile",
-            remedy="Look at it as it is now, and change it again",
+            remedy="Reload it and retry",
         )
 
 

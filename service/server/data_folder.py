@@ -70,7 +70,7 @@ class DataFolder:
         with storage_errors(self.path, _COMES_BACK):
             place = self._place()
         raise FolderGoneError(
-            f"the data folder was moved, deleted or unmounted, and nothing is kept: {place}",
+            f"the data folder was moved, deleted or unmounted, and nothing is stored: {place}",
             where=str(self.path),
             remedy=_COMES_BACK,
             errno=errno.ENOENT,
@@ -101,7 +101,7 @@ class DataFolder:
             StorageError: it is not writable.
         """
         self.check()
-        # As much as some seconds of frames: on a full disk an empty file can still be written.
+        # The size of some seconds of frames: a full disk still accepts an empty file.
         write_whole(self.path / _PROBE_NAME, bytes(_PROBE_BYTES))
 
     def close(self) -> None:
@@ -155,7 +155,7 @@ class DataFolder:
         except FileNotFoundError:
             return None
         except DamagedFileError as error:
-            self.problems.append(f"{put_aside(path, error)}; nodes get to know this server anew")
+            self.problems.append(f"{put_aside(path, error)}; nodes treat this server as a new one")
             log.warning("%s", self.problems[-1])
             return None
         return kept.id if kept.is_proven else self._new_id(kept.id)

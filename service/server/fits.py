@@ -178,7 +178,7 @@ class Fits:
             self._end(fit, "failed")
         except Exception as error:
             log.exception("fit %s: this is a bug", fit.id)
-            fit.problem = f"the server made a mistake: {error!r}"
+            fit.problem = f"internal error: {error!r}"
             self._end(fit, "failed")
 
     def _end(self, fit: Fit, state: FitState) -> None:
@@ -201,7 +201,7 @@ class Fits:
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is for us
+            start_new_session=True,  # Ctrl-C is for the server
         )
         try:
             with suppress(OSError):
@@ -210,7 +210,7 @@ class Fits:
                 await self._listen(fit, process)
                 code = await process.wait()
         except TimeoutError as error:
-            raise StateError(f"it was not done after {_LASTS_MAX_S:.0f} s") from error
+            raise StateError(f"not finished after {_LASTS_MAX_S:.0f} s") from error
         finally:
             if process.returncode is None:
                 process.kill()

@@ -192,7 +192,7 @@ def _following(session: Session, node: ServerNode) -> Iterable[str]:
     boot_id, order = session.parts[-1].boot_id, node.order
     if boot_id in order:
         return order[order.index(boot_id) + 1 :]
-    # The node does not remember it: what began after its last frame came after it.
+    # Hello no longer lists it: streams that began after its last frame are later.
     newest = streams_of(session, node)[boot_id].t_ns_near(NO_END, newest=True)
 
     def is_later(name: str) -> bool:
@@ -211,7 +211,7 @@ def _offset_ns(session: Session, node: ServerNode | None, boot_id: str) -> int |
     rows = [row for row in session.clock if row.boot_id == boot_id]
     if rows:
         return rows[-1].server_minus_node_ns
-    # The node had no link during that stream: its clock was most likely as wrong as it is now.
+    # No link during that stream: most likely the node's clock was as wrong as now.
     return node.clock.server_minus_node_ns if node is not None and node.clock is not None else None
 
 

@@ -131,10 +131,12 @@ class NodeIdentities:
             if claim.answer.secret is not None:
                 self._keep(claim.node, claim.answer.secret)
                 return
-            why = "its disk keeps none"
+            why = "its disk stores none"
         except StorageError as error:
             why = str(error)
-        log.warning("no secret of node %s is kept; any machine may take it: %s", claim.node, why)
+        log.warning(
+            "no secret of node %s is stored; any machine may use its name: %s", claim.node, why
+        )
 
     def accept(self, node: str, fingerprint: str) -> None:
         """Accept the machine that was refused last as the node from now on.
@@ -147,12 +149,12 @@ class NodeIdentities:
         asking = self.replacements.get(node)
         if asking is None:
             raise StateError(
-                f"no other machine asks to connect as {node!r}",
-                remedy="Start it; it asks again by itself every few seconds",
+                f"no other machine was refused as {node!r}",
+                remedy="Start it; it retries every few seconds",
             )
         if asking.fingerprint != fingerprint:
             raise ChangedError(
-                f"another machine asked to connect as {node!r} meanwhile: {asking.fingerprint}",
+                f"another machine was refused as {node!r} meanwhile: {asking.fingerprint}",
                 expected=f"the machine {fingerprint}",
                 remedy="Compare it with the fingerprint that the machine itself prints",
             )

@@ -186,13 +186,13 @@ class ServerNode:
             stream.owed = Intervals()
             if stream.boot_id not in self.order and not hello.has_more:
                 stream.is_gone()
-                if stream.journal is None:  # nothing of it ever came
+                if stream.journal is None:  # no frame ever came
                     del self.streams[stream.boot_id]
         for earlier in hello.earlier:
             self._stream_of(earlier.array_info).has_ended(earlier)
         self.present = self._stream_of(hello.array_info)
         self.present.is_present(hello, now_t_ns)
-        # What is here but was never acknowledged, because the link broke before: acknowledge it.
+        # Acknowledge stored frames again: a link may have broken before their acknowledgement.
         for name in self.order:
             stream = self.streams[name]
             stream.owed = stream.held & stream.may_come
@@ -271,9 +271,7 @@ class ServerNode:
             StorageError: the tare cannot be stored.
         """
         if not self.connected:
-            raise StateError(
-                f"node {self.name!r} is away", remedy="Tare when it is connected again"
-            )
+            raise StateError(f"node {self.name!r} is not connected", remedy="Connect it and retry")
         return self.estimates.tare_keeper.by_hand(reason)
 
     def read_again(self) -> None:

@@ -107,13 +107,13 @@ class ServerNodes:
         if info.node not in self._nodes:
             if len(self._nodes) >= _NODES_MAX:
                 raise LinkError(
-                    f"this server knows {len(self._nodes)} nodes already",
-                    remedy="Delete the folders in nodes/ of those that are gone, and start it anew",
+                    f"this server has {len(self._nodes)} nodes already",
+                    remedy="Delete the folders of unused nodes in nodes/, and restart the server",
                 )
             try:
                 self._nodes[info.node] = self._make(hello)
             except FootTileError as error:
-                raise LinkError(f"node {info.node!r} cannot be taken in: {error}") from error
+                raise LinkError(f"node {info.node!r} cannot be accepted: {error}") from error
         node = self._nodes[info.node]
         for said in (info, *(each.array_info for each in hello.earlier)):
             known = node.streams.get(said.boot_id)
@@ -140,7 +140,7 @@ def _read_hello(path: Path) -> Hello:
         StorageError: it cannot be read now.
     """
     text = read_checked(path).text
-    again = "it is known again when it connects"
+    again = "the node is unknown until it connects"
     try:
         said = json.loads(text)
         protocol = said["protocol"]
@@ -150,7 +150,7 @@ def _read_hello(path: Path) -> Hello:
     except (ValueError, KeyError, TypeError, RecursionError, LinkError) as error:
         what = " ".join(str(error).split())[:200]
         raise DamagedFileError(
-            f"not what this node said last: {what}", where=str(path), remedy=again.capitalize()
+            f"not this node's last hello: {what}", where=str(path), remedy=again.capitalize()
         ) from error
     if hello is None:
         raise FileFormatError(

@@ -87,14 +87,12 @@ class Recorder:
         """
         node = self._nodes.get(node_name)
         if not node.connected or node.last_seq is None or node.last_t_ns is None:
-            raise StateError(
-                f"node {node_name!r} is not sending", remedy="Record when it is connected"
-            )
+            raise StateError(f"node {node_name!r} sends no frames", remedy="Connect it and retry")
         behind_s = (node.node_t_ns(utc_ns()) - node.last_t_ns) * 1e-9
         if node.clock is not None and behind_s > BEHIND_S:
             raise StateError(
                 f"node {node_name!r} is {behind_s:.1f} s behind: its link is too slow",
-                remedy="Record when it has caught up",
+                remedy="Retry when it has caught up",
             )
         part = following.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
         session = begun(
@@ -316,6 +314,6 @@ class Recorder:
                     and (stream.clock.t_mono_ns > max(known, default=-1))
                 ):
                     session = session.with_clock(stream.all_clock_rows())
-        except StorageError as error:  # its frames are worth more than its clock
+        except StorageError as error:  # frames matter more than clock measurements
             log.warning("session %s: %s", session.id, error)
         return session

@@ -187,7 +187,7 @@ class Server:
     async def close(self) -> None:
         """Close the links, cancel the calibration job, wait for running sealing."""
         for link in list(self.links.values()):
-            link.end(Close.RESTART, "the server is going down; connect again")
+            link.end(Close.RESTART, "the server is stopping; reconnect")
         await self.fits.close()
         await self.settling.close()
         for node in self.nodes:
@@ -299,7 +299,7 @@ class Server:
     def _ask_again(self, node: ServerNode) -> None:
         link = self.links.get(node.name)
         if link is not None:
-            link.end(Close.RESTART, "frames are damaged here; send what the server lacks")
+            link.end(Close.RESTART, "frames are damaged here; resend the missing ones")
 
     def _tell_session(self, session: Session) -> None:
         if self.hub.subscribers:
@@ -377,7 +377,7 @@ class Server:
         self.tell_node(node)
         if node.name in self.links:
             self.links[node.name].end(
-                Close.RESTART, "the server can write again; send what it lacks"
+                Close.RESTART, "the server can write again; resend the missing frames"
             )
 
     def _cannot_keep(self, node: ServerNode, error: Exception) -> None:
@@ -385,5 +385,5 @@ class Server:
         node.storage_problem = str(error)
         if node.name not in self._unkept:
             self._unkept.add(node.name)
-            log.warning("node %s: nothing of it is kept: %s", node.name, error)
+            log.warning("node %s: its frames are not stored: %s", node.name, error)
             self.tell_node(node)

@@ -29,7 +29,7 @@ log = logging.getLogger("foottile.settling")
 
 _SEAL_AGAIN_S = 10.0
 _COMPILED_S = 0.1
-_UNREAD = "a journal of it cannot be read now, and is tried again: see what the server says of it"
+_UNREAD = "a journal cannot be read now, and is retried: see the server's problems"
 
 
 class Settling:
@@ -197,7 +197,7 @@ class Settling:
                 log.exception("session %s: this is a bug", session_id)
             log.warning("session %s cannot be sealed: %s", session_id, error)
             self._again_after[session_id] = time.monotonic() + _SEAL_AGAIN_S
-            self._not_sealed[session_id] = f"cannot be sealed yet, and is tried again: {error}"
+            self._not_sealed[session_id] = f"cannot be sealed yet, and is retried: {error}"
             book.changed(book.get(session_id))
         finally:
             del self._sealing[session_id]

@@ -98,7 +98,7 @@ class ServerStream:
         newest = journal.held.last
         if newest is not None:
             stream._first_seq = next(iter(journal.held))[0]
-            # Most likely it was deleted because nothing needed it.
+            # Most likely these frames were deleted as unneeded.
             stream._guessed = True
             stream._forgotten = journal.held.missing(0, newest) - stream.lost.all
         return stream
@@ -231,9 +231,9 @@ class ServerStream:
         """Handle the node's report of how this stream ended."""
         self.node_has = Intervals(said.held)
         self.t_ns_first = said.t_ns_first
-        # A node that was killed may know an older count than it had told.
+        # A node that was killed may have an older count than it had reported.
         self.missed_slots = max(self.missed_slots, said.missed_slots)
-        # What a node lost with its power may have come here before.
+        # Frames that a node lost in a power failure may be stored here.
         beyond = max(0, (-1 if self.held.last is None else self.held.last) + 1 - said.next_seq)
         tail = max(0, said.unsynced_tail_max - beyond)
         self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)

@@ -20,7 +20,7 @@ from service.server_clock import utc_ns
 from storage.sessions.folder import Asked, Session
 
 _FAILED_KEPT = 1000
-_NOT_THEN = "it could not be recorded when this take was begun"
+_NOT_THEN = "it could not be recorded when this take was started"
 TAKE_ID = re.compile(r"[0-9a-f]{12}")
 
 
@@ -104,7 +104,7 @@ class Takes:
         if not take.sessions:
             raise StateError(
                 "no node is connected" if not take.failed else _in_words(take.failed),
-                remedy="Record when a node is connected and sends",
+                remedy="Connect a node and retry",
             )
         if asked is not None:
             self._failed[take.id] = take.failed
@@ -158,7 +158,7 @@ class Takes:
         if not running:
             raise StateError(
                 f"take {take_id} was stopped already",
-                expected="one of which a session is recording",
+                expected="a take that is being recorded",
             )
         for session in running:
             try:

@@ -18,7 +18,7 @@ def calibration_of(content: bytes, *, where: str) -> Calibration:
         CalibrationError: it is no calibration, or its hashes do not match.
     """
     with suppress(UnicodeDecodeError):  # `checked` reports this as damage
-        content = decode_text(content).encode()  # as an editor may have saved it
+        content = decode_text(content).encode()  # encodings of editors
     try:
         text = checked(content, where=where).text
     except DamagedFileError as error:

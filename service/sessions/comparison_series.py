@@ -112,7 +112,7 @@ def _bins_of(table: pa.Table, gap_ns: float) -> Bins:
     bins: Bins = {
         "t_first_ns": t_ns,
         "t_last_ns": t_ns,
-        "part": np.cumsum(gaps).astype(np.uint16),  # it is enough that neighbours differ
+        "part": np.cumsum(gaps).astype(np.uint16),  # only neighbours have to differ
         "frames": np.ones(len(t_ns), np.uint32),
         "missing": gaps.astype(np.uint32),
     }

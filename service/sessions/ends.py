@@ -126,7 +126,7 @@ def at_end(session: Session, streams: Streams, now_t_ns: int | None = None) -> S
             if stream.next_seq is None:
                 session = ended(session, part, beyond - 1, _unheard(session, stream, now_t_ns))
             else:
-                # What a node lost with its power may have come here before.
+                # Frames that a node lost in a power failure may be stored here.
                 tail = stream.unsynced_tail_max - max(0, beyond - stream.next_seq)
                 session = ended(session, part, max(stream.next_seq, beyond) - 1, max(0, tail))
     return session
@@ -188,7 +188,7 @@ def _seq_at_stop(
         return last
     if waiting and stream.may_come & Intervals([(last + 1, after - 1)]):
         return None
-    # The stop lies among lost frames: the rate tells how many of them came after it.
+    # The stop lies among lost frames: the rate gives the number of those after it.
     after_t_ns = stream.t_ns_near(after, newest=False) or stop_t_ns
     late = math.ceil((after_t_ns - stop_t_ns) * 1e-9 * _rate_hz(stream))
     return min(after - 1, max(last, after - late))
@@ -202,7 +202,7 @@ def _unheard(session: Session, stream: SessionStream, now_t_ns: int | None) -> i
     known = [t_ns for t_ns in (session.stopped_t_ns, now_t_ns) if t_ns is not None]
     if not known:
         return open_tail(stream)
-    # Frames that were sent late came later than they were taken.
+    # Arrival times of delayed frames are too late.
     newest_t_ns, seen_t_ns = stream.t_ns_near(NO_END, newest=True), stream.last_seen_t_ns
     if newest_t_ns is not None and (stream.offset_ns is not None or seen_t_ns is None):
         seen_t_ns = newest_t_ns + (stream.offset_ns or 0)

@@ -45,7 +45,7 @@ log = logging.getLogger("foottile.overview")
 POINTS_MAX = 8000
 _VALUES_MAX = 1 << 18
 """Values read at once for a zoom into frames: 2 MiB."""
-_NOT_WRITTEN = f"{OVERVIEW_NAME} was not written, and is made again when it is asked for"
+_NOT_WRITTEN = f"{OVERVIEW_NAME} was not written, and is rebuilt on request"
 
 
 class OverviewBeside:

@@ -85,7 +85,7 @@ class EstimateRun:
         for begin in range(0, len(frames), CHUNK):
             end = min(begin + CHUNK, len(frames))
             rows, rows_of = frames, extra
-            if end - begin < len(frames):  # a message that comes live is not cut
+            if end - begin < len(frames):  # do not copy a whole live message
                 rows = frames.rows(begin, end)
                 rows_of = {name: v[begin:end] for name, v in extra.items()}
             self._held.append((rows, rows_of))
@@ -118,7 +118,7 @@ class EstimateStream:
         self._over = 0
         """Number of changes of the tare up to now."""
         self._last_t_mono_ns = 0
-        # Refuse now what would fail later: unknown models, tiles without calibration.
+        # Fail early: unknown models, tiles without calibration.
         if options.tare_s is not None and not 0 <= options.tare_s[0] < options.tare_s[1]:
             raise UsageError(
                 f"--tare-s {options.tare_s[0]:g},{options.tare_s[1]:g} is no interval",
@@ -190,7 +190,7 @@ class EstimateStream:
             rest, rest_of = frames, extra
             if not len(rest):
                 continue
-            if int(rest.t_mono_ns[0]) < self._last_t_mono_ns:  # the node was switched on again
+            if int(rest.t_mono_ns[0]) < self._last_t_mono_ns:  # the node was restarted
                 yield from run.finish()
             self._last_t_mono_ns = int(rest.t_mono_ns[-1])
             while (tare := self._next_tare()) is not None and int(rest.t_ns[-1]) > tare.t_ns:

@@ -116,7 +116,7 @@ def recover(
     recovery.removed += remove_stale_temporaries(data)
     before = _unread(data)
     if _is_local(data):
-        settle_left_over(data)  # a killed node leaves its frames in flight in a file
+        settle_left_over(data)  # frames in flight of a killed node
     opened, recovery.problems = open_streams(data, tell, is_local=_is_local(data))
     for path in sorted(_unread(data) - before):
         name = f"{path.parent.parent.name}/{path.parent.name}"
@@ -243,7 +243,7 @@ def _of_no_session(
 ) -> list[Session]:
     """Return new sessions for frames that belong to no session, one for each run of a stream."""
     # Frames of a deleted session must not come back as a new one. A session in the trash that
-    # cannot be read does not say which frames it has.
+    # cannot be read has unknown frames.
     known = [*known, *SessionFolder(data / "trash").load_all()[0]]
     found = []
     for (node, boot_id), stream in streams.items():

@@ -44,7 +44,7 @@ def restore(sessions: SessionFolder, session_id: str) -> Session | None:
     path = folder / SESSION_NAME
     try:
         if read_checked(path).is_proven:
-            return None  # whole, and written by another version
+            return None  # intact, but of another version
     except FileNotFoundError:
         what = f"its {SESSION_NAME} was gone"
     except StorageError:
@@ -87,7 +87,7 @@ def _session_of(folder: Path, what: str) -> Session | None:
         "calibration_source": notes.get("calibration_source", "node"),
         "events": events.events if events is not None else (),
         "clock": clock.offsets if clock is not None else (),
-        "problem": f"{what} and was made again from {FRAMES_NAME}; lost are {', '.join(lost)}",
+        "problem": f"{what} and was rebuilt from {FRAMES_NAME}; lost are {', '.join(lost)}",
         "ledger": file.ledger,
         "frames": file.frames,
         "duration_s": _duration_s(file),

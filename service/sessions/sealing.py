@@ -29,7 +29,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     """
     session = sources.session
     if not ledger.recorded:
-        update = {"state": "sealed", "ledger": ledger, "problem": "not one frame was recorded"}
+        update = {"state": "sealed", "ledger": ledger, "problem": "no frame was recorded"}
         return session.model_copy(update=update)
     frames, stances = SessionFrames(sources), StancesBeside()
     overview = OverviewBeside(len(sources.info.tiles))

@@ -27,7 +27,7 @@ log = logging.getLogger("foottile.stances")
 _NEEDED = (*GATHERED, "part")
 _ROWS = 1 << 14
 """Number of frames that are analysed together: half a megabyte, a minute or less."""
-_NOT_WRITTEN = f"{STANCES_NAME} was not written, and is made again when it is asked for"
+_NOT_WRITTEN = f"{STANCES_NAME} was not written, and is rebuilt on request"
 
 
 class StancesBeside:

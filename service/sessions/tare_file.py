@@ -98,7 +98,7 @@ def read_tares(path: Path) -> TaresFound:
         return _missing(path)
     except DamagedFileError as error:
         return TaresFound((LOST,), f"{error.what}: all of its tares are lost", is_damaged=True)
-    is_proven, what = False, "it is no whole list of tares"
+    is_proven, what = False, "not a complete list of tares"
     try:
         is_proven = checked(text, where=str(path)).is_proven
         older = None if is_proven else _of_older_version(text)

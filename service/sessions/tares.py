@@ -58,11 +58,11 @@ class TareHistory:
             self._mend(found.problem, is_damaged=found.is_damaged)
 
     def _mend(self, problem: str, *, is_damaged: bool) -> None:
-        done = f"it is kept as {set_aside(self._path).name}" if is_damaged else "it is written anew"
+        done = f"it is kept as {set_aside(self._path).name}" if is_damaged else "it is rewritten"
         try:
             self._keep(self._entries)
         except StorageError as error:
-            done = f"that cannot be mended: {error}"
+            done = f"it cannot be rewritten: {error}"
         self.problem = f"{self._path}: {problem}; {done}"
 
     @property
@@ -133,7 +133,7 @@ class TareHistory:
         fitting = [
             (t_ns, tare)
             for t_ns, tare in known
-            # A lost one may have been taken after it.
+            # A lost tare may be newer than this one.
             if not any(first < t_ns < last for first, last in gaps)
         ]
         tiles = len(info.tiles)
@@ -150,7 +150,7 @@ class TareHistory:
         for at, entry in enumerate(self._entries):
             if isinstance(entry, LostTares):
                 beside = self._t_ns(at - 1, _EVER[0]), self._t_ns(at + 1, _EVER[1])
-                # A clock that was set back in between has them the other way round.
+                # A clock that was set back reverses their order.
                 yield min(beside), max(beside)
 
     def _t_ns(self, at: int, otherwise: int) -> int:
@@ -219,8 +219,8 @@ _EVER = (-(2**63), 2**63 - 1)
 def _bounded(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
     automatic = [t for t in entries if isinstance(t, RecordedTare) and t.is_automatic]
     if len(automatic) > AUTOMATIC_KEPT_MAX:
-        # Drop the tare that says least: in the older half, the one with the closest neighbours. The
-        # very first stays, because others may be compared with it.
+        # Drop the least informative tare: in the older half, the closest to its neighbours. The
+        # very first stays: it may be the reference of automatic tares.
         gaps_ns = {
             now.id: after.tare.t_ns - before.tare.t_ns
             for before, now, after in zip(automatic, automatic[1:], automatic[2:], strict=False)

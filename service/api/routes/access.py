@@ -37,7 +37,7 @@ def present(path: Path) -> Path:
         UnknownError: it does not exist.
     """
     if not path.is_file():
-        raise UnknownError(f"the file {path.name} has been taken away", where=str(path))
+        raise UnknownError(f"the file {path.name} is missing", where=str(path))
     return path
 
 

@@ -16,7 +16,7 @@ from service.server_clock import utc_ns
 router = APIRouter(tags=["login"])
 
 _NOT_TAKEN = (
-    "This ticket is not taken: each is good once and for five minutes, until the server ends. Get "
+    "Invalid ticket: each is valid once and for five minutes, until the server ends. Get "
     "a new one with `foottile ticket` on the computer on which `foottile serve` runs"
 )
 _NOTHING_SHOWN = "A login needs a ticket, or the token as Authorization: Bearer TOKEN"

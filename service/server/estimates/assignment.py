@@ -18,7 +18,7 @@ from service.estimation.calibration import Calibration
 from storage.checked_json import read_checked, write_checked
 from storage.durable import ASIDE, make_folder, put_aside, storage_errors
 
-_LOST = "assign a calibration again, or take the assignment back"
+_LOST = "assign a calibration again, or unassign it"
 
 
 @dataclass(frozen=True)

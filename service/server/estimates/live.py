@@ -88,7 +88,7 @@ class LiveEstimates:
                 self._calibration = calibration
                 self.calibration_id = calibration.id
                 self.ranges = Ranges.of(info, calibration)
-            except FootTileError as error:  # does not fit these tiles: report it and go without
+            except FootTileError as error:  # it does not fit these tiles: report it
                 self.calibration_problem = str(error)
         self.use(tare)
 
@@ -229,7 +229,7 @@ class LiveEstimates:
         """
         calibration = self._needed()
         if not self._recent:
-            raise TareError("no frames have come yet", remedy="Is the node connected?")
+            raise TareError("no frames have come yet", remedy="Connect the node")
         frames = FrameBatch.concatenate(list(self._recent))
         seen = self._seen(frames, calibration)
         return newest_unloaded_tare(seen, present=self.tare, bears=self._bears)

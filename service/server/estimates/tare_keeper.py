@@ -48,7 +48,7 @@ class TareKeeper:
         self._live = live
         self._history = history
         self._automatic = automatic
-        self._lead_is_over = False  # and has been looked at
+        self._lead_is_over = False  # and evaluated
         self._has_seen_lead = False
         self._lead_over_t_ns: int | None = None
         self._lead_problem: str | None = None

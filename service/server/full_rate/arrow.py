@@ -81,7 +81,7 @@ class Encoder:
         for name, column, tile in self._chosen:
             values = getattr(frames, column.name) if column.name in _FRAMES else None
             values = columns.get(column.name) if values is None else values
-            if values is None:  # there is no calibration, no tare, or they are compiled just now
+            if values is None:  # no calibration, no tare, or still compiling
                 arrays.append(pa.array([None] * (end - begin), column.type))
                 continue
             values = values[begin:end] if tile is None else values[begin:end, tile]

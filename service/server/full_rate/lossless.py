@@ -82,7 +82,7 @@ class Lossless:
             return Rows(at.boot_id, rows, found.number if begin == 0 else None)
         stream = self._look(at.boot_id)
         if stream is None:
-            raise HangUp(Close.NO_STREAM, f"not kept any more: stream {at.boot_id}")
+            raise HangUp(Close.NO_STREAM, f"no longer stored: stream {at.boot_id}")
         ahead = memory.after(at.boot_id, at.seq)
         held = stream.held
         if held.within(at.seq, at.seq):
@@ -108,7 +108,7 @@ class Lossless:
             piece = memory[number]
             if piece.boot_id == at.boot_id and piece.first <= at.seq:
                 return piece
-            self._number = None  # frames are missing between
+            self._number = None  # frames between are missing
         return None
 
     def _gap(self, at: Position, stream: Known, ahead: Piece | None) -> Item | None:

@@ -64,7 +64,7 @@ class Newest:
             else:
                 self._number = piece.number + 1
                 begin = 0 if at is None else at.seq - piece.first
-                if begin < len(piece.frames):  # else it was had before the server was restarted
+                if begin < len(piece.frames):
                     self.position = Position(piece.boot_id, piece.last + 1)
                     rows = cut((piece.frames, piece.columns), begin, len(piece.frames))
                     return Rows(piece.boot_id, rows, piece.number if begin == 0 else None)

@@ -120,7 +120,7 @@ class Reader:
             if is_warming() or step == self._not_due:
                 return None
             async with self._memory.turn:
-                step = self._course.next()  # meanwhile frames may have come, or gone
+                step = self._course.next()  # frames may have come or gone meanwhile
                 if not isinstance(step, Again):
                     return step
                 rows = await self._estimated_again(step)
@@ -159,9 +159,9 @@ class Reader:
         if first > at.seq:
             self._recomputed = None
             if begins and stream.held.within(at.seq, at.seq):
-                raise self._unreadable(at, "a frame that is held is not in its journal")
+                raise self._unreadable(at, "a stored frame is not in its journal")
             return None
-        if step.until is not None and last >= step.until:  # memory has the rest, as it came
+        if step.until is not None and last >= step.until:  # the buffer has the rest
             found = cut(found, 0, step.until - first)
         rows = Rows(at.boot_id, found, recomputed=True)
         self._course.had(rows)
@@ -169,5 +169,5 @@ class Reader:
 
     def _unreadable(self, at: Position, why: object) -> HangUp:
         log.warning("node %s, for a live client: %s", self._node.name, why)
-        reason = f"frame {at.seq} cannot be given, see the server's log; {at}"
+        reason = f"frame {at.seq} cannot be read, see the server's log; {at}"
         return HangUp(Close.UNREADABLE, reason)

@@ -166,7 +166,7 @@ class Recomputed:
                 return None
             begin = int(np.searchsorted(frames.seq, self.position.seq))
             end = min(len(frames), begin + ROWS_AT_ONCE)
-            # Only frames that follow one another leave together.
+            # Return consecutive frames only.
             steps = np.flatnonzero(np.diff(frames.seq[begin:end]) != 1)
             if len(steps):
                 end = begin + int(steps[0]) + 1
@@ -181,7 +181,7 @@ def _fits(calibration: Calibration, info: ArrayInfo, present: ArrayInfo) -> bool
     """Return whether a stream can be estimated with the calibration of the node's present one."""
     if not info.has_same_tiles_as(present):
         return False
-    try:  # its scene may have asked for other models
+    try:  # its scene may name other models
         EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
     except FootTileError:
         return False

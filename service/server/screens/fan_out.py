@@ -118,7 +118,7 @@ class Feed:
             return
         told = Told(self._summary, _ages_ms(self._nodes.values()))
         for at, viewer in enumerate(tuple(self.viewers), 1):
-            if viewer in self.viewers:  # it may have left while others had their turn
+            if viewer in self.viewers:  # it may have left meanwhile
                 viewer.tell(told, now_s)
             if at % _AT_A_TIME == 0:
                 await asyncio.sleep(0)

@@ -115,7 +115,7 @@ def test_a_viewer_looks_and_cannot_press(guarded: Running) -> None:
     with logged_in(guarded, "look") as viewer:
         for method, path in CHANGES:
             answer = viewer.request(method, path, json={})
-            assert_refused(answer, 403, "look and not press")
+            assert_refused(answer, 403, "may not change anything")
         assert viewer.get("/sessions").status_code == 200
 
 

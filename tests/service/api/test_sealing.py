@@ -272,7 +272,7 @@ def test_a_session_without_tare_is_sealed_raw_and_says_why(node: FakeNode) -> No
 def test_a_session_without_frames_says_so(tared: FakeNode) -> None:
     session = tared.record()
     sealed = tared.finish(session)
-    assert sealed["problem"] == "not one frame was recorded"
+    assert sealed["problem"] == "no frame was recorded"
     assert sealed["frames"] == 0
     assert sealed["complete"] is True
 

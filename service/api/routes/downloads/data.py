@@ -83,7 +83,7 @@ async def data(
     if session.state != "sealed" and query.to.needs_sealed:
         others = [each.name for each in FORMATS.values() if not each.needs_sealed]
         raise StateError(
-            f"session {session_id} is {session.state}, and {query.to.title} is made when it is "
+            f"session {session_id} is {session.state}, and {query.to.title} is available when it is "
             "sealed",
             remedy=f"Stop it, or ask for format={' or '.join(others)}",
         )
@@ -108,7 +108,7 @@ def _stored(
     if wanted is not None:
         found = _SINGLE_RANGE.fullmatch(wanted.replace(" ", ""))
         if found is None or (found[2] and found[1] and int(found[2]) < int(found[1])):
-            # RFC 9110 14.2: what is not understood, or is several, is ignored.
+            # RFC 9110 14.2: an invalid range, or several, are ignored.
             del MutableHeaders(scope=request.scope)["range"]
         elif (found[1] and int(found[1]) >= size) or found[3] == "0":
             return problem(
@@ -163,12 +163,12 @@ def _chunks(session: Session, query: DataQuery, server: Server, marks: Marks | N
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
-        # Of all frames each is needed once, whatever is remembered of some.
+        # A whole session is estimated once: no cached preview is needed.
         is_some, so_fars = query.slice.is_some, server.so_fars
         so_far = so_fars.nearly(sources) if is_some else SoFar(sources, server.data)
         frames = FramesSoFar(so_far, sources, query.slice)
         source = {"session": session.id, "state": session.state}
-        content = frames.content()  # the first frames: then it is known how they are estimated
+        content = frames.content()  # reads the first frames, which sets `notes`
         yield from query.to.written(
             Export(
                 content,

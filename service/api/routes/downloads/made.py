@@ -40,7 +40,7 @@ def known(session: Session) -> Session:
 async def tag_of_made(session: Session, query: MadeQuery, server: Server) -> str:
     """Return an entity tag of everything that an export of a session depends on."""
     beside = ""
-    if query.clock_name == "server" or query.has_marks:  # marks are placed by the clocks
+    if query.clock_name == "server" or query.has_marks:  # markers are placed by the clocks
         beside = await run_in_threadpool(_clocks_hash, session, server)
     if query.has_marks:
         beside += "".join(event.model_dump_json() for event in session.events)

@@ -62,7 +62,7 @@ async def take_data(
         if session.sha256 is None:
             raise StateError(
                 f"session {session.id} of {session.node} is {session.state}, and {to.title} of a "
-                "take is made when all of it is sealed",
+                "take is available when all of it is sealed",
                 remedy="Stop it, or ask for each session by itself",
             )
     is_lossy = any(server.recorder.ledger(session.id).lossy for session in sessions)

@@ -67,7 +67,7 @@ async def zip_sessions(
 def _sealed(session: Session, folder: Path) -> Sealed:
     if session.state != "sealed":
         raise StateError(
-            f"session {session.id} is {session.state}, and a zip file is of sealed ones",
+            f"session {session.id} is {session.state}, and a zip file has sealed ones only",
             remedy="Stop it, or leave it out",
         )
     if session.sha256 is None:

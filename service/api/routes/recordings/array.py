@@ -83,7 +83,7 @@ def _view(
 ) -> ArrayView:
     try:
         ranges = None if calibration is None else Ranges.of(info, calibration)
-    except FootTileError:  # it is of other tiles: then there are no estimates by it either
+    except FootTileError:  # it is of other tiles
         ranges = None
     said = None
     if calibration is not None and ranges is not None:

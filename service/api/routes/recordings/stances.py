@@ -185,7 +185,7 @@ def _sealed(session_id: str, server: Server) -> Session:
     session = server.sessions.get(session_id)
     if session.state != "sealed":
         raise StateError(
-            f"session {session_id} is {session.state}, and its stances are counted when it is "
+            f"session {session_id} is {session.state}, and its stances are available when it is "
             "sealed",
             remedy="Stop it",
         )

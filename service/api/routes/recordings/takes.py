@@ -40,7 +40,7 @@ class TakeView(View):
     )
     failed: dict[str, ShownText] = Field(
         description="Errors by node; the other nodes are not affected.",
-        examples=[{"left": "node 'left' is not sending. Record when it is connected"}],
+        examples=[{"left": "node 'left' sends no frames. Connect it and retry"}],
     )
 
     @classmethod

@@ -63,11 +63,11 @@ async def ingest(socket: WebSocket, server: Server) -> None:
             await _serve(socket, server, link)
     except HangUp as end:
         await _close(socket, end)
-    except WebSocketDisconnect:  # it went away, perhaps while we were sending
+    except WebSocketDisconnect:  # it disconnected, perhaps while we were sending
         pass
     except Exception:
         log.exception("this is a bug; a node's connection ends, the server goes on")
-        await _close(socket, HangUp(Close.BUG, "the server has a bug; its log says which"))
+        await _close(socket, HangUp(Close.BUG, "bug in the server; see its log"))
 
 
 async def _challenge(socket: WebSocket, server: Server, offered: list[str]) -> Claim:
@@ -79,7 +79,7 @@ async def _challenge(socket: WebSocket, server: Server, offered: list[str]) -> C
         )
     first = await _receive(socket)
     if (protocol := _protocol_of(first)) is not None and protocol != PROTOCOL:
-        # Before it is read: another version's first message has other fields.
+        # Before parsing: another version's first message has other fields.
         raise HangUp(
             Close.WRONG_VERSION,
             f"protocol {protocol}; this server speaks {PROTOCOL}: update the "
@@ -103,7 +103,7 @@ async def _receive_hello(socket: WebSocket, claim: Claim) -> Hello:
     if hello.array_info.node != claim.node:
         raise HangUp(
             Close.REFUSED,
-            f"node {claim.node!r} says hello as {hello.array_info.node[:80]!r}",
+            f"node {claim.node!r} sends hello as {hello.array_info.node[:80]!r}",
         )
     return hello
 
@@ -244,7 +244,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
             case Lost():
                 _announced(node, said.boot_id).note_losses(said.lost)
             case Identify() | Proof() | Hello():
-                raise HangUp(Close.REFUSED, f"{said.type} was said before")
+                raise HangUp(Close.REFUSED, f"{said.type} was sent before")
 
 
 def _announced(node: ServerNode, boot_id: str) -> ServerStream:
@@ -282,7 +282,7 @@ async def _receive(socket: WebSocket) -> str | bytes:
         async with asyncio.timeout(SILENCE_S):
             message = await socket.receive()
     except TimeoutError as error:
-        raise HangUp(Close.SILENT, f"nothing was heard for {SILENCE_S:g} s") from error
+        raise HangUp(Close.SILENT, f"nothing was received for {SILENCE_S:g} s") from error
     if message["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(message.get("code", 1005))
     data: str | bytes | None = message.get("bytes")

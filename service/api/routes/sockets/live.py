@@ -44,7 +44,7 @@ async def live(socket: WebSocket, server: Server) -> None:
             await _show(socket, server, outlet)
     except HangUp as end:
         outlet.hang_up(end.code, close_reason(end.reason))
-    except WebSocketDisconnect:  # it went away, perhaps while we were sending
+    except WebSocketDisconnect:  # it disconnected, perhaps while we were sending
         pass
     except Exception:
         log.exception("this is a bug; one live connection ends, the server goes on")
@@ -127,7 +127,7 @@ async def _read(socket: WebSocket) -> None:
             with suppress(ValueError, RecursionError):
                 said = json.loads(text)
         if not isinstance(said, dict) or said.get("type") != "ping":
-            raise HangUp(Close.POLICY, 'only {"type":"ping","t_ms":NUMBER} is understood here')
+            raise HangUp(Close.POLICY, 'only {"type":"ping","t_ms":NUMBER} is accepted here')
         t_ms = said.get("t_ms")
         if isinstance(t_ms, bool) or not isinstance(t_ms, int | float) or not abs(t_ms) < 1e18:
             raise HangUp(Close.POLICY, "ping needs t_ms, a number")
