@@ -83,8 +83,8 @@ async def data(
     if session.state != "sealed" and query.to.needs_sealed:
         others = [each.name for each in FORMATS.values() if not each.needs_sealed]
         raise StateError(
-            f"session {session_id} is {session.state}, and {query.to.title} is available when it is "
-            "sealed",
+            f"session {session_id} is {session.state}, and {query.to.title} is available when it "
+            "is sealed",
             remedy=f"Stop it, or ask for format={' or '.join(others)}",
         )
     if session.sha256 is not None and query.is_stored:
