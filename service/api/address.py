@@ -188,9 +188,9 @@ def token_for(given: str | None, data: Path) -> str:
         log.warning("%s, and a new token is generated", put_aside(path, error))
     with storage_errors(path):
         data.mkdir(parents=True, exist_ok=True)
-        kept = secrets.token_urlsafe(18)
-        write_whole(path, kept.encode() + b"\n", mode=0o600)
-    return kept
+        token = secrets.token_urlsafe(18)
+        write_whole(path, token.encode() + b"\n", mode=0o600)
+    return token
 
 
 def kept_token(data: Path) -> str:
@@ -202,10 +202,10 @@ def kept_token(data: Path) -> str:
         StorageError: it cannot be read: only its user may.
     """
     path = data / KEPT_IN
-    kept = read_whole(path).decode("ascii", "replace").strip()
-    if not _TOKEN.fullmatch(kept):
+    token = read_whole(path).decode("ascii", "replace").strip()
+    if not _TOKEN.fullmatch(token):
         raise DamagedFileError("it holds no token", where=str(path))
-    return kept
+    return token
 
 
 @contextmanager

@@ -154,8 +154,8 @@ class Doors:
 
     def go(self, visitor: Visitor) -> None:
         """Remove a closed connection."""
-        for those in (self._waiting, self._busy, self._nodes):
-            those.pop(visitor, None)
+        for places in (self._waiting, self._busy, self._nodes):
+            places.pop(visitor, None)
         self._leaving.discard(visitor)
 
     def turn_out(self) -> None:

@@ -134,11 +134,11 @@ class Guard:
         needed = self._needed(scope)
         if needed is None:
             return None
-        shown = self._logins.shown_by(HTTPConnection(scope))
-        if shown.left_s is not None and changes and "origin" not in headers:
+        credentials = self._logins.shown_by(HTTPConnection(scope))
+        if credentials.left_s is not None and changes and "origin" not in headers:
             # Cookies come from browsers, which state the Origin of every change.
-            shown = Shown(None)
-        return _lacking(needed, shown)
+            credentials = Shown(None)
+        return _lacking(needed, credentials)
 
     def _needed(self, scope: Scope) -> Right | None:
         path, looking = scope["path"], Right.LOOK if self._logins.is_private else None

@@ -89,14 +89,14 @@ class Secrets:
     def _find(self, secret: str) -> bytes | None:
         self._forget_old()
         digest, found = _digest(secret), None
-        for known in self._given:  # compare all: constant time
-            if hmac.compare_digest(known, digest):
-                found = known
+        for stored in self._given:  # compare all: constant time
+            if hmac.compare_digest(stored, digest):
+                found = stored
         return found
 
     def _forget_old(self) -> None:
         now_s = self._now_s()
-        self._given = {d: given for d, given in self._given.items() if given.ends_s > now_s}
+        self._given = {d: grant for d, grant in self._given.items() if grant.ends_s > now_s}
 
 
 def _digest(secret: str) -> bytes:
@@ -140,10 +140,10 @@ class Logins:
     def shown_by(self, request: HTTPConnection) -> Shown:
         """Check the credentials of a request; the token takes precedence over a cookie."""
         if "authorization" in request.headers:
-            given = bearer_token(request.headers.getlist("authorization"))
-            if given is not None and hmac.compare_digest(given.encode(), self.token.encode()):
+            token = bearer_token(request.headers.getlist("authorization"))
+            if token is not None and hmac.compare_digest(token.encode(), self.token.encode()):
                 return Shown(Right.OWN)
-            return Shown(None, has_wrong_token=given is not None)
+            return Shown(None, has_wrong_token=token is not None)
         cookie = self.cookie_of(request)
         if cookie is None:
             return Shown(None)

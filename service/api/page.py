@@ -51,9 +51,9 @@ class PageFiles(StaticFiles):
         status_code: int = 200,
     ) -> Response:
         """Answer with a file, compressed if the client accepts gzip; each form has its own ETag."""
-        asked = Headers(scope=scope)
+        request_headers = Headers(scope=scope)
         file = self._file(Path(full_path), stat_result)
-        packed = file.packed is not None and takes_gzip(asked.get("accept-encoding", ""))
+        packed = file.packed is not None and takes_gzip(request_headers.get("accept-encoding", ""))
         answer = Response(
             file.packed if packed else file.plain,
             status_code=status_code,
@@ -62,20 +62,20 @@ class PageFiles(StaticFiles):
         )
         if packed:
             answer.headers["Content-Encoding"] = "gzip"
-        if self.is_not_modified(answer.headers, asked):
+        if self.is_not_modified(answer.headers, request_headers):
             return NotModifiedResponse(answer.headers)
         return answer
 
     def _file(self, path: Path, stat: os.stat_result) -> _Kept:
         written = (stat.st_mtime_ns, stat.st_size)
-        kept = self._kept.get(str(path))
-        if kept is None or kept.written != written:
+        cached = self._kept.get(str(path))
+        if cached is None or cached.written != written:
             plain = path.read_bytes()
             packed = gzip.compress(plain, 9, mtime=0)
-            kept = self._kept[str(path)] = _Kept(
+            cached = self._kept[str(path)] = _Kept(
                 written,
                 plain,
                 packed if len(packed) < _WORTH_IT * len(plain) else None,
                 hashlib.sha256(plain).hexdigest(),
             )
-        return kept
+        return cached

@@ -34,7 +34,7 @@ log = logging.getLogger("foottile.book")
 def load_or_restore(folder: SessionFolder) -> tuple[list[Session], dict[str, str]]:
     """Load all sessions, rebuilding damaged ones; return them, and errors by id."""
     found, unreadable = folder.load_all()
-    left: dict[str, str] = {}
+    errors: dict[str, str] = {}
     for session_id, error in unreadable.items():
         if not any(folder.path(session_id).glob("[!.]*")):
             continue  # never saved
@@ -45,11 +45,11 @@ def load_or_restore(folder: SessionFolder) -> tuple[list[Session], dict[str, str
             session = None
         if session is None:
             log.warning("session %s is left out, and no frames are dropped: %s", session_id, error)
-            left[session_id] = str(error)
+            errors[session_id] = str(error)
         else:
             log.warning("session %s: %s", session_id, session.problem)
             found.append(session)
-    return found, left
+    return found, errors
 
 
 def told_strays(strays: Iterable[StraySession]) -> dict[str, str]:
@@ -277,7 +277,7 @@ class SessionBook:
             StorageError: it cannot be saved.
         """
         session = self.get(session_id)
-        event = next((known for known in session.events if known.id == event_id), None)
+        event = next((marker for marker in session.events if marker.id == event_id), None)
         if event is None:
             event = Event(
                 id=event_id or uuid.uuid4().hex[:12],

@@ -123,17 +123,17 @@ class CalibrationBook:
             StateError: the store is full.
             StorageError: it cannot be written.
         """
-        kept = Kept.of(calibration)
-        if kept.id not in self._kept and len(self._kept) >= CALIBRATIONS_MAX:
+        summary = Kept.of(calibration)
+        if summary.id not in self._kept and len(self._kept) >= CALIBRATIONS_MAX:
             raise StateError(
                 f"this server keeps {len(self._kept)} calibrations already",
                 remedy="Delete unused ones",
             )
         with storage_errors(self._folder):
             make_folder(self._folder)
-        write_whole(self._path(kept.id), content_of(calibration))
-        self._kept[kept.id] = kept
-        return kept
+        write_whole(self._path(summary.id), content_of(calibration))
+        self._kept[summary.id] = summary
+        return summary
 
     def delete(self, calibration_id: str) -> None:
         """Delete a calibration; nodes and sessions that use it have a copy.

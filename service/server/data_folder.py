@@ -151,14 +151,14 @@ class DataFolder:
         """
         path = self.path / SERVER_ID_NAME
         try:
-            kept = read_server_id(path)
+            stored = read_server_id(path)
         except FileNotFoundError:
             return None
         except DamagedFileError as error:
             self.problems.append(f"{put_aside(path, error)}; nodes treat this server as a new one")
             log.warning("%s", self.problems[-1])
             return None
-        return kept.id if kept.is_proven else self._new_id(kept.id)
+        return stored.id if stored.is_proven else self._new_id(stored.id)
 
     def _new_id(self, made: str) -> str:
         write_server_id(self.path / SERVER_ID_NAME, made)

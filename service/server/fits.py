@@ -193,10 +193,10 @@ class Fits:
         Raises:
             StateError: the process failed.
         """
-        said = {"name": fit.name, **options}
+        all_options = {"name": fit.name, **options}
         process = await asyncio.create_subprocess_exec(
             *(*_COMMAND, f"--out={out}"),
-            *(f"--{name.replace('_', '-')}={value}" for name, value in said.items()),
+            *(f"--{name.replace('_', '-')}={value}" for name, value in all_options.items()),
             *("--", *map(str, paths)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,

@@ -79,10 +79,10 @@ def followed(session: Session, node: ServerNode) -> list[Session]:
     """
     found = [reattach(session, node)]
     while found[-1].parts[-1].seq_last is None:
-        further = _step(found[-1], node)
-        if not further:
+        extended = _step(found[-1], node)
+        if not extended:
             break
-        found[-1:] = further
+        found[-1:] = extended
     return found
 
 
@@ -93,26 +93,35 @@ def reattach(session: Session, node: ServerNode) -> Session:
     one goes on, as when a copy of a node's card was in use for a while, the recording goes on in
     the earlier one, with all frames that it has had meanwhile.
     """
-    left = session.parts[-1]
-    stream = node.streams.get(left.boot_id)
-    may_go_on = stream is not None and (left.boot_id in node.order or bool(stream.may_come))
-    if left.seq_last is not None or not node.has_spoken or may_go_on or left.boot_id in node.unread:
+    last_part = session.parts[-1]
+    stream = node.streams.get(last_part.boot_id)
+    may_go_on = stream is not None and (last_part.boot_id in node.order or bool(stream.may_come))
+    if (
+        last_part.seq_last is not None
+        or not node.has_spoken
+        or may_go_on
+        or last_part.boot_id in node.unread
+    ):
         return session
     for boot_id in node.order:
-        own = [part for part in session.parts if part.boot_id == boot_id]
+        own_parts = [part for part in session.parts if part.boot_id == boot_id]
         stream = node.streams[boot_id]
-        ends = [part.seq_last for part in own if part.seq_last is not None]
+        ends = [part.seq_last for part in own_parts if part.seq_last is not None]
         seq_first = max(ends, default=-1) + 1
-        if own and (stream.held | stream.may_come).within(seq_first, NO_END):
+        if own_parts and (stream.held | stream.may_come).within(seq_first, NO_END):
             session = _go_on_in(session, node, Part(boot_id=boot_id, seq_first=seq_first))
     return session
 
 
 def _go_on_in(session: Session, node: ServerNode, part: Part) -> Session:
     """Return the session with its open part closed and another one open."""
-    *before, left = at_end(session, streams_of(session, node), utc_ns()).parts
+    *before, last_part = at_end(session, streams_of(session, node), utc_ns()).parts
     tails = {name: n for name, n in session.unsynced_tail_max.items() if name != part.boot_id}
-    parts = before if left.seq_last is None or left.seq_last < left.seq_first else [*before, left]
+    parts = (
+        before
+        if last_part.seq_last is None or last_part.seq_last < last_part.seq_first
+        else [*before, last_part]
+    )
     if parts and parts[-1].boot_id == part.boot_id:
         part = parts.pop().model_copy(update={"seq_last": None})
     return session.model_copy(update={"parts": (*parts, part), "unsynced_tail_max": tails})
@@ -162,11 +171,11 @@ def _step(session: Session, node: ServerNode) -> list[Session]:
     following = next(iter(_following(session, node)), None)
     if following is None:
         return []
-    begun = session.stopped_t_ns is None or _has_begun(session, node, following)
-    if begun is None:
+    began = session.stopped_t_ns is None or _has_begun(session, node, following)
+    if began is None:
         return []
     closed, stream = at_end(session, streams, utc_ns()), streams[boot_id]
-    if not begun:
+    if not began:
         wanted = numbers_of(closed.parts).get(boot_id, Intervals())
         return [] if (stream.may_come - stream.held) & wanted else [closed]
     info = node.streams[following].info
@@ -199,8 +208,8 @@ def _following(session: Session, node: ServerNode) -> Iterable[str]:
         begin = node.streams[name].t_ns_first
         return newest is not None and begin is not None and begin > newest
 
-    known = {part.boot_id for part in session.parts}
-    return [n for n in order if n not in known and (n == node.boot_id or is_later(n))]
+    known_ids = {part.boot_id for part in session.parts}
+    return [n for n in order if n not in known_ids and (n == node.boot_id or is_later(n))]
 
 
 def _offset_ns(session: Session, node: ServerNode | None, boot_id: str) -> int | None:
@@ -231,17 +240,17 @@ def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
     stop_t_ns = session.stopped_t_ns or utc_ns()
     offset_ns = _offset_ns(session, node, boot_id)
     if boot_id != node.boot_id:
-        known = offset_ns is not None and stream.t_ns_first is not None
-        return _begin_t_ns(session, node, boot_id) <= stop_t_ns if known else None
-    said = node.hello
-    if node.greeted_t_ns is not None and not said.next_seq and not stream.held:
+        is_known = offset_ns is not None and stream.t_ns_first is not None
+        return _begin_t_ns(session, node, boot_id) <= stop_t_ns if is_known else None
+    hello = node.hello
+    if node.greeted_t_ns is not None and not hello.next_seq and not stream.held:
         # Hello may not count the newest frames; these come at once.
         is_settled = stop_t_ns < node.greeted_t_ns < utc_ns() - _UNHEARD_NS
         return False if is_settled else None
-    if said.t_ns_first and said.held and offset_ns is not None:
-        if said.t_ns_first + offset_ns <= stop_t_ns:
+    if hello.t_ns_first and hello.held and offset_ns is not None:
+        if hello.t_ns_first + offset_ns <= stop_t_ns:
             return True
-        if said.held[0][0] == 0:
+        if hello.held[0][0] == 0:
             return False
     journal = stream.journal
     oldest = next(iter(stream.held), None)
@@ -262,8 +271,8 @@ def ledger_now(session: Session, node: ServerNode | None) -> Ledger:
     if session.state == "sealed" and session.ledger is not None:
         return session.ledger
     finished = session.stopped_t_ns is not None and session.parts[-1].seq_last is not None
-    about, streams = _provisional(session, node)
-    return ledger_of(about.parts, states_of(about, streams), finished=finished)
+    likely, streams = _provisional(session, node)
+    return ledger_of(likely.parts, states_of(likely, streams), finished=finished)
 
 
 def sources_now(session: Session, node: ServerNode, *, exact: bool = False) -> Sources:

@@ -111,10 +111,10 @@ class NodeIdentities:
             StorageError: as `read_secret`.
         """
         node, answer = claim.node, claim.answer
-        known = self.secret_of(node)
-        if known is None:
+        secret = self.secret_of(node)
+        if secret is None:
             return False
-        if is_proven(known, claim.challenge, node, answer):
+        if is_proven(secret, claim.challenge, node, answer):
             return True
         if answer.secret is not None:
             self.replacements[node] = Replacement(answer.secret, claim.address, now_t_ns)

@@ -45,9 +45,9 @@ class SessionIndex:
 
     def put(self, session: Session) -> None:
         """Add a session, or replace the one with its id."""
-        known = self._by_id.get(session.id)
-        if known is None or age_of(known) != age_of(session):
-            if known is not None:
+        previous = self._by_id.get(session.id)
+        if previous is None or age_of(previous) != age_of(session):
+            if previous is not None:
                 self.take(session.id)
             insort(self._ages, age_of(session))
         self._by_id[session.id] = session

@@ -145,9 +145,9 @@ class ServerNode:
     @property
     def lost(self) -> dict[str, int]:
         """Number of lost frames of the present stream, by reason."""
-        gone = self.missing - self.present.may_come
-        named = {why: lost.count for why, lost in self.present.lost.within(gone).items()}
-        if unnamed := gone.count - sum(named.values()):
+        unobtainable = self.missing - self.present.may_come
+        named = {why: lost.count for why, lost in self.present.lost.within(unobtainable).items()}
+        if unnamed := unobtainable.count - sum(named.values()):
             named[NODE_RESTARTED] = named.get(NODE_RESTARTED, 0) + unnamed
         return named
 
@@ -209,9 +209,9 @@ class ServerNode:
         for name in self.order:
             stream, present = self.streams[name], name == self.boot_id
             wanted = needed.get(name, Intervals())
-            asked = stream.lacks(wanted, all_of_it=present)
-            first = (asked & wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
-            numbers = _joined([*first, *asked - first])
+            requested = stream.lacks(wanted, all_of_it=present)
+            first = (requested & wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
+            numbers = _joined([*first, *requested - first])
             if numbers:
                 found.append(StreamNumbers(boot_id=name, numbers=with_open_ends(numbers)))
         return tuple(found)
@@ -315,11 +315,11 @@ class ServerNode:
             StorageError: a file cannot be deleted.
         """
         for name, stream in list(self.streams.items()):
-            kept = keep.get(name, Intervals())
+            needed = keep.get(name, Intervals())
             if stream is self.present:
                 if self.last_t_ns is not None:
-                    stream.prune(self.last_t_ns - RING_NS, kept)
-            elif not kept:
+                    stream.prune(self.last_t_ns - RING_NS, needed)
+            elif not needed:
                 is_there = stream.journal is not None
                 stream.delete()
                 if name not in self.order:

@@ -91,8 +91,8 @@ class ServerNodes:
             UnknownError: no node has this name.
         """
         if name not in self._nodes:
-            known = ", ".join(self._nodes) or "none so far"
-            raise UnknownError(f"no node {name[:80]!r}", expected=f"one of: {known}")
+            names = ", ".join(self._nodes) or "none so far"
+            raise UnknownError(f"no node {name[:80]!r}", expected=f"one of: {names}")
         return self._nodes[name]
 
     def greet(self, hello: Hello) -> ServerNode:
@@ -115,10 +115,10 @@ class ServerNodes:
             except FootTileError as error:
                 raise LinkError(f"node {info.node!r} cannot be accepted: {error}") from error
         node = self._nodes[info.node]
-        for said in (info, *(each.array_info for each in hello.earlier)):
-            known = node.streams.get(said.boot_id)
-            if known is not None and known.info != said:
-                raise LinkError(f"stream {said.boot_id} was announced with another array")
+        for announced in (info, *(each.array_info for each in hello.earlier)):
+            stored = node.streams.get(announced.boot_id)
+            if stored is not None and stored.info != announced:
+                raise LinkError(f"stream {announced.boot_id} was announced with another array")
         return node
 
     def forget(self, name: str) -> None:
@@ -142,8 +142,8 @@ def _read_hello(path: Path) -> Hello:
     text = read_checked(path).text
     again = "the node is unknown until it connects"
     try:
-        said = json.loads(text)
-        protocol = said["protocol"]
+        content = json.loads(text)
+        protocol = content["protocol"]
         hello = Hello.model_validate_json(text) if protocol == PROTOCOL else None
         if hello is not None:
             _check(hello)

@@ -306,12 +306,12 @@ class Recorder:
         try:
             for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
                 stream = node.streams.get(boot_id)
-                known = [row.t_mono_ns for row in session.clock if row.boot_id == boot_id]
+                times_ns = [row.t_mono_ns for row in session.clock if row.boot_id == boot_id]
                 # A log may be long: read it only if the session lacks its newest row.
                 if (
                     stream is not None
                     and stream.clock is not None
-                    and (stream.clock.t_mono_ns > max(known, default=-1))
+                    and (stream.clock.t_mono_ns > max(times_ns, default=-1))
                 ):
                     session = session.with_clock(stream.all_clock_rows())
         except StorageError as error:  # frames matter more than clock measurements

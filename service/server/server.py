@@ -349,7 +349,7 @@ class Server:
 
     async def _sync_stream(self, node: ServerNode, stream: ServerStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()
-        owed, stream.owed = stream.owed, Intervals()
+        unacked, stream.owed = stream.owed, Intervals()
         try:
             await asyncio.to_thread(stream.sync)
             self.folder.check()
@@ -362,8 +362,8 @@ class Server:
                 raise
             return
         link = self.links.get(node.name)
-        if link is not None and owed:
-            link.acknowledge(stream.boot_id, owed)
+        if link is not None and unacked:
+            link.acknowledge(stream.boot_id, unacked)
 
     async def _try_again(self, node: ServerNode) -> None:
         """Retry after a storage error; once the disk is writable, request the missing frames."""

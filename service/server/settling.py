@@ -140,11 +140,11 @@ class Settling:
             return session
         followed = following.followed(session, node)
         # Save the sessions that continue it first: if the server is killed between, none is lost.
-        further = followed[1:]
-        if further and not any(
-            known.continues == session.id for known in self._book.newest_first()
+        continuations = followed[1:]
+        if continuations and not any(
+            other.continues == session.id for other in self._book.newest_first()
         ):
-            for each in reversed(further):
+            for each in reversed(continuations):
                 self._book.keep(each)
         return session if followed[0] is session else self._book.keep(followed[0])
 

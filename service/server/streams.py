@@ -140,8 +140,8 @@ class ServerStream:
     @property
     def may_come(self) -> Intervals:
         """Frames that the node can still send, or has sent."""
-        known = Intervals([(0, NO_END)]) if self.node_has is None else self.node_has
-        return known - Losses(self.notes.lost).all
+        reported = Intervals([(0, NO_END)]) if self.node_has is None else self.node_has
+        return reported - Losses(self.notes.lost).all
 
     @property
     def lost(self) -> Losses:
@@ -184,11 +184,11 @@ class ServerStream:
         """
         if self.journal is None:
             return None
-        found, held = self._around.get((t_ns, at_least)), self.held
+        found, stored = self._around.get((t_ns, at_least)), self.held
         if found is not None:
             last, after = found
-            ends = held.within(after, after) and (last < at_least or held.within(last, last))
-            missing = held.missing(last + 1, after - 1) if after > last + 1 else Intervals()
+            ends = stored.within(after, after) and (last < at_least or stored.within(last, last))
+            missing = stored.missing(last + 1, after - 1) if after > last + 1 else Intervals()
             none_came = missing.count == after - last - 1
             if ends and (none_came or (waiting and missing & self.may_come)):
                 return found
@@ -215,10 +215,10 @@ class ServerStream:
         """
         if self.node_has is None:
             return Intervals()
-        asked = self.may_come - self.held
+        requested = self.may_come - self.held
         if all_of_it:
-            return asked - (self._forgotten - needed)
-        return asked & needed
+            return requested - (self._forgotten - needed)
+        return requested & needed
 
     def is_present(self, hello: Hello, now_t_ns: int) -> None:
         """Handle hello of the node for which this is the present stream."""

@@ -80,8 +80,8 @@ class Takes:
             StateError: no node could be recorded.
             UsageError: the key came with another request before.
         """
-        if begun := self._book.begun_by(asked):
-            return self._begun(begun, nodes or ())
+        if earlier := self._book.begun_by(asked):
+            return self._begun(earlier, nodes or ())
         if nodes is None:
             nodes = sorted(node.name for node in self._nodes if node.connected)
         take = Take(secrets.token_hex(6))

@@ -72,7 +72,7 @@ def taken_up(
     if session.state == "recording":
         update |= {"state": "pending", "stopped_t_ns": begin_t_ns}
     name, number = numbered(session.name)
-    further = begun(
+    continuation = begun(
         info,
         f"{name} ({number + 1})",
         Part(boot_id=info.boot_id, seq_first=0),
@@ -85,7 +85,7 @@ def taken_up(
         continues=session.id,
         **{field: getattr(session, field) for field in ("subject", "notes", "tags", "take")},
     )
-    return session.model_copy(update=update), further
+    return session.model_copy(update=update), continuation
 
 
 def numbered(name: str) -> tuple[str, int]:

@@ -92,16 +92,16 @@ class SeriesKept:
         path = folder / SERIES_NAME
         with self._one_at_a_time:
             stamps = stamps_of(path)
-            kept = self._of.pop(path, None)
-            if kept is None or kept[0] != stamps:
+            cached = self._of.pop(path, None)
+            if cached is None or cached[0] != stamps:
                 table = read_series(folder)
                 if table is None:
                     return None
-                kept = stamps, Series(folder, table)
-            self._of[path] = kept
+                cached = stamps, Series(folder, table)
+            self._of[path] = cached
             while len(self._of) > _KEPT:
                 self._of.popitem(last=False)
-            return kept[1]
+            return cached[1]
 
 
 def _bins_of(table: pa.Table, gap_ns: float) -> Bins:

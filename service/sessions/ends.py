@@ -199,14 +199,14 @@ def _unheard(session: Session, stream: SessionStream, now_t_ns: int | None) -> i
 
     Until the earlier of stop and now; if neither is known, until the newest was synced.
     """
-    known = [t_ns for t_ns in (session.stopped_t_ns, now_t_ns) if t_ns is not None]
-    if not known:
+    limits_ns = [t_ns for t_ns in (session.stopped_t_ns, now_t_ns) if t_ns is not None]
+    if not limits_ns:
         return open_tail(stream)
     # Arrival times of delayed frames are too late.
     newest_t_ns, seen_t_ns = stream.t_ns_near(NO_END, newest=True), stream.last_seen_t_ns
     if newest_t_ns is not None and (stream.offset_ns is not None or seen_t_ns is None):
         seen_t_ns = newest_t_ns + (stream.offset_ns or 0)
-    silent_s = (min(known) - (seen_t_ns or session.started_t_ns)) / 1e9
+    silent_s = (min(limits_ns) - (seen_t_ns or session.started_t_ns)) / 1e9
     return max(1, stream.unsynced_tail_max, math.ceil(silent_s * _rate_hz(stream)))
 
 

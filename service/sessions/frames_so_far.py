@@ -67,9 +67,9 @@ class FramesSoFar:
         """Return the ranges of checkpoints with frames of an interval; the last one is open."""
         newest = len(self._places) - 1
         wanted = [
-            at
-            for at, place in enumerate(self._places[:newest])
-            if place.left < self._places[at + 1].left
+            index
+            for index, place in enumerate(self._places[:newest])
+            if place.left < self._places[index + 1].left
             and self._axis.may_overlap(place.begin_ns, place.end_ns, begin_ns, end_ns)
         ]
         last = self._places[newest].last
@@ -77,18 +77,18 @@ class FramesSoFar:
         if end_ns is None or last is None or self._is_before(*last, end_ns):
             wanted.append(newest)
         legs: list[tuple[int, int]] = []
-        for at in wanted:
-            begin = legs.pop()[0] if legs and legs[-1][1] == at else at
-            legs.append((begin, at + 1))
+        for index in wanted:
+            begin = legs.pop()[0] if legs and legs[-1][1] == index else index
+            legs.append((begin, index + 1))
         return legs
 
     def _run(self, begin: int, end: int, end_ns: int | None) -> Pieces:
         """Yield the frames between two checkpoints, with estimates, up to an end time."""
         places = self._places
-        left = places[end].left if end < len(places) else NO_END
-        at, stream = self._milestones.stream_at(places, begin, self._sources)
-        ahead, count = places[begin].left - places[at].left, left - places[at].left
-        pieces: Pieces = raw_from(self._sources, places[at].part, places[at].seq)
+        end_count = places[end].left if end < len(places) else NO_END
+        start, stream = self._milestones.stream_at(places, begin, self._sources)
+        ahead, count = places[begin].left - places[start].left, end_count - places[start].left
+        pieces: Pieces = raw_from(self._sources, places[start].part, places[start].seq)
         if stream is not None:
             pieces = stream.run(pieces)
         for frames, columns in pieces:
@@ -112,9 +112,9 @@ class FramesSoFar:
     def _begins_ns(self, number: int) -> int:
         """Return a lower bound of times in this and later parts, on the time axis."""
         begins = [
-            t_ns + self._axis.shift_ns(at)
-            for at, part in enumerate(self._sources.session.parts)
-            if at >= number
+            t_ns + self._axis.shift_ns(index)
+            for index, part in enumerate(self._sources.session.parts)
+            if index >= number
             and (journal := self._sources.journals.get(part.boot_id)) is not None
             and (t_ns := journal.t_ns_near(part.seq_first, newest=False)) is not None
         ]

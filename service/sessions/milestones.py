@@ -121,9 +121,9 @@ class Milestones:
             Index of the checkpoint used; and the stream, None without estimates.
         """
         stream = stream_of(sources)
-        while stream is not None and (kept := places[at].kept) is not None:
+        while stream is not None and (state := places[at].kept) is not None:
             try:
-                with np.load(io.BytesIO(self._scratch.get(kept)), allow_pickle=False) as memory:
+                with np.load(io.BytesIO(self._scratch.get(state)), allow_pickle=False) as memory:
                     stream.go_on(dict(memory))
             except Exception:  # damaged bytes cause any error; the first checkpoint has no bytes
                 at, stream = at - 1, stream_of(sources)

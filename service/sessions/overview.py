@@ -68,9 +68,11 @@ class OverviewBeside:
             return
         try:
             wanted = frame_columns(estimated="grf_n" in columns)
-            known = {name: columns[name] for name in (*wanted, "part") if name in columns}
-            own = {name: getattr(frames, name) for name in wanted if name not in known}
-            self._pyramid.feed(known | own)
+            given_columns = {name: columns[name] for name in (*wanted, "part") if name in columns}
+            frame_fields = {
+                name: getattr(frames, name) for name in wanted if name not in given_columns
+            }
+            self._pyramid.feed(given_columns | frame_fields)
         except Exception as error:  # never fail a session for a derived file
             log.exception("overview: this is a bug")
             self.problem = f"{_NOT_WRITTEN}: {error}"
@@ -132,8 +134,8 @@ def overview_of_session(
     begin_ns, end_ns = session.span_ns()
     bounds = part.bounds_ns(begin_ns)
     try:
-        with open_overview(path) as kept:
-            found = _of_levels(kept, frames_sha256, bounds, points, session.axis)
+        with open_overview(path) as stored:
+            found = _of_levels(stored, frames_sha256, bounds, points, session.axis)
     except (FileNotFoundError, FileFormatError, StorageError):
         with _made(path, session, frames_sha256) as made:
             found = _of_levels(made, frames_sha256, bounds, points, session.axis)
@@ -187,8 +189,8 @@ def _of_frames(
         frames = {name: values[inside] for name, values in piece.items()}
         if not len(frames["seq"]):
             continue
-        of = int(frames["part"][0]) if "part" in frames else 0
-        before = last[1] if last is not None and last[0] == of else None
+        first_part = int(frames["part"][0]) if "part" in frames else 0
+        before = last[1] if last is not None and last[0] == first_part else None
         found.append(bins_of_frames(frames, before))
         last = int(frames["part"][-1]) if "part" in frames else 0, int(frames["seq"][-1])
     bins = on_axis(joined([{name: piece[name] for name in types} for piece in found]), session.axis)

@@ -60,21 +60,21 @@ class EstimateRun:
 
     def kept(self) -> Columns:
         """Return the state, with the frames that wait for their look-ahead."""
-        held: Columns = {}
+        waiting: Columns = {}
         if self._held:
             frames = FrameBatch.concatenate([frames for frames, _ in self._held])
-            held = {f"held/{name}": column for name, column in vars(frames).items()}
+            waiting = {f"held/{name}": column for name, column in vars(frames).items()}
             for name in self._held[0][1]:
-                held[f"with/{name}"] = np.concatenate([extra[name] for _, extra in self._held])
-        return {f"run/{name}": c for name, c in self._estimator.kept().items()} | held
+                waiting[f"with/{name}"] = np.concatenate([extra[name] for _, extra in self._held])
+        return {f"run/{name}": c for name, c in self._estimator.kept().items()} | waiting
 
     @classmethod
     def going_on(cls, plan: EstimationPlan, kept: Columns) -> Self:
         """Create a run from the state of another one, as `Estimator.from_state`."""
         new = cls(plan)
         new._estimator = Estimator.going_on(plan, _under("run/", kept))
-        if held := _under("held/", kept):
-            new._held.append((FrameBatch(**held), _under("with/", kept)))
+        if waiting := _under("held/", kept):
+            new._held.append((FrameBatch(**waiting), _under("with/", kept)))
         return new
 
     def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
@@ -151,8 +151,8 @@ class EstimateStream:
         """
         if self.plan is None or self._run is None:
             raise TareError("the recording has no frames")
-        said = [self.plan.tare.as_dict(), self._over, self._last_t_mono_ns]
-        return {"stream": np.array(json.dumps(said)), **self._run.kept()}
+        content = [self.plan.tare.as_dict(), self._over, self._last_t_mono_ns]
+        return {"stream": np.array(json.dumps(content)), **self._run.kept()}
 
     def go_on(self, kept: Columns) -> None:
         """Resume from the state of another stream with the same array and options.
@@ -183,9 +183,9 @@ class EstimateStream:
             if self._options.tares:
                 run = self._begin(self._options.tares[0])
             else:
-                taken = self._until_tare(pieces)
-                run = self._begin(self._find_tare([frames for frames, _ in taken]))
-                pieces = chain(taken, pieces)
+                read_ahead = self._until_tare(pieces)
+                run = self._begin(self._find_tare([frames for frames, _ in read_ahead]))
+                pieces = chain(read_ahead, pieces)
         for frames, extra in pieces:
             rest, rest_of = frames, extra
             if not len(rest):
@@ -194,12 +194,12 @@ class EstimateStream:
                 yield from run.finish()
             self._last_t_mono_ns = int(rest.t_mono_ns[-1])
             while (tare := self._next_tare()) is not None and int(rest.t_ns[-1]) > tare.t_ns:
-                at = int(np.searchsorted(rest.t_ns, tare.t_ns, side="right"))
-                if at:
-                    head = {name: v[:at] for name, v in rest_of.items()}
-                    yield from run.feed(rest.rows(0, at), head)
-                    rest = rest.rows(at, len(rest))
-                    rest_of = {name: v[at:] for name, v in rest_of.items()}
+                count = int(np.searchsorted(rest.t_ns, tare.t_ns, side="right"))
+                if count:
+                    head = {name: v[:count] for name, v in rest_of.items()}
+                    yield from run.feed(rest.rows(0, count), head)
+                    rest = rest.rows(count, len(rest))
+                    rest_of = {name: v[count:] for name, v in rest_of.items()}
                 yield from run.finish()
                 self._run = run = EstimateRun(self.plan_of(tare))
                 self.tare = tare
@@ -225,14 +225,14 @@ class EstimateStream:
         self, pieces: Iterator[tuple[FrameBatch, Extra]]
     ) -> list[tuple[FrameBatch, Extra]]:
         """Read batches until the tare's interval has passed."""
-        taken: list[tuple[FrameBatch, Extra]] = []
+        batches: list[tuple[FrameBatch, Extra]] = []
         for piece in pieces:
-            taken.append(piece)
-            if self._tare_is_in(taken):
+            batches.append(piece)
+            if self._tare_is_in(batches):
                 break
-        if not taken:
+        if not batches:
             raise TareError("the recording has no frames")
-        return taken
+        return batches
 
     def _find_tare(self, frames: list[FrameBatch]) -> Tare:
         return take_tare(
@@ -273,22 +273,22 @@ def _paired(
     One batch per run of consecutive numbers: subscribers see a gap between two batches.
     """
     pieces: list[tuple[FrameBatch, Extra]] = []
-    given = at = 0
-    while at < len(estimates):
+    first = end = 0
+    while end < len(estimates):
         frames, extra = held.popleft()
-        lack = len(estimates) - at
+        lack = len(estimates) - end
         if lack < len(frames):
             rest = {name: values[lack:] for name, values in extra.items()}
             held.appendleft((frames.rows(lack, len(frames)), rest))
             frames = frames.rows(0, lack)
             extra = {name: values[:lack] for name, values in extra.items()}
         if pieces and int(frames.seq[0]) != int(pieces[-1][0].seq[-1]) + 1:
-            yield _joined(pieces, estimates.rows(given, at))
-            pieces, given = [], at
+            yield _joined(pieces, estimates.rows(first, end))
+            pieces, first = [], end
         pieces.append((frames, extra))
-        at += len(frames)
+        end += len(frames)
     if pieces:
-        yield _joined(pieces, estimates.rows(given, at) if given else estimates)
+        yield _joined(pieces, estimates.rows(first, end) if first else estimates)
 
 
 def _joined(

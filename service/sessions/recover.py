@@ -121,8 +121,8 @@ def recover(
     for path in sorted(_unread(data) - before):
         name = f"{path.parent.parent.name}/{path.parent.name}"
         recovery.cut[name] = recovery.cut.get(name, 0) + path.stat().st_size
-    known, unreadable = sessions.load_all()
-    known.sort(key=lambda session: session.id)
+    loaded, unreadable = sessions.load_all()
+    loaded.sort(key=lambda session: session.id)
     for session_id, error in sorted(unreadable.items()):
         if not any(sessions.path(session_id).iterdir()):
             continue
@@ -132,7 +132,7 @@ def recover(
             recovery.restored.append(session_id)
     strays = [*sessions.strays(), *SessionFolder(data / "trash").strays()]
     recovery.problems += [str(stray.error) for stray in strays]
-    for session in known:
+    for session in loaded:
         if session.state == "sealed":
             if _mend_events(session, sessions.path(session.id)):
                 recovery.mended.append(session.id)
@@ -140,7 +140,7 @@ def recover(
         tell(f"session {session.id} ({session.name})")
         recovery.sessions.append(_complete(data, sessions, session, opened, give_up=give_up))
     if streams:
-        for session in _of_no_session(data, known, opened, now):
+        for session in _of_no_session(data, loaded, opened, now):
             tell(f"session {session.id} ({session.name})")
             recovery.sessions.append(_complete(data, sessions, session, opened, give_up=True))
     return recovery
@@ -150,21 +150,21 @@ def _complete(
     data: Path, sessions: SessionFolder, session: Session, opened: Streams, *, give_up: bool
 ) -> Recovered:
     """Seal one session, or return the reason why not."""
-    own = {part.boot_id: opened.get((session.node, part.boot_id)) for part in session.parts}
-    for stream in own.values():
+    own_streams = {part.boot_id: opened.get((session.node, part.boot_id)) for part in session.parts}
+    for stream in own_streams.values():
         if stream is not None:
             with suppress(StorageError):  # frames matter more than clock measurements
                 session = session.with_clock(ClockLog(stream.journal.folder).rows())
     is_local, give_up = _is_local(data), give_up or session.given_up
-    session = _with_ends(session, own, is_local=is_local, give_up=give_up)
+    session = _with_ends(session, own_streams, is_local=is_local, give_up=give_up)
     if any(part.seq_last is None for part in session.parts):
         return Recovered(session, "waiting", "its node may still be recording it")
     for part in session.parts:
-        stream = own[part.boot_id]
+        stream = own_streams[part.boot_id]
         if stream is not None and part.seq_last is not None:
             stream.disown_damaged(part.seq_first, part.seq_last)
             stream.note_losses()
-    streams = _described(session, own, is_local=is_local)
+    streams = _described(session, own_streams, is_local=is_local)
     ledger = ledger_of(session.parts, states_of(session, streams), finished=True)
     if pending := ledger.pending:
         text = f"{pending} frames may still come from node {session.node}"
@@ -201,8 +201,8 @@ def _with_ends(
         streams = _described(session, own, is_local=is_local)
         try:
             if is_local or give_up:
-                ended = broken_off(session, streams)
-                return ended.model_copy(update={"given_up": not is_local})
+                closed = broken_off(session, streams)
+                return closed.model_copy(update={"given_up": not is_local})
             return at_stop(session, streams, waiting=True)
         except DamagedFramesError as error:  # at the stop: retry without these frames
             _disown(own.values(), error)
@@ -248,15 +248,15 @@ def _of_no_session(
     found = []
     for (node, boot_id), stream in streams.items():
         parts = (part for session in known if session.node == node for part in session.parts)
-        taken = numbers_of(parts).get(boot_id, Intervals())
+        used = numbers_of(parts).get(boot_id, Intervals())
         journal, hello = stream.journal, hello_of(data, node)
         # Lost frames do not split a run; frames that belong to a session do.
-        own = (journal.held | stream.lost.all | stream.damaged) - taken
-        for run in own:
-            held = list(journal.held.within(*run))
-            if not held:
+        unused = (journal.held | stream.lost.all | stream.damaged) - used
+        for run in unused:
+            stored = list(journal.held.within(*run))
+            if not stored:
                 continue
-            first, last = held[0][0], held[-1][1]
+            first, last = stored[0][0], stored[-1][1]
             session = begun(
                 journal.info,
                 f"recovered {node} {boot_id}",

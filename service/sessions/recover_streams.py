@@ -92,16 +92,16 @@ class OpenedStream:
         Raises:
             StorageError: it cannot be read.
         """
-        at = first
-        while at <= last:
+        seq = first
+        while seq <= last:
             try:
-                for _ in self.journal.messages(at, last):
+                for _ in self.journal.messages(seq, last):
                     pass
             except DamagedFramesError as error:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
                 self.journal.disown(damaged)
                 self.damaged = self.damaged | (damaged - self.journal.held)
-                at = error.seq_last + 1
+                seq = error.seq_last + 1
             else:
                 return
 

@@ -70,11 +70,11 @@ class SoFar:
 
     def places(self, sources: Sources) -> list[Milestone]:
         """Return the checkpoints before any change: the beginning, and perhaps more."""
-        known = self.milestones.all
+        checkpoints = self.milestones.all
         if not self.is_of(sources):
             return [Milestone()]
-        count = bisect_left(known, True, key=lambda place: not self._is_true(place, sources))
-        return list(known[: max(1, count)])
+        count = bisect_left(checkpoints, True, key=lambda place: not self._is_true(place, sources))
+        return list(checkpoints[: max(1, count)])
 
     def take(self, sources: Sources) -> None:
         """Estimate the frames that have come; `can_use` is true of `inputs`, the present ones.
@@ -109,17 +109,17 @@ class SoFar:
     def go_back(self, sources: Sources) -> None:
         """Drop everything after the last valid checkpoint."""
         all_, true = self.milestones.all, self.places(sources)
-        kept = self._bins.cut(true[-1].left)
+        kept_frames = self._bins.cut(true[-1].left)
         # Repeat one frame at least: its number shows whether the next one follows it.
-        at = max(0, bisect_left(true, max(kept, 1), key=lambda place: place.left) - 1)
-        at, self._stream = self.milestones.stream_at(all_, at, sources)
-        self.milestones.go_back(at + 1)
-        place = all_[at]
+        index = max(0, bisect_left(true, max(kept_frames, 1), key=lambda place: place.left) - 1)
+        index, self._stream = self.milestones.stream_at(all_, index, sources)
+        self.milestones.go_back(index + 1)
+        place = all_[index]
         self.begin_again(self)
         self._at = Milestone(
             place.part, place.seq, place.taken, place.left, place.newest_ns, place.last
         )
-        self._again = kept - place.left
+        self._again = kept_frames - place.left
         self._sources = sources
 
     def begin_again(self, before: SoFar) -> None:
@@ -145,22 +145,29 @@ class SoFar:
         return Seen(found, count * self._bins.frames_in_bin, begin_ns, end_ns, axis)
 
     def _feed(self, frames: FrameBatch, extra: Columns) -> None:
-        at = self._at
+        position = self._at
         pieces = [(frames, extra)]
         due = iter(pieces) if self._stream is None else self._stream.run(pieces, ends=False)
         names = frame_columns(estimated=self.is_estimated)
-        for left, columns in due:
-            own = {name: getattr(left, name) for name in names if name not in columns}
-            own |= {name: columns[name] for name in (*names, "part") if name in columns}
-            self._again -= self._bins.feed(own, there=self._again)
-            self.milestones.note(left.t_ns)
-            at.left += len(left)
-            at.last = int(columns["part"][-1]), int(left.t_ns[-1])
-        at.part, at.seq = int(extra["part"][-1]), int(frames.seq[-1]) + 1
-        at.taken += len(frames)
-        at.newest_ns = max(at.newest_ns, int(frames.t_ns.max()))
-        if at.taken - self.milestones.all[-1].taken >= self.milestones.every:
-            place = Milestone(at.part, at.seq, at.taken, at.left, at.newest_ns, at.last)
+        for estimated, columns in due:
+            fields = {name: getattr(estimated, name) for name in names if name not in columns}
+            fields |= {name: columns[name] for name in (*names, "part") if name in columns}
+            self._again -= self._bins.feed(fields, there=self._again)
+            self.milestones.note(estimated.t_ns)
+            position.left += len(estimated)
+            position.last = int(columns["part"][-1]), int(estimated.t_ns[-1])
+        position.part, position.seq = int(extra["part"][-1]), int(frames.seq[-1]) + 1
+        position.taken += len(frames)
+        position.newest_ns = max(position.newest_ns, int(frames.t_ns.max()))
+        if position.taken - self.milestones.all[-1].taken >= self.milestones.every:
+            place = Milestone(
+                position.part,
+                position.seq,
+                position.taken,
+                position.left,
+                position.newest_ns,
+                position.last,
+            )
             self.milestones.add(place, None if self._stream is None else self._stream.kept())
 
     def _is_true(self, place: Milestone, sources: Sources) -> bool:
@@ -168,15 +175,15 @@ class SoFar:
         tares = sources.tares[len(self._sources.tares) :]
         if any(tare.t_ns < place.newest_ns for tare in tares):
             return False
-        held = 0
+        stored_frames = 0
         for i, each in enumerate(sources.session.parts[: place.part + 1]):
             journal = sources.journals.get(each.boot_id)
             ends = [place.seq - 1] if i == place.part else []
             ends += [each.seq_last] if each.seq_last is not None else []
             last = min(ends, default=-1)
             if journal is not None and last >= each.seq_first:
-                held += journal.held.within(each.seq_first, last).count
-        return held == place.taken
+                stored_frames += journal.held.within(each.seq_first, last).count
+        return stored_frames == place.taken
 
 
 class SoFars:

@@ -50,11 +50,11 @@ class Sources:
     def streams(self) -> tuple[StreamFacts, ...]:
         """Facts about the clocks of the session's streams."""
         boot_ids = dict.fromkeys(part.boot_id for part in self.session.parts)
-        known = {boot_id: journal.info for boot_id, journal in self.journals.items()}
-        known[self.info.boot_id] = self.info
+        infos = {boot_id: journal.info for boot_id, journal in self.journals.items()}
+        infos[self.info.boot_id] = self.info
         return tuple(
             StreamFacts(boot_id, info.utc_offset_ns, info.clock_set)
-            if (info := known.get(boot_id)) is not None
+            if (info := infos.get(boot_id)) is not None
             else StreamFacts(boot_id)
             for boot_id in boot_ids
         )
@@ -81,12 +81,12 @@ class Sources:
             if journal is None:
                 continue
             end = NO_END if part.seq_last is None else part.seq_last
-            held = journal.held.within(part.seq_first, end)
-            if held.first is None or held.last is None:
+            stored = journal.held.within(part.seq_first, end)
+            if stored.first is None or stored.last is None:
                 continue
             first, last = (
                 FrameBatch.concatenate(list(journal.read(seq, seq)))
-                for seq in (held.first, held.last)
+                for seq in (stored.first, stored.last)
             )
             t_mono_ns = int(first.t_mono_ns[0]), int(last.t_mono_ns[-1])
             t_ns = int(first.t_ns[0]), int(last.t_ns[-1])

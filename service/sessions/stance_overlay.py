@@ -64,11 +64,13 @@ def overlay_of_session(
         )
     whole = stances.filter(stances["is_whole"])
     long = whole.filter(pc.greater(whole["end_t_ns"], whole["begin_t_ns"]))
-    taken = long.take(evenly(long.num_rows, STANCES_MAX))
-    part, begin_ns, end_ns = (taken[name].to_numpy() for name in ("part", "begin_t_ns", "end_t_ns"))
-    rows = evenly(taken.num_rows, curves)
+    chosen = long.take(evenly(long.num_rows, STANCES_MAX))
+    part, begin_ns, end_ns = (
+        chosen[name].to_numpy() for name in ("part", "begin_t_ns", "end_t_ns")
+    )
+    rows = evenly(chosen.num_rows, curves)
     gathered = StanceOverlay(part, begin_ns, end_ns, points=points, rows=rows.tolist())
-    if taken.num_rows:
+    if chosen.num_rows:
         names = ("t_ns", *OVERLAID, *(("part",) if session.has("part") else ()))
         begins_ns, ends_ns = (session.axis.at(t_ns, part) for t_ns in (begin_ns, end_ns))
         groups = session.groups_within(int(begins_ns.min()), int(ends_ns.max()) + 1)
@@ -77,9 +79,9 @@ def overlay_of_session(
     overlay = gathered.finish()
     return SessionOverlay(
         overlay,
-        tuple(taken["number"].to_numpy()[overlay.rows].tolist()),
+        tuple(chosen["number"].to_numpy()[overlay.rows].tolist()),
         whole=long.num_rows,
-        overlaid=taken.num_rows,
+        overlaid=chosen.num_rows,
         not_whole=stances.num_rows - whole.num_rows,
         too_short=whole.num_rows - long.num_rows,
     )

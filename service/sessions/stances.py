@@ -57,8 +57,8 @@ class StancesBeside:
         if self.problem is not None or "contact" not in columns:
             return
         self._has_estimates = True
-        kept = {name: columns[name] for name in _NEEDED if name in columns}
-        self._waiting.append({"seq": seq, "t_ns": t_ns, **kept})
+        needed = {name: columns[name] for name in _NEEDED if name in columns}
+        self._waiting.append({"seq": seq, "t_ns": t_ns, **needed})
         self._rows += len(seq)
         if self._rows >= _ROWS:
             self._take_waiting()

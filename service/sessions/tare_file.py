@@ -150,10 +150,10 @@ def _proven(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
     places: dict[int, set[bytes]] = {}
     totals = set()
     for line in _LINE.finditer(text):
-        body, number, of, digits = line.groups()
+        body, number, total, digits = line.groups()
         if _hash(body) == digits:
             places.setdefault(int(number), set()).add(body)
-            totals.add(int(of))
+            totals.add(int(total))
     if len(totals) != 1:
         return (LOST,), None
     entries: list[Entry] = []
@@ -168,11 +168,11 @@ def _proven(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
 
 def in_order(entries: Iterable[Entry]) -> tuple[Entry, ...]:
     """Return the entries with each run of lost ones merged into one."""
-    kept: list[Entry] = []
+    merged: list[Entry] = []
     for entry in entries:
-        if not (isinstance(entry, LostTares) and kept and kept[-1] == entry):
-            kept.append(entry)
-    return tuple(kept)
+        if not (isinstance(entry, LostTares) and merged and merged[-1] == entry):
+            merged.append(entry)
+    return tuple(merged)
 
 
 def _content(entry: Entry) -> dict[str, object]:

@@ -129,10 +129,10 @@ class TareHistory:
         which it may have been in force.
         """
         gaps = list(self._gaps())
-        known = [(recorded.tare.t_ns, recorded.tare) for recorded in self._of(info)]
+        valid = [(recorded.tare.t_ns, recorded.tare) for recorded in self._of(info)]
         fitting = [
             (t_ns, tare)
-            for t_ns, tare in known
+            for t_ns, tare in valid
             # A lost tare may be newer than this one.
             if not any(first < t_ns < last for first, last in gaps)
         ]
@@ -147,9 +147,9 @@ class TareHistory:
 
     def _gaps(self) -> Iterator[tuple[int, int]]:
         """Yield the intervals of lost tares: between the times of their neighbours."""
-        for at, entry in enumerate(self._entries):
+        for index, entry in enumerate(self._entries):
             if isinstance(entry, LostTares):
-                beside = self._t_ns(at - 1, _EVER[0]), self._t_ns(at + 1, _EVER[1])
+                beside = self._t_ns(index - 1, _EVER[0]), self._t_ns(index + 1, _EVER[1])
                 # A clock that was set back reverses their order.
                 yield min(beside), max(beside)
 

@@ -90,8 +90,8 @@ class SecondsQuery(BaseModel):
 
 def has_it(request: Request, tag: str) -> bool:
     """Return whether If-None-Match names this entity tag, given without quotes."""
-    given = request.headers.get("if-none-match", "")
-    return any(t.strip().removeprefix("W/") in (f'"{tag}"', "*") for t in given.split(","))
+    header = request.headers.get("if-none-match", "")
+    return any(t.strip().removeprefix("W/") in (f'"{tag}"', "*") for t in header.split(","))
 
 
 ServerState = Annotated[Server, Depends(_server)]
@@ -117,8 +117,8 @@ IdempotencyKey = Annotated[
 
 def tag_of(if_match: str | None) -> str | None:
     """Return the revision in an `If-Match`, with or without quotes; None for `*` or no header."""
-    said = (if_match or "").strip().removeprefix("W/").strip('"')
-    return None if said in ("", "*") else said
+    revision = (if_match or "").strip().removeprefix("W/").strip('"')
+    return None if revision in ("", "*") else revision
 
 
 def asked_with(key: str | None, what: str, body: BaseModel) -> Asked | None:

@@ -147,7 +147,7 @@ class NodeCalibrationView(View):
     @classmethod
     def of(cls, node: ServerNode) -> NodeCalibrationView:
         """Return the present calibration of a node."""
-        estimates, own = node.estimates, node.hello.calibration
+        estimates, own_calibration = node.estimates, node.hello.calibration
         live, assigned = estimates.live, estimates.assignment.present
         used = None
         if live.calibration is not None and live.calibration_id and live.ranges is not None:
@@ -162,7 +162,7 @@ class NodeCalibrationView(View):
             assigned_t_ns=None if assigned is None else assigned.t_ns,
             calibration=used,
             problem=estimates.calibration_problem,
-            own_id=None if own is None else own.id,
+            own_id=None if own_calibration is None else own_calibration.id,
         )
 
 
@@ -178,7 +178,7 @@ InUse = Annotated[
 @router.get("/calibrations", operation_id="listCalibrations", summary="Calibrations")
 async def list_calibrations(server: ServerState) -> Page[KeptView]:
     """Return the calibrations on the server, the newest recordings first."""
-    return Page(items=[KeptView.of(kept) for kept in server.calibrations.all()])
+    return Page(items=[KeptView.of(summary) for summary in server.calibrations.all()])
 
 
 @router.post(
@@ -208,9 +208,9 @@ async def upload(request: Request, server: ServerState, response: Response) -> K
     A file without `id` and `check` was written by hand, and is marked as unproven.
     """
     calibration = await run_in_threadpool(_understood, await request.body())
-    kept = server.calibrations.keep(calibration)
-    response.headers["Location"] = f"/api/v1/calibrations/{kept.id}"
-    return KeptView.of(kept)
+    summary = server.calibrations.keep(calibration)
+    response.headers["Location"] = f"/api/v1/calibrations/{summary.id}"
+    return KeptView.of(summary)
 
 
 @router.get("/calibrations/fits", operation_id="listFits", summary="Fits")

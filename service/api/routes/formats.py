@@ -36,5 +36,5 @@ class FormatsView(BaseModel):
 @router.get("", operation_id="listFormats", summary="Formats of downloads")
 def formats() -> FormatsView:
     """Return the formats in the order of menus."""
-    known = FORMATS.values()
-    return FormatsView(items=[FormatView.model_validate(f, from_attributes=True) for f in known])
+    formats_ = FORMATS.values()
+    return FormatsView(items=[FormatView.model_validate(f, from_attributes=True) for f in formats_])

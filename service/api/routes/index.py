@@ -49,9 +49,9 @@ async def index(request: Request) -> IndexView:
             RouteView(
                 method=method,
                 href=path,
-                operation=said["operationId"],
-                summary=said["summary"],
+                operation=operation["operationId"],
+                summary=operation["summary"],
             )
-            for path, method, said in operations(app.openapi())
+            for path, method, operation in operations(app.openapi())
         ],
     )

@@ -77,8 +77,8 @@ LoginsState = Annotated[Logins, Depends(_logins)]
 @router.get("/login", operation_id="getLogin", summary="Current permissions")
 async def get_login(request: Request, logins: LoginsState) -> LoginView:
     """Return the permissions by the cookie or the token of this request."""
-    shown = logins.shown_by(request)
-    return _view(logins, shown.right, shown.left_s, has_ended=shown.has_ended)
+    credentials = logins.shown_by(request)
+    return _view(logins, credentials.right, credentials.left_s, has_ended=credentials.has_ended)
 
 
 @router.post(
@@ -89,12 +89,12 @@ async def log_in(
 ) -> LoginView:
     """Set a cookie, HttpOnly and SameSite=Strict, valid for 12 hours or until the server ends."""
     if body.ticket is not None:
-        given = logins.tickets.take(body.ticket)
-        right = None if given is None else given.right
+        grant = logins.tickets.take(body.ticket)
+        right = None if grant is None else grant.right
     else:
-        shown = logins.shown_by(request)
+        credentials = logins.shown_by(request)
         # A cookie cannot renew itself: it would never expire.
-        right = Right.PRESS if shown.right is Right.OWN else None
+        right = Right.PRESS if credentials.right is Right.OWN else None
     if right is None:
         detail = _NOT_TAKEN if body.ticket is not None else _NOTHING_SHOWN
         headers = {"www-authenticate": "Bearer"}

@@ -79,8 +79,8 @@ class LiveEstimates:
         self._due_t_ns: int | None = None
         self._has_begun = False
         is_same = before is not None and before.info.boot_id == info.boot_id
-        known = before.begun if before is not None and is_same else ()
-        self.begun: deque[Begun] = deque(known, _BEGUN_MAX)
+        epochs = before.begun if before is not None and is_same else ()
+        self.begun: deque[Begun] = deque(epochs, _BEGUN_MAX)
         """Epochs of the estimates, oldest first, to recompute frames as they were."""
         if calibration is not None:
             try:
@@ -140,8 +140,8 @@ class LiveEstimates:
         self._recent.append(frames)
         while int(frames.t_ns[-1]) - int(self._recent[0].t_ns[-1]) > LOOK_BACK_NS:
             self._recent.popleft()
-        left, self._left = self._left, []
-        yield from left
+        flushed, self._left = self._left, []
+        yield from flushed
         if not self._has_begun and not (self._run is not None and is_warming()):
             self._has_begun = True
             tare = None if self._run is None else self._run.plan.tare
@@ -150,8 +150,10 @@ class LiveEstimates:
             yield frames, {}
             return
         if is_warming():
-            held, _ = hold_temperature(frames)
-            kpa = self._compensation.readable_kpa(held) - self._run.plan.tare.baseline_kpa
+            with_temperature, _ = hold_temperature(frames)
+            kpa = (
+                self._compensation.readable_kpa(with_temperature) - self._run.plan.tare.baseline_kpa
+            )
             yield frames, {"gauge_kpa": kpa}
             return
         for due, columns in self._run.feed(frames, {}):
@@ -176,9 +178,9 @@ class LiveEstimates:
         recent = [*takewhile(lambda each: each.t_ns[-1] >= since_t_ns, reversed(self._recent))]
         tadc = np.concatenate([frames.tadc for frames in recent])
         status = np.concatenate([frames.status for frames in recent])
-        known = (tadc != NOT_READ) & ((status & np.uint8(TileStatus.UNUSABLE)) == 0)
-        counts = known.sum(axis=0)
-        total = np.where(known, tadc, 0).sum(axis=0)
+        is_usable = (tadc != NOT_READ) & ((status & np.uint8(TileStatus.UNUSABLE)) == 0)
+        counts = is_usable.sum(axis=0)
+        total = np.where(is_usable, tadc, 0).sum(axis=0)
         return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
     def newtons(self, shift_kpa: Floats) -> float | None:
@@ -212,9 +214,9 @@ class LiveEstimates:
         if self.free_since_t_ns is None or self._due_t_ns is None:
             return Look()
         # Contact of newer frames is not estimated yet.
-        known = int(np.searchsorted(frames.t_ns, self._due_t_ns, side="right"))
+        count = int(np.searchsorted(frames.t_ns, self._due_t_ns, side="right"))
         return look_in_flight(
-            self._seen(frames.rows(0, known), calibration),
+            self._seen(frames.rows(0, count), calibration),
             present=tare,
             anchor=anchor,
             free_since_t_ns=self.free_since_t_ns,
@@ -248,13 +250,13 @@ class LiveEstimates:
     def _note_contact(self, frames: FrameBatch, columns: Columns) -> None:
         t_ns = frames.t_ns
         before_t_ns = self._due_t_ns if self._due_t_ns is not None else int(t_ns[0])
-        taken = columns["contact"] != 0  # in contact, or unknown
+        may_have_contact = columns["contact"] != 0  # in contact, or unknown
         # A gap that is too short for a step, such as a missed slot, cannot hide a contact.
         if int(t_ns[-1]) - before_t_ns > UNSEEN_NS:
-            taken[0] |= int(t_ns[0]) - before_t_ns > UNSEEN_NS
-            taken[1:] |= t_ns[1:] - t_ns[:-1] > UNSEEN_NS
+            may_have_contact[0] |= int(t_ns[0]) - before_t_ns > UNSEEN_NS
+            may_have_contact[1:] |= t_ns[1:] - t_ns[:-1] > UNSEEN_NS
         self._due_t_ns = int(t_ns[-1])
-        if np.count_nonzero(taken):
-            self.free_since_t_ns = int(t_ns[np.flatnonzero(taken)[-1]])
+        if np.count_nonzero(may_have_contact):
+            self.free_since_t_ns = int(t_ns[np.flatnonzero(may_have_contact)[-1]])
         elif self.free_since_t_ns is None:
             self.free_since_t_ns = int(t_ns[0])

@@ -55,8 +55,8 @@ class NodeEstimates:
     @property
     def damages(self) -> list[str]:
         """Damage found in the files, and the consequence, as text."""
-        said = (self.tares.problem, self.assignment.problem)
-        return [problem for problem in said if problem is not None]
+        texts = (self.tares.problem, self.assignment.problem)
+        return [problem for problem in texts if problem is not None]
 
     @property
     def calibration(self) -> Calibration | None:
@@ -78,8 +78,10 @@ class NodeEstimates:
     @property
     def calibration_problem(self) -> str | None:
         """Reason why no calibration is in use."""
-        own = self._hello.calibration_problem if self.calibration_source == "node" else None
-        return self.assignment.problem or self.live.calibration_problem or own
+        node_problem = (
+            self._hello.calibration_problem if self.calibration_source == "node" else None
+        )
+        return self.assignment.problem or self.live.calibration_problem or node_problem
 
     def begun(self, boot_id: str) -> tuple[Begun, ...]:
         """Return the epochs of a stream since the server was started, in order."""
@@ -112,12 +114,15 @@ class NodeEstimates:
 
     def greet(self, hello: Hello) -> None:
         """Restart the estimator if hello has another stream or calibration."""
-        known, self._hello = self._hello, hello
-        if known.array_info.boot_id != hello.array_info.boot_id:
-            self._begun[known.array_info.boot_id] = tuple(self.live.begun)
+        previous, self._hello = self._hello, hello
+        if previous.array_info.boot_id != hello.array_info.boot_id:
+            self._begun[previous.array_info.boot_id] = tuple(self.live.begun)
             if len(self._begun) > _ENDED_MAX:
                 self._begun.popitem(last=False)
-        is_same = (known.array_info, known.calibration) == (hello.array_info, hello.calibration)
+        is_same = (previous.array_info, previous.calibration) == (
+            hello.array_info,
+            hello.calibration,
+        )
         if not is_same or self._has_failed:
             self._begin()
 

@@ -77,15 +77,15 @@ class TareKeeper:
         tare, newest_t_ns = self._live.tare, self._live.newest_t_ns
         if tare is None or newest_t_ns is None:
             return []
-        said = []
+        texts = []
         age_ns = newest_t_ns - tare.t_ns
         if age_ns > TARE_OLD_NS:
-            said.append(f"tared {age_ns / 60e9:.0f} min ago: {_BY_HAND}")
+            texts.append(f"tared {age_ns / 60e9:.0f} min ago: {_BY_HAND}")
         if "temperature" not in self._info.models and (warmed := self._warmed(tare)) is not None:
-            said.append(warmed)
+            texts.append(warmed)
         if self._doubt is not None:
-            said.append(self._doubt)
-        return said
+            texts.append(self._doubt)
+        return texts
 
     def _warmed(self, tare: Tare) -> str | None:
         tadc = self._live.recent_tadc()
@@ -97,10 +97,10 @@ class TareKeeper:
         mean_k = float(warmer[tiles].mean())
         who = f"tile {self._info.serials[tiles[0]]} is" if len(tiles) == 1 else "the tiles are"
         shift_n = self._live.newtons(expected_shift_kpa(tare, warmer))
-        about = "" if shift_n is None else f", about {shift_n:+.1f} N on the foot"
+        effect = "" if shift_n is None else f", about {shift_n:+.1f} N on the foot"
         return (
             f"{who} {abs(mean_k):.1f} K {'warmer' if mean_k > 0 else 'colder'} than when tared"
-            f"{about}: {_BY_HAND}"
+            f"{effect}: {_BY_HAND}"
         )
 
     def by_hand(self, reason: str = "") -> RecordedTare:
@@ -170,10 +170,10 @@ class TareKeeper:
         except TareError as error:
             self._lead_is_over, self._lead_problem = True, error.what
             return
-        known = {(t.tare.source, t.tare.t_ns) for t in self._history.all}
+        keys = {(t.tare.source, t.tare.t_ns) for t in self._history.all}
         # In the history, or lost: the server was restarted, and another tare may have followed.
         is_older = not self._has_seen_lead and self._history.may_have_held(tare.t_ns)
-        if ("lead", tare.t_ns) not in known and not is_older:
+        if ("lead", tare.t_ns) not in keys and not is_older:
             self._live.use(self._history.add(tare, self._info).tare)
         self._lead_is_over = True
 

@@ -87,9 +87,9 @@ class KnownStream:
     @property
     def end(self) -> int:
         """See `StreamView.end_seq`."""
-        said = None if self._stream is None else self._stream.notes.next_seq
-        known = [last + 1 for last in (self.held.last, self.lost.all.last) if last is not None]
-        return max([said or 0, *known])
+        announced = None if self._stream is None else self._stream.notes.next_seq
+        ends = [last + 1 for last in (self.held.last, self.lost.all.last) if last is not None]
+        return max([announced or 0, *ends])
 
     @property
     def following(self) -> str | None:

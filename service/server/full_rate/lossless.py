@@ -68,30 +68,30 @@ class Lossless:
             HangUp: the reader cannot go on; the reason has the position to resume from.
         """
         memory = self._memory
-        if (at := self.position) is None:
+        if (position := self.position) is None:
             if self._number is None or self._number >= memory.next_number:
                 return None
             self._number = max(self._number, memory.oldest)
             piece = memory[self._number]
-            at = self.position = Position(piece.boot_id, piece.first)
-        if (found := self._piece(at)) is not None:
+            position = self.position = Position(piece.boot_id, piece.first)
+        if (found := self._piece(position)) is not None:
             self._number = found.number + 1
-            self.position = Position(at.boot_id, found.last + 1)
-            begin = at.seq - found.first
+            self.position = Position(position.boot_id, found.last + 1)
+            begin = position.seq - found.first
             rows = cut((found.frames, found.columns), begin, len(found.frames))
-            return Rows(at.boot_id, rows, found.number if begin == 0 else None)
-        stream = self._look(at.boot_id)
+            return Rows(position.boot_id, rows, found.number if begin == 0 else None)
+        stream = self._look(position.boot_id)
         if stream is None:
-            raise HangUp(Close.NO_STREAM, f"no longer stored: stream {at.boot_id}")
-        ahead = memory.after(at.boot_id, at.seq)
-        held = stream.held
-        if held.within(at.seq, at.seq):
+            raise HangUp(Close.NO_STREAM, f"no longer stored: stream {position.boot_id}")
+        ahead = memory.after(position.boot_id, position.seq)
+        stored = stream.held
+        if stored.within(position.seq, position.seq):
             # The live estimator still holds these frames for their look-ahead.
-            if ahead is None and not stream.is_over and memory.last(at.boot_id) is not None:
+            if ahead is None and not stream.is_over and memory.last(position.boot_id) is not None:
                 return None
             until = None if ahead is None else ahead.first
-            return Again(at, held.last or at.seq, stream.is_over, until)
-        return self._gap(at, stream, ahead)
+            return Again(position, stored.last or position.seq, stream.is_over, until)
+        return self._gap(position, stream, ahead)
 
     def had(self, rows: Rows) -> None:
         """Move the position behind recomputed frames."""
@@ -116,8 +116,10 @@ class Lossless:
         comes = stream.to_come().within(at.seq, NO_END).first
         if comes == at.seq:
             return None
-        held = stream.held.within(at.seq, NO_END).first
-        here = [n for n in (None if ahead is None else ahead.first, held, comes) if n is not None]
+        next_stored = stream.held.within(at.seq, NO_END).first
+        here = [
+            n for n in (None if ahead is None else ahead.first, next_stored, comes) if n is not None
+        ]
         if not here and stream.is_over:
             here = [max(at.seq, stream.end)]
         to_seq = min(here, default=at.seq) - 1
@@ -137,10 +139,10 @@ class Lossless:
 
 def _reason(stream: Known, first: int, last: int) -> tuple[str, int]:
     """Return the reason why frames are lost, and the last frame with this reason."""
-    known = stream.lost.within(Intervals([(first, last)]))
-    for reason, numbers in known.items():
+    by_reason = stream.lost.within(Intervals([(first, last)]))
+    for reason, numbers in by_reason.items():
         for begin, end in numbers:
             if begin == first:
                 return reason, end
-    begins = [begin for numbers in known.values() for begin, _ in numbers]
+    begins = [begin for numbers in by_reason.values() for begin, _ in numbers]
     return NOT_KEPT, min([last, *(begin - 1 for begin in begins)])

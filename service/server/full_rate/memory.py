@@ -89,8 +89,8 @@ class NodeMemory:
             self._next_number += 1
             self._bytes += _bytes_of(frames, columns)
         while self._bytes > self._bytes_max and len(self._pieces) > 1:
-            gone = self._pieces.popleft()
-            self._bytes -= _bytes_of(gone.frames, gone.columns)
+            oldest = self._pieces.popleft()
+            self._bytes -= _bytes_of(oldest.frames, oldest.columns)
         self.wake()
 
     def wake(self) -> None:

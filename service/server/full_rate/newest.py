@@ -44,26 +44,26 @@ class Newest:
         self._number = memory.next_number
         """Number of the next batch to send."""
         if position is not None:
-            at = position.boot_id, position.seq
-            found = memory.find(*at) or memory.after(*at)
+            key = position.boot_id, position.seq
+            found = memory.find(*key) or memory.after(*key)
             self._number = self._number if found is None else found.number
 
     def next(self) -> Item | None:
         """Return the next event; None: nothing yet."""
         while self._number < self._memory.next_number:
-            piece, at = self._wanted(), self.position
+            piece, position = self._wanted(), self.position
             reason = SLOW if piece.number > self._number else LATE
-            if at is not None and at.boot_id != piece.boot_id:
-                end = self._end(at.boot_id)
-                self.position = Position(self._onward(at.boot_id, piece.boot_id), 0)
-                if at.seq < end:
-                    return Missing(at.boot_id, at.seq, end - 1, reason)
-            elif at is not None and at.seq < piece.first:
-                self.position = Position(at.boot_id, piece.first)
-                return Missing(at.boot_id, at.seq, piece.first - 1, reason)
+            if position is not None and position.boot_id != piece.boot_id:
+                end = self._end(position.boot_id)
+                self.position = Position(self._onward(position.boot_id, piece.boot_id), 0)
+                if position.seq < end:
+                    return Missing(position.boot_id, position.seq, end - 1, reason)
+            elif position is not None and position.seq < piece.first:
+                self.position = Position(position.boot_id, piece.first)
+                return Missing(position.boot_id, position.seq, piece.first - 1, reason)
             else:
                 self._number = piece.number + 1
-                begin = 0 if at is None else at.seq - piece.first
+                begin = 0 if position is None else position.seq - piece.first
                 if begin < len(piece.frames):
                     self.position = Position(piece.boot_id, piece.last + 1)
                     rows = cut((piece.frames, piece.columns), begin, len(piece.frames))
@@ -93,13 +93,13 @@ class Newest:
     def _onward(self, boot_id: str, aim: str) -> str:
         """Return the stream after this one, on the way to the stream of a batch."""
         first, seen = aim, {boot_id}
-        at: str | None = boot_id
-        while at is not None and at != aim:
-            stream = self._look(at)
-            at = None if stream is None else stream.following
-            if at in seen:
+        current: str | None = boot_id
+        while current is not None and current != aim:
+            stream = self._look(current)
+            current = None if stream is None else stream.following
+            if current in seen:
                 return aim
-            if at is not None and len(seen) == 1:
-                first = at
-            seen.add(at or "")
-        return first if at == aim else aim
+            if current is not None and len(seen) == 1:
+                first = current
+            seen.add(current or "")
+        return first if current == aim else aim

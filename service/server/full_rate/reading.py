@@ -93,7 +93,7 @@ class Reader:
         Raises:
             HangUp: the reader cannot go on.
         """
-        said: str | None = None
+        announced_id: str | None = None
         async with self._memory.watched() as news:
             while True:
                 news.clear()
@@ -101,9 +101,9 @@ class Reader:
                 if item is None:
                     await wait_for(news)
                     continue
-                if not isinstance(item, Begins) and item.boot_id != said:
+                if not isinstance(item, Begins) and item.boot_id != announced_id:
                     yield Begins(item.boot_id, item.from_seq)
-                said = item.boot_id
+                announced_id = item.boot_id
                 yield item
 
     async def next(self) -> Item | None:
@@ -134,36 +134,36 @@ class Reader:
 
     async def _estimated_again(self, step: Again) -> Rows | None:
         """Return the next recomputed rows; None: the state has changed, or no frame is due."""
-        at, stream = step.at, self._node.streams[step.at.boot_id]
-        begins = self._recomputed is None or self._recomputed.position != at
+        position, stream = step.at, self._node.streams[step.at.boot_id]
+        begins = self._recomputed is None or self._recomputed.position != position
         try:
             if self._recomputed is None or begins:
-                self._recomputed = Recomputed(self._node, stream, at, ends=step.ends)
+                self._recomputed = Recomputed(self._node, stream, position, ends=step.ends)
                 self._asked = step
             found = await asyncio.to_thread(self._recomputed.next_rows)
         except DamagedFramesError as error:
             self._recomputed = None
             self._drop_damaged(error)
             if stream.held & Intervals([(error.seq_first, error.seq_last)]):
-                raise self._unreadable(at, error) from error
+                raise self._unreadable(position, error) from error
             return None
         except StorageError as error:
             log.warning("node %s, for a live client: %s", self._node.name, error)
-            raise HangUp(Close.TRY_LATER, f"frames cannot be read now; {at}") from error
+            raise HangUp(Close.TRY_LATER, f"frames cannot be read now; {position}") from error
         except FootTileError as error:
-            raise self._unreadable(at, error) from error
+            raise self._unreadable(position, error) from error
         if found is None:  # the journal's end at creation is reached
             self._recomputed, self._not_due = None, self._asked
             return None
         first, last = int(found[0].seq[0]), int(found[0].seq[-1])
-        if first > at.seq:
+        if first > position.seq:
             self._recomputed = None
-            if begins and stream.held.within(at.seq, at.seq):
-                raise self._unreadable(at, "a stored frame is not in its journal")
+            if begins and stream.held.within(position.seq, position.seq):
+                raise self._unreadable(position, "a stored frame is not in its journal")
             return None
         if step.until is not None and last >= step.until:  # the buffer has the rest
             found = cut(found, 0, step.until - first)
-        rows = Rows(at.boot_id, found, recomputed=True)
+        rows = Rows(position.boot_id, found, recomputed=True)
         self._course.had(rows)
         return rows
 

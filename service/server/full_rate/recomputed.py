@@ -74,10 +74,10 @@ def estimated(
     to_come = deque(changes)
     for frames in batches:
         rest = frames
-        while to_come and (at := to_come[0].rows_before(rest)) < len(rest):
-            if at:
-                yield from _fed(run, rest.rows(0, at))
-                rest = rest.rows(at, len(rest))
+        while to_come and (count := to_come[0].rows_before(rest)) < len(rest):
+            if count:
+                yield from _fed(run, rest.rows(0, count))
+                rest = rest.rows(count, len(rest))
             if run is not None:
                 yield from run.finish()
             run = _run(info, to_come.popleft())
@@ -196,20 +196,20 @@ def _changes(
     last: int,
 ) -> list[Change]:
     """Return the changes of calibration and tare within these frames, in order."""
-    own = [
+    recorded = [
         Change(each.calibration, each.tare, seq=each.seq)
         for each in node.estimates.begun(stream.boot_id)
     ]
-    before = [change for change in own if change.seq is not None and change.seq <= begin]
+    before = [change for change in recorded if change.seq is not None and change.seq <= begin]
     if before:  # this server has estimated all of these frames
-        return own[len(before) - 1 :]
+        return recorded[len(before) - 1 :]
     journal = stream.journal
     if journal is None:
-        return own
-    until = last if not own or own[0].seq is None else max(begin, own[0].seq - 1)
+        return recorded
+    until = last if not recorded or recorded[0].seq is None else max(begin, recorded[0].seq - 1)
     t_ns = journal.t_ns_near(begin, newest=False)
     until_ns = journal.t_ns_near(until, newest=True)
     if t_ns is None or until_ns is None:
-        return own
+        return recorded
     tares = node.estimates.tares.during(stream.info, t_ns, until_ns)
-    return [*(Change(calibration, tare, t_ns=tare.t_ns) for tare in tares), *own]
+    return [*(Change(calibration, tare, t_ns=tare.t_ns) for tare in tares), *recorded]

@@ -116,11 +116,11 @@ class Feed:
         """Send the pending update to all subscribers."""
         if not self._summary:
             return
-        told = Told(self._summary, _ages_ms(self._nodes.values()))
-        for at, viewer in enumerate(tuple(self.viewers), 1):
+        tick = Told(self._summary, _ages_ms(self._nodes.values()))
+        for count, viewer in enumerate(tuple(self.viewers), 1):
             if viewer in self.viewers:  # it may have left meanwhile
-                viewer.tell(told, now_s)
-            if at % _AT_A_TIME == 0:
+                viewer.tell(tick, now_s)
+            if count % _AT_A_TIME == 0:
                 await asyncio.sleep(0)
 
 
@@ -205,8 +205,8 @@ class Hub:
 
     def age_ms(self, node: ServerNode) -> float | None:
         """Return the age of the newest frame of a node's present stream; None if unknown."""
-        known = node.last_seq is not None
-        return _ages_ms([node]).get(node.name) if known else None
+        has_frames = node.last_seq is not None
+        return _ages_ms([node]).get(node.name) if has_frames else None
 
     def _changing(self) -> list[Summary]:
         return [feed.change() for feed, _ in self._feeds.values()]

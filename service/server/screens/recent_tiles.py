@@ -43,21 +43,21 @@ class RecentTiles:
     def add(self, span: Span, columns: Mapping[str, npt.NDArray[Any]]) -> None:
         """Merge published frames into each tile's minimum and maximum."""
         unknown = np.full((1, self.tiles), np.nan)
-        given = [columns.get(unit, unknown).clip(-_GREATEST, _GREATEST) for unit in UNITS]
+        quantities = [columns.get(unit, unknown).clip(-_GREATEST, _GREATEST) for unit in UNITS]
         least, greatest = (
-            np.array([pick.reduce(values, axis=0) for values in given], np.float16)
+            np.array([pick.reduce(values, axis=0) for values in quantities], np.float16)
             for pick in (np.fmin, np.fmax)
         )
         if self._count and span.t_ns_first - self._begun_ns < APART_NS:
-            at = (self._count - 1) % _MOST
-            row, kept = self._rows[at], self._extremes[at]
+            index = (self._count - 1) % _MOST
+            row, extremes = self._rows[index], self._extremes[index]
             row["seq"], row["n"], row["t_ns"] = span.seq, row["n"] + span.n, span.t_ns
-            np.fmin(kept[0], least, out=kept[0])
-            np.fmax(kept[1], greatest, out=kept[1])
+            np.fmin(extremes[0], least, out=extremes[0])
+            np.fmax(extremes[1], greatest, out=extremes[1])
             return
-        at, self._begun_ns = self._count % _MOST, span.t_ns_first
-        self._rows[at] = span.seq_first, span.seq, span.n, span.t_ns
-        self._extremes[at] = least, greatest
+        index, self._begun_ns = self._count % _MOST, span.t_ns_first
+        self._rows[index] = span.seq_first, span.seq, span.n, span.t_ns
+        self._extremes[index] = least, greatest
         self._count += 1
 
     def rows(
@@ -73,10 +73,10 @@ class RecentTiles:
         Returns:
             Numbers (n,) with the fields of `ForceSpan`, minimum and maximum (n, tiles).
         """
-        at = np.arange(max(0, self._count - _MOST), self._count) % _MOST
-        rows = self._rows[at]
+        indices = np.arange(max(0, self._count - _MOST), self._count) % _MOST
+        rows = self._rows[indices]
         keep = rows["seq_first"] < (np.iinfo(np.int64).max if before_seq is None else before_seq)
         if keep.any():
             keep &= rows["t_ns"] > rows["t_ns"][keep][-1] - int(seconds * 1e9)
-        least, greatest = self._extremes[at[keep], :, UNITS.index(unit)].swapaxes(0, 1)
+        least, greatest = self._extremes[indices[keep], :, UNITS.index(unit)].swapaxes(0, 1)
         return rows[keep], least, greatest

@@ -123,10 +123,10 @@ class DriftView(View):
         """Return the present drift of a node."""
         live, tiles = node.estimates.live, len(node.info.tiles)
         line = trend(node.estimates.tares.valid(node.info), tiles=tiles)
-        none = np.full(tiles, np.nan)
-        slope = none if live.ranges is None else live.ranges.slope_n_per_kpa
-        warmer_by_k = none if live.tare is None else warmer_k(live.tare, live.recent_tadc())
-        since_kpa = none if live.tare is None else expected_shift_kpa(live.tare, warmer_by_k)
+        unknown = np.full(tiles, np.nan)
+        slope = unknown if live.ranges is None else live.ranges.slope_n_per_kpa
+        warmer_by_k = unknown if live.tare is None else warmer_k(live.tare, live.recent_tadc())
+        since_kpa = unknown if live.tare is None else expected_shift_kpa(live.tare, warmer_by_k)
         # A bare tile has no sealed gas.
         since_kpa = np.where([tile.reference for tile in node.info.tiles], np.nan, since_kpa)
         return cls(
@@ -393,9 +393,9 @@ class EventView(View):
 
 def tiles_of(info: ArrayInfo, ranges: Ranges | None) -> list[TileView]:
     """Return the tiles of an array; without a calibration their ranges are null."""
-    none = [None] * len(info.tiles)
-    full_scales = none if ranges is None else _known(ranges.full_scale_n)
-    entries = none if ranges is None else ranges.entries
+    nones = [None] * len(info.tiles)
+    full_scales = nones if ranges is None else _known(ranges.full_scale_n)
+    entries = nones if ranges is None else ranges.entries
     placed = {"serial", "mux", "channel", "x_m", "y_m", "z_m", "reference"}
     return [
         TileView(

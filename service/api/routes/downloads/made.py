@@ -49,8 +49,8 @@ async def tag_of_made(session: Session, query: MadeQuery, server: Server) -> str
     else:
         recorded = server.recorder.ledger(session.id).recorded
         content = f"{session.id}|{session.state}|{recorded}"
-    about = f"{content}|{query.canonical}|{beside}|{SOFTWARE}"
-    return hashlib.sha256(about.encode()).hexdigest()
+    text = f"{content}|{query.canonical}|{beside}|{SOFTWARE}"
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def said_of_marks(marks: list[Marks]) -> dict[str, str]:

@@ -60,8 +60,8 @@ def _sealed(session_id: str, server: Server) -> ArrayView:
     with server.sessions.frames(session_id, only_slices=True) as reader:
         info, notes, estimated = reader.info, reader.notes, reader.has("grf_n")
     if not estimated:
-        said = str(notes.get("estimates", "no estimates")).removeprefix("no estimates: ")
-        return _view(session_id, info, _calibration(notes), None, said)
+        reason = str(notes.get("estimates", "no estimates")).removeprefix("no estimates: ")
+        return _view(session_id, info, _calibration(notes), None, reason)
     lag_ms = notes.get("lag_ms")
     known_ms = float(lag_ms) if isinstance(lag_ms, int | float) else None
     return _view(session_id, info, _calibration(notes), known_ms, None)
@@ -85,17 +85,19 @@ def _view(
         ranges = None if calibration is None else Ranges.of(info, calibration)
     except FootTileError:  # it is of other tiles
         ranges = None
-    said = None
+    calibration_view = None
     if calibration is not None and ranges is not None:
         scale = scale_of(ranges)
-        said = CalibrationView(id=calibration.id, name=calibration.name, absolute_scale=scale)
+        calibration_view = CalibrationView(
+            id=calibration.id, name=calibration.name, absolute_scale=scale
+        )
     return ArrayView(
         session_id=session_id,
         node=info.node,
         tiles=tiles_of(info, ranges),
         servo=info.servo,
         nominal_rate_hz=info.nominal_rate_hz,
-        calibration=said,
+        calibration=calibration_view,
         lag_ms=lag_ms,
         estimates_problem=problem,
     )

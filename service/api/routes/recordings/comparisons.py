@@ -160,12 +160,14 @@ def _frames_hash(session: Session, server: Server) -> object:
 
 
 def _view(frames: object, name: str, content: dict[str, Any]) -> ComparisonView:
-    of = content["session"].get("file_sha256")
+    compared_sha256 = content["session"].get("file_sha256")
     missed = content.get("missed")
     return ComparisonView(
         name=name,
         problem=None,
-        is_of_these_frames=of == frames if isinstance(of, str) and frames is not None else None,
+        is_of_these_frames=compared_sha256 == frames
+        if isinstance(compared_sha256, str) and frames is not None
+        else None,
         missed=[str(line) for line in missed] if isinstance(missed, list) else [],
     )
 
@@ -183,8 +185,8 @@ def _report(session: Session, name: str, server: Server) -> ReportView:
 
 
 def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> bytes:
-    kept = server.series.of(comparison_of(server.sessions.folder.path(session.id), name))
-    if kept is None:
+    cached = server.series.of(comparison_of(server.sessions.folder.path(session.id), name))
+    if cached is None:
         raise UnknownError(
             f"the comparison with {name!r} has no series",
             remedy="An older version made it, or it is too long: compare again",
@@ -192,16 +194,16 @@ def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> 
     with server.sessions.frames(session.id, only_slices=True) as reader:
         begin_ns, end_ns = reader.span_ns()
     part = Slice(query.start_s, query.end_s)
-    bins, size = kept.seen(begin_ns, part, query.points)
+    bins, size = cached.seen(begin_ns, part, query.points)
     columns = {column: values for column, values in bins.items() if column != "part"}
     times = {
         f"t_{which}_s": (columns.pop(f"t_{which}_ns") - begin_ns) * 1e-9
         for which in ("first", "last")
     }
-    about = {
+    metadata = {
         "session_id": session.id,
         "begin_t_ns": begin_ns,
         "duration_s": (end_ns - begin_ns) * 1e-9,
         "frames_in_bin": size,
     }
-    return numbers_as_json(about, times | columns)
+    return numbers_as_json(metadata, times | columns)

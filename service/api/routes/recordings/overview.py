@@ -114,8 +114,8 @@ async def overview(
     if session.sha256 is None:
         return await _so_far(session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
     server.so_fars.forget(session_id)
-    asked = f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{as_gzip}|{SOFTWARE}"
-    tag = hashlib.sha256(asked.encode()).hexdigest()
+    etag_input = f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{as_gzip}|{SOFTWARE}"
+    tag = hashlib.sha256(etag_input.encode()).hexdigest()
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
     headers |= {"Vary": "Accept, Accept-Encoding"}
     if has_it(request, tag):
@@ -137,8 +137,8 @@ async def _so_far(
     def make() -> bytes:
         so_far = server.so_fars.taken(sources)
         seen, serials = so_far.seen(part, query.points), list(sources.info.serials)
-        said = {"provisional": True, "behind": so_far.is_behind}
-        return _written(session, seen, serials, said, query, as_arrow=as_arrow, as_gzip=as_gzip)
+        flags = {"provisional": True, "behind": so_far.is_behind}
+        return _written(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
 
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     headers = {"Cache-Control": "no-store"} | ({"Content-Encoding": "gzip"} if as_gzip else {})
@@ -155,8 +155,8 @@ def _content(
     with server.sessions.frames(session.id, only_slices=True) as reader:
         seen = overview_of_session(reader, part, query.points, frames_sha256=session.sha256)
         serials = list(reader.info.serials)
-    said = {"provisional": False, "behind": False}
-    return _written(session, seen, serials, said, query, as_arrow=as_arrow, as_gzip=as_gzip)
+    flags = {"provisional": False, "behind": False}
+    return _written(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
 
 
 def _written(

@@ -138,10 +138,10 @@ async def start(
 
     Several sessions may be recorded on one node at a time; each is stopped by its id.
     """
-    asked = asked_with(idempotency_key, "session", body)
-    begun = server.sessions.begun_by(asked)
-    if begun:
-        session = begun[0]
+    record = asked_with(idempotency_key, "session", body)
+    earlier = server.sessions.begun_by(record)
+    if earlier:
+        session = earlier[0]
     else:
         session = server.recorder.start(
             body.node,
@@ -150,7 +150,7 @@ async def start(
             subject=body.subject or "",
             notes=body.notes,
             tags=body.tags,
-            asked=asked,
+            asked=record,
         )
         server.tell_node(server.nodes.get(body.node))
     response.headers["Location"] = f"/api/v1/sessions/{session.id}"
@@ -244,8 +244,8 @@ async def list_sessions(
     since_t_ns = choice.from_t_ns or 0
     listed = server.sessions.newest_first(min(ends, default=None))
     recent = takewhile(lambda session: session.started_t_ns >= since_t_ns, listed)
-    of = server.recorder.completeness_of
-    found = (session for session in recent if choice.takes(session, of))
+    get_completeness = server.recorder.completeness_of
+    found = (session for session in recent if choice.takes(session, get_completeness))
     page = list(islice(found, limit))
     more = next(found, None) is not None
     return SessionPage(

@@ -168,8 +168,8 @@ async def stances_overlay(
     """
     session = _sealed(session_id, server)
     as_gzip = takes_gzip(accept_encoding)
-    asked = f"{session.sha256}|{query.model_dump_json()}|{as_gzip}|{SOFTWARE}"
-    tag = hashlib.sha256(asked.encode()).hexdigest()
+    etag_input = f"{session.sha256}|{query.model_dump_json()}|{as_gzip}|{SOFTWARE}"
+    tag = hashlib.sha256(etag_input.encode()).hexdigest()
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
     if has_it(request, tag):
         return Response(status_code=304, headers=headers)

@@ -101,11 +101,11 @@ async def stop(take_id: str, server: ServerState) -> TakeView:
     """
     take = server.takes.stop(take_id)
     _tell_nodes(server, take)
-    there = [node.name for node in server.nodes if node.connected]
+    connected = [node.name for node in server.nodes if node.connected]
     settled = [
         server.settling.settled(session.id, one.SETTLE_S)
         for session in take.sessions
-        if session.node in there
+        if session.node in connected
     ]
     await asyncio.gather(*settled)
     now = [server.sessions.get(session.id) for session in take.sessions]

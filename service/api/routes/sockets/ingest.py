@@ -112,10 +112,10 @@ def _expect(kind: type[_Message], message: str | bytes) -> _Message:
     name = kind.model_fields["type"].default
     if isinstance(message, bytes):
         raise HangUp(Close.REFUSED, f"{name} was expected, in text")
-    said = _parse(message)
-    if not isinstance(said, kind):
-        raise HangUp(Close.REFUSED, f"{name} was expected, not {said.type}")
-    return said
+    parsed = _parse(message)
+    if not isinstance(parsed, kind):
+        raise HangUp(Close.REFUSED, f"{name} was expected, not {parsed.type}")
+    return parsed
 
 
 def _is_proven(server: Server, claim: Claim) -> bool:
@@ -149,8 +149,8 @@ def _joined(server: Server, hello: Hello, claim: Claim) -> Iterator[Link]:
     if other is not None:
         # A node that was restarted lists the stream it had before. The ids of streams are
         # public, so without a secret they prove nothing.
-        known = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
-        if not is_proven or other.node.boot_id not in known:
+        known_ids = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
+        if not is_proven or other.node.boot_id not in known_ids:
             raise HangUp(
                 Close.NAME_TAKEN,
                 f"a node {name!r} is connected already; give this one another name (--name)",
@@ -229,22 +229,22 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
             if node.estimates.live.tare is not tare_before:
                 server.tell_node(node)
             continue
-        said = _parse(message)
-        match said:
+        parsed = _parse(message)
+        match parsed:
             case Probe(id=number):
                 await _answer(socket, Probe(id=number, server_t_ns=utc_ns()))
             case FramesOf(boot_id=boot_id):
                 link.stream = _announced(node, boot_id)
             case ClockRow():
-                server.recorder.note_clock(node, said, utc_ns())
+                server.recorder.note_clock(node, parsed, utc_ns())
             case Status():
-                node.present.missed_slots = said.missed_slots
-                node.troubles, node.fault_counts = said.troubles, said.counts
+                node.present.missed_slots = parsed.missed_slots
+                node.troubles, node.fault_counts = parsed.troubles, parsed.counts
                 server.tell_node(node)
             case Lost():
-                _announced(node, said.boot_id).note_losses(said.lost)
+                _announced(node, parsed.boot_id).note_losses(parsed.lost)
             case Identify() | Proof() | Hello():
-                raise HangUp(Close.REFUSED, f"{said.type} was sent before")
+                raise HangUp(Close.REFUSED, f"{parsed.type} was sent before")
 
 
 def _announced(node: ServerNode, boot_id: str) -> ServerStream:
@@ -314,13 +314,13 @@ def _frames(message: bytes) -> bytes:
 def _protocol_of(message: str | bytes) -> int | None:
     """Return the protocol of a first message, whatever else it has; None without one."""
     try:
-        said = json.loads(message) if isinstance(message, str) else None
+        content = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):
         return None
     # Until protocol 2 the first message was hello.
-    if not isinstance(said, dict) or said.get("type") not in ("identify", "hello"):
+    if not isinstance(content, dict) or content.get("type") not in ("identify", "hello"):
         return None
-    protocol = said.get("protocol")
+    protocol = content.get("protocol")
     return protocol if isinstance(protocol, int) else None
 
 

@@ -40,13 +40,13 @@ class LiveFrames:
     """
 
     def __init__(self, socket: WebSocket, server: Server) -> None:
-        given = socket.query_params
-        if unknown := set(given) - PARAMETERS:
+        parameters = socket.query_params
+        if unknown := set(parameters) - PARAMETERS:
             raise HangUp(Close.POLICY, f"unknown parameter {sorted(unknown)[0][:60]!r}")
         self._socket = socket
-        self._node = _node(server, given.get("node"))
-        self._policy = _policy(given.get("policy", "lossless"))
-        names = [name.strip() for name in given.get("columns", "").split(",")]
+        self._node = _node(server, parameters.get("node"))
+        self._policy = _policy(parameters.get("policy", "lossless"))
+        names = [name.strip() for name in parameters.get("columns", "").split(",")]
         self._columns = tuple(name for name in names if name)
         try:
             check_columns(self._node.info, self._columns)
@@ -54,8 +54,8 @@ class LiveFrames:
             raise HangUp(Close.POLICY, error.what) from error
         position = first_position(
             self._node,
-            _matching(given.get("boot_id"), _BOOT_ID, "boot_id", "32 hex digits"),
-            _number(given.get("from_seq")),
+            _matching(parameters.get("boot_id"), _BOOT_ID, "boot_id", "32 hex digits"),
+            _number(parameters.get("from_seq")),
         )
         node, self._memory = self._node, server.frames.of(self._node.name)
         self._reader = Reader(
@@ -104,8 +104,8 @@ class LiveFrames:
                 await self._send(self._encoder.header())
             case Missing(boot_id=boot_id, from_seq=first, to_seq=last, reason=reason):
                 kind = "lost" if self._policy == "lossless" else "dropped"
-                said = {"boot_id": boot_id, "from_seq": first, "to_seq": last, "reason": reason}
-                await self._send(dumps({"type": kind, **said}))
+                fields = {"boot_id": boot_id, "from_seq": first, "to_seq": last, "reason": reason}
+                await self._send(dumps({"type": kind, **fields}))
                 self._at = Position(boot_id, last + 1)
             case _:
                 assert self._encoder is not None  # noqa: S101  # a stream has begun before
@@ -128,11 +128,11 @@ class LiveFrames:
 
 
 def _node(server: Server, name: str | None) -> ServerNode:
-    known = list(server.nodes)
+    all_nodes = list(server.nodes)
     if name is None:
-        if len(known) == 1:
-            return known[0]
-        names = ", ".join(node.name for node in known)
+        if len(all_nodes) == 1:
+            return all_nodes[0]
+        names = ", ".join(node.name for node in all_nodes)
         raise HangUp(Close.POLICY, f"node= is missing; nodes: {names or 'none so far'}"[:120])
     found = server.nodes.find(name)
     if found is None:
