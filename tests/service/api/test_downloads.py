@@ -287,6 +287,6 @@ def test_an_odd_id_is_not_found(sealed: Sealed) -> None:
 def test_a_file_that_was_taken_away_is_said_to_be(sealed: Sealed) -> None:
     path = sealed.session.folder / "frames.parquet"
     path.unlink()
-    assert_refused(sealed.get(), 404, "taken away")
+    assert_refused(sealed.get(), 404, "is missing")
     assert sealed.made(format="csv").status_code in (404, 500)
     assert sealed.running.http.get("/health").status_code == 200
