@@ -30,5 +30,5 @@ VOLUME /data
 EXPOSE 8000
 STOPSIGNAL SIGTERM
 # Without FOOTTILE_TOKEN it makes a token, which is not in the log. A link that logs a browser in, once:
-# docker exec NAME foottile ticket
+# docker exec NAME foottile invite
 CMD ["foottile", "serve", "--host", "0.0.0.0", "--data", "/data"]

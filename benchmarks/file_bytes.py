@@ -59,7 +59,7 @@ def measured(recording: data.Recording, folder: Path, *, with_ladder: bool) -> l
     }
     if with_ladder:
         ways["whole ladder"] = (
-            find_calibration("bench", recording.info.serials),
+            find_calibration("emulated-rig", recording.info.serials),
             sealing.LADDER,
         )
     journal = Journal.open(folder / "journal")

@@ -2,7 +2,7 @@
 
     python benchmarks/ladders.py --data DIR [--draws N] [--case NAME] [--out FILE]
 
-`foottile bench` compares what a scene names; here a scene may have every model that its
+`foottile benchmark` compares what a scene names; here a scene may have every model that its
 calibration offers. Ladders are built up to all of them, and each is left out of the whole; recorded
 loads of DIR are pressed on the emulated domes where a scene has no ground of its own.
 """

@@ -100,7 +100,7 @@ def jobs(
         "with estimates, `static`": lambda: sealing("static", paper_eq2_shape(), STATIC),
     }
     if with_ladder:
-        bench = find_calibration("bench", recording.info.serials)
+        bench = find_calibration("emulated-rig", recording.info.serials)
         found["with estimates, the whole ladder"] = lambda: sealing("ladder", bench, LADDER)
     return found
 

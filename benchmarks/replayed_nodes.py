@@ -103,7 +103,7 @@ def played(tiles: int, rate_hz: float) -> Played:
     if tiles > _FOOT_TILES:
         foot = thinned(foot, rate_hz)
     foot = at_rate(foot, rate_hz)
-    bench = find_calibration("bench", foot.info.serials)
+    bench = find_calibration("emulated-rig", foot.info.serials)
     serials = [f"T{i + 1:02d}" for i in range(tiles)]
     places = [i % _FOOT_TILES for i in range(tiles)]
     info = foot.info.model_copy(

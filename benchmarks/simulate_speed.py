@@ -32,7 +32,7 @@ RUNS = 3
 def session(scene_name: str, schedule: ScheduleName | None) -> tuple[float, float]:
     """Frames/s in virtual time, and virtual seconds per wall second."""
     scene = load_scene(scene_name)
-    calibration = find_calibration("bench", [tile.serial for tile in scene.tile])
+    calibration = find_calibration("emulated-rig", [tile.serial for tile in scene.tile])
     options = SimulateOptions(scene, seconds=SECONDS, schedule=schedule)
     estimate = EstimateOptions(calibration, scene.models, 100.0)
     results = []

@@ -95,7 +95,7 @@ def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_late
         (("simulate", "--scene", "standing"), "server"),
         (("estimate", "in.parquet", "--out", "out.parquet"), "server"),
         (("calibrate", "in.parquet", "--out", "out.json"), "server"),
-        (("bench", "--out", "."), "server"),
+        (("benchmark", "--out", "."), "server"),
         (("sessions",), "client"),
         (("pull", "id", "--out", "."), "client"),
         (("stream",), "client"),

@@ -54,7 +54,7 @@ SECONDS_MAX = NUMBER_MAX = 1e9
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ExactOption = Annotated[
     bool,
-    typer.Option("--exact", help="Keep estimates as computed: do not round off their noise."),
+    typer.Option("--no-quantize", help="Keep estimates as computed: do not round off their noise."),
 ]
 CaOption = Annotated[
     Path | None,

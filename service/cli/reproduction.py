@@ -20,7 +20,7 @@ from devices.scene.file import load_scene
 from service.cli.laboratory import Laboratory, Trial
 from service.estimation.calibration import Calibration
 from service.estimation.domes import DOMES, PAPER_DOME, Dome
-from service.offline.calibrations import BENCH, bench_scene, find_calibration
+from service.offline.calibrations import EMULATED_RIG, bench_scene, find_calibration
 from service.offline.processes import spread
 from service.offline.reproduce.judge import Judged, judge
 from service.offline.reproduce.mill import (
@@ -161,7 +161,7 @@ def _mill(run: _Run) -> tuple[tuple[DomeFound, ...], Calibration | None]:
     try:
         if options.quick:
             calibration = find_calibration(
-                BENCH, _serials(), parts_seed=options.parts_seed, progress=run.tell
+                EMULATED_RIG, _serials(), parts_seed=options.parts_seed, progress=run.tell
             )
         elif set(calibrated) == set(serials):
             calibration = together([calibrated[serial] for serial in serials], "reproduce")

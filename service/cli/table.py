@@ -17,38 +17,29 @@ _IN = "service.cli.commands"
 
 SUMMARIES = {
     "demo": "Run a server and an emulated node, and print a link to the live page.",
-    "serve": "Take in nodes, estimate, show live, record, and give sessions away over HTTP.",
-    "node": "Take frames from an array, keep them on disk and publish them to a server.",
-    "ticket": "Give a ticket for the live page: an address, and on a terminal its QR code.",
+    "serve": "Run the server: live view, recording, REST API.",
+    "node": "Read an array, keep its frames on disk and send them to a server.",
+    "invite": "Create a one-time login link, and on a terminal its QR code.",
     "accept-node": "Accept another machine under the name of a node.",
     "sessions": "List recorded sessions, newest first.",
-    "pull": "Download a sealed session: data, description, events.",
-    "stream": "Print live frames of a node with their estimates, a line each, until Ctrl-C.",
+    "pull": "Download a sealed session: data, description, markers.",
+    "stream": "Print live frames of a node with their estimates, one line each, until Ctrl-C.",
     "export": "Write a sealed session, or a slice of it, in another format.",
-    "query": "Ask in SQL about all sealed sessions at once.",
+    "query": "Run SQL over all sealed sessions.",
     "simulate": "Run a scene on emulated hardware in virtual time and write the session.",
     "estimate": "Estimate a recorded session again and write it with the new estimates.",
     "compare": "Compare a session with a reference: a force plate, an insole, another session.",
     "calibrate": (
-        "Fit every tile that was pressed in the recordings, and say how good the fit is."
+        "Fit curve and effects of every tile in the recordings, with confidence intervals."
     ),
-    "domes": "List the domes of the paper's Table I, and say which one bears a load.",
-    "verify": (
-        "Prove sessions and journals from their files alone: checksums, hashes, order and ledger."
-    ),
-    "recover": (
-        "Complete what a crash has left, without a server: mend journals, seal sessions, prove "
-        "them."
-    ),
-    "doctor": (
-        "Find the tiles of a bus, measure it, and say what rate it will hold and what to change."
-    ),
-    "reproduce": (
-        "Repeat the paper's experiments on emulated hardware, from the mill to the comparison."
-    ),
-    "bench": "Measure time per frame and error of every rung of the model ladder.",
+    "domes": "List the domes of the paper's Table I and their load ranges.",
+    "verify": "Verify sessions and journals from their files: checksums, hashes, order and ledger.",
+    "recover": "Repair journals and seal sessions after a crash, without a server.",
+    "doctor": "Find the tiles of a bus, measure it, and predict its frame rate.",
+    "reproduce": "Repeat the paper's experiments on emulated hardware.",
+    "benchmark": "Measure time and error of every model set.",
 }
-"""What each command does, as the first sentence of its function says; in the order of `--help`."""
+"""Summary of each command, the first sentence of its function, in the order of `--help`."""
 
 _MODULES = {"pull": "sessions", "export": "sessions"}
 """Modules with more than one command."""

@@ -83,7 +83,7 @@ def remark_reach(urls: list[str], host: str) -> None:
         else:
             remark(
                 "this machine is in no network, so no phone reaches it: start a hotspot or join a "
-                "network; `foottile ticket` then shows its address"
+                "network; `foottile invite` then shows its address"
             )
     if any("%25" in url for url in urls):
         remark(
@@ -124,7 +124,7 @@ def show_code(address: str, *, viewer: bool = False) -> None:
         sys.stdout.write(f"{_BLACK_ON_WHITE}{solid}{_USUAL}\n")
     sys.stdout.flush()
     may = "look" if viewer else "tare, record and change"
-    remark(f"for a phone: it may {may}; good once, for five minutes; more with `foottile ticket`")
+    remark(f"for a phone: it may {may}; good once, for five minutes; more with `foottile invite`")
 
 
 def say_ticket(urls: list[str], *, viewer: bool) -> None:

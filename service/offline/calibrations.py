@@ -32,11 +32,11 @@ from service.user_folders import user_folder
 from service.version import SOFTWARE
 from storage.durable import make_folder, read_whole, set_aside
 
-BENCH = "bench"
+EMULATED_RIG = "emulated-rig"
 SHIPPED = Path(__file__).parent / "shipped"
-"""Written by `FOOTTILE_WRITE_BENCH=1 sh scripts/test tests/service/offline/test_shipped.py`."""
-BENCH_REFERENCE = "emulated mill, 12 bit over 100 N"
-BENCH_DELAY = Parameter(value=0.0, sigma=0.0001)
+"""Written by `FOOTTILE_WRITE_RIG=1 sh scripts/test tests/service/offline/test_shipped.py`."""
+RIG_REFERENCE = "emulated mill, 12 bit over 100 N"
+RIG_DELAY = Parameter(value=0.0, sigma=0.0001)
 """Its amplifier has no filter, and its converter is asked within the frame."""
 
 Progress = Callable[[str], None]
@@ -55,7 +55,7 @@ def find_calibration(
     """The calibration called `name`, checked to cover `serials`.
 
     Args:
-        name: "bench", a preset's name, or the path of a file.
+        name: "emulated-rig", a preset's name, or the path of a file.
         serials: tiles that it must cover.
         parts_seed: which parts the emulated bench presses.
         family: of which family of parts.
@@ -66,13 +66,13 @@ def find_calibration(
     Raises:
         CalibrationError: no such calibration, or it lacks a tile.
     """
-    if name == BENCH:
+    if name == EMULATED_RIG:
         folder = cache if cache is not None else _cache_folder()
         scenes = [bench_scene(serial, family, repeatability) for serial in serials]
         entries = [_bench_tile(scene, parts_seed, folder, progress) for scene in scenes]
         return Calibration(
-            name=BENCH,
-            reference=BENCH_REFERENCE,
+            name=EMULATED_RIG,
+            reference=RIG_REFERENCE,
             date=entries[0].date,
             tiles=tuple(tile for entry in entries for tile in entry.tiles),
         )
@@ -85,7 +85,7 @@ def find_calibration(
 def _cache_folder() -> Path | None:
     """Return the folder of the bench's results in the user's cache; None: there can be none."""
     with suppress(UsageError):
-        return user_folder("cache", None, "") / "bench"
+        return user_folder("cache", None, "") / "rig"
     return None
 
 
@@ -101,7 +101,7 @@ def read_calibration(path: Path) -> Calibration:
     except FileNotFoundError as error:
         raise CalibrationError(
             f"no calibration {str(path)!r}",
-            expected=f"a file, {BENCH!r}, or a preset: {', '.join(PRESETS)}",
+            expected=f"a file, {EMULATED_RIG!r}, or a preset: {', '.join(PRESETS)}",
         ) from error
     except (DamagedFileError, RuntimeError) as error:  # the second: links in a circle
         what = error.what if isinstance(error, DamagedFileError) else str(error)
@@ -133,9 +133,9 @@ def _bench_tile(
         simulate(SimulateOptions(scene, foot=foot), recording, None)
         calibration = calibrate_recordings(
             read_recordings([recording]),
-            name=f"{BENCH}-{serial}",
-            reference=BENCH_REFERENCE,
-            delay=BENCH_DELAY,
+            name=f"{EMULATED_RIG}-{serial}",
+            reference=RIG_REFERENCE,
+            delay=RIG_DELAY,
         )
     if kept is None:
         progress(

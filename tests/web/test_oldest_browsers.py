@@ -56,7 +56,9 @@ def test_what_is_too_new_is_deleted_in_these_tests(server: Running, open_page: O
 
 
 @pytest.mark.parametrize(
-    "path", ["README.md", "CONTRIBUTING.md", "web/guard.js"], ids=["readme", "contributing", "page"]
+    "path",
+    ["docs/session-page.md", "CONTRIBUTING.md", "web/guard.js"],
+    ids=["document", "contributing", "page"],
 )
 def test_the_oldest_browsers_are_the_same_everywhere(path: str) -> None:
     text = " ".join((ROOT / path).read_text("utf-8").split())

@@ -4,7 +4,7 @@ import { parseAnswer, Refusal, sendRequest } from "./request.js";
 import { el, setText } from "./text.js";
 
 const PATH = "/api/v1/login";
-const WHERE = "Ask who started the server: “foottile ticket”, on that computer, shows an address and a code to scan "
+const WHERE = "Ask who started the server: “foottile invite”, on that computer, shows an address and a code to scan "
   + "that let you in. Or type in the server's token.";
 const ASKED = `Anyone may watch; to tare, record or change something you have to log in. ${WHERE}`;
 const PRIVATE = `This server is private: to look you have to log in, too. ${WHERE}`;

@@ -81,8 +81,8 @@ def calibrate_command(
         Path | None,
         typer.Option(help="Draw curves, residuals, a release and a tap to this PNG."),
     ] = None,
-    reference: Annotated[
-        str, typer.Option(help="The force sensor that the scale comes from.")
+    sensor: Annotated[
+        str, typer.Option(help="Name of the force sensor, for the calibration file.")
     ] = "not stated",
     reference_delay_ms: Annotated[
         float | None,
@@ -91,7 +91,7 @@ def calibrate_command(
     reference_delay_sigma_ms: Annotated[
         float, typer.Option(min=0.0, max=1000.0, help="Standard uncertainty of that.")
     ] = 0.1,
-    against: Annotated[
+    reference: Annotated[
         Path | None,
         typer.Option(
             help="What a force plate has recorded under the foot of IN, a session: fits how it is "
@@ -99,15 +99,15 @@ def calibrate_command(
         ),
     ] = None,
     per_tile: Annotated[
-        bool, typer.Option("--per-tile", help="With --against: a gain for each tile.")
+        bool, typer.Option("--per-tile", help="With --reference: a gain for each tile.")
     ] = False,
     shear: Annotated[
         bool,
-        typer.Option("--shear", help="With --against: which way the ground pushes tilted tiles."),
+        typer.Option("--shear", help="With --reference: which way the ground pushes tilted tiles."),
     ] = False,
     reference_gain_sigma: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, help="With --against: uncertainty of the plate's gain."),
+        typer.Option(min=0.0, max=1.0, help="With --reference: uncertainty of the plate's gain."),
     ] = 0.0,
     columns: ColumnsOfReference = None,
     units: UnitsOfReference = None,
@@ -120,21 +120,21 @@ def calibrate_command(
     lag_range_s: LagRange = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit every tile that was pressed in the recordings, and say how good the fit is.
+    """Fit curve and effects of every tile in the recordings, with confidence intervals.
 
-    With --live it guides through dead weights on tiles of a running node and has the server fit
-    them: docs/calibrate-a-tile.md. Else a recording is a session with reference_force_n,
-    pressed_tile and phase, as the mill or `foottile simulate --scene indentation` makes it, or with
-    marks that say which weight stood on which tile. A tile whose recording gives no believable
-    curve is refused with the reason. With --against it is a session of the mounted foot on a force
-    plate: its calibration is written with the foot's gains, and its shear if asked for; what the
-    load does not determine is refused. Exit codes: 0 good, 1 failed, no tile has a curve, 2 wrong
-    usage, 3 written, but a tile was refused; with --live: not accepted, and not written.
+    A recording is a session with reference_force_n, pressed_tile and phase, as an indenter or
+    `foottile simulate --scene indentation` makes it, or a session whose markers say which weight
+    stood on which tile. --live guides through dead weights on tiles of a running node; the server
+    fits them (docs/calibrate-a-tile.md). --reference fits the mounted foot of a session to a force
+    plate: gains of the foot or of its tiles, and shear. A tile whose recording gives no
+    believable curve, or a parameter that the load does not determine, is refused with the reason.
+    Exit codes: 0 success, 1 no tile has a curve, 2 wrong usage, 3 written but a tile was refused,
+    or, with --live, not accepted and not written.
     """
     if live:
-        if recordings or tile is None or against is not None or plot is not None:
+        if recordings or tile is None or reference is not None or plot is not None:
             raise UsageError(
-                "--live goes with --tile, and without recordings, --plot and --against",
+                "--live goes with --tile, and without recordings, --plot and --reference",
                 remedy="foottile calibrate --live --tile T01 --out cal.json",
             )
         from service.cli.commands.calibrate_live import LiveWeights, calibrate_live
@@ -147,7 +147,7 @@ def calibrate_command(
                 within_percent=within_percent,
                 node=node,
                 name=name or f"{tile}, dead weights",
-                reference="dead weights" if reference == "not stated" else reference,
+                reference="dead weights" if sensor == "not stated" else sensor,
                 assign=assign,
                 yes=yes,
             ),
@@ -168,10 +168,10 @@ def calibrate_command(
         "decimal": decimal,
         "encoding": encoding,
     }
-    if against is not None:
+    if reference is not None:
         if len(recordings) > 1 or plot is not None or reference_delay_ms is not None:
             raise UsageError(
-                "--against goes with one session, and without --plot and --reference-delay-ms"
+                "--reference goes with one session, and without --plot and --reference-delay-ms"
             )
         from service.cli.commands.calibrate_against import calibrate_mounted
         from service.offline.against import AgainstOptions
@@ -189,9 +189,9 @@ def calibrate_command(
             per_tile=per_tile,
             shear=shear,
             reference_gain_sigma=reference_gain_sigma,
-            reference=reference,
+            reference=sensor,
         )
-        calibrate_mounted(recordings[0], against, out, options, as_json=as_json)
+        calibrate_mounted(recordings[0], reference, out, options, as_json=as_json)
         return
     if (
         per_tile
@@ -202,7 +202,9 @@ def calibrate_command(
             for one in (columns, units, sign, rate_hz, lag_range_s, *of_text.values())
         )
     ):
-        raise UsageError("that is said of a plate, and none is named", remedy="Add --against FILE")
+        raise UsageError(
+            "that is said of a plate, and none is named", remedy="Add --reference FILE"
+        )
     from service.cli.calibration_report import calibration_json, calibration_tables
     from service.estimation.effects import Parameter
     from service.estimation.fitting.bench.weights import has_weights
@@ -229,7 +231,7 @@ def calibrate_command(
         ):
             raise UsageError("--plot draws strokes of a mill, and these are dead weights")
         calibration = calibrate_recordings(
-            pressed, name=name or path.stem, reference=reference, delay=delay, progress=remark
+            pressed, name=name or path.stem, reference=sensor, delay=delay, progress=remark
         )
         png = None
         if plot_path is not None:

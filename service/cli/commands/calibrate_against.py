@@ -1,4 +1,4 @@
-"""`foottile calibrate --against`: a mounted foot against a force plate."""
+"""`foottile calibrate --reference`: a mounted foot against a force plate."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def doctor_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the tiles of a bus, measure it, and say what rate it will hold and what to change.
+    """Find the tiles of a bus, measure it, and predict its frame rate.
 
     Looks behind every multiplexer, reads each tile's coefficients three times, measures the bus
     clock and every part's conversion time, and predicts the frame rate of every schedule. With a

@@ -19,7 +19,7 @@ def domes_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the domes of the paper's Table I, and say which one bears a load.
+    """List the domes of the paper's Table I and their load ranges.
 
     The paper states a range for one dome only, 11 mm of Vytaflex 60; the others are scaled by
     modulus and area, which is an estimate. Exit codes: 0 good, 2 wrong usage, 3 every dome

@@ -56,8 +56,8 @@ def estimate_command(
     calibration: Annotated[
         str | None,
         typer.Option(
-            help="Calibration file, preset, 'bench', or the id of the one in the session; default: "
-            "the one in the session, else the scene's."
+            help="Calibration file, preset, 'emulated-rig', or id of the session's calibration; "
+            "default: the session's, else the scene's."
         ),
     ] = None,
     models: Annotated[

@@ -64,7 +64,7 @@ def node_command(
         bool, typer.Option("--end-with-parent", hidden=True, help="End when its parent dies.")
     ] = False,
 ) -> None:
-    """Take frames from an array, keep them on disk and publish them to a server.
+    """Read an array, keep its frames on disk and send them to a server.
 
     Every frame is journaled: what sessions need stays until the server has it on its disk, the rest
     for ten minutes. It keeps trying: when the server is away, or this node was switched off, frames
@@ -146,12 +146,12 @@ async def _run(options: NodeOptions) -> Outcome:
 
 def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]:
     """The calibration that the scene names, or why there is none: raw frames are worth having."""
-    from service.offline.calibrations import BENCH, find_calibration
+    from service.offline.calibrations import EMULATED_RIG, find_calibration
 
     scene = options.scene
     if scene.calibration == "none":
         return None, "the scene names no calibration"
-    if scene.calibration == BENCH and not options.emulated:
+    if scene.calibration == EMULATED_RIG and not options.emulated:
         # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
         problem = (
             "the emulated bench knows emulated tiles only: press the tiles on a real bench, run "

@@ -47,7 +47,7 @@ def query_command(
     as_csv: Annotated[bool, typer.Option("--csv", help="Print the answer as CSV.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Ask in SQL about all sealed sessions at once.
+    """Run SQL over all sealed sessions.
 
     Columns and examples are in docs/query.md. No question changes a session. Sessions that are not
     sealed yet, or damaged, are left out and named on stderr; the exit code is 3 then.

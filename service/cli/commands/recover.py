@@ -31,7 +31,7 @@ def recover_command(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Complete what a crash has left, without a server: mend journals, seal sessions, prove them.
+    """Repair journals and seal sessions after a crash, without a server.
 
     A server does this by itself when it is started; this is for a folder that has none, and for a
     node alone. It can be run again at any time. Exit codes: 0 good, 1 something could not be

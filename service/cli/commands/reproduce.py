@@ -48,7 +48,7 @@ def reproduce_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Repeat the paper's experiments on emulated hardware, from the mill to the comparison.
+    """Repeat the paper's experiments on emulated hardware.
 
     Six domes are pressed, a foot is calibrated, rolls over a pressure plate and hops on a force
     plate; node and server are processes of their own, over loopback and in real time. Exit codes: 0

@@ -42,10 +42,10 @@ def serve_command(
         bool | None,
         typer.Option("--private", help="Ask for a login to look, too; default: only to change."),
     ] = None,
-    exact: Annotated[
+    no_quantize: Annotated[
         bool | None,
         typer.Option(
-            "--exact",
+            "--no-quantize",
             help="Seal sessions with estimates as computed: do not round off their noise.",
         ),
     ] = None,
@@ -71,11 +71,11 @@ def serve_command(
         float | None, _bound("A connection may wait so long for its next request; 30.")
     ] = None,
 ) -> None:
-    """Take in nodes, estimate, show live, record, and give sessions away over HTTP.
+    """Run the server: live view, recording, REST API.
 
     Settings come from options, else from FOOTTILE_HOST and the like, else from --config. Changes
     need a token: FOOTTILE_TOKEN, or one that is made and kept in the data folder. On a terminal a
-    link is printed that logs a browser in; `foottile ticket` prints others. Commands of this user
+    link is printed that logs a browser in; `foottile invite` prints others. Commands of this user
     on this machine find the token by themselves. Ctrl-C ends it; what is being recorded goes on
     when it runs again.
     """
@@ -92,7 +92,7 @@ def serve_command(
         allow_host=tuple(allow_host or ()) or None,
         advertise=advertise,
         private=private,
-        exact=exact,
+        no_quantize=no_quantize,
         trusted_proxy=tuple(trusted_proxy or ()) or None,
         max_connections=max_connections,
         max_connections_per_address=max_connections_per_address,
@@ -118,7 +118,7 @@ async def _serve(settings: Settings) -> None:
     stop = stop_on_signals()
     keep_private(settings.data)
     with listen(settings.host, settings.port) as listening:
-        server = Server(settings.data, exact=settings.exact)
+        server = Server(settings.data, exact=settings.no_quantize)
         token = token_for(settings.token, settings.data)
         logins = Logins(token, is_private=settings.private)
         find_urls = partial(urls_of, listening, settings.host, settings.advertise)
@@ -168,6 +168,6 @@ def announce(
     where = f"$(cat {shlex.quote(str(data / KEPT_IN))})" if is_kept else '"$FOOTTILE_TOKEN"'
     if not has_screen:
         place = f"in {data / KEPT_IN}" if is_kept else "the one that was given"
-        remark(f"its token is {place}; `foottile ticket` prints a link that logs a browser in")
+        remark(f"its token is {place}; `foottile invite` prints a link that logs a browser in")
     shown = token if sys.stderr.isatty() else where
     remark(f"a node: FOOTTILE_TOKEN={shown} foottile node --scene FILE --server {urls[0]}")

@@ -155,7 +155,7 @@ def pull_command(
     *,
     options: FormatOptions,
 ) -> None:
-    """Download a sealed session: data, description, events. Goes on where it was broken off.
+    """Download a sealed session: data, description, markers. Goes on where it was broken off.
 
     The data is compared with its hash. Some seconds or columns, another format, or all of a take,
     are made by the server for the asking, and are one file in --out. Exit code 3: the session is
@@ -222,13 +222,11 @@ def export_command(
             "if there are events beside the frames.",
         ),
     ] = None,
-    take: Annotated[
-        str | None, typer.Option(help="Those of this take in --data, --together.")
-    ] = None,
+    take: Annotated[str | None, typer.Option(help="Those of this take in --data, --merge.")] = None,
     together: Annotated[
         bool,
         typer.Option(
-            "--together",
+            "--merge",
             help=f"All of them into one file, on the server's axis of time: {', '.join(SEVERAL)}.",
         ),
     ] = False,
@@ -262,7 +260,7 @@ def export_command(
     )
     if together and (manifest is not None or is_remote(out)):
         raise UsageError(
-            "--together with --manifest, or into a URI", remedy="Name the sessions, and a file"
+            "--merge with --manifest, or into a URI", remedy="Name the sessions, and a file"
         )
     if not together and (not is_one(sessions, manifest) or is_remote(out)):
         from service.offline.archive.tasks import ExportTask

@@ -40,7 +40,7 @@ def stream_command(
     server: ServerOption = None,
     ca: CaOption = None,
 ) -> None:
-    """Print live frames of a node with their estimates, a line each, until Ctrl-C.
+    """Print live frames of a node with their estimates, one line each, until Ctrl-C.
 
     Who reads may end it by going away, as in `foottile stream left | head`. What is lost is said on
     stderr.

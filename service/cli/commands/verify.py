@@ -59,7 +59,7 @@ def verify_command(
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Prove sessions and journals from their files alone: checksums, hashes, order and ledger.
+    """Verify sessions and journals from their files: checksums, hashes, order and ledger.
 
     Nothing is written, and a server may run meanwhile. Exit codes: 0 everything is whole and
     complete, 1 something is damaged, 2 wrong usage, 3 whole, but lossy or not yet sealed, 4 not

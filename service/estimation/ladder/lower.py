@@ -20,6 +20,7 @@ from service.estimation.ladder.state import FootState, TileState
 from service.estimation.ladder.unseen import EVENLY, farthest, guess_n, was_away
 from service.estimation.models import gas
 from service.estimation.models.ambient import around
+from service.estimation.models.denoise import AVERAGED_MAX
 from service.estimation.models.outliers import is_spike
 from service.estimation.models.skew import at_frame
 from service.estimation.models.static import curve
@@ -70,12 +71,19 @@ def feel(
     after = buffer.rows[i + 1] if i + 1 < foot_state.end_row else row
     has_after = i + 1 < foot_state.end_row and after.after_gap == 0
     ambient_kpa, bare_sum_kpa, bare_count = 0.0, 0.0, 0
+    foot_kpa = 0.0
+    for j in range(n):
+        if params.tiles[j].is_load_bearing == 1:
+            foot_kpa += buffer.samples[i, j].pressure_kpa - params.tiles[j].baseline_kpa
     for j in range(n):
         tile_params, sample = params.tiles[j], buffer.samples[i, j]
         if checks_warmth and _has_warmed(tile_params, sample):
             row.flags |= _TARE_OLD
         after_kpa = buffer.samples[i + 1, j].pressure_kpa if has_after else math.nan
-        _judge(foot_params, tile_params, foot_state, tile_states[j], row, sample, after_kpa, n)
+        _judge(
+            foot_params, tile_params, foot_state, tile_states[j], row, sample, after_kpa, foot_kpa,
+            n,
+        )  # fmt: skip
         gauge_kpa = sample.pressure_kpa - tile_params.baseline_kpa
         # A bare tile beyond the chip's range shows a fault of its own, not the surroundings.
         is_bare = tile_params.is_load_bearing == 0
@@ -143,6 +151,7 @@ def _judge(
     row: FrameRow,
     sample: TileSample,
     after_kpa: float,
+    foot_kpa: float,
     tiles: int,
 ) -> None:
     """Detect clipping, a stuck tile and outliers, and remove their pressures."""
@@ -153,7 +162,8 @@ def _judge(
         if tile_params.is_load_bearing == 1:
             end_of_range(
                 tile_state.clipping, as_read_kpa, row.t_ns, baseline_kpa, unloaded_band_kpa,
-                noise_kpa,
+                noise_kpa, tile_params.variance_inflation[AVERAGED_MAX],
+                foot_kpa - (as_read_kpa - baseline_kpa),
             )  # fmt: skip
         may_stand_still = as_read_kpa >= tile_params.stuck_check_max_kpa
         above_kpa = math.nan if may_stand_still else as_read_kpa - baseline_kpa

@@ -36,7 +36,7 @@ from service.version import SOFTWARE
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What to compare; see `foottile bench --help`."""
+    """What to compare; see `foottile benchmark --help`."""
 
     scenes: tuple[Scene, ...]
     draws: int

@@ -89,7 +89,7 @@ def gain_notes(alignment: Alignment) -> list[str]:
         return []
     return [
         f"a newton of the reference is {alignment.scale.value:.3f} N of ours: load may pass beside "
-        "the domes, or a gain is off; `foottile calibrate --against` fits a mounted foot"
+        "the domes, or a gain is off; `foottile calibrate --reference` fits a mounted foot"
     ]
 
 

@@ -12,7 +12,7 @@ from devices.scene.emulated import Family
 from devices.scene.file import Scene
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
-from service.offline.calibrations import BENCH, find_calibration
+from service.offline.calibrations import EMULATED_RIG, find_calibration
 from service.offline.estimate.request import EstimateRequest
 from service.sessions.pipeline import EstimateOptions
 from storage.schema import MILL, PARTS, TRUTH
@@ -123,7 +123,7 @@ def _calibration(
             where=where,
             remedy="Add --calibration FILE, or --scene with a scene that names one",
         )
-    if name == BENCH and "parts_seed" not in notes:
+    if name == EMULATED_RIG and "parts_seed" not in notes:
         # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
         raise CalibrationError(
             "the emulated bench knows emulated tiles only, and this session is of real ones",

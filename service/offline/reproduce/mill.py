@@ -20,7 +20,7 @@ from service.estimation.fitting.confidence import curve_n, mean_band_n
 from service.estimation.fitting.fit import fit_tile
 from service.offline.calibrate import Pressed as MillRecording
 from service.offline.calibrate import calibrate_recordings, read_recordings
-from service.offline.calibrations import BENCH_DELAY, BENCH_REFERENCE, bench_scene
+from service.offline.calibrations import RIG_DELAY, RIG_REFERENCE, bench_scene
 from service.offline.simulate import SimulateOptions, simulate
 from service.rig.emulated import EmulatedFoot
 
@@ -92,9 +92,7 @@ def calibrate(scene: Scene, *, seed: int, parts_seed: int) -> Calibration:
     """
     name = f"mill-{scene.tile[0].serial}"
     with _recorded(scene, seed, parts_seed) as recordings:
-        return calibrate_recordings(
-            recordings, name=name, reference=BENCH_REFERENCE, delay=BENCH_DELAY
-        )
+        return calibrate_recordings(recordings, name=name, reference=RIG_REFERENCE, delay=RIG_DELAY)
 
 
 @contextmanager
@@ -112,7 +110,7 @@ def together(calibrations: Sequence[Calibration], name: str) -> Calibration:
     """Calibrations of single tiles as one of all."""
     return Calibration(
         name=name,
-        reference=BENCH_REFERENCE,
+        reference=RIG_REFERENCE,
         date=max(one.date for one in calibrations),
         tiles=tuple(tile for one in calibrations for tile in one.tiles),
     )

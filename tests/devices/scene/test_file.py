@@ -88,7 +88,7 @@ def test_a_scene_file_is_read_by_its_path(tmp_path: Path) -> None:
 def test_what_a_scene_does_not_say_has_the_defaults_of_the_design() -> None:
     bare = scene()
     assert bare.rate_hz == 0
-    assert bare.calibration == "bench"
+    assert bare.calibration == "emulated-rig"
     assert bare.array.bus == "emulated"
     assert bare.array.scl_hz == 400_000
     assert bare.array.conversion_ms is None

@@ -101,7 +101,7 @@ def test_through_a_bare_proxy_nobody_changes_anything_without_the_token(
     running: Running, bare: str
 ) -> None:
     with httpx.Client(base_url=f"{bare}/api/v1", trust_env=False) as anybody:
-        assert_refused(anybody.delete("/trash"), 401, "token", "foottile ticket")
+        assert_refused(anybody.delete("/trash"), 401, "token", "foottile invite")
         assert anybody.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
         assert anybody.post("/tickets", json={}).status_code == 401
         assert anybody.get("/sessions").status_code == 200

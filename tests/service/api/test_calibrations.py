@@ -225,7 +225,7 @@ def test_a_node_without_a_calibration_of_its_own_gets_one(
     node.taken_in()
     assert running.node()["calibration_problem"] == "for this test"
     refused = assign(running, stiffer("T01", "T02"), **{"If-Match": NONE})
-    assert_refused(refused, 412, "changed by somebody else")
+    assert_refused(refused, 412, "changed by another client")
     view = assign(running, stiffer("T01", "T02"), **{"If-Match": "none"}).json()
     assert (view["problem"], view["own_id"]) == (None, None)
     node.send(20)
@@ -237,9 +237,9 @@ def test_two_people_do_not_overwrite_each_others_choice(running: Running, tared:
     first = stiffer("T01", "T02", name="first")
     assert assign(running, first, **{"If-Match": f'"{seen}"'}).status_code == 200
     second = assign(running, stiffer("T01", "T02", name="second"), **{"If-Match": seen})
-    assert_refused(second, 412, "changed by somebody else")
+    assert_refused(second, 412, "changed by another client")
     back = running.http.delete("/nodes/bench/calibration", headers={"If-Match": seen})
-    assert_refused(back, 412, "changed by somebody else")
+    assert_refused(back, 412, "changed by another client")
     assert running.node()["calibration"]["name"] == "first"
 
 

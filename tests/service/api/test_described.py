@@ -58,5 +58,5 @@ def test_a_private_server_shows_the_page_and_keeps_the_description_for_who_logs_
     private = serve_with(token=TOKEN, is_private=True)
     assert site(private, "/docs").status_code == 200
     for path in ("/api/v1/openapi.json", "/api/v1"):
-        assert_refused(site(private, path), 401, "private", "foottile ticket")
+        assert_refused(site(private, path), 401, "private", "foottile invite")
         assert site(private, path, Authorization=f"Bearer {TOKEN}").status_code == 200

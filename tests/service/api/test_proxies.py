@@ -97,7 +97,7 @@ def test_behind_tls_a_page_without_tls_is_another_site(
 @pytest.mark.parametrize("value", ["127.0.0.1", "for=127.0.0.1;proto=https", "::1", "root"])
 def test_no_forwarded_header_is_a_right(running: Running, header: str, value: str) -> None:
     answer = httpx.delete(f"{running.url}/api/v1/trash", headers={header: value}, trust_env=False)
-    assert_refused(answer, 401, "token", "foottile ticket")
+    assert_refused(answer, 401, "token", "foottile invite")
 
 
 def test_an_ipv4_proxy_is_trusted_at_a_socket_of_ipv6() -> None:

@@ -134,7 +134,7 @@ def test_tares_outlive_the_server(running: Running, tared: FakeNode) -> None:
 
 def test_a_node_that_is_away_is_not_tared(running: Running, tared: FakeNode) -> None:
     tared.leave()
-    assert_refused(running.http.post("/nodes/bench/tare", json={}), 409, "away")
+    assert_refused(running.http.post("/nodes/bench/tare", json={}), 409, "not connected")
 
 
 def test_a_tare_during_a_recording_serves_from_then_on(running: Running, tared: FakeNode) -> None:
@@ -272,7 +272,7 @@ def test_a_session_without_tare_is_sealed_raw_and_says_why(node: FakeNode) -> No
 def test_a_session_without_frames_says_so(tared: FakeNode) -> None:
     session = tared.record()
     sealed = tared.finish(session)
-    assert sealed["problem"] == "not one frame was recorded"
+    assert sealed["problem"] == "no frame was recorded"
     assert sealed["frames"] == 0
     assert sealed["complete"] is True
 

@@ -13,7 +13,7 @@ from tests.service.strangers import answer_of, portal, tls_before
 TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 COMMANDS = (
     (("sessions",), ""),
-    (("ticket",), ""),
+    (("invite",), ""),
     (("stream", "nobody"), "nobody"),
     (("pull", "20200101T000000Z-000000", "--out", "."), "20200101T000000Z-000000"),
 )

@@ -37,7 +37,7 @@ def test_the_help_of_all_names_each_with_its_summary_and_that_of_one_is_its_own(
     for name, summary in SUMMARIES.items():
         assert f"  {name} " in said
         assert summary[:30] in said
-    assert "--family" in run("bench", "--help").out
+    assert "--family" in run("benchmark", "--help").out
 
 
 def test_a_name_that_is_nearly_one_is_answered_with_that(run: Run) -> None:

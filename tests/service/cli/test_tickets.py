@@ -1,4 +1,4 @@
-"""Tickets as people get them: at the server's start, and with `foottile ticket`."""
+"""Tickets as people get them: at the server's start, and with `foottile invite`."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_what_keeps_others_away_is_remarked(
     assert bool(said) is bool(word)
 
 
-@pytest.mark.parametrize(("option", "may"), [((), "press"), (("--viewer",), "look")])
+@pytest.mark.parametrize(("option", "may"), [((), "press"), (("--read-only",), "look")])
 def test_ticket_prints_an_address_that_lets_in_who_opens_it(
     serve_with: ServeWith,
     run: Run,
@@ -137,7 +137,7 @@ def test_ticket_prints_an_address_that_lets_in_who_opens_it(
     running = serve_with(token=TOKEN)
     (tmp_path / "token").write_text(TOKEN + "\n")
     monkeypatch.delenv("FOOTTILE_TOKEN", raising=False)
-    done = run("ticket", "--server", running.url, "--data", str(tmp_path), *option)
+    done = run("invite", "--server", running.url, "--data", str(tmp_path), *option)
     assert done.code == 0, done.err
     address, _, ticket = done.out.strip().partition("#ticket=")
     assert address == running.url + "/"
@@ -151,7 +151,7 @@ def test_ticket_as_json_by_the_token_of_the_environment(
 ) -> None:
     running = serve_with(token=TOKEN)
     monkeypatch.setenv("FOOTTILE_TOKEN", TOKEN)
-    done = run("ticket", "--server", running.url, "--json")
+    done = run("invite", "--server", running.url, "--json")
     assert json.loads(done.out)["may"] == "press"
     assert TOKEN not in done.out
 
@@ -161,8 +161,8 @@ def test_ticket_without_the_token_says_what_is_lacking(
 ) -> None:
     running = serve_with(token=TOKEN)
     monkeypatch.delenv("FOOTTILE_TOKEN")
-    run("ticket", "--server", running.url).fails(1, "token is needed", "FOOTTILE_TOKEN")
-    run("ticket", "--server", running.url, "--data", tmp_path).fails(2, "no token", "--data")
+    run("invite", "--server", running.url).fails(1, "token is needed", "FOOTTILE_TOKEN")
+    run("invite", "--server", running.url, "--data", tmp_path).fails(2, "no token", "--data")
 
 
 def test_a_private_server_is_read_with_its_token(

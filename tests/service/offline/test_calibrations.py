@@ -49,7 +49,7 @@ def test_verify_proves_it_and_a_folder_of_them(path: Path, tmp_path: Path) -> No
     _flipped(path)
     assert [verdict_of(verify(each)) for each in (path, tmp_path)] == ["damaged"] * 2
     path.write_text(CALIBRATION.to_json())
-    assert verify(path).as_dict()["unproven"] == ["toe.json: it states no hash of itself"]
+    assert verify(path).as_dict()["unproven"] == ["toe.json: it has no hash"]
 
 
 def test_one_of_an_older_version_is_proven_by_its_id(path: Path) -> None:
@@ -139,7 +139,9 @@ def test_a_cached_calibration_that_does_not_prove_itself_is_set_aside_and_made_a
     said: list[str] = []
 
     def found() -> Calibration:
-        return find_calibration("bench", ["A01"], cache=tmp_path / "cache", progress=said.append)
+        return find_calibration(
+            "emulated-rig", ["A01"], cache=tmp_path / "cache", progress=said.append
+        )
 
     first = found()
     assert found() == first
@@ -161,9 +163,11 @@ def test_each_family_of_parts_and_each_repeatability_has_a_bench_of_its_own(
     tmp_path: Path, pressed: list[str]
 ) -> None:
     for _ in range(2):
-        find_calibration("bench", ["A01"], cache=tmp_path)
-        find_calibration("bench", ["A01"], cache=tmp_path, family="broad")
-        find_calibration("bench", ["A01"], cache=tmp_path, family="broad", repeatability=0.01)
+        find_calibration("emulated-rig", ["A01"], cache=tmp_path)
+        find_calibration("emulated-rig", ["A01"], cache=tmp_path, family="broad")
+        find_calibration(
+            "emulated-rig", ["A01"], cache=tmp_path, family="broad", repeatability=0.01
+        )
     assert pressed == ["bench-A01"] * 3
 
 
@@ -174,6 +178,6 @@ def test_a_cache_that_cannot_be_written_is_said_and_no_reason_to_fail(
     said: list[str] = []
     cache = tmp_path / "file" / "cache"
     for _ in range(2):
-        find_calibration("bench", ["A01"], cache=cache, progress=said.append)
+        find_calibration("emulated-rig", ["A01"], cache=cache, progress=said.append)
     assert pressed == ["bench-A01"] * 2
     assert any("is not kept" in line for line in said)

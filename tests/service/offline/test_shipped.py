@@ -1,6 +1,6 @@
 """Calibrations that come with the program: of every tile of a built-in scene, and not out of date.
 
-`FOOTTILE_WRITE_BENCH=1 sh scripts/test tests/service/offline/test_shipped.py` makes them anew.
+`FOOTTILE_WRITE_RIG=1 sh scripts/test tests/service/offline/test_shipped.py` makes them anew.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import pytest
 from devices.scene.file import builtin_scenes, load_scene
 from service.estimation.calibration import Calibration, TileCalibration
 from service.offline import calibrations
-from service.offline.calibrations import BENCH, SHIPPED, find_calibration
+from service.offline.calibrations import EMULATED_RIG, SHIPPED, find_calibration
 
 TILES = sorted(
     {
         tile.serial
         for name in builtin_scenes()
-        if (scene := load_scene(name)).calibration == BENCH
+        if (scene := load_scene(name)).calibration == EMULATED_RIG
         for tile in scene.tile
         if not tile.reference
     }
@@ -34,10 +34,10 @@ def refuse(message: str) -> None:
 def pressed(serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calibration:
     """A tile on the bench, as if none had come with the program."""
     monkeypatch.setattr(calibrations, "SHIPPED", tmp_path / "nothing")
-    return find_calibration(BENCH, [serial], cache=tmp_path / "cache")
+    return find_calibration(EMULATED_RIG, [serial], cache=tmp_path / "cache")
 
 
-@pytest.mark.skipif("FOOTTILE_WRITE_BENCH" not in os.environ, reason="writes them")
+@pytest.mark.skipif("FOOTTILE_WRITE_RIG" not in os.environ, reason="writes them")
 def test_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for serial in TILES:
         pressed(serial, tmp_path, monkeypatch)
@@ -47,7 +47,7 @@ def test_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_no_built_in_scene_waits_for_the_mill(tmp_path: Path) -> None:
     assert [f"T0{number}" for number in range(1, 9)] == TILES
-    find_calibration(BENCH, TILES, cache=tmp_path, progress=refuse)
+    find_calibration(EMULATED_RIG, TILES, cache=tmp_path, progress=refuse)
     assert list(tmp_path.iterdir()) == []
     assert len(list(SHIPPED.iterdir())) == len(TILES)  # none is left of a version before
 
@@ -59,7 +59,7 @@ def test_no_built_in_scene_waits_for_the_mill(tmp_path: Path) -> None:
 def test_pressed_anew_a_tile_is_as_it_was(
     serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shipped = find_calibration(BENCH, [serial], cache=tmp_path / "empty").tiles[0]
+    shipped = find_calibration(EMULATED_RIG, [serial], cache=tmp_path / "empty").tiles[0]
     (anew,) = pressed(serial, tmp_path, monkeypatch).tiles
     (numbers, words), (as_numbers, as_words) = map(told, (shipped, anew))
     assert as_words == words

@@ -26,7 +26,7 @@ from service.offline.benchmark.broad.results import (
 )
 from service.offline.benchmark.broad.tiles import tiles_of
 from service.offline.benchmark.draws import LAGS_MS, estimates_of, reason, recorded
-from service.offline.calibrations import BENCH, BENCH_REFERENCE, find_calibration
+from service.offline.calibrations import EMULATED_RIG, RIG_REFERENCE, find_calibration
 
 SCENES = ("rolling", "poppy", "mud")
 SERIALS = ("T01", "T02", "T03", "T04")
@@ -105,7 +105,7 @@ def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Re
             try:
                 entries.append(
                     find_calibration(
-                        BENCH,
+                        EMULATED_RIG,
                         [serial],
                         parts_seed=seed,
                         family="broad",
@@ -120,7 +120,9 @@ def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Re
     if refusals:
         return None, refusals
     tiles = tuple(tile for entry in entries for tile in entry.tiles)
-    whole = Calibration(name=BENCH, reference=BENCH_REFERENCE, date=entries[0].date, tiles=tiles)
+    whole = Calibration(
+        name=EMULATED_RIG, reference=RIG_REFERENCE, date=entries[0].date, tiles=tiles
+    )
     return whole, []
 
 

@@ -26,7 +26,7 @@ from storage.durable import make_folder
 
 @dataclass(frozen=True)
 class BroadOptions:
-    """What to run; see `foottile bench --help`."""
+    """What to run; see `foottile benchmark --help`."""
 
     arrays: int
     seeds: Seeds

@@ -34,7 +34,7 @@ SHORT = (
 )
 COMMANDS: dict[str, tuple[object, ...]] = {
     "accept-node": ("bench", "--server", "http://127.0.0.1:1"),
-    "bench": ("--out", "bench", "--scene", "gone.toml"),
+    "benchmark": ("--out", "bench", "--scene", "gone.toml"),
     "calibrate": ("s.parquet", "--out", "cal.json"),
     "compare": ("s.parquet", "--reference", "s.parquet", "--out", "o"),
     "demo": ("--scene", "gone.toml"),
@@ -54,7 +54,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "sessions": ("--data", "."),
     "simulate": SHORT[1:],
     "stream": ("bench", "--server", "http://127.0.0.1:1"),
-    "ticket": ("--server", "http://127.0.0.1:1", "--data", "."),
+    "invite": ("--server", "http://127.0.0.1:1", "--data", "."),
     "verify": ("s.parquet",),
 }
 """For each command, arguments with which it ends within a moment."""
@@ -169,9 +169,9 @@ FILES = {"missing", "empty", "junk", "hole", "no Parquet"}
 
 
 READ: dict[tuple[str, str], tuple[object, ...]] = {
-    ("bench", "scene"): ("--out", "bench", "--scene", "{}"),
+    ("benchmark", "scene"): ("--out", "bench", "--scene", "{}"),
     ("calibrate", "recordings"): ("{}", "--out", "cal.json"),
-    ("calibrate", "against"): ("s.parquet", "--out", "cal.json", "--against", "{}"),
+    ("calibrate", "reference"): ("s.parquet", "--out", "cal.json", "--reference", "{}"),
     ("compare", "session"): ("{}", "--reference", "s.parquet", "--out", "o"),
     ("compare", "manifest"): ("--manifest", "{}", "--out", "o"),
     ("compare", "reference"): ("s.parquet", "--reference", "{}", "--out", "o"),
@@ -201,7 +201,7 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
     ),
     ("sessions", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
     ("stream", "ca"): ("bench", "--server", "https://127.0.0.1:1", "--ca", "{}"),
-    ("ticket", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
+    ("invite", "ca"): ("--server", "https://127.0.0.1:1", "--ca", "{}"),
 }
 WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ("calibrate", "out"): ("s.parquet", "--out", "{}"),
@@ -217,7 +217,7 @@ WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ("simulate", "pressure_plate"): (*SHORT[1:], "--pressure-plate", "{}"),
 }
 IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
-    ("bench", "out"): ("--out", "{}", "--scene", "standing", "--seconds", 0.01),
+    ("benchmark", "out"): ("--out", "{}", "--scene", "standing", "--seconds", 0.01),
     ("compare", "out"): ("s.parquet", "--reference", "s.parquet", "--out", "{}"),
     ("compare", "data"): (
         *("20200101T000000Z-000000", "--reference", "s.parquet"),
@@ -233,7 +233,7 @@ IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("serve", "data"): ("--port", 0, "--data", "{}"),
     ("sessions", "data"): ("--data", "{}"),
     ("accept-node", "data"): ("bench", "--server", "http://127.0.0.1:1", "--data", "{}"),
-    ("ticket", "data"): ("--server", "http://127.0.0.1:1", "--data", "{}"),
+    ("invite", "data"): ("--server", "http://127.0.0.1:1", "--data", "{}"),
     ("verify", "data"): ("20200101T000000Z-000000", "--data", "{}"),
 }
 

@@ -1,4 +1,4 @@
-"""`foottile calibrate --against`: a mounted foot on a plate that sees its rim as well."""
+"""`foottile calibrate --reference`: a mounted foot on a plate that sees its rim as well."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def plate(session: Path, tmp_path: Path) -> Path:
 def test_a_gain_in_situ_makes_newtons_of_an_assumed_curve_those_of_the_plate(
     run: Run, session: Path, plate: Path
 ) -> None:
-    said = run("calibrate", session, "--against", plate, "--out", "cal.json", *LAG, "--json")
+    said = run("calibrate", session, "--reference", plate, "--out", "cal.json", *LAG, "--json")
     found = said.printed()
     assert "the plate's own gain is taken as exact" in said.err
     assert set(found["gains"]) == {"T01", "T02", "T03", "T04"}
@@ -50,9 +50,18 @@ def test_a_gain_in_situ_makes_newtons_of_an_assumed_curve_those_of_the_plate(
 def test_gains_of_a_session_that_was_estimated_with_gains_are_gains_to_the_bench(
     run: Run, session: Path, plate: Path
 ) -> None:
-    once = run("calibrate", session, "--against", plate, "--out", "1.json", *LAG, "--json")
+    once = run("calibrate", session, "--reference", plate, "--out", "1.json", *LAG, "--json")
     run("estimate", session, "--calibration", "1.json", "--out", "mounted.parquet")
-    asked = ("calibrate", "mounted.parquet", "--against", plate, "--out", "2.json", *LAG, "--json")
+    asked = (
+        "calibrate",
+        "mounted.parquet",
+        "--reference",
+        plate,
+        "--out",
+        "2.json",
+        *LAG,
+        "--json",
+    )
     first, second = once.printed(), run(*asked).printed()
     assert second["gains"]["T01"]["value"] == pytest.approx(
         first["gains"]["T01"]["value"], rel=0.02
@@ -63,7 +72,7 @@ def test_gains_of_a_session_that_was_estimated_with_gains_are_gains_to_the_bench
 def test_a_shear_that_three_hops_do_not_determine_is_refused_and_nothing_is_written(
     run: Run, session: Path, plate: Path
 ) -> None:
-    asked = ("calibrate", session, "--against", plate, "--out", "cal.json", *LAG, "--shear")
+    asked = ("calibrate", session, "--reference", plate, "--out", "cal.json", *LAG, "--shear")
     run(*asked).fails(1, "does not determine the shear")
     assert not Path("cal.json").exists()
 
@@ -80,10 +89,10 @@ def test_a_shear_that_three_hops_do_not_determine_is_refused_and_nothing_is_writ
 def test_what_is_said_of_a_plate_needs_one(
     run: Run, session: Path, arguments: tuple[object, ...], says: str
 ) -> None:
-    run("calibrate", session, "--out", "cal.json", *arguments).fails(2, "--against")
+    run("calibrate", session, "--out", "cal.json", *arguments).fails(2, "--reference")
 
 
 def test_a_plate_goes_with_one_session_and_no_plot(run: Run, session: Path, plate: Path) -> None:
-    both = ("calibrate", session, session, "--against", plate, "--out", "cal.json")
+    both = ("calibrate", session, session, "--reference", plate, "--out", "cal.json")
     run(*both).fails(2, "one session")
-    run("calibrate", session, "--against", plate, "--out", "c.json", "--plot", "c.png").fails(2)
+    run("calibrate", session, "--reference", plate, "--out", "c.json", "--plot", "c.png").fails(2)

@@ -29,6 +29,6 @@ def test_a_session_is_estimated_with_a_bench_of_its_own_family(
     scene.write_text(scene_text("standing") + f'\n[emulation]\nfamily = "{family}"\n')
     simulate = ("simulate", "--scene", scene, "--seconds", 0.5, "--parts-seed", 5)
     run(*simulate, "--no-estimates", "--out", "s.parquet").fails(0)
-    again = ("estimate", "s.parquet", "--calibration", "bench", "--out", "e.parquet")
+    again = ("estimate", "s.parquet", "--calibration", "emulated-rig", "--out", "e.parquet")
     run(*again).fails(1, "no bench here")
     assert asked == [(family, 5)]

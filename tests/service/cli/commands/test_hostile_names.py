@@ -73,7 +73,7 @@ COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
     "sessions": ((), ("--node", HOSTILE), ("--from", HOSTILE)),
     "verify": ((ID,), (), (HOSTILE,), ("--manifest", HOSTILE)),
     # What these print of names is the user's own, or a scene's, which has to be one of a few words.
-    "bench": (("--scene", HOSTILE, "--out", "o"),),
+    "benchmark": (("--scene", HOSTILE, "--out", "o"),),
     "demo": (("--scene", HOSTILE),),
     "doctor": (("--scene", HOSTILE),),
     "domes": (("--family", HOSTILE),),
@@ -82,7 +82,7 @@ COMMANDS: dict[str, tuple[tuple[object, ...], ...]] = {
     "serve": (("--host", HOSTILE),),
     "simulate": (("--scene", HOSTILE, "--out", "x.parquet"),),
     "stream": ((HOSTILE, "--server", "http://127.0.0.1:1"),),
-    "ticket": (("--server", HOSTILE),),
+    "invite": (("--server", HOSTILE),),
 }
 _IN_FOLDER = {"calibrate", "compare", "estimate", "export", "query", "sessions", "verify"}
 

@@ -35,7 +35,10 @@ def is_fitting(process: subprocess.Popen[bytes], folder: Path) -> bool:
     ("arguments", "has_begun"),
     [
         (["simulate", "--scene=standing", "--seconds=100000", "--no-estimates"], has_file),
-        (["bench", "--scene=standing", "--draws=500", "--jobs=2", "--out=a/bench"], has_children),
+        (
+            ["benchmark", "--scene=standing", "--draws=500", "--jobs=2", "--out=a/bench"],
+            has_children,
+        ),
         (["calibrate", "bench.parquet", "--out=cal.json", "--plot=cal.png"], is_fitting),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",

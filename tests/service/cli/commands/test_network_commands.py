@@ -370,7 +370,7 @@ def test_a_token_is_made_kept_and_asked_for_and_commands_of_its_user_find_it(
     assert by_name.status_code == 403
     by_name = httpx.get(f"{url}/api/v1/nodes", headers={"Host": "robot.example"}, trust_env=False)
     assert by_name.status_code == 200
-    found = run("ticket", "--server", url)
+    found = run("invite", "--server", url)
     assert "/#ticket=" in found.stdout, found.stderr
     serve.terminate()
     assert ended(serve) == 0

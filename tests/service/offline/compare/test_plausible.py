@@ -88,7 +88,7 @@ def test_a_gain_that_is_not_one_points_to_the_calibration_of_a_mounted_foot() ->
     aligned = same_clock()
     assert gain_notes(replace(aligned, scale=Estimate(0.99, 0.02, 8.0))) == []
     (note,) = gain_notes(replace(aligned, scale=Estimate(0.8, 0.02, 8.0)))
-    assert "calibrate --against" in note
+    assert "calibrate --reference" in note
 
 
 TRAVEL = np.linspace(-0.015, 0.015, len(FORCE_N))

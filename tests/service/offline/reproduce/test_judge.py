@@ -36,7 +36,7 @@ def recorded(
     serials = [tile.serial for tile in scene.tile]
 
     def estimate() -> EstimateOptions:
-        calibration = find_calibration("bench", serials, cache=cache / "foottile" / "bench")
+        calibration = find_calibration("emulated-rig", serials, cache=cache / "foottile" / "rig")
         return EstimateOptions(calibration, scene.models, OFFLINE_LAG_MS)
 
     foot = EmulatedFoot(seed=5, plates=plates)

@@ -394,5 +394,5 @@ def test_sessions_without_a_common_axis_are_not_put_together() -> None:
 def test_sessions_of_different_days_are_refused_and_not_joined() -> None:
     one, _ = two_feet()
     other = replace(one, content=two_feet()[1].content, clock=compared(86_400_000_000_000))
-    with pytest.raises(UsageError, match="with what lies between"):
+    with pytest.raises(UsageError, match="gaps included"):
         list(C3D.written_together([one, other]))

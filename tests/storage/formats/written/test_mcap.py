@@ -269,7 +269,7 @@ def test_a_nodes_name_becomes_one_of_ros(tmp_path: Path, node: str, name: str) -
 
 
 def test_columns_of_ros_messages_cannot_be_chosen() -> None:
-    with pytest.raises(UsageError, match="fields of their own"):
+    with pytest.raises(UsageError, match="fixed fields"):
         written(ROS2, Slice(columns=("grf_n",)))
 
 

@@ -1,4 +1,4 @@
-"""`foottile bench` as a user meets it, with a preset instead of the emulated bench."""
+"""`foottile benchmark` as a user meets it, with a preset instead of the emulated bench."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def scene(tmp_path: Path) -> Path:
 
 
 def test_bench_writes_json_tables_and_plot(run: Run, scene: Path, tmp_path: Path) -> None:
-    outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "new/folder", "--json")
+    outcome = run(
+        "benchmark", "--scene", scene, "--draws", 2, *QUICK, "--out", "new/folder", "--json"
+    )
     outcome.fails(0, "rolling: 2 of 2 draws")
     folder = tmp_path / "new" / "folder"
     content = json.loads((folder / "bench.json").read_text())
@@ -51,7 +53,9 @@ def test_bench_writes_json_tables_and_plot(run: Run, scene: Path, tmp_path: Path
 
 
 def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run: Run, scene: Path) -> None:
-    outcome = run("bench", "--scene", scene, "--draws", 1, *QUICK, "--out", "o", "--check-goals")
+    outcome = run(
+        "benchmark", "--scene", scene, "--draws", 1, *QUICK, "--out", "o", "--check-goals"
+    )
     assert outcome.code == 3
     assert outcome.out.startswith("# Speed against error")
     # The paper's curve has another scale than the emulated domes.
@@ -68,7 +72,7 @@ def test_a_draw_that_fails_is_reported_and_the_others_count(
         return find_calibration(*asked, parts_seed=parts_seed, **others)
 
     monkeypatch.setattr(draws, "find_calibration", refuses)
-    outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
+    outcome = run("benchmark", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
     outcome.fails(3, "rolling, draw 1: tile T03 does not rise")
     assert "- draw 1: tile T03 does not rise" in (tmp_path / "o" / "bench.md").read_text()
     (rolling,) = json.loads((tmp_path / "o" / "bench.json").read_text())["scenes"]
@@ -80,7 +84,7 @@ def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(
     run: Run, scene: Path, tmp_path: Path
 ) -> None:
     scene.write_text(scene.read_text().replace("paper-eq2-shape", "nowhere.json"))
-    outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
+    outcome = run("benchmark", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
     outcome.fails(1, "none of 2 draws gave a figure", "nowhere.json")
     assert not (tmp_path / "o").exists()
 
@@ -97,12 +101,12 @@ def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(
 def test_what_cannot_be_meant_is_refused_before_anything_takes_time(
     run: Run, arguments: tuple[object, ...], says: str
 ) -> None:
-    run("bench", *arguments, "--out", "o").fails(2, says)
+    run("benchmark", *arguments, "--out", "o").fails(2, says)
 
 
 def test_a_scene_of_real_hardware_is_refused(run: Run, scene: Path) -> None:
     scene.write_text(scene.read_text() + '\n[array]\nbus = "/dev/i2c-1"\n')
-    run("bench", "--scene", scene, "--out", "o").fails(2, "only emulates")
+    run("benchmark", "--scene", scene, "--out", "o").fails(2, "only emulates")
 
 
 def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
@@ -111,5 +115,5 @@ def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
     import sys
 
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    outcome = run("bench", "--scene", "rolling", "--out", "o")
+    outcome = run("benchmark", "--scene", "rolling", "--out", "o")
     outcome.fails(2, "pip install 'foottile[plot]'")

@@ -1,4 +1,4 @@
-"""`foottile bench --family broad` as a user meets it, with arrays that nobody ran."""
+"""`foottile benchmark --family broad` as a user meets it, with arrays that nobody ran."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.service.offline.benchmark.broad.kept import made
 
 pytestmark = pytest.mark.slow
 
-BROAD = ("bench", "--family", "broad", "--draws", 3, "--jobs", 1, "--out", "o")
+BROAD = ("benchmark", "--family", "broad", "--draws", 3, "--jobs", 1, "--out", "o")
 
 
 def test_broad_writes_json_tables_and_plot(run: Run, tmp_path: Path, quick: None) -> None:
@@ -62,11 +62,11 @@ def test_what_gave_no_result_is_named_and_code_3(
         (("--family", "odd"), "--family odd"),
         (("--family", "broad", "--seeds", "mine"), "--seeds mine"),
         (("--family", "broad", "--scene", "rolling"), "--scene and --family broad"),
-        (("--family", "broad", "--whole-only"), "--whole-only and --family broad"),
+        (("--family", "broad", "--full-only"), "--full-only and --family broad"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(
     run: Run, tmp_path: Path, arguments: tuple[object, ...], says: str
 ) -> None:
-    run("bench", *arguments, "--out", "o").fails(2, says)
+    run("benchmark", *arguments, "--out", "o").fails(2, says)
     assert not (tmp_path / "o").exists()

@@ -1,4 +1,4 @@
-"""`foottile bench --family broad`: arrays of domes nobody has seen, and quantiles of errors."""
+"""`foottile benchmark --family broad`: arrays of domes nobody has seen, and quantiles of errors."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def is_broad(family: str, given: Mapping[str, object]) -> bool:
     return family == "broad"
 
 
-def bench_broad(
+def benchmark_broad(
     folder: Path,
     *,
     arrays: int,

@@ -1,4 +1,4 @@
-"""`foottile bench`: speed against error of the model ladder."""
+"""`foottile benchmark`: speed against error of the model ladder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from devices.errors import UsageError, needs_extra
 from devices.scene.file import load_scene
-from service.cli.commands.bench_broad import ARRAYS, QUICK_ARRAYS, bench_broad, is_broad
+from service.cli.commands.benchmark_broad import ARRAYS, QUICK_ARRAYS, benchmark_broad, is_broad
 from service.cli.options import (
     JsonOption,
     check_emulated,
@@ -35,8 +35,8 @@ JOBS_MAX = 1024
 REPETITIONS, QUICK_REPETITIONS = 5, 3
 
 
-@needs_extra("server", "`foottile bench`")
-def bench_command(
+@needs_extra("server", "`foottile benchmark`")
+def benchmark_command(
     out: Annotated[
         Path,
         typer.Option(
@@ -72,7 +72,7 @@ def bench_command(
         typer.Option(min=1, max=JOBS_MAX, help="Draws at the same time; default: one per core."),
     ] = None,
     whole_only: Annotated[
-        bool, typer.Option("--whole-only", help="Only the scenes' whole ladders, for many draws.")
+        bool, typer.Option("--full-only", help="Only the scenes' whole ladders, for many draws.")
     ] = False,
     repeatability: Annotated[
         float | None,
@@ -110,7 +110,7 @@ def bench_command(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure time per frame and error of every rung of the model ladder.
+    """Measure time and error of every model set.
 
     Each draw has other tiles, calibrated on the emulated bench as a user would, and other noise.
     Rungs are built up model by model to the scene's whole ladder, and the whole is tried without
@@ -124,11 +124,11 @@ def bench_command(
             "--seconds": seconds,
             "--frames": frames,
             "--correlated-ms": correlated_ms,
-            "--whole-only": whole_only or None,
+            "--full-only": whole_only or None,
         },
     ):
         with result_folder(out) as folder:
-            bench_broad(
+            benchmark_broad(
                 folder,
                 arrays=draws or (QUICK_ARRAYS if quick else ARRAYS),
                 seeds=seeds,
