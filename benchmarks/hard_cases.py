@@ -334,8 +334,9 @@ def count_alarms(
                 for bit in JUDGED:
                     there = ((status & bit) != 0).astype(int)
                     alarms.onsets[bit] += int((np.diff(there, prepend=0) == 1).sum())
-                tiles = estimator._tiles  # noqa: SLF001  # no estimate says how near a clip was
-                alarms.evidence = max(alarms.evidence, float(tiles["clip"]["evidence"].max()))
+                states = estimator._tile_states  # noqa: SLF001  # no estimate says how near a clip was
+                evidence = float(states["clipping"]["evidence"].max())
+                alarms.evidence = max(alarms.evidence, evidence)
 
 
 def most_per_hour(alarms: int, hours: float) -> float:
