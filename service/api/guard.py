@@ -55,7 +55,7 @@ _VIEWER = (
 )
 _NO_LOGIN = "For this no login is enough: it needs the server's token"
 _OPEN = re.compile(
-    rf"/|/nodes|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
+    rf"/|/nodes|/calibrate|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
 )
 """What also a private server shows everybody: pages and files without data, how to get in, and for
 those who watch over its process whether it works."""
