@@ -27,7 +27,7 @@ from service.server.node import ServerNode
 from service.server.recorder import Recorder
 from service.server.settling import Settling
 from service.server.weighing import Action, Begin, End, Method, Weighing, Withdraw
-from storage.sessions.folder import Session
+from storage.sessions.folder import FRAMES_NAME, Session
 
 log = logging.getLogger("foottile.weighings")
 
@@ -305,7 +305,9 @@ class Weighings:
                 )
             fit = await self._fit(weighing)
             if fit.calibration_id is None:
-                raise CalibrationError(fit.problem or f"the fit was {fit.state}")
+                file = self._sessions.folder.path(weighing.session_id) / FRAMES_NAME
+                problem = fit.problem or f"the fit was {fit.state}"
+                raise CalibrationError(problem.replace(f"{file}, ", ""))
             weighing.calibration = await asyncio.to_thread(
                 self._calibrations.get, fit.calibration_id
             )

@@ -169,10 +169,14 @@ class WeighingResultView(View):
     def of(cls, calibration: Calibration, node: ServerNode) -> WeighingResultView:
         """From the calibration, for the tiles of a node."""
         misfit = None
-        try:
-            check_fits(node, calibration)
-        except UsageError as error:
-            misfit = str(error)
+        bearing = [tile.serial for tile in node.info.tiles if not tile.reference]
+        if lacking := [serial for serial in bearing if calibration.find(serial) is None]:
+            misfit = f"It has no curve of {', '.join(lacking)}: calibrate all tiles in one go"
+        else:
+            try:
+                check_fits(node, calibration)
+            except UsageError as error:
+                misfit = str(error)
         return cls(
             calibration_id=calibration.id,
             name=calibration.name,

@@ -35,8 +35,13 @@ def started(running: Running, **body: object) -> dict[str, Any]:
     return content
 
 
-def now(running: Running) -> Any:
-    return running.http.get(URL).json()["weighing"]
+def now(running: Running) -> dict[str, Any]:
+    found: dict[str, Any] = running.http.get(URL).json()["weighing"]
+    return found
+
+
+def is_closed(running: Running) -> bool:
+    return bool(running.http.get(URL).json() == {"node": "bench", "weighing": None})
 
 
 def labels(running: Running, session_id: str) -> list[str]:
@@ -94,7 +99,7 @@ def test_tiles_are_calibrated_one_after_the_other_and_the_node_can_use_it(
     used = running.http.put("/nodes/bench/calibration", json={"id": result["calibration_id"]})
     assert used.json()["calibration"]["name"] == "left leg"
     assert running.http.delete(URL).status_code == 204
-    assert now(running) is None
+    assert is_closed(running)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +122,7 @@ def test_what_cannot_become_a_curve_is_refused_before_the_first_weight(
 ) -> None:
     answer = running.http.post(URL, json={"tiles": ["T01"], "weights": FIVE_N} | body)
     assert_refused(answer, 422, says)
-    assert now(running) is None
+    assert is_closed(running)
     assert running.sessions() == []
 
 
@@ -132,7 +137,7 @@ def test_one_at_a_time_on_a_node_and_another_one_is_not_ended(
             assert running.http.request(method, url, headers={"If-Match": '"x"'}).status_code == 412
         trial = running.record()  # others record meanwhile
         assert running.http.delete(URL, headers={"If-Match": first["session_id"]}).is_success
-        assert now(running) is None
+        assert is_closed(running)
         until(lambda: running.session(first["session_id"]).now()["state"] != "recording")
         assert trial.now()["state"] == "recording"
         assert started(running)["session_id"] != first["session_id"]
