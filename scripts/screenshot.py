@@ -165,7 +165,7 @@ def calibrate(browser: Browser) -> None:
             rows += [f"{t_s},0", f"{t_s + 8},0", f"{t_s + 8.5},{force_n}", f"{t_s + 19},{force_n}"]
         load.write_text("\n".join([*rows, "99.5,0", "130,0", ""]))
         with demo(f"--scene={scene}", f"--load={load}", "--lead-s=60", is_tared=False) as url:
-            page = browser.new_page(viewport={"width": 1100, "height": 640})
+            page = browser.new_page(viewport={"width": 1100, "height": 670})
             page.goto(f"{url}calibrate#token={TOKEN}")
             page.fill("#within", "0.5")
             page.click("#start")

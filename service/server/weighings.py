@@ -197,7 +197,7 @@ class Weighings:
     def push(self, node: ServerNode, due: Sequence[Estimated]) -> None:
         """Take the newest frames of a node; cheap if none of its tiles is calibrated."""
         weighing = self._of.get(node.name)
-        if weighing is None:
+        if weighing is None or node.boot_id != weighing.boot_id:
             return
         for frames, _ in due:
             if weighing.state == "weighing" and len(frames):
@@ -231,7 +231,7 @@ class Weighings:
         await self._cancel(weighing)
 
     def check(self, node: ServerNode, now_s: float) -> None:
-        """End the weighing of a node without progress, or of a node that has left.
+        """End the weighing of a node without progress, without recording, or that has left.
 
         Args:
             node: of the server.
@@ -244,6 +244,10 @@ class Weighings:
             if node.boot_id != weighing.boot_id:
                 raise StateError(
                     f"node {node.name!r} was restarted", remedy="Repeat: begin with the first rest"
+                )
+            if self._sessions.get(weighing.session_id).state != "recording":
+                raise StateError(
+                    "its recording was stopped", remedy="Repeat, and leave the recording alone"
                 )
             if now_s - weighing.seen_s > AWAY_S:
                 raise StateError(

@@ -217,6 +217,24 @@ def test_a_viewer_sees_it_and_cannot_act(serve_with: ServeWith, node_of: NodeOf)
         assert running.http.delete(URL).status_code == 401
 
 
+def test_it_ends_when_somebody_stops_its_recording(running: Running, tared: FakeNode) -> None:
+    with Play(tared, alive=True):
+        running.http.post(f"/sessions/{started(running)['session_id']}/stop")
+        until(lambda: now(running)["state"] == "failed")
+    assert "its recording was stopped" in now(running)["problem"]
+
+
+def test_markers_have_the_instants_of_frames_that_come_late(
+    running: Running, tared: FakeNode
+) -> None:
+    tared.next_t_mono_ns = time.monotonic_ns() - 1_500_000_000
+    tared.deliver(20, alive=True)
+    id_ = started(running)["session_id"]
+    while not (events := running.http.get(f"/sessions/{id_}/events").json()["items"]):
+        tared.deliver(20, alive=True)
+    assert events[0]["t_ns"] <= running.node()["last_t_ns"]
+
+
 def test_a_server_that_ends_stops_the_recording(running: Running, tared: FakeNode) -> None:
     with Play(tared, alive=True):
         id_ = started(running)["session_id"]
