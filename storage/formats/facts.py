@@ -17,6 +17,7 @@ AXES = (
 MASKED = (
     "Estimates are missing where they are not known, and estimate_status says why: no centre of "
     "pressure without contact or in doubt (16), no GRF with a tile saturated (1) or missing (32). "
+    "Of tiles in one row the COP is not measured across the row. "
     "Nothing stands in their place."
 )
 _NODES = "The node's clock (t_ns), UTC since 1970, as its node had it set."
