@@ -76,6 +76,8 @@ class Estimator:
         tiles = len(plan.info.tiles)
         self._scene, self._tiles = at_rest(tiles)
         self._room = make_room(ROWS_LEAST, tiles)
+        axes = zip(whole.ALONG, plan.cop_measured, strict=True)
+        self._unmeasured = [row for rows, is_measured in axes if not is_measured for row in rows]
 
     def step(self, frames: FrameBatch) -> Estimates:
         """Take the next frames, in order; return the estimates that are due.
@@ -96,13 +98,15 @@ class Estimator:
         if self._scene["end"][0] + n > len(self._room.rows):
             self._make_room(n)
         columns = [_as_compiled(getattr(frames, name)) for name in _COLUMNS]
-        return _estimates(_step(self._laws, self._scene, self._tiles, self._room, *columns))
+        answers = _step(self._laws, self._scene, self._tiles, self._room, *columns)
+        return _estimates(answers, self._unmeasured)
 
     def finish(self) -> Estimates | None:
         """The estimates that still wait for their look-ahead, at the end; None if none wait."""
         if self._scene["due"][0] == self._scene["end"][0]:
             return None
-        return _estimates(_finish(self._laws, self._scene, self._tiles, self._room))
+        answers = _finish(self._laws, self._scene, self._tiles, self._room)
+        return _estimates(answers, self._unmeasured)
 
     def kept(self) -> Columns:
         """All that it remembers, for another one to go on with; records as their bytes."""
@@ -162,8 +166,10 @@ def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return column
 
 
-def _estimates(answers: Answers) -> Estimates:
+def _estimates(answers: Answers, unmeasured: list[int]) -> Estimates:
     seq, t_ns, by_tile, by_frame, contact, status = answers
+    # Not before: whether a centre of pressure is masked is decided with the row's place.
+    by_frame[unmeasured] = math.nan
     return Estimates(
         seq=seq,
         t_ns=t_ns,
