@@ -172,7 +172,9 @@ def test_the_client_pulls_any_format_and_one_of_sealed_sessions_waits_for_that(
             pulled = pull_made(server, sealed.id, tmp_path, Slice(0.25, 0.5), format_named(name))
             assert Path(pulled["path"]).read_bytes().startswith(begin)
             assert Path(pulled["path"]).name == f"{sealed.id}_0.25s-0.5s.{name}"
-        with pytest.raises(foottile.ConflictError, match=r"MATLAB is available when it is sealed.*xdf"):
+        with pytest.raises(
+            foottile.ConflictError, match=r"MATLAB is available when it is sealed.*xdf"
+        ):
             pull_made(server, sealed.recording.id, tmp_path, Slice(), format_named("mat"))
 
 
