@@ -30,6 +30,8 @@ from devices.facts import (
 NOT_READ = 65535
 NO_SERVO_COUNTS = -(2**31)
 NO_SERVO_AGE = -1
+SAME_PLACE_M = 1e-6
+"""Tiles that differ by no more along an axis stand in one row."""
 
 
 class TileStatus(IntFlag):
@@ -213,3 +215,17 @@ class ArrayInfo(Facts):
     def serials(self) -> tuple[str, ...]:
         """Serials of the tiles, in frame order."""
         return tuple(tile.serial for tile in self.tiles)
+
+    @property
+    def row_place_m(self) -> tuple[float | None, float | None]:
+        """Place along x and y of the row in which all loaded tiles stand; None without such a row.
+
+        A row measures no centre of pressure along the axis that it has a place on.
+        """
+
+        def common(places_m: list[float]) -> float | None:
+            is_row = bool(places_m) and max(places_m) - min(places_m) <= SAME_PLACE_M
+            return places_m[0] if is_row else None
+
+        loaded = [tile for tile in self.tiles if not tile.reference]
+        return common([tile.x_m for tile in loaded]), common([tile.y_m for tile in loaded])

@@ -3,6 +3,7 @@
 // common/    REST calls, the websocket, dialogs, notices, words and elements
 // live/      panels that draw the newest frame, and the buttons beside them
 // nodes/     the page of all nodes
+// calibrate/ the page of the guided calibration
 // sessions/  the page of recorded sessions, and the trash
 //
 // A panel is a class that owns one element of index.html; it is made here and handed what the

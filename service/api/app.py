@@ -19,7 +19,7 @@ from service.api.guard import Guard
 from service.api.head import HeadFromGet
 from service.api.logins import Logins
 from service.api.page import PageFiles
-from service.api.routes import access, calibrations, formats, health, index, login, nodes
+from service.api.routes import access, calibrations, formats, health, index, login, nodes, weighings
 from service.api.routes.downloads import data, take_data, zips
 from service.api.routes.recordings import (
     array,
@@ -111,6 +111,7 @@ def make_app(
         login,
         nodes,
         calibrations,
+        weighings,
         zips,  # before the route with a session's id
         sessions,
         takes,
@@ -146,6 +147,10 @@ def make_app(
     @app.get("/nodes", include_in_schema=False)
     async def nodes_page(request: Request) -> Response:
         return await page.get_response("nodes.html", request.scope)
+
+    @app.get("/calibrate", include_in_schema=False)
+    async def calibrate_page(request: Request) -> Response:
+        return await page.get_response("calibrate.html", request.scope)
 
     @app.get("/sessions", include_in_schema=False)
     async def sessions_page(request: Request) -> Response:

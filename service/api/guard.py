@@ -55,7 +55,7 @@ _VIEWER = (
 )
 _NO_LOGIN = "A login is not enough for this: it needs the server's token"
 _OPEN = re.compile(
-    rf"/|/nodes|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
+    rf"/|/nodes|/calibrate|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
 )
 """Paths that a private server also serves without credentials: pages and files without data, login,
 and the readiness probe."""

@@ -346,3 +346,8 @@ class WeightFacts(CalibrationPart):
     """Standard uncertainty of the weights' common scale, relative."""
     band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
     """Bands at ten equal steps; `new_loading_n` is for an estimate of a settled load."""
+
+    def half_width_n(self, gauge_kpa: float) -> float:
+        """Return the half width of the 95 % interval of a new loading at this pressure."""
+        grid = [point.gauge_kpa for point in self.band_95]
+        return float(np.interp(gauge_kpa, grid, [point.new_loading_n for point in self.band_95]))

@@ -78,6 +78,8 @@ class Estimator:
         tiles = len(plan.info.tiles)
         self._foot_state, self._tile_states = at_rest(tiles)
         self._buffer = make_room(ROWS_LEAST, tiles)
+        axes = zip(whole.ALONG, plan.cop_measured, strict=True)
+        self._unmeasured = [row for rows, is_measured in axes if not is_measured for row in rows]
 
     def step(self, frames: FrameBatch) -> Estimates:
         """Process the next frames, in order; return the estimates that are due.
@@ -99,14 +101,15 @@ class Estimator:
         if self._foot_state["end_row"][0] + n > len(self._buffer.rows):
             self._make_room(n)
         columns = [_as_compiled(getattr(frames, name)) for name in _COLUMNS]
-        estimates = _step(self._params, self._foot_state, self._tile_states, self._buffer, *columns)
-        return _estimates(estimates)
+        output = _step(self._params, self._foot_state, self._tile_states, self._buffer, *columns)
+        return _estimates(output, self._unmeasured)
 
     def finish(self) -> Estimates | None:
         """Return the estimates that still wait for their look-ahead; None if there are none."""
         if self._foot_state["release_row"][0] == self._foot_state["end_row"][0]:
             return None
-        return _estimates(_finish(self._params, self._foot_state, self._tile_states, self._buffer))
+        output = _finish(self._params, self._foot_state, self._tile_states, self._buffer)
+        return _estimates(output, self._unmeasured)
 
     def kept(self) -> Columns:
         """Return a copy of its state for `from_state`; records as their bytes."""
@@ -167,8 +170,10 @@ def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return column
 
 
-def _estimates(answers: Answers) -> Estimates:
+def _estimates(answers: Answers, unmeasured: list[int]) -> Estimates:
     seq, t_ns, by_tile, by_frame, contact, status = answers
+    # Not before: whether a centre of pressure is masked is decided with the row's place.
+    by_frame[unmeasured] = math.nan
     return Estimates(
         seq=seq,
         t_ns=t_ns,

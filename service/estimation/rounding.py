@@ -112,12 +112,11 @@ def _least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
     most_kpa = float(plan.ladder.curves.high_kpa.sum())
     end_n = plan.ladder.curves.force(plan.ladder.curves.high_kpa[None]).force_n
     most_n = float((plan.gain * end_n).sum())
-    x, y = (of_tile_n.min() * _extent(plan.bearing_m[:, axis]) / most_n for axis in (0, 1))
-    cop = {"x": x or y, "y": y or x}  # across a line of tiles there is nothing to be rounded
     least = {"gauge_kpa": reading_kpa, "force_n": force_n, "force_sigma_n": force_n}
     least |= dict.fromkeys(("grf_n", "grf_sigma_n", "grf_at_least_n"), grf_n)
-    for axis, sigma_m in cop.items():
-        names = f"cop_{axis}_m", f"cop_sigma_{axis}_m", f"cop_ground_{axis}_m"
+    for name, is_measured, places_m in zip("xy", plan.cop_measured, plan.bearing_m.T, strict=False):
+        sigma_m = of_tile_n.min() * _extent(places_m) / most_n if is_measured else math.nan
+        names = f"cop_{name}_m", f"cop_sigma_{name}_m", f"cop_ground_{name}_m"
         least |= dict.fromkeys(names, np.array([sigma_m]))
     if plan.grid is not None:
         noise_kpa = float(tare.noise_kpa[plan.bearing].min())

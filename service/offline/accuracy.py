@@ -69,8 +69,9 @@ class Accuracy:
     """Errors of one recording. NaN where there is nothing to judge.
 
     GRF: frames with more than 0.5 N of truth and no saturated or missing tile. COP: frames with
-    more than 3 N of truth in which it is stated. Flight: frames without any load. `grf_phases`: all
-    frames without a saturated or missing tile, by what the true force does.
+    more than 3 N of truth in which it is stated; of tiles in one row, the coordinate that they
+    measure. Flight: frames without any load. `grf_phases`: all frames without a saturated or
+    missing tile, by what the true force does.
     """
 
     frames: int
@@ -131,15 +132,16 @@ def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0)
     after = usable & ((columns["estimate_status"] & EstimateStatus.AFTER_SATURATION) != 0)
     judged = (true_n > GRF_FROM_N) & usable
     heavy = true_n > COP_FROM_N
-    stated = heavy & np.isfinite(columns["cop_x_m"])
-    off_m = np.hypot(
-        columns["cop_x_m"][stated] - columns["true_cop_x_m"][stated],
-        columns["cop_y_m"][stated] - columns["true_cop_y_m"][stated],
+    cop_m, true_m = (
+        np.stack([columns[f"{source}cop_{axis}_m"] for axis in "xy"]) for source in ("", "true_")
     )
+    measured = np.isfinite(cop_m).any(axis=1)  # across a row of tiles nothing is
+    stated = heavy & np.isfinite(cop_m[measured]).all(axis=0) & measured.any()
+    off_m = np.hypot(*np.where(measured[:, None], cop_m - true_m, 0.0)[:, stated])
     within = np.abs(error_n[judged]) <= INTERVAL_95 * columns["grf_sigma_n"][judged]
+    stated_x = stated & measured[0]
     within_x = (
-        np.abs(columns["cop_x_m"][stated] - columns["true_cop_x_m"][stated])
-        <= INTERVAL_95 * columns["cop_sigma_x_m"][stated]
+        np.abs(cop_m[0] - true_m[0])[stated_x] <= INTERVAL_95 * columns["cop_sigma_x_m"][stated_x]
     )
     peaks_n, impulses_ns = _stances(columns["t_ns"], true_n, columns["grf_n"])
     flight = error_n[(true_n == 0.0) & np.isfinite(error_n)]

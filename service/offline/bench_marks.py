@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.errors import CalibrationError
-from service.estimation.fitting.bench.weights import parse_weight
+from service.estimation.weights import parse_weight
 from storage.schema import NO_INSTANT
 from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.folder import Event

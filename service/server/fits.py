@@ -80,6 +80,11 @@ class Fits:
         self._task: asyncio.Task[None] | None = None
         self._running: Fit | None = None
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether one is under way."""
+        return self._running is not None
+
     def all(self) -> list[Fit]:
         """Return the known jobs, newest first."""
         return [*reversed(self._fits.values())]

@@ -27,6 +27,7 @@ from service.server.screens.views import Counted, NodeView, SessionView
 from service.server.settling import Settling
 from service.server.streams import ServerStream
 from service.server.takes import Takes
+from service.server.weighings import Weighings
 from service.server_clock import utc_ns
 from service.sessions.comparison_series import SeriesKept
 from service.sessions.so_far import SoFars
@@ -110,6 +111,9 @@ class Server:
             self.recorder = Recorder(self.sessions, self.nodes, self.settling)
             self.takes = Takes(self.recorder, self.sessions, self.nodes)
             self.fits = Fits(self.sessions, self.calibrations)
+            self.weighings = Weighings(
+                self.sessions, self.recorder, self.settling, self.fits, self.calibrations
+            )
         except FootTileError:
             self.folder.close()
             raise
@@ -136,6 +140,9 @@ class Server:
                 folder_is_there = True
             if not folder_is_there:
                 continue
+            with self._alone("guided calibrations"):
+                for node in self.nodes:
+                    self.weighings.check(node, now_s)
             with self._alone("sessions"):
                 self.settling.settle()
             for link in list(self.links.values()):
@@ -188,6 +195,7 @@ class Server:
         """Close the links, cancel the calibration job, wait for running sealing."""
         for link in list(self.links.values()):
             link.end(Close.RESTART, "the server is stopping; reconnect")
+        await self.weighings.close()
         await self.fits.close()
         await self.settling.close()
         for node in self.nodes:

@@ -17,6 +17,7 @@ AXES = (
 MASKED = (
     "Unknown estimates are missing, and estimate_status says why: no centre of "
     "pressure without contact or in doubt (16), no GRF with a tile saturated (1) or missing (32). "
+    "Of tiles in one row the COP is not measured across the row. "
     "They are not replaced."
 )
 _NODE_TIME_BASE = "The node's clock (t_ns), UTC since 1970, as set on the node."

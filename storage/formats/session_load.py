@@ -52,6 +52,7 @@ def as_load(
         elif all(stem + name in columns for name in _TOTAL):
             names = ("fz_n", *_TOTAL[1:])
             found = {name: columns[stem + old] for name, old in zip(names, _TOTAL, strict=True)}
+            found |= _across_row(found)
         if found:
             break
     if not found:
@@ -78,6 +79,17 @@ def as_load(
         raise LoadTraceError("no row of it has a load", where=where)
     begin, end = int(rows[0]), int(rows[-1]) + 1
     return {name: column[begin:end] for name, column in found.items()}
+
+
+def _across_row(found: Mapping[str, Column]) -> dict[str, Column]:
+    """Return 0 for the coordinate of the COP that one row of tiles does not measure.
+
+    Any constant gives the same load: a trace's COP counts from its mean.
+    """
+    stated = {name: ~np.isnan(found[name]) for name in _TOTAL[1:]}
+    if not any(rows.any() for rows in stated.values()):
+        return {}
+    return {name: np.zeros(len(rows)) for name, rows in stated.items() if not rows.any()}
 
 
 def _cells(

@@ -26,15 +26,16 @@ class CalibrationDialog {
     this.back = el("button", { type: "button", cls: "small presses", id: "calibration-back", text: "Use the node’s own again" });
     this.back.hidden = true;
     this.list = el("ul", { id: "calibrations", "aria-label": "Calibrations that the server keeps, newest first" });
-    this.none = el("p", { text: "The server keeps none yet. Upload a file that “foottile calibrate” has written." });
+    this.none = el("p", { text: "The server keeps none yet. Calibrate with weights, or upload a file that “foottile calibrate” has written." });
     this.none.hidden = true;
     this.said = el("p", { id: "calibration-said", role: "alert" });
     this.file = el("input", { type: "file", id: "calibration-file", accept: ".json,application/json" });
+    const guided = el("a", { id: "calibration-guided", href: `/calibrate?node=${encodeURIComponent(node)}`, text: "Calibrate with weights …" });
     const upload = el("label", { cls: "presses", text: "Upload a calibration file " }, this.file);
     this.element = el("dialog", { id: "calibration-dialog", "aria-labelledby": "calibration-title" },
       el("h2", { id: "calibration-title", text: `Calibration of ${node}` }), this.inUse, this.back,
       el("p", { cls: "soft", text: "A choice counts from the next frame on; what is being recorded keeps what it began with." }),
-      this.none, this.list, upload, this.said,
+      this.none, this.list, guided, upload, this.said,
       el("form", { method: "dialog" }, el("p", { cls: "row" }, el("button", { type: "submit", value: "", autofocus: "", text: "Close" }))));
     this.back.addEventListener("click", () => this.doing(() => this.takeBack()));
     this.file.addEventListener("change", () => this.doing(() => this.upload()));

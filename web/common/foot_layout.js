@@ -1,6 +1,7 @@
 // Where the tiles of a foot are in a picture: from the side (a line of tiles) or from above (a grid). Pure.
 
 const GRID_FROM_M = 0.005; // tiles spread wider than this in y are a grid
+const SAME_PLACE_M = 1e-6; // tiles that differ by no more stand in one row
 
 /** @typedef {{x: number, y: number}} Point in pixels */
 
@@ -27,6 +28,12 @@ export function isGrid(tiles) {
   const pitch = spacing(tiles, (tile) => tile.y_m);
   const beside = (a, b) => Math.max(Math.abs(a.x_m - b.x_m), Math.abs(a.y_m - b.y_m)) > 0.98 * pitch;
   return isPlan(tiles) && tiles.every((a, i) => tiles.slice(0, i).every((b) => beside(a, b)));
+}
+
+/** @param {number[]} placesM @returns {number | null} */
+function commonPlace(placesM) {
+  const [least, most] = range(placesM);
+  return most - least <= SAME_PLACE_M ? least : null;
 }
 
 export class FootLayout {
@@ -65,6 +72,9 @@ export class FootLayout {
     this.baseline = this.plan ? heightPx / 2 : heightPx - basePx;
     this.radiusPx = Math.min(0.44 * this.pitch * this.scale, 30);
     this.points = tiles.map((tile) => this.at(tile.x_m, up(tile)));
+    const loaded = tiles.filter((tile) => !tile.reference);
+    /** Where the one row of loaded tiles stands along x and y, in metres; null: they measure the centre of pressure along it. */
+    this.row = { x: commonPlace(loaded.map((tile) => tile.x_m)), y: commonPlace(loaded.map((tile) => tile.y_m)) };
     /** Tiles from heel to toe. */
     this.order = tiles.map((_, i) => i).sort((a, b) => tiles[a].x_m - tiles[b].x_m);
   }
@@ -77,6 +87,18 @@ export class FootLayout {
     const [forward, up] = [(xM - this.middle.x) * this.scale, (upM - this.middle.up) * this.scale];
     if (this.toesUp) return { x: this.widthPx / 2 - up, y: this.baseline - forward };
     return { x: this.widthPx / 2 + forward, y: this.baseline - up };
+  }
+
+  /**
+   * The place in metres at which a centre of pressure is drawn: the coordinate that is not measured is that of the row.
+   * @param {number | null | undefined} xM
+   * @param {number | null | undefined} yM
+   * @returns {{x: number, y: number} | null} null: no centre of pressure
+   */
+  copPlace(xM, yM) {
+    if (!Number.isFinite(xM) && !Number.isFinite(yM)) return null;
+    const [x, y] = [xM ?? this.row.x, yM ?? this.row.y];
+    return x === null || y === null ? null : { x, y };
   }
 
   /** The sole behind a line of tiles, open to the leg above, as an SVG path. */

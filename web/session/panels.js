@@ -74,7 +74,7 @@ export function panelsOf(bins, asHeat, beside = null) {
     panels.push({
       key: `cop-${axis}`, title, unit: "mm", factor: 1e3, kind: "series",
       columns: [`cop_${axis}_m_min`, `cop_${axis}_m_max`], band: [`cop_${axis}_low_m_min`, `cop_${axis}_high_m_max`],
-      height: PLACE_PX, head: TITLE_PX, ...(axis === "x" && !measuresY(bins) ? { note: Y_UNMEASURED } : {}),
+      height: PLACE_PX, head: TITLE_PX, ...unmeasured(bins, axis === "x" ? "y" : "x"),
     });
   }
   if (bins.estimated && bins.has("angle_rad_min")) {
@@ -86,10 +86,8 @@ export function panelsOf(bins, asHeat, beside = null) {
   return panels;
 }
 
-export const Y_UNMEASURED = "COP y not measured: tiles in one row";
-
-/** A row of tiles does not measure across it. */
-export const measuresY = (bins) => bins.has("cop_y_m_max");
+/** A row of tiles does not measure the centre of pressure across it. */
+const unmeasured = (bins, axis) => (bins.has(`cop_${axis}_m_max`) ? {} : { note: `COP ${axis} not measured: tiles in one row` });
 
 /** On a line of tiles one coordinate is always the same: that is no plot. */
 function moves(bins, stem) {

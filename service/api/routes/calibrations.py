@@ -332,7 +332,7 @@ async def assign(
     the_node = server.nodes.get(node)
     calibration = await run_in_threadpool(server.calibrations.get, body.id)
     _expect_in_use(the_node, if_match)
-    _check_fits(the_node, calibration)
+    check_fits(the_node, calibration)
     the_node.estimates.use_calibration(calibration, utc_ns())
     server.tell_node(the_node)
     return NodeCalibrationView.of(the_node)
@@ -377,7 +377,7 @@ def _expect_in_use(node: ServerNode, if_match: str | None) -> None:
     expect(tag_of(if_match), present, f"the calibration of {node.name!r}")
 
 
-def _check_fits(node: ServerNode, calibration: Calibration) -> None:
+def check_fits(node: ServerNode, calibration: Calibration) -> None:
     """Refuse a calibration with which the present tiles cannot be estimated.
 
     Raises:

@@ -29,12 +29,8 @@ from service.estimation.fitting.bench.indentation import Indentation, place
 from service.estimation.fitting.bench.weights import Hold, holds
 from service.estimation.fitting.confidence import cubic_basis, curve_n
 from service.estimation.models.static import StaticCurves
+from service.estimation.weights import check_enough
 
-HOLDS_MIN = 5
-LEVELS_MIN = 4
-"""Least number of different weights: of three a single one would determine the curve's shape."""
-LEVEL_APART = 1.1
-"""Least ratio of two different weights."""
 SMALL_N = 2.0
 """Force below which an error is absolute rather than relative."""
 RESIDUAL_MAX = 0.3
@@ -62,7 +58,7 @@ def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     where = ", ".join(place(recording) for recording in recordings)
     per_file = [holds(recording) for recording in recordings]
     steps = [step for found in per_file for step in found]
-    _refuse_too_few(steps, where)
+    check_enough([step.weight.force_n for step in steps], where)
     drift_kpa = max(
         max(abs(step.baseline_kpa - found[0].baseline_kpa) for step in found)
         for found in per_file
@@ -172,20 +168,6 @@ def _left_out_rms_n(design: Floats, force_n: Floats, weight: Floats, basis: Floa
         found, *_ = np.linalg.lstsq(design[others], (force_n * weight)[others], rcond=None)
         errors.append(float(basis[i] @ found - force_n[i]))
     return float(np.sqrt(np.mean(np.square(errors))))
-
-
-def _refuse_too_few(steps: Sequence[Hold], where: str) -> None:
-    levels: list[float] = []
-    for force_n in sorted(step.weight.force_n for step in steps):
-        if not levels or force_n > LEVEL_APART * levels[-1]:
-            levels.append(force_n)
-    if len(steps) < HOLDS_MIN or len(levels) < LEVELS_MIN:
-        raise CalibrationError(
-            f"{len(steps)} weights on the tile, {len(levels)} of them different",
-            where=where,
-            expected=f"{HOLDS_MIN} or more, {LEVELS_MIN} of them different by a tenth or more",
-            remedy="Put more weights on it; two together are a third one",
-        )
 
 
 def _refuse_no_rise(force_n: Floats, gauge_kpa: Floats, steps: Sequence[Hold], where: str) -> None:

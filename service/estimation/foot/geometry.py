@@ -12,9 +12,8 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.compiled import compiled
-from devices.frames import ServoInfo
+from devices.frames import SAME_PLACE_M, ServoInfo
 
-_SAME_PLACE_M = 1e-6  # tiles that differ by less are in one line
 _CURVED_TILES = 3  # least positions along x that determine a parabola
 
 
@@ -31,7 +30,7 @@ def hull(positions_m: Floats) -> tuple[Floats, Floats]:
     centre_m = positions_m.mean(axis=0)
     _, spread_m, directions = np.linalg.svd(positions_m - centre_m)
     extends = np.zeros(2, dtype=bool)
-    extends[: len(spread_m)] = spread_m > _SAME_PLACE_M
+    extends[: len(spread_m)] = spread_m > SAME_PLACE_M
     if extends.all():
         from scipy.spatial import ConvexHull
 
@@ -48,8 +47,8 @@ def grid_indices(
 
     A line of tiles is a grid of one row.
     """
-    columns, x = np.unique(np.round(positions_m[:, 0] / _SAME_PLACE_M), return_inverse=True)
-    rows, y = np.unique(np.round(positions_m[:, 1] / _SAME_PLACE_M), return_inverse=True)
+    columns, x = np.unique(np.round(positions_m[:, 0] / SAME_PLACE_M), return_inverse=True)
+    rows, y = np.unique(np.round(positions_m[:, 1] / SAME_PLACE_M), return_inverse=True)
     places = set(zip(x.tolist(), y.tolist(), strict=True))
     if len(places) != len(positions_m) or len(places) != len(columns) * len(rows):
         return None
@@ -63,7 +62,7 @@ def axes_rad(positions_m: Floats) -> Floats:
     (tiles, 3). Zero if these do not determine it. As the segment rolls, tiles are vertical in turn.
     """
     x_m, z_m = positions_m[:, 0], positions_m[:, 2]
-    if len(np.unique(np.round(x_m / _SAME_PLACE_M))) < _CURVED_TILES:
+    if len(np.unique(np.round(x_m / SAME_PLACE_M))) < _CURVED_TILES:
         return np.zeros(len(positions_m))
     design = np.stack([np.ones(len(x_m)), x_m, x_m**2], axis=1)
     (_, slope, bend), *_ = np.linalg.lstsq(design, z_m, rcond=None)

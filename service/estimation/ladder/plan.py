@@ -84,6 +84,8 @@ class EstimationPlan:
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
     """(tiles, 3), positions of the tiles."""
+    cop_measured: tuple[bool, bool]
+    """Whether the tiles measure the centre of pressure along x and y; across a row they do not."""
     gain: Floats
     """Newtons of the ground on a tile's part of the foot for a newton of the dome."""
     gain_sigma: Floats
@@ -195,6 +197,7 @@ def make_plan(
         ),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
+        cop_measured=(info.row_place_m[0] is None, info.row_place_m[1] is None),
         gain=np.array([1.0 if gain is None else gain.value for gain in gains]),
         gain_sigma=np.array([0.0 if gain is None else gain.sigma for gain in gains]),
         axis_rad=axis_rad,

@@ -244,17 +244,26 @@ def _crossings(pairs: Pairs, window: slice) -> tuple[float, float] | None:
 def _cop(
     pairs: Pairs, rows: Bools, reference_sigma_m: float | None
 ) -> tuple[dict[str, float], dict[str, int]]:
-    """Errors of the COP where both are in contact and state it, and the counts."""
-    ours = np.stack([pairs.columns["cop_x_m"], pairs.columns["cop_y_m"]], axis=1)
-    by_ours = rows & (pairs.columns["contact"] == 1) & np.isfinite(ours).all(axis=1)
+    """Return errors of the COP where both are in contact and state it, and the counts.
+
+    Our tiles in one row measure one axis, or none: the other one is in no distance.
+    """
+    ours, sigma_m = (
+        np.stack([pairs.columns[f"{name}_{axis}_m"] for axis in "xy"], axis=1)
+        for name in ("cop", "cop_sigma")
+    )
+    # Files of earlier versions have the row's place there, with a sigma of 0.
+    measured = (sigma_m[rows] > 0.0).any(axis=0)
+    by_ours = rows & (pairs.columns["contact"] == 1) & measured.any()
+    by_ours &= np.isfinite(ours[:, measured]).all(axis=1)
     known = np.isfinite(pairs.reference_cop_m)
     axes = known[rows].any(axis=0)  # of a treadmill there is one
     by_reference = rows & pairs.contact & known[:, axes].all(axis=1) & axes.any()
     both = by_ours & by_reference
-    off_m = ours[both] - pairs.reference_cop_m[both]
-    distance_m = np.hypot(*off_m.T)
+    off_m = np.where(measured, ours - pairs.reference_cop_m, np.nan)[both]
     mean_m = off_m.mean(axis=0) if len(off_m) else np.full(2, np.nan)
-    about_mean_m = np.hypot(*(off_m - mean_m).T)
+    distance_m = np.hypot(*np.where(measured, off_m, 0.0).T)
+    about_mean_m = np.hypot(*np.where(measured, off_m - mean_m, 0.0).T)
     figures = {
         "cop_mean_m": _mean(distance_m),
         "cop_p95_m": _p95(distance_m),
@@ -262,12 +271,10 @@ def _cop(
         "cop_bias_y_m": float(mean_m[1]),
         "cop_p95_about_mean_m": _p95(about_mean_m),
     }
-    for axis, off in zip("xy", off_m.T, strict=True):
-        sigma_m = pairs.columns[f"cop_sigma_{axis}_m"][both].astype(np.float64)
-        # Across a line of tiles nothing is measured, and nothing is uncertain.
-        told = reference_sigma_m is not None and (sigma_m > 0.0).any() and np.isfinite(off).any()
-        most_m = INTERVAL_95 * np.hypot(sigma_m, reference_sigma_m or 0.0)
-        figures[f"cop_coverage_{axis}_95"] = _mean(np.abs(off) <= most_m) if told else math.nan
+    most_m = INTERVAL_95 * np.hypot(sigma_m[both].astype(np.float64), reference_sigma_m or 0.0)
+    for axis, off, most in zip("xy", off_m.T, most_m.T, strict=True):
+        told = reference_sigma_m is not None and np.isfinite(off).any()
+        figures[f"cop_coverage_{axis}_95"] = _mean(np.abs(off) <= most) if told else math.nan
     counts = {"ours": by_ours, "reference": by_reference, "both": both}
     return figures, {name: int(which.sum()) for name, which in counts.items()}
 

@@ -117,6 +117,8 @@ def _rolling(experiment: Experiment) -> bytes:
     _tiles(force, first, rows, t_s)
     for k, (name, colour) in enumerate((("x", OURS), ("y", "#009E73"))):
         ours_mm = 1e3 * pairs.columns[f"cop_{name}_m"][rows]
+        if np.isnan(ours_mm).all():  # across a row of tiles
+            continue
         half_mm = INTERVAL_95 * 1e3 * pairs.columns[f"cop_sigma_{name}_m"][rows]
         place.fill_between(
             t_s, ours_mm - half_mm, ours_mm + half_mm, color=colour, alpha=0.3, linewidth=0

@@ -11,6 +11,7 @@ import numpy as np
 from devices.arrays import Floats
 from storage.formats.export import Export
 from storage.formats.facts import completeness
+from storage.formats.written.row_place import row_facts
 
 
 def described(export: Export, begin_ns: int) -> dict[str, str]:
@@ -44,6 +45,7 @@ def described(export: Export, begin_ns: int) -> dict[str, str]:
         "CALIBRATION": _calibration(notes),
         "SCALE": str(notes.get("absolute_scale") or "not known"),
         "SOFTWARE": export.info.software,
+        **row_facts(export.info),
     }
     return {name: ascii_of(text) for name, text in texts.items()}
 

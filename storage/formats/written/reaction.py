@@ -15,11 +15,13 @@ import numpy.typing as npt
 from devices.arrays import Floats, Times
 from devices.errors import UsageError
 from storage.formats.export import Export
+from storage.formats.written.row_place import NEEDED as POINT
+from storage.formats.written.row_place import with_row_place
 from storage.formats.written.steady import Steady, axis_of, steady
 from storage.formats.written.together import instants_of
 from storage.schema import SERVER_TIME, Array
 
-NEEDED = ("t_ns", "contact", "grf_n", "cop_x_m", "cop_y_m", "estimate_status")
+NEEDED = ("t_ns", "contact", *POINT)
 """Required columns, which every session with estimates has."""
 FURTHER = (
     *("grf_sigma_n", "grf_at_least_n", "cop_sigma_x_m", "cop_sigma_y_m"),
@@ -39,7 +41,7 @@ class Reaction:
 
     Attributes:
         steady: resampling of frames to samples.
-        columns: flat columns of frames, (m,) each.
+        columns: flat columns of frames, (m,) each; the COP `with_row_place`.
         events: time in seconds after the first sample, and label: first the markers, then begins
             and ends of contact.
         marks: number of markers among the events.
@@ -126,7 +128,7 @@ def _frames(
             where=export.called,
             remedy="Ask for Parquet, Arrow or CSV: they have counts and bounds",
         )
-    return t_ns, columns
+    return t_ns, with_row_place(columns, export.info)
 
 
 def _marks(columns: Mapping[str, Array], since_s: Floats) -> list[tuple[float, str]]:

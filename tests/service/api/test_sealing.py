@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import time
 
@@ -67,6 +68,34 @@ def test_a_download_before_the_seal_has_the_rounded_estimates_of_the_sealed_file
         np.testing.assert_array_equal(found, sealed[name].to_numpy()[:100], err_msg=name)
         whole = found.astype(np.float64) / step
         np.testing.assert_array_equal(whole, np.rint(whole), err_msg=name)
+
+
+def test_of_tiles_in_one_row_neither_file_nor_answer_has_a_number_across_it(
+    tared: FakeNode,
+) -> None:
+    session = tared.record()
+    tared.deliver(200, [20.0, 60.0])
+    tared.finish(session)
+    sealed = pq.ParquetFile(session.folder / "frames.parquet")
+    frames = sealed.read(["cop_x_m", "cop_y_m", "cop_sigma_y_m"])
+    assert np.isfinite(frames["cop_x_m"].to_numpy()).any()
+    for name in ("cop_y_m", "cop_sigma_y_m"):
+        assert not np.isfinite(frames[name].to_numpy()).any()
+    group = sealed.metadata.row_group(0)
+    (statistics,) = (
+        group.column(i).statistics
+        for i in range(group.num_columns)
+        if group.column(i).path_in_schema == "cop_y_m"
+    )
+    assert statistics is None or not statistics.has_min_max
+    rows = list(csv.DictReader(session.data(format="csv").text.splitlines()))
+    assert any(row["cop_x_m"] for row in rows)
+    assert {row["cop_y_m"] for row in rows} == {""}
+    get = session.running.http.get
+    bins = get(f"{session.url}/overview").json()["columns"]
+    assert any(value is not None for value in bins["cop_x_m_max"])
+    for name in ("cop_y_m_min", "cop_y_m_max", "cop_y_low_m_min", "cop_y_high_m_max"):
+        assert set(bins[name]) == {None}
 
 
 def test_a_server_that_is_told_so_seals_estimates_as_computed(

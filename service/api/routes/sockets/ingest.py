@@ -226,6 +226,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
                 raise HangUp(Close.REFUSED, str(error)) from error
             server.hub.publish(node, due)
             server.frames.publish(node, due)
+            server.weighings.push(node, due)
             if node.estimates.live.tare is not tare_before:
                 server.tell_node(node)
             continue

@@ -7,37 +7,18 @@ rest before it, because the rubber creeps for seconds.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from devices.errors import CalibrationError
 from service.estimation.fitting.bench.indentation import Indentation, place
+from service.estimation.weights import Weight, parse_weight
 
-STANDARD_GRAVITY_M_S2 = 9.80665
-GRAVITY_SIGMA = 0.0015
-"""Relative uncertainty of gravity: 0.5 % between pole and equator, 0.1 % by height."""
-TOLERANCE_PERCENT = 1.0
-"""Tolerance of a weight without a stated one."""
 LEAST_NS = 2_000_000_000
 """Least duration of a step or rest, for the tile to settle."""
 _PART_NS = 1_000_000_000  # first and last part of a step, which are compared
 _READINGS_MIN = 10
-_WEIGHT = re.compile(
-    r"(?P<size>\d{1,6}(?:\.\d{1,6})?) ?(?P<unit>g|kg|N)"
-    r"(?: ?(?:\+-|±) ?(?P<off>\d{1,2}(?:\.\d{1,4})?) ?%)?"
-)
-_NEWTONS = {"g": 1e-3 * STANDARD_GRAVITY_M_S2, "kg": STANDARD_GRAVITY_M_S2, "N": 1.0}
-_HEAVIEST_N = 1000.0
-
-
-@dataclass(frozen=True)
-class Weight:
-    """Known force with its relative standard uncertainty."""
-
-    force_n: float
-    relative_sigma: float
 
 
 @dataclass(frozen=True)
@@ -59,20 +40,6 @@ class Hold:
     noise_kpa: float
     settle_kpa: float
     baseline_kpa: float
-
-
-def parse_weight(text: str) -> Weight | None:
-    """Parse a weight such as `500 g`, `0.5 kg +-1 %` or `4.9 N`; None: the text is no weight."""
-    found = _WEIGHT.fullmatch(text.strip())
-    if found is None:
-        return None
-    force_n = float(found["size"]) * _NEWTONS[found["unit"]]
-    if not 0.0 < force_n <= _HEAVIEST_N:
-        return None
-    # A tolerance bounds the error: its standard uncertainty is that of a uniform distribution.
-    percent = TOLERANCE_PERCENT if found["off"] is None else float(found["off"])
-    gravity = 0.0 if found["unit"] == "N" else GRAVITY_SIGMA
-    return Weight(force_n, float(np.hypot(0.01 * percent / np.sqrt(3.0), gravity)))
 
 
 def has_weights(recording: Indentation) -> bool:

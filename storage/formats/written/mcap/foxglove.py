@@ -8,6 +8,7 @@ all messages of a session have one length. The foot is a `foxglove.SceneUpdate`,
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -30,10 +31,12 @@ from storage.formats.written.mcap.source import (
     frame_id,
     numbers,
 )
+from storage.formats.written.row_place import NEEDED as POINT
+from storage.formats.written.row_place import with_row_place
 from storage.schema import KNOWN, Array, Column
 
 _NS = 1_000_000_000
-_SCENE = ("grf_n", "cop_x_m", "cop_y_m", "force_n")
+_SCENE = (*POINT, "force_n")
 
 # Protobuf's types of fixed width: their number, wire type (of 32 or 64 bits), and numpy's name.
 _FLOAT = FieldDescriptorProto.TYPE_FLOAT, 5, "<f4"
@@ -105,6 +108,8 @@ class FoxgloveMessages:
     def _scenes(self, frames: Frames) -> Iterator[bytes]:
         tiles = self._info.tiles
         rows = frames.shown
+        if self._has_forces:
+            frames = replace(frames, flat=with_row_place(frames.flat, self._info))
         unknown = np.full((len(rows), len(tiles)), np.nan)
         forces_n = frames.tiles("force_n", len(tiles))[rows] if self._has_forces else unknown
         for row, force_n in zip(rows, forces_n.tolist(), strict=True):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,13 +29,15 @@ from storage.formats.written.mcap.source import (
     colour,
     frame_id,
 )
+from storage.formats.written.row_place import NEEDED as POINT
+from storage.formats.written.row_place import with_row_place
 from storage.schema import Array
 
 _NS = 1_000_000_000
 _STAMP = {"sec": ("<i4", 4), "nanosec": ("<u4", 8)}
 """Fields of a header's stamp, after four bytes that state the encoding."""
 _READINGS = ("padc", "tadc", "status", "sample_offset_us")
-_FORCES = ("grf_n", "cop_x_m", "cop_y_m", "force_n")
+_FORCES = (*POINT, "force_n")
 _HELD_NS = _NS
 """Longest age of a chip's last temperature that is used for frames without one."""
 
@@ -90,6 +93,7 @@ class Ros2Messages:
         t_ns = frames.t_ns.tolist()
         topics: list[tuple[int, list[bytes]]] = []
         if self._has_forces:
+            frames = replace(frames, flat=with_row_place(frames.flat, self._info))
             topics.append((self._wrenches, self._wrench.messages(_wrenches(frames))))
         topics += zip(self._tiles, self._of_tiles(frames), strict=True)
         beside: dict[int, list[Message]] = {}

@@ -25,7 +25,7 @@ from storage.formats.export import Export
 from storage.formats.written.csv_text import write_csv
 from storage.formats.written.described import ascii_of, clock_bound, described
 from storage.formats.written.format import Format
-from storage.formats.written.opensim.loads import COLUMNS, GROUND, Loads, loads_of
+from storage.formats.written.opensim.loads import COLUMNS, GROUND_X, Loads, loads_of
 from storage.formats.written.reaction import Reaction, reactions_of
 from storage.formats.written.sink import Sink
 from storage.formats.written.together import distinct
@@ -113,7 +113,7 @@ def _feet(exports: Sequence[Export]) -> list[Foot]:
                 expected="one for each, in their order, with commas between: "
                 + ", ".join(each.called for each in exports),
             )
-    found = reactions_of(exports, GROUND, FRAMES_MAX // len(exports))
+    found = reactions_of(exports, [GROUND_X], FRAMES_MAX // len(exports))
     loads = [
         loads_of(each, export, is_alone=is_alone)
         for each, export in zip(found, exports, strict=True)

@@ -21,6 +21,7 @@ from devices.arrays import Floats
 from devices.errors import UsageError
 from storage.formats.export import Export
 from storage.formats.written.reaction import Reaction
+from storage.formats.written.row_place import COP
 
 LINE_S = 0.02
 """Longest interpolated stretch of unknown GRF; longer stretches are 0."""
@@ -31,8 +32,8 @@ COLUMNS = (
     *(f"ground_torque_{axis}" for axis in "xyz"),
 )
 """Columns of one foot, after `time`."""
-GROUND = ("cop_ground_x_m", "cop_ground_y_m")
-_FOOT = ("cop_x_m", "cop_y_m")
+GROUND_X = "cop_ground_x_m"
+"""Ground x; the foot rolls about its y axis, so y is the same in both frames."""
 
 
 _WHY = {
@@ -108,9 +109,12 @@ def loads_of(found: Reaction, export: Export, *, is_alone: bool) -> Loads:
         UsageError: no sample has a centre of pressure.
     """
     places = [tile.z_m for tile in export.info.tiles if not tile.reference]
-    ground = [found.at(name) for name in GROUND if name in found.columns]
-    is_ground = is_alone and len(ground) == 2 and bool(np.isfinite(ground).all(axis=0).any())
-    points = ground if is_ground else [found.at(name) for name in _FOOT]
+    points = [found.at(name) for name in COP]
+    is_ground = False
+    if is_alone and GROUND_X in found.columns:
+        ground_x_m = found.at(GROUND_X)
+        is_ground = bool(np.isfinite(ground_x_m).any())
+        points[0] = ground_x_m if is_ground else points[0]
     stated = np.isfinite(points).all(axis=0)
     if not stated.any():
         raise UsageError(
