@@ -172,7 +172,7 @@ def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def _estimates(answers: Answers, unmeasured: list[int]) -> Estimates:
     seq, t_ns, by_tile, by_frame, contact, status = answers
-    # Not before: whether a centre of pressure is masked is decided with the row's place.
+    # Afterwards: masking of the centre of pressure needs the row's position.
     by_frame[unmeasured] = math.nan
     return Estimates(
         seq=seq,

@@ -1,4 +1,4 @@
-"""Known weights: their names, forces and tolerances, and how many of them determine a curve."""
+"""Dead weights: parsing of their texts, and the least number for a curve."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from devices.errors import CalibrationError, UsageError
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 GRAVITY_SIGMA = 0.0015
-"""Relative; gravity differs by 0.5 % between pole and equator, and 0.1 % by height."""
+"""Relative uncertainty of gravity: 0.5 % between pole and equator, 0.1 % by height."""
 TOLERANCE_PERCENT = 1.0
-"""Of a weight whose tolerance is not stated."""
+"""Tolerance of a weight without a stated one."""
 HOLDS_MIN = 5
 LEVELS_MIN = 4
-"""Different weights: three would leave the shape of the curve to a single one."""
+"""Least number of different weights: of three a single one would determine the curve's shape."""
 LEVEL_APART = 1.1
-"""Weights within a tenth of one another are one level."""
+"""Least ratio of two different weights."""
 _WEIGHT = re.compile(
     r"(?P<size>\d{1,6}(?:\.\d{1,6})?) ?(?P<unit>g|kg|N)"
     r"(?: ?(?:\+-|±) ?(?P<off>\d{1,2}(?:\.\d{1,4})?) ?%)?"
@@ -30,14 +30,14 @@ _HEAVIEST_N = 1000.0
 
 @dataclass(frozen=True)
 class Weight:
-    """A known force, with its standard uncertainty as a part of it."""
+    """Known force with its relative standard uncertainty."""
 
     force_n: float
     relative_sigma: float
 
 
 def parse_weight(text: str) -> Weight | None:
-    """Return the force of `500 g`, `0.5 kg +-1 %` or `4.9 N`; None: it names no weight."""
+    """Parse a weight such as `500 g`, `0.5 kg +-1 %` or `4.9 N`; None: the text is no weight."""
     found = _WEIGHT.fullmatch(text.strip())
     if found is None:
         return None
@@ -51,10 +51,10 @@ def parse_weight(text: str) -> Weight | None:
 
 
 def weight_labels(texts: Sequence[str], within_percent: float) -> tuple[str, ...]:
-    """Return weights as markers have them, `500 g +-0.5 %`; a tolerance in a text stays.
+    """Make the texts of weights for markers, `500 g +-0.5 %`; a tolerance in a text stays.
 
     Raises:
-        UsageError: a text names no weight, or they are too few for a curve.
+        UsageError: a text is no weight, or there are too few for a curve.
     """
     labels, forces_n = [], []
     for text in texts:
@@ -74,10 +74,10 @@ def weight_labels(texts: Sequence[str], within_percent: float) -> tuple[str, ...
 
 
 def check_enough(forces_n: Sequence[float], where: str = "") -> None:
-    """Refuse weights that are too few, or too much alike, to determine a curve.
+    """Reject weights that are too few, or too similar, for a curve.
 
     Raises:
-        CalibrationError: they are.
+        CalibrationError: there are too few, or too few different ones.
     """
     levels: list[float] = []
     for force_n in sorted(forces_n):

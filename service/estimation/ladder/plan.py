@@ -85,7 +85,7 @@ class EstimationPlan:
     bearing_m: Floats
     """(tiles, 3), positions of the tiles."""
     cop_measured: tuple[bool, bool]
-    """Whether the tiles measure the centre of pressure along x and y; across a row they do not."""
+    """Measurement of the centre of pressure along x, and along y; False across a row of tiles."""
     gain: Floats
     """Newtons of the ground on a tile's part of the foot for a newton of the dome."""
     gain_sigma: Floats

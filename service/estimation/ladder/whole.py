@@ -22,7 +22,7 @@ GRF, GRF_SIGMA, AT_LEAST, X, Y, SIGMA_X, SIGMA_Y, INDEX_X, INDEX_Y, GROUND_X, GR
 """Columns of `compute_grf_cop`; the last is needed for the ground frame only."""
 COLUMNS = 13
 ALONG = ((X, SIGMA_X, GROUND_X), (Y, SIGMA_Y, GROUND_Y))
-"""Answers that need the centre of pressure along x, and along y."""
+"""Columns of the centre of pressure along x, and along y."""
 
 
 @inlined

@@ -1,4 +1,4 @@
-"""Dead weights on a tile: parsing of their texts, and the tile's settled readings.
+"""Settled readings of a tile under dead weights.
 
 A step names the weight and its tolerance, `500 g +-0.5 %`; a reading of a kitchen scale or a force
 sensor is written the same way. The pressure is that at the end of the step, above the end of the
