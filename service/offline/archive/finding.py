@@ -1,7 +1,7 @@
-"""Sealed sessions, found for questions about many of them, and why others are left out.
+"""Search for sealed sessions, with the reason for each one left out.
 
-Each is taken by its `session.json`, held against its hash; its frames have the length that it says
-there.
+A session is accepted if the checksum of its `session.json` is right and its frames file has the
+length stated there.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from storage.sessions.folder import FRAMES_NAME
 
 
 def find_sessions(places: Sequence[str], mirror: Path | None = None) -> Archive:
-    """All sealed sessions in some places.
+    """Find all sealed sessions at some locations.
 
     Args:
-        places: as `service.offline.archive.places` knows them.
-        mirror: empty folder for what is copied of sessions in a store; needed if there are any.
+        places: paths, globs or URIs; see `service.offline.archive.locations`.
+        mirror: empty folder for metadata copied from object stores; required for remote sessions.
 
     Raises:
-        UsageError: one of them is not there.
+        UsageError: a location does not exist.
         StorageError: a store does not answer.
     """
     found = Archive()
@@ -70,7 +70,7 @@ def _are_same(one: str, other: str) -> bool:
 
 
 def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]:
-    """The session, or why it is left out."""
+    """Return the session; or, with None, the reason to leave it out."""
     if place.is_file:
         return "it is a file by itself, and no session's folder", None
     try:
