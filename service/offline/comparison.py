@@ -1,4 +1,4 @@
-"""A sealed session against a reference: read, aligned, judged."""
+"""Comparison of a sealed session with a reference: reading, alignment, errors."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.reader import SessionReader
 
 ROW = "row"
-"""Beside the columns of a session: in which row of the file a frame is."""
+"""Column added to a session's columns: the frame's row in the file."""
 ANGLE = "angle_rad"
-"""Beside what is compared, of a foot with a servo."""
+"""Column of a foot with a servo, read beside the compared ones."""
 
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """How to compare; see `foottile compare --help`."""
+    """Options of a comparison; see `foottile compare --help`."""
 
     stated: Stated
     lag_range_s: tuple[float, float] | None = None
@@ -55,21 +55,21 @@ class CompareOptions:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What came of it.
+    """Result of a comparison.
 
     Attributes:
-        session: which one, as its file says.
-        reference: the file.
-        alignment: of the two.
-        clock_lag: what the lag has to be by the clocks, where both are sessions of one server.
+        session: path and identity of the session.
+        reference: path of the reference.
+        alignment: alignment of both.
+        clock_lag: lag by the clock tables, if both are sessions of one server.
         pairs: our frames with the reference.
-        force_n: (n, tiles), forces of the tiles in these frames; of a bare one NaN.
-        serials: of the tiles.
-        errors: by trial and over trials.
-        trials_are: what a trial is.
-        notes: what a user should know of both recordings.
-        advice: what a user may do to learn more of the foot.
-        options: as given.
+        force_n: (n, tiles), tile forces of these frames; NaN for a reference tile without dome.
+        serials: serials of the tiles.
+        errors: errors by trial and over trials.
+        trials_are: definition of a trial, in words.
+        notes: remarks on both recordings.
+        advice: suggestions for a more informative comparison.
+        options: options of the comparison.
     """
 
     session: Mapping[str, object]
@@ -86,7 +86,7 @@ class Comparison:
     options: CompareOptions
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return the JSON representation."""
         alignment, pairs = self.alignment, self.pairs
         return {
             "session": self.session,
@@ -117,7 +117,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     """Compare a sealed session with a reference.
 
     Raises:
-        FileFormatError: one of the files cannot be read, or the session has no estimates.
+        FileFormatError: a file cannot be read, or the session has no estimates.
         UsageError: a unit or sign of the reference is not stated.
         ComparisonError: the two cannot be compared.
     """
@@ -181,7 +181,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
 
 
 def _columns(session: SessionReader) -> tuple[Columns, Floats]:
-    """What is compared, `t_ns` on the session's time axis, and the forces of the tiles."""
+    """Read the compared columns, with `t_ns` on the session's time axis, and the tile forces."""
     wanted = [*COMPARED, "force_n"]
     if absent := [name for name in wanted if not session.has(name)]:
         raise FileFormatError(
@@ -215,7 +215,7 @@ def _columns(session: SessionReader) -> tuple[Columns, Floats]:
 
 
 def _marks(session: SessionReader, path: Path, columns: Columns) -> tuple[list[Mark], list[str]]:
-    """Marks that lie beside a session, at their frames, and which could not be placed."""
+    """Read a session's markers at their frames; also return notes on those without a frame."""
     beside = path.with_name(EVENTS_NAME)
     if not beside.is_file():
         return [], []
@@ -230,7 +230,7 @@ def _marks(session: SessionReader, path: Path, columns: Columns) -> tuple[list[M
 
 
 def _clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:
-    """By the clock tables beside two sessions; None: one has none, or it says nothing of then."""
+    """Compute the lag from two sessions' clock tables; None if either has no row at `at_ns`."""
     found = [_server_offset(one, at_ns) for one in (path, reference_path)]
     if found[0] is None or found[1] is None:
         return None
@@ -239,7 +239,7 @@ def _clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:
 
 
 def _server_offset(path: Path, at_ns: int) -> tuple[int, int] | None:
-    """The server's time less that of the session's axis, and its bound, at the frame nearest."""
+    """Return server time minus session time at the nearest frame, and its bound, in ns."""
     with SessionReader(path) as session:
         try:
             clock = clock_beside(session)

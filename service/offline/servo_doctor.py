@@ -1,4 +1,4 @@
-"""Which servos are on a serial line, and whether the one that a scene means is among them."""
+"""Diagnosis of a serial line: its servos, and whether the scene's servo is among them."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from devices.errors import ServoSetupError
 from devices.scene.hardware import ServoScene
 
 TIMEOUTS_S = (0.05, 0.25)
-"""For how long an answer is waited for; again, and longer, where nobody answered at all: a machine
-that is busy may be late itself, and a servo that is there must not be looked for in its cable."""
+"""Response timeouts; the second one is used if no servo answered, because a busy machine may read
+late, and a working servo must not be reported as missing."""
 
 
 @dataclass(frozen=True)
 class ServoDiagnosis:
-    """Which servos are on a serial line.
+    """Result of a serial line's diagnosis.
 
     Attributes:
         found: every servo that answered.
-        latency_timer_ms: of the adapter; None if it has none.
-        is_well: is the one that is wanted there, as the scene says, and the adapter quick?
-        verdict: all of it in a sentence or two, with what to change.
+        latency_timer_ms: latency timer of the adapter; None if it has none.
+        is_well: True if the expected servo is present with the scene's settings, and the adapter
+            is fast.
+        verdict: summary in a few sentences, with advice.
     """
 
     found: tuple[FoundServo, ...]
@@ -34,12 +35,12 @@ class ServoDiagnosis:
 
 
 def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoDiagnosis:
-    """Ask for a servo in both protocols at the usual baud rates.
+    """Search for a servo in both protocols at the usual baud rates.
 
     Args:
-        port: its serial port.
-        clock: a real one.
-        wanted: what the scene says of it; None: the one with id 1.
+        port: serial port.
+        clock: a real clock.
+        wanted: the scene's servo; None: any with id 1.
     """
     servo_id = wanted.id if wanted is not None else 1
     rates = dict.fromkeys((*((wanted.baudrate,) if wanted is not None else ()), *BAUDRATES))

@@ -1,8 +1,8 @@
-"""The steps of a calibration with dead weights, followed by what the tile reads.
+"""State machine of a calibration with dead weights, driven by the tile's pressure.
 
-Nobody has a hand free for a key: a weight that was put on shows in the tile's pressure, and so does
-one that was taken off. `Weighing` waits until the pressure is steady, has the step marked, watches
-it for some seconds, and goes on; a step in which something moved is withdrawn and made again.
+The user's hands are busy, so no key is needed: adding or removing a weight shows in the pressure.
+`WeighingProcedure` waits until the pressure is steady, requests the step's marker, observes it for
+some seconds, and continues. A step with movement is withdrawn and repeated.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from devices.arrays import Floats
 
 REST_S = 4.0
 HOLD_S = 5.0
-"""Marks come some tenths of a second late; a fit takes no step that is shorter than 2 s."""
+"""Durations of a step: markers are some tenths of a second late, and a fit needs 2 s per step."""
 STEADY_S = 1.0
-"""So long the pressure has to stand still before a step begins."""
+"""Time with steady pressure before a step begins."""
 LOADED_KPA = 0.3
-"""A pressure that is so far above that of the rest is a load; a light weight gives 0.5 kPa."""
+"""Pressure above rest that counts as a load; a light weight gives 0.5 kPa."""
 MOVED_PART = 0.15
-"""A step whose pressure moves by more than that part of it is made again: creep stays below."""
-_MOVED_KPA = 0.15  # or by more than this, where the part is less
-_BIN_S = 0.25  # readings are averaged over this, or noise would look like movement
+"""Relative change of a step's pressure from which it is repeated; creep stays below."""
+_MOVED_KPA = 0.15  # least absolute change
+_BIN_S = 0.25  # averaging time, so that noise does not look like movement
 _WINDOW_BINS = round(STEADY_S / _BIN_S)
 
 StepName = Literal["empty", "resting", "put on", "holding", "done"]
@@ -33,19 +33,19 @@ StepName = Literal["empty", "resting", "put on", "holding", "done"]
 
 @dataclass(frozen=True)
 class Begin:
-    """A step begins: have it marked with this label."""
+    """Action: a step begins; set a marker with this label."""
 
     label: str
 
 
 @dataclass(frozen=True)
 class End:
-    """The step is over."""
+    """Action: the step is over."""
 
 
 @dataclass(frozen=True)
 class Withdraw:
-    """Something moved: remove the marks of the newest step."""
+    """Action: movement was detected; remove the markers of the newest step."""
 
     reason: str
 
@@ -55,21 +55,21 @@ Action = Begin | End | Withdraw
 
 @dataclass(frozen=True)
 class Repeatability:
-    """What a step's pressure is like so far, in kPa; above the rest for a weight."""
+    """Statistics of the current step's pressure, in kPa; above rest for a weight."""
 
     mean_kpa: float
     spread_kpa: float
-    """Standard deviation of quarter seconds."""
+    """Standard deviation of quarter-second means."""
     settle_kpa: float
-    """Newest quarter second less the first."""
+    """Latest quarter-second mean minus the first."""
 
 
 class Weighing:
-    """One pass over a list of weights on one tile.
+    """Procedure for one series of weights on one tile.
 
     Args:
-        serial: of the tile.
-        weights: as they are written in marks, in the order in which they are put on.
+        serial: serial of the tile.
+        weights: weights as written in markers, in loading order.
     """
 
     def __init__(self, serial: str, weights: Sequence[str]) -> None:
@@ -81,14 +81,14 @@ class Weighing:
         self.repeatability: Repeatability | None = None
         """Of the step under way, or of the last one."""
         self._rest_kpa = np.nan
-        self._held_kpa = 0.0  # of the last weight
+        self._held_kpa = 0.0  # pressure of the last weight
         self._bins: list[float] = []
         self._in_step: list[float] = []
         self._sum, self._count, self._bin_ends_s = 0.0, 0, -np.inf
 
     @property
     def prompt(self) -> str:
-        """What to do now, in a sentence."""
+        """Instruction for the user, in a sentence."""
         weight = self.weights[self.number] if self.number < len(self.weights) else ""
         place = f"{self.number + 1} of {len(self.weights)}"
         return {
@@ -100,11 +100,11 @@ class Weighing:
         }[self.step]
 
     def push(self, t_s: Floats, kpa: Floats) -> list[Action]:
-        """Take readings of the tile, and return what has to be marked, in order.
+        """Process readings of the tile, and return the resulting actions in order.
 
         Args:
-            t_s: (n,), instants in seconds, rising from call to call.
-            kpa: (n,), absolute pressures; NaN where there was none.
+            t_s: (n,), times in seconds, rising from call to call.
+            kpa: (n,), absolute pressures; NaN where missing.
         """
         actions: list[Action] = []
         for at_s, reading_kpa in zip(t_s.tolist(), kpa.tolist(), strict=True):
@@ -117,13 +117,13 @@ class Weighing:
         return actions
 
     def _advance(self, kpa: float) -> list[Action]:
-        """Go on by a quarter of a second."""
+        """Advance by a quarter of a second."""
         self._bins = [*self._bins[1 - _WINDOW_BINS :], kpa]
         match self.step:
             case "empty" if self._is_steady(0.0) and self._is_empty(kpa):
                 return self._begin("resting", "rest")
             case "put on" if kpa < self._rest_kpa - LOADED_KPA:
-                # What looked like a rest was a load, or had not settled.
+                # The assumed rest was a load, or had not settled.
                 self.step = "empty"
                 return [Withdraw("the tile was not at rest")]
             case "put on" if self._is_steady(self._rest_kpa) and self._is_loaded(kpa):
@@ -173,5 +173,5 @@ class Weighing:
         return kpa > self._rest_kpa + LOADED_KPA
 
     def _is_empty(self, kpa: float) -> bool:
-        """Return whether the last weight is off; its creep goes back slowly."""
+        """Return whether the last weight is off, allowing for slow recovery of creep."""
         return self.number == 0 or kpa < self._rest_kpa + max(LOADED_KPA, 0.3 * self._held_kpa)
