@@ -1,4 +1,4 @@
-"""The benchmark as Markdown: figures, coverage, error budget, goals, and what failed."""
+"""Markdown report of the benchmark: figures, coverage, error budget, goals, failures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ERRORS = (
 _WORDS = {"rung", "mode", "ladder", "of the whole ladder", "met"} | {
     *("scene", "condition", "figure", "model", "of", "reason")
 }
-"""Heads of columns that are words, not figures."""
+"""Heads of text columns."""
 BESIDE = (
     ("in flight, mean N", "flight_mean_n", 1.0, 3),
     ("in flight, mean abs N", "flight_mae_n", 1.0, 3),
@@ -47,7 +47,7 @@ BESIDE = (
 
 
 def markdown(bench: Bench) -> str:
-    """All tables of a benchmark."""
+    """Format the report of a benchmark."""
     o = bench.options
     lines = [
         "# Speed against error",
@@ -128,7 +128,7 @@ def _coverage(figures: SceneFigures) -> list[str]:
 
 
 def _budget(figures: SceneFigures) -> list[str]:
-    """What each model takes away: how much greater the error is without it."""
+    """Format the error budget: the increase of the error without each model."""
     rows = []
     for rung in figures.rungs:
         if rung.lacks is None and rung.spare is None:
@@ -180,7 +180,7 @@ def _cells(m: Measured, columns: Sequence[tuple[str, str, float, int]]) -> list[
 
 
 def spread_text(spread: Spread, scale: float, digits: int, *, sign: str = "") -> str:
-    """Median and range in one cell; `sign` "+": with the sign also of what is positive."""
+    """Format median and range in one cell; `sign` "+" also shows positive signs."""
     if not spread.n:
         return "-"
     low, median, high = (
@@ -190,11 +190,11 @@ def spread_text(spread: Spread, scale: float, digits: int, *, sign: str = "") ->
 
 
 def draws_text(n: int) -> str:
-    """So many draws."""
+    """Format a number of draws."""
     return "1 draw" if n == 1 else f"{n} draws"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table in Markdown: text to the left, figures to the right."""
+    """Format a Markdown table: text left-aligned, figures right-aligned."""
     rule = ["---" if title in _WORDS else "--:" for title in head]
     return [f"| {' | '.join(cells)} |" for cells in (head, rule, *rows)]

@@ -1,4 +1,4 @@
-"""Arrays of the broad family as Markdown: goals, errors, coverage, flags, models, refusals."""
+"""Markdown report of the broad benchmark: goals, errors, coverage, flags, models, refusals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _HEAVY = "a leg of 3.3 kg on firmer poppy seeds, up to 28 N a tile: for saturati
 
 
 def markdown(bench: BroadBench) -> str:
-    """All tables."""
+    """Format the report."""
     o, results = bench.options, bench.results
     rows = rows_of(results)
     spent_s = sum(result.cpu_bench_s + result.cpu_scenes_s for result in results)
