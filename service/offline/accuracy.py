@@ -43,7 +43,7 @@ PHASES = ("flight", "loading", "mid_stance", "unloading")
 
 @dataclass(frozen=True)
 class Covered:
-    """Frames of one phase, and how many of them have the truth within 1.96 sigma.
+    """Counts of one phase: frames, and frames with the truth within 1.96 sigma.
 
     As counts, so that recordings can be pooled by addition.
     """

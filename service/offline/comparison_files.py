@@ -47,8 +47,8 @@ class Compared:
 
     Attributes:
         content: content of `compare.json`.
-        text: content of `compare.md`.
-        missed: descriptions of missed limits.
+        report_text: content of `compare.md`.
+        missed_limits: descriptions of missed limits.
     """
 
     content: Mapping[str, Any]
@@ -69,8 +69,8 @@ def write_comparison(
     `series.parquet` is not written if it would exceed `ROWS_MAX`.
 
     Args:
-        source: the session's frames file.
-        reference: the reference file.
+        session_path: the session's frames file.
+        reference_path: the reference file.
         options: options of the comparison.
         limits: limits of figures' means, by name.
         folder: folder to write to.

@@ -53,11 +53,11 @@ class Diagnosis:
     Attributes:
         tiles: findings for all tiles of the scene and all others found.
         scl_hz: measured bus clock; None without a working tile.
-        asked_scl_hz: configured bus clock.
-        transaction_s: overhead of a transaction beyond its bits.
+        configured_scl_hz: configured bus clock.
+        transaction_overhead_s: overhead of a transaction beyond its bits.
         rates_hz: frames per second by schedule; None if it would open too many channels.
-        schedule: fastest schedule; None without tiles.
-        holds: True if all tiles work and the requested rate is reached.
+        fastest_schedule: fastest schedule; None without tiles.
+        is_rate_reached: True if all tiles work and the requested rate is reached.
         verdict: summary in a few sentences, with advice.
     """
 
@@ -78,7 +78,7 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         bus: the bus.
         clock: virtual or real clock.
         scene: expected parts; None: accept any.
-        asked_hz: requested frames per second; 0: the highest possible.
+        requested_hz: requested frames per second; 0: the highest possible.
 
     Raises:
         BusFaultError: the bus itself does not work.

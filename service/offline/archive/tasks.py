@@ -52,7 +52,7 @@ class Task(Protocol):
 
         Args:
             source: the session's folder or file.
-            work: empty folder for the result's files; the caller makes them durable.
+            result_folder: empty folder for the result's files; the caller makes them durable.
 
         Returns:
             Report of the task, as JSON values.
@@ -77,7 +77,7 @@ class LongTask(Task, Protocol):
 
         Args:
             source: as for `run`.
-            folder: folder of the chunks; the new one is written to it.
+            chunks_folder: folder of the chunks; the new one is written to it.
 
         Returns:
             False if all chunks existed already.
@@ -103,7 +103,7 @@ class EstimateTask(EstimateRequest):
     PIECES: ClassVar[tuple[str, ...]] = ("json", "npz")
 
     def options(self) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         named = self.calibration
         return {
             **{name: value for name, value in vars(self).items() if name != "piece_frames"},
@@ -113,7 +113,7 @@ class EstimateTask(EstimateRequest):
         }
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         from service.offline.estimate.session import estimate_session
 
         frames, remarks = frames_of(source), list[str]()
@@ -164,12 +164,12 @@ class ExportTask:
     command: ClassVar[str] = "export"
 
     def options(self) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         asked = self.export.options.model_dump(exclude_none=True)
         return {**vars(self.export), "part": vars(self.export.part), "options": asked}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         name = f"{Path(FRAMES_NAME).stem}.{format_named(self.export.to).ending}"
         done = export_session(frames_of(source), work / name, self.export)
         left_out = {mark.event.label: mark.left_out for mark in done.left_out}
@@ -183,11 +183,11 @@ class VerifyTask:
     command: ClassVar[str] = "verify"
 
     def options(self) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         return {}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         report = verify(source)
         text = json.dumps(report.as_dict(), indent=1).encode()
         (work / "verify.json").write_bytes(text)
@@ -211,7 +211,7 @@ class CompareTask:
         return {"reference_sha256": said, "limits": self.limits, **options}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         from service.offline.comparison_files import write_comparison
 
         title = f"{source.name} against {self.reference.rpartition('/')[2]}"
@@ -232,11 +232,11 @@ class RefusedTask:
     command: str
 
     def options(self) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         raise UsageError(self.reason)
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
+        """See `SessionTask`."""
         raise UsageError(self.reason)
 
 

@@ -70,8 +70,8 @@ def time_rungs(
 
     Args:
         recording: recording that is estimated repeatedly.
-        rungs: model sets to time.
-        frames: frames per repetition, by mode.
+        model_sets: model sets to time.
+        frames_per_repetition: frames per repetition, by mode.
         repetitions: number of repetitions.
 
     Returns:
@@ -109,7 +109,7 @@ def plan_of(recording: Recording, models: tuple[str, ...], lag_ms: float) -> Est
 
 
 def ns_per_frame(plan: EstimationPlan, stream: Endless, frames: int, batch: int) -> float:
-    """Measure the CPU time in ns per frame for `frames` frames of a stream, `batch` per step."""
+    """Measure the CPU time per frame in ns, over `frames` frames, `batch_frames` per step."""
     estimator = Estimator(plan)
     spent_ns = 0
     for begin in range(0, frames, batch):
@@ -188,7 +188,7 @@ def record(
         scene: scene to run.
         seconds: duration; None: the scene's, or `SECONDS` if it has no end.
         draw: seed of tiles and noise.
-        progress: called before slow steps.
+        on_progress: called before slow steps.
 
     Raises:
         FootTileError: scene or calibration is not usable.

@@ -23,10 +23,10 @@ class Rung:
         label: short name for tables and plots.
         models: the models, in the order of `MODELS`.
         is_built_up: True for the first set and each set with one model more than the set before.
-        adds: model that it adds to the set before; None for the first and ablated sets.
-        lacks: the one model of the full set that is missing in it; None otherwise.
-        spare: model that it adds to the full set.
-        is_default: True for the scene's full set.
+        added_model: model that it adds to the set before; None for the first and ablated sets.
+        missing_model: the one model of the full set that is missing in it; None otherwise.
+        extra_model: model that it adds to the full set.
+        is_full_set: True for the scene's full set.
     """
 
     label: str
@@ -50,9 +50,9 @@ def rungs(
     `list_missing_models`.
 
     Args:
-        models_of_scene: models of the scene, with `static`.
-        existing: all models, in order of application.
-        offered: further models that array and calibration support.
+        scene_models: models of the scene, with `static`.
+        all_models: all models, in order of application.
+        extra_models: further models that array and calibration support.
     """
     whole = tuple(name for name in existing if name in models_of_scene)
     later = [name for name in existing if name not in (*FOUNDATION, *BY_WHAT_MATTERS)]

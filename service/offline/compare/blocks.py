@@ -44,7 +44,7 @@ class Estimate:
         value: estimate.
         sigma: standard error.
         dof: its degrees of freedom, not an integer, as blocks have unequal information.
-        own: standard uncertainty from our foot's error that repeats in every stance.
+        repeating_sigma: standard uncertainty from our foot's error that repeats in every stance.
     """
 
     value: float
@@ -80,8 +80,8 @@ class Spread:
     Attributes:
         covariance: (p, p).
         dof: (p,), degrees of freedom.
-        blocks: number of time blocks.
-        own: (p, p), covariance of our foot's error that repeats in every stance.
+        block_count: number of time blocks.
+        repeating_covariance: (p, p), covariance of our foot's error that repeats in every stance.
     """
 
     covariance: Floats

@@ -46,11 +46,11 @@ class Mount:
     Attributes:
         gains: gain of each tile; all equal if one common gain was fitted.
         shear: shear coefficient; None if it was not fitted.
-        late_s: residual lag.
-        before_n: mean absolute GRF error under load before the fit, without the reference's zero.
-        after_n: cross-validated mean absolute GRF error with gains and shear.
-        frames: number of loaded frames.
-        blocks: number of time blocks behind the uncertainties.
+        residual_lag_s: residual lag.
+        mae_before_n: mean absolute GRF error under load before the fit, reference zero removed.
+        mae_after_n: cross-validated mean absolute GRF error with gains and shear.
+        frame_count: number of loaded frames.
+        block_count: number of time blocks behind the uncertainties.
     """
 
     gains: tuple[Parameter, ...]
@@ -150,10 +150,10 @@ def fit_mount(
     Args:
         pairs: our frames with the reference, its zero removed.
         force_n: (n, tiles), forces of the load-bearing tiles.
-        tilted: (n, tiles), 1 - cos of the angle between tile axis and vertical; NaN: unknown.
+        tilt_loss: (n, tiles), 1 - cos of the angle between tile axis and vertical; NaN: unknown.
         serials: serials of the tiles.
         per_tile: fit a gain for each tile instead of one for all.
-        shear: fit the shear coefficient too.
+        fit_shear: fit the shear coefficient too.
         reference_gain_sigma: standard uncertainty of the reference's gain.
 
     Raises:

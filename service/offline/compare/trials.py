@@ -66,7 +66,7 @@ class OverTrials:
 def trials_of(
     t_ns: Times, part: npt.NDArray[Any], marks: Sequence[Mark]
 ) -> tuple[list[Trial], str]:
-    """Split a session into trials, and describe what a trial is.
+    """Split a session into trials; also return the definition of a trial.
 
     Each marker begins a trial that lasts until the next marker or the end; frames before the first
     marker are in none. Without markers, each contiguously recorded part is a trial.
@@ -74,7 +74,7 @@ def trials_of(
     Args:
         t_ns: (n,), UTC of the frames.
         part: (n,), session part of the frames.
-        marks: markers in any order.
+        markers: markers in any order.
     """
     if marks:
         ordered = sorted(marks, key=lambda mark: mark.t_ns)

@@ -35,12 +35,12 @@ class Estimated:
     """Result of a re-estimation.
 
     Attributes:
-        frames: number of frames.
+        frame_count: number of frames.
         plan: initial constants of the estimate.
         begin_t_ns: UTC of the first frame of the session.
         findings: stances, and errors against the truth; empty if not requested.
-        asked: omitted models with a considerable effect, with that effect in N; empty if not
-            requested.
+        omitted_effects_n: omitted models with a considerable effect, with that effect in N; empty
+            if not requested.
     """
 
     frames: int
@@ -71,8 +71,8 @@ def estimate_session(
         source: the session.
         out: the session to write; may be the same file unless a part is estimated.
         request: options of the estimate.
-        remark: called with each remark.
-        is_judged: True to compute findings, which doubles the run time.
+        on_remark: called with each remark.
+        with_findings: True to compute findings, which doubles the run time.
 
     Raises:
         FootTileError: the session, scene, calibration or tare is not usable, or the part has no
@@ -121,17 +121,17 @@ def write_estimated(
 
     Args:
         out: the file.
-        what: the resolved request.
+        prepared_estimate: the resolved request.
         notes: notes of the session.
         stream: the estimator; its plan must exist once the first batch is yielded.
-        pieces: all batches with their columns.
-        remark: called if the stances cannot be written.
+        batches: all batches with their columns.
+        on_remark: called if the stances cannot be written.
 
     Returns:
         Number of frames; with none, no file is written.
 
     Raises:
-        FootTileError: from `pieces`, or the file cannot be written.
+        FootTileError: from `batches`, or the file cannot be written.
     """
     left = iter(pieces)
     first = next(left, None)

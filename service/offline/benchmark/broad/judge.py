@@ -34,8 +34,8 @@ def judged(
 
     Args:
         columns: `EVALUATED_COLUMNS` of every frame of the recording.
-        below_end: returns `find_unsaturated_tiles`, (n, tiles); called only if needed, because it
-            takes as long as the recording.
+        find_unsaturated: returns `find_unsaturated_tiles`, (n, tiles); called only if needed,
+            because it takes as long as the recording.
         lag_ms: look-ahead of the estimates.
     """
     accuracy = accuracy_of({name: columns[name] for name in COMPARED}, lag_ms=lag_ms)
