@@ -70,12 +70,12 @@ def calibrate_against(
         raise CalibrationError(
             far[0],
             where=str(reference_path),
-            remedy="Mend its units, or name the plate's recording of this very session",
+            remedy="Check its units, and that it is the plate's recording of this session",
         )
     pairs = comparison.pairs
     if not pairs.removed:
         raise CalibrationError(
-            "the foot is never in flight for long enough to tell the plate's zero",
+            "no flight is long enough to estimate the plate's zero",
             where=str(path),
             remedy="Lift the foot off the plate for a second before or after",
         )

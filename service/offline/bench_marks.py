@@ -47,8 +47,8 @@ def programme_of(session: SessionReader) -> Programme | None:
     except FileNotFoundError:
         return None
     serials, where = session.info.serials, str(session.path.parent)
-    said = [(event, _said_by(event, serials, where)) for event in events]
-    steps = sorted(((event.t_ns, step) for event, step in said if step is not None))
+    parsed = [(event, _said_by(event, serials, where)) for event in events]
+    steps = sorted(((event.t_ns, step) for event, step in parsed if step is not None))
     if not steps:
         return None
     clock = clock_beside(session)
@@ -59,7 +59,7 @@ def programme_of(session: SessionReader) -> Programme | None:
     t_server_ns = np.concatenate(pieces)
     if (t_server_ns == NO_INSTANT).any():
         raise CalibrationError(
-            "the node's clock was not compared with the server's, by which its marks are",
+            "the markers are on the server's clock, and the node's clock was not compared with it",
             where=where,
             remedy="Record once the node's clock is measured, some seconds after it connects",
         )
@@ -88,7 +88,7 @@ def _said_by(event: Event, serials: Sequence[str], where: str) -> tuple[str, str
     begins = any(re.match(rf"{re.escape(known)}\b", label) for known in serials)
     if begins or phase in PRESSED or label.lower() in IDLE:
         raise CalibrationError(
-            f"mark {label[:80]!r} says no step of a bench",
+            f"mark {label[:80]!r} is no calibration step",
             where=where,
             expected=f"{_FORM}, of a tile of {', '.join(serials)}",
             remedy="Rename or remove it on the session's page",

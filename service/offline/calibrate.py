@@ -148,7 +148,7 @@ def _refuse_contradiction(first: Pressed, second: Pressed) -> None:
         and second.seq[0] <= first.seq[1]
     ):
         raise CalibrationError(
-            f"tile {serial}: the same frames are given twice",
+            f"tile {serial}: the same frames occur twice",
             where=files,
             remedy="Name each recording once",
         )
@@ -160,9 +160,9 @@ def _fitted(pressed: Sequence[Pressed], delay: Parameter) -> TileCalibration:
     if any(weighted):
         if not all(weighted):
             raise CalibrationError(
-                "one recording has dead weights, another one strokes of a mill",
+                "one recording uses dead weights, another one an indenter",
                 where=", ".join(recording.where for recording in recordings),
-                remedy="Calibrate from one kind of them",
+                remedy="Calibrate from one kind of recording",
             )
         tile = fit_weights(pressed_in(recordings))
         return tile.model_copy(update={"coefficient_words": pressed[0].chip})
@@ -211,7 +211,7 @@ def _marked(session: SessionReader) -> Programme:
             "the node was restarted while it was recorded",
             where=str(session.path),
             expected="a recording in one part",
-            remedy="Record the bench once more",
+            remedy="Record again",
         )
     marked = programme_of(session)
     if marked is None:

@@ -126,7 +126,7 @@ def _bench_tile(
         from service.offline.calibrate import calibrate_recordings, read_recordings
         from service.offline.simulate import SimulateOptions, simulate
 
-    progress(f"pressing tile {serial} on the emulated bench")
+    progress(f"calibrating tile {serial} on the emulated rig")
     foot = EmulatedFoot(parts_seed=parts_seed)
     with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:
         recording = Path(work) / f"bench-{serial}.parquet"
@@ -139,7 +139,7 @@ def _bench_tile(
         )
     if kept is None:
         progress(
-            f"the calibration of {serial} is not kept: no home folder can be written. Name a "
+            f"the calibration of {serial} is not cached: the home folder is not writable. Name a "
             "folder in XDG_CACHE_HOME"
         )
         return calibration
@@ -147,7 +147,7 @@ def _bench_tile(
         make_folder(kept.parent)
         write_calibration(kept, calibration)
     except OSError as error:  # the calibration is usable without a cache
-        progress(f"the calibration of {serial} is not kept: {error}")
+        progress(f"the calibration of {serial} is not cached: {error}")
     return calibration
 
 

@@ -200,10 +200,10 @@ def _columns(session: SessionReader) -> tuple[Columns, Floats]:
     columns["t_ns"] = session.axis.at(columns["t_ns"], columns.get("part"))
     if (np.diff(columns["t_ns"]) <= 0).any():
         raise ComparisonError(
-            "time runs back within a part of the session",
+            "time decreases within a part of the session",
             where=str(session.path),
             expected="frames whose t_ns rises",
-            remedy="See what is wrong with it: foottile verify",
+            remedy="Check it with foottile verify",
         )
     force_n = columns.pop("force_n").astype(np.float64)
     columns["grf_n"] = columns["grf_n"].astype(np.float64)
@@ -255,11 +255,11 @@ def _server_offset(path: Path, at_ns: int) -> tuple[int, int] | None:
             if nearest is None or apart_ns < abs(int(nearest["axis_ns"][0]) - at_ns):
                 nearest = one
     assert nearest is not None  # noqa: S101  # both have been compared
-    said = clock.columns(nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part"))
-    server_ns = int(said["t_server_ns"][0])
+    server_times = clock.columns(nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part"))
+    server_ns = int(server_times["t_server_ns"][0])
     if server_ns == NO_INSTANT:
         return None
-    return server_ns - int(nearest["axis_ns"][0]), int(said["t_server_uncertainty_ns"][0])
+    return server_ns - int(nearest["axis_ns"][0]), int(server_times["t_server_uncertainty_ns"][0])
 
 
 def _reference(data: ReferenceData, begin_ns: int, cop_offset_m: tuple[float, float]) -> Reference:
@@ -278,7 +278,9 @@ def _remarks(alignment: Alignment, pairs: Pairs, options: CompareOptions) -> Seq
             "does not explain the difference"
         )
     if options.remove_offset and not pairs.removed:
-        notes.append("no flight is long enough to tell the reference's offset: nothing is removed")
+        notes.append(
+            "no flight is long enough to estimate the reference's offset; it is not removed"
+        )
     elif not pairs.removed and pairs.zero_n is not None:
         low_n, high_n = pairs.zero_n.interval_95
         if low_n > 0.0 or high_n < 0.0:
@@ -296,8 +298,8 @@ def _remarks(alignment: Alignment, pairs: Pairs, options: CompareOptions) -> Seq
 def _advice(alignment: Alignment, options: CompareOptions) -> list[str]:
     if options.reference_sigma_n is not None:
         return gain_notes(alignment)
-    said = "nothing is said of coverage: --reference-sigma-n was not given"
-    return [*gain_notes(alignment), said]
+    hint = "coverage is not computed: --reference-sigma-n is not given"
+    return [*gain_notes(alignment), hint]
 
 
 def _any(pairs: Pairs, bit: EstimateStatus) -> bool:

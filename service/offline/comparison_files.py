@@ -28,14 +28,16 @@ from storage.sessions.comparisons import (
 )
 
 _WANTING = {
-    **dict.fromkeys(("grf_coverage_95",), ": --reference-sigma-n says how true the reference is"),
+    **dict.fromkeys(
+        ("grf_coverage_95",), ": give the reference's uncertainty with --reference-sigma-n"
+    ),
     **dict.fromkeys(
         ("cop_coverage_x_95", "cop_coverage_y_95"),
-        ": --reference-cop-sigma-m says how true the reference's COP is",
+        ": give the reference's COP uncertainty with --reference-cop-sigma-m",
     ),
     **dict.fromkeys(
         ("cop_mean_m", "cop_p95_m", "cop_bias_x_m", "cop_bias_y_m", "cop_p95_about_mean_m"),
-        ": the reference states no centre of pressure under load",
+        ": the reference has no centre of pressure under load",
     ),
 }
 """Requirement of each figure that may be missing, appended to error messages."""

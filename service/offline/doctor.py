@@ -98,10 +98,10 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
     for finding, info in well:
         try:
             conversion_ns = measure_conversion_ns(bus, clock, info, wires)
-            never = "its words never change: is it converting?"
+            never = "its readings never change: it may not be converting"
             problem = "" if conversion_ns is not None else never
         except I2cError as error:
-            conversion_ns, problem = None, f"it went silent while it was measured: {error}"
+            conversion_ns, problem = None, f"it stopped responding during the measurement: {error}"
         conversions_ns.append(conversion_ns)
         conversion_ms = None if conversion_ns is None else conversion_ns / 1e6
         measured[finding.mux, finding.channel] = replace(

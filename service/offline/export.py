@@ -97,7 +97,7 @@ def _export_of(reader: SessionReader, options: ExportOptions) -> tuple[Export, b
     stored = read_events(beside) if options.marks is not False and beside.is_file() else None
     if options.marks and stored is None:
         raise UsageError(
-            f"there is no {EVENTS_NAME} beside {reader.path.name}, so nothing is known of marks",
+            f"there is no {EVENTS_NAME} beside {reader.path.name}, so its markers are unknown",
             where=str(reader.path.parent),
             expected="a session's folder as a server sealed it or `foottile pull` fetched it",
         )

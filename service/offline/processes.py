@@ -101,10 +101,10 @@ def _lost(times: int, code: int | None) -> WorkerLostError:
     with suppress(ValueError):
         name = signal.Signals(-(code or 0)).name
         return WorkerLostError(
-            f"{times} processes were killed over it, the last by {name}",
+            f"{times} processes were killed while running it, the last by {name}",
             remedy="If memory ran out, use fewer --jobs",
         )
-    return WorkerLostError(f"{times} processes ended over it, the last with {code}")
+    return WorkerLostError(f"{times} processes exited while running it, the last with {code}")
 
 
 class _Worker:

@@ -54,7 +54,7 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
         holders = ", ".join(holders_of(port))
         held = f" It is open in {holders}." if holders else ""
         return ServoDiagnosis((), None, is_well=False, verdict=f"{error}.{held}")
-    said = [
+    found_texts = [
         f"{servo.model or f'model {servo.model_number}'}, protocol {servo.protocol}, "
         f"{servo.baudrate} baud, id {servo.servo_id}."
         for servo in found
@@ -73,8 +73,12 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
     if remark := latency_remark(port):
         wrong.append(remark)
     if (lasting := stable_path(port)) != port:
-        said.append(f"Name it {lasting} in the scene: {port} may be another adapter's next time.")
-    return ServoDiagnosis(found, latency_timer_ms(port), not wrong, " ".join((*said, *wrong)))
+        found_texts.append(
+            f"Name it {lasting} in the scene: {port} may be another adapter's next time."
+        )
+    return ServoDiagnosis(
+        found, latency_timer_ms(port), not wrong, " ".join((*found_texts, *wrong))
+    )
 
 
 def _is_wanted(servo: FoundServo, wanted: ServoScene) -> bool:

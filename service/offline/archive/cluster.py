@@ -92,7 +92,7 @@ def spread_over_cluster(
             elif future.status == "error":
                 result = future.exception()
                 if isinstance(result, dask.scheduler.KilledWorker):
-                    result = WorkerLostError("workers were killed over it, again and again")
+                    result = WorkerLostError("several workers were killed while running it")
             else:
                 raise _away(address, f"a task is {future.status}")
             future.release()
@@ -136,7 +136,7 @@ def _check(found: dict[str, Any]) -> None:
                     if theirs.get(name) != ours[name]
                 )
                 if isinstance(theirs, dict)
-                else f"it cannot say: {theirs}"
+                else f"version unknown: {theirs}"
             )
             raise UsageError(
                 f"a worker is of another version: {printable(differ)[:300]}",

@@ -73,7 +73,7 @@ def _are_same(one: str, other: str) -> bool:
 def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]:
     """Return the session; or, with None, the reason to leave it out."""
     if place.is_file:
-        return "it is a file by itself, and no session's folder", None
+        return "it is a single file, not a session's folder", None
     try:
         check_text(place)
     except FootTileError as error:
@@ -81,7 +81,7 @@ def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]
     folder, sizes = Path(place.where), None
     if is_remote(place.where):
         if mirror is None:
-            raise ValueError("sessions of a store need a mirror")
+            raise ValueError("remote sessions need a folder for downloads")
         folder = mirror / hashlib.sha256(place.where.encode()).hexdigest()[:16] / place.name
         try:
             sizes = sizes_in(place.where)
@@ -92,12 +92,12 @@ def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]
         except FootTileError as error:
             return str(error), None
     problems: list[str] = []
-    said = claims_in(folder, bytes_of(folder / SESSION_NAME), problems, [])
-    if problems or said is None:
+    metadata = claims_in(folder, bytes_of(folder / SESSION_NAME), problems, [])
+    if problems or metadata is None:
         return f"damaged: {'; '.join(problems)}", None
-    content = said.content
+    content = metadata.content
     if content["id"] != place.name:
-        return f"it is session {content['id']}, in the folder of another", None
+        return f"it is session {content['id']} in another session's folder", None
     if content["state"] != "sealed":
         return f"it is {content['state']}, and not sealed yet", None
     if content.get("sha256") is not None:
@@ -108,4 +108,4 @@ def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]
             return f"damaged: {FRAMES_NAME} is missing", None
         if sizes[FRAMES_NAME] != content["bytes"]:
             return f"damaged: {FRAMES_NAME} is not as long as {SESSION_NAME} says", None
-    return "", Archived(place, folder, said)
+    return "", Archived(place, folder, metadata)

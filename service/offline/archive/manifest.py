@@ -47,7 +47,7 @@ def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
     except (OSError, UnicodeError, csv.Error) as error:
         raise UsageError(f"--manifest {str(path)!r} cannot be read: {error}") from error
     if any("\0" in line for line in head):
-        raise UsageError(f"--manifest {str(path)!r} is no text")
+        raise UsageError(f"--manifest {str(path)!r} is not a text file")
     at = next((i for i, line in enumerate(head) if line.strip(" ,;\t\r\n")), 0)
     stated = _STATED.fullmatch(head[at].strip()) if head else None
     delimiters = stated[1] if stated else ",;\t"

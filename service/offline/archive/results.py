@@ -57,8 +57,8 @@ class Note:
     @property
     def key(self) -> str:
         """Hash of version, input and options: equal for equal results."""
-        said = json.dumps([self.command, self.software, self.input_sha256, self.options])
-        return hashlib.sha256(said.encode()).hexdigest()[:16]
+        content = json.dumps([self.command, self.software, self.input_sha256, self.options])
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def is_of(self, other: Note) -> bool:
         """Return whether both were made from the same input by the same version and options."""

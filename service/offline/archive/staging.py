@@ -40,10 +40,10 @@ def identity(place: Place) -> str:
     """
     if place.is_file:
         with reading(place.where) as file:
-            said = footer_in(file)
+            metadata = footer_in(file)
     else:
-        said = read_bytes(f"{place.where}/{SESSION_NAME}")
-    return hashlib.sha256(said).hexdigest()
+        metadata = read_bytes(f"{place.where}/{SESSION_NAME}")
+    return hashlib.sha256(metadata).hexdigest()
 
 
 def identity_of_file(where: str) -> str:
@@ -89,9 +89,9 @@ def staged(place: Place) -> Iterator[Path]:
         stated = claims_of(folder).content.get("sha256")
         if stated is not None and hashes.get(FRAMES_NAME, stated) != stated:
             raise DamagedFileError(
-                f"the {FRAMES_NAME} that came is not the one that {SESSION_NAME} names",
+                f"the {FRAMES_NAME} received does not have the hash in {SESSION_NAME}",
                 where=place.where,
-                remedy="Try again; if it stays, the store's copy is damaged",
+                remedy="Retry. If the error remains, the store's copy is damaged",
             )
         yield folder
 
@@ -124,10 +124,10 @@ def claims_of(folder: Path) -> Claims:
         FileFormatError: `session.json` is missing or damaged.
     """
     problems: list[str] = []
-    said = claims_in(folder, bytes_of(folder / SESSION_NAME), problems, [])
-    if problems or said is None:
+    metadata = claims_in(folder, bytes_of(folder / SESSION_NAME), problems, [])
+    if problems or metadata is None:
         raise FileFormatError("; ".join(problems), where=str(folder))
-    return said
+    return metadata
 
 
 def frames_of(source: Path) -> Path:
@@ -139,13 +139,13 @@ def frames_of(source: Path) -> Path:
     """
     if not source.is_dir():
         return source
-    said, frames = claims_of(source).content, source / FRAMES_NAME
-    if said["state"] != "sealed":
-        raise StateError(f"it is {said['state']}, and not sealed yet", where=str(source))
-    if said.get("sha256") is None:
+    metadata, frames = claims_of(source).content, source / FRAMES_NAME
+    if metadata["state"] != "sealed":
+        raise StateError(f"it is {metadata['state']}, and not sealed yet", where=str(source))
+    if metadata.get("sha256") is None:
         raise FileFormatError("no frame was recorded", where=str(source))
-    if not frames.is_file() or frames.stat().st_size != said["bytes"]:
-        raise DamagedFileError(f"{FRAMES_NAME} is not the one that it names", where=str(source))
+    if not frames.is_file() or frames.stat().st_size != metadata["bytes"]:
+        raise DamagedFileError(f"{FRAMES_NAME} does not match session.json", where=str(source))
     return frames
 
 

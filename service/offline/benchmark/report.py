@@ -64,8 +64,8 @@ def markdown(bench: Bench) -> str:
         "",
         EMULATED,
     ]
-    said = {"repeatability": o.repeatability, "noise correlated over ms": o.correlated_ms}
-    named = ", ".join(f"{name} {value:g}" for name, value in said.items() if value is not None)
+    overrides = {"repeatability": o.repeatability, "noise correlated over ms": o.correlated_ms}
+    named = ", ".join(f"{name} {value:g}" for name, value in overrides.items() if value is not None)
     if named:
         lines += ["", f"The emulation differs from that of the scenes: {named}."]
     for figures in bench.scenes:

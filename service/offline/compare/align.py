@@ -174,7 +174,7 @@ def _check_varies(signal: Signal, whose: str) -> None:
     if not height_n > 12.0 * noise_n or height_n == 0.0:
         raise ComparisonError(
             f"{whose} is constant but for noise: {height_n:.3g} N from least to greatest",
-            expected="a load that comes and goes",
+            expected="a varying load",
         )
 
 

@@ -142,7 +142,7 @@ def join_pieces(
     pieces = _pieces_in(folder)
     with SessionReader(source, only_slices=True) as session:
         if not pieces or pieces[-1].groups != len(session.footer.group_rows):
-            raise FileFormatError("not all pieces are there", where=str(folder))
+            raise FileFormatError("chunks are missing", where=str(folder))
         what = prepared(session, request, remark)
         stream = _going_on(what, folder, pieces)
         ordered = in_order(_read(what, folder, pieces), where=str(source))
@@ -191,10 +191,10 @@ def _pieces_in(folder: Path) -> list[_Done]:
     while True:
         path = folder / f"{len(found):04}.json"
         try:
-            said: dict[str, Any] = json.loads(checked(read_whole(path), where=str(path)).text)
+            index: dict[str, Any] = json.loads(checked(read_whole(path), where=str(path)).text)
         except FileNotFoundError:
             return found
-        found.append(_Done(**said))
+        found.append(_Done(**index))
 
 
 def _proven(folder: Path, piece: _Done, ending: str) -> Path:
@@ -205,9 +205,9 @@ def _proven(folder: Path, piece: _Done, ending: str) -> Path:
         is_same = False
     if not is_same:
         raise DamagedFileError(
-            "a piece of a session is not the one that was made",
+            "a chunk of a session has another hash than its index states",
             where=str(path),
-            remedy="Delete its folder: the session is begun again",
+            remedy="Delete its folder; the session is then estimated from its begin",
         )
     return path
 

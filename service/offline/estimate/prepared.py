@@ -126,9 +126,9 @@ def _calibration(
     if name == EMULATED_RIG and "parts_seed" not in notes:
         # The emulated rig would calibrate an emulated tile of the same serial: plausible and wrong.
         raise CalibrationError(
-            "the emulated bench knows emulated tiles only, and this session is of real ones",
+            "the emulated rig calibrates emulated tiles only, and this session has real ones",
             where=where,
-            remedy="Press the tiles on a real bench and run `foottile calibrate`",
+            remedy="Load the tiles on a real rig and run `foottile calibrate`",
         )
     return find_calibration(
         name,

@@ -61,7 +61,7 @@ def plot_broad(results: Sequence[ArrayResult]) -> bytes:
     figure.legend(loc="outside lower center", ncols=4, frameon=False)
     refused = sum(result.tiles_refused > 0 for result in results)
     but = f", {refused} of them without a calibration" if refused else ""
-    figure.suptitle(f"{len(results)} arrays of domes nobody has seen{but}", fontsize=14)
+    figure.suptitle(f"{len(results)} arrays of unseen domes{but}", fontsize=14)
     return png_of(figure)
 
 
