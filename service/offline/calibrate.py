@@ -122,7 +122,7 @@ def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
     }
     if not bench:
         raise CalibrationError(
-            "no tile is pressed in any of the recordings",
+            "no tile is loaded in any of the recordings",
             where=", ".join(str(path) for path in paths),
             expected="phases load and unload, with pressed_tile naming a tile",
         )
@@ -220,7 +220,7 @@ def _marked(session: SessionReader) -> Programme:
             where=str(session.path),
             expected="columns pressed_tile and phase beside reference_force_n, or marks such as "
             "`T01 load`",
-            remedy="Record one with the mill, or `foottile simulate --scene indentation`",
+            remedy="Record one with a rig, or `foottile simulate --scene indentation`",
         )
     return marked
 
@@ -259,7 +259,7 @@ def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
     ]
     if not tiles:
         raise CalibrationError(
-            "no tile of the array is pressed in the recording",
+            "no tile of the array is loaded in the recording",
             where=str(session.path),
             expected="pressed_tile naming one of " + ", ".join(session.info.serials),
         )

@@ -122,7 +122,7 @@ def _bench_tile(
     if (SHIPPED / name).is_file():
         return read_calibration(SHIPPED / name)
     # Imported here: only the emulated rig needs the physics.
-    with needs_extra("server", "the emulated bench"):
+    with needs_extra("server", "the emulated rig"):
         from service.offline.calibrate import calibrate_recordings, read_recordings
         from service.offline.simulate import SimulateOptions, simulate
 

@@ -165,14 +165,14 @@ def _legend(figure: Figure) -> None:
 
     figure.legend(
         handles=[
-            mark("#BFBFBF", "black", 2.0, 11, "the scene's whole ladder"),
+            mark("#BFBFBF", "black", 2.0, 11, "the scene's full model set"),
             mark(GREY, GREY, 1.2, 6, "built up, one model more each"),
             mark(
                 "white",
                 GREY,
                 1.2,
                 6,
-                "whole ladder without (\N{MINUS SIGN}) or with one more (++) model",
+                "full model set without (\N{MINUS SIGN}) or with one more (++) model",
             ),
             Line2D([], [], color=GREY, linewidth=1.5, label="Pareto front"),
             Line2D([], [], color=GREY, linewidth=1.0, linestyle=GOAL_DASHES, label="goal"),

@@ -83,7 +83,7 @@ def _domes(domes: Sequence[DomeFound]) -> bytes:
                 label=f"the paper's range of {found.dome.name}",
             )
     curves.set_xlabel("pressure above the unloaded one, kPa, up to the chip's 115")
-    curves.set_ylabel("force on the mill, N")
+    curves.set_ylabel("indentation force, N")
     curves.set_title("Six domes, four loadings each: cubics with 95 % bands", fontsize=9.5)
     curves.legend(fontsize=8, loc="upper left")
     curves.set_xlim(0.0, None)

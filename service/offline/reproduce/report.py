@@ -126,7 +126,7 @@ def _domes(result: Reproduction) -> Iterator[str]:
     if not result.domes:
         return
     yield from (
-        "## Table I: six domes on the mill",
+        "## Table I: six indented domes",
         "",
         "Two polyurethanes, three diameters, pressed four times each past the chip's 115 kPa, in "
         "virtual time, and fitted as `foottile calibrate` does. The paper states a range for 11 "

@@ -41,9 +41,9 @@ CLEAN = "clean"
 REPEATABILITY_MAX = 0.03
 CONDITIONS: Mapping[str, str] = {
     CLEAN: "repeatability 0, drift 0, white noise",
-    "repeatability": "loadings differ as they did on the array's bench, by 0 to 3 %",
+    "repeatability": "loadings differ as on the array's rig, by 0 to 3 %",
     "correlated": "noise correlated over 10 ms, of the same variance",
-    "drift": "gains have drifted by up to 1 % since the bench",
+    "drift": "gains have drifted by up to 1 % since the calibration",
 }
 
 
@@ -116,7 +116,7 @@ def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Re
             except Exception as error:
                 # Without the path of the temporary folder.
                 why = re.sub(r"\S*/(?=bench-)", "", reason(error))
-                refusals.append(Refusal(what=f"bench of {serial}", why=why))
+                refusals.append(Refusal(what=f"calibration of {serial}", why=why))
     if refusals:
         return None, refusals
     tiles = tuple(tile for entry in entries for tile in entry.tiles)

@@ -214,7 +214,7 @@ def error_goals(results: Sequence[ArrayResult]) -> list[Goal]:
             f"false alarms an hour at most (95 %): {alarms.alarms} within {alarms.hours:.1f} hours"
         )
         goals.append(Goal("live", figure, alarms.most_per_hour, None, ALARMS_PER_HOUR))
-    figure = "tiles that their bench refuses, %"
+    figure = "tiles refused by the calibration, %"
     goals.append(Goal("", figure, share, None, 100.0 * _MODELS_SHARE))
     for title, of, part in (
         ("tiles that lose a model whose effect exceeds 0.1 N, %", "needed", "lost"),
