@@ -37,7 +37,7 @@ def markdown(bench: BroadBench) -> str:
         f"{bench.software}, code {bench.made_by}, {bench.made}, on {bench.machine}.",
         "",
         f"{len(results)} arrays of four tiles of the broad family, seeds of {o.seeds}, each "
-        f"calibrated on its own emulated rig (repeatability there: {alike}), then run through every "
+        f"calibrated on its own rig (repeatability there: {alike}), then run through every "
         f"scene with the scene's own models. {spent_s / 60:.0f} min CPU in all. Quantiles are over "
         "arrays, signs are dropped; coverage is pooled over the frames of all arrays.",
         "",
