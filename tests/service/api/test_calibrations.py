@@ -317,7 +317,7 @@ def test_a_bench_session_is_fitted_here_and_what_cannot_be_says_why(with_bench: 
     running.http.patch(url, json={"label": "T01 laod"})
     failed = ended(running, fit(running))
     assert failed["state"] == "failed"
-    assert "'T01 laod' says no step of a bench" in failed["problem"]
+    assert "'T01 laod' is no calibration step" in failed["problem"]
     assert len(listed(running)) == 1
     assert [one["state"] for one in running.http.get("/calibrations/fits").json()["items"]] == [
         "failed",

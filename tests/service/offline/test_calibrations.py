@@ -180,4 +180,4 @@ def test_a_cache_that_cannot_be_written_is_said_and_no_reason_to_fail(
     for _ in range(2):
         find_calibration("emulated-rig", ["A01"], cache=cache, progress=said.append)
     assert pressed == ["bench-A01"] * 2
-    assert any("is not kept" in line for line in said)
+    assert any("is not cached" in line for line in said)
