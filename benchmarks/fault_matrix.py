@@ -238,9 +238,8 @@ def main() -> None:
     a = parser.parse_args()
     began_s = time.monotonic()
     lines = [
-        "| fault | schedule | struck | flagged in its frame | needlessly | right | passed on, "
-        "wrong by <= 0.5 kPa | more, <= 10 frames | missed | worst kPa | longest run | others "
-        "flagged | others wrong | rate kept | recovered after |",
+        "| fault | schedule | struck | flagged | needless | right | small | short | missed | kPa "
+        "| run | others | wrong | rate | back |",
         "|---|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for r in matrix(a.rounds):
