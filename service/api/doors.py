@@ -74,7 +74,7 @@ class Doors:
     """Connections of one server, with their limits; used from one event loop.
 
     Args:
-        limits: limits of connections.
+        bounds: limits of connections.
         files_max: descriptors that the process may have.
     """
 
@@ -117,8 +117,8 @@ class Doors:
         """Make an idle connection busy with a request or subscription; False: limit reached.
 
         Args:
-            connection: the connection.
-            client_address: address of the client behind a trusted proxy; None: the peer's.
+            visitor: the connection.
+            client: address of the client behind a trusted proxy; None: the peer's.
         """
         if visitor in self._busy:
             return True

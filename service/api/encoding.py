@@ -41,7 +41,7 @@ def numbers_as_json(about: Mapping[str, object], columns: Mapping[str, Array]) -
     By pydantic, which takes a fifth of the time of Python's `json`.
 
     Args:
-        metadata: metadata by name.
+        about: metadata by name.
         columns: columns by name; single precision is written to a millionth: micrometres and
             micronewtons.
     """

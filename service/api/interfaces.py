@@ -65,7 +65,7 @@ def list_addresses(*, has_ipv6: bool) -> list[str]:
     """Return the addresses of all interfaces that are up, the most useful one first.
 
     Args:
-        include_ipv6: include IPv6 addresses.
+        has_ipv6: include IPv6 addresses.
     """
     families = {socket.AF_INET, socket.AF_INET6} if has_ipv6 else {socket.AF_INET}
     states = psutil.net_if_stats()

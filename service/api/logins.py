@@ -52,8 +52,8 @@ class Secrets:
     """Random secrets, stored as digests with a role; each expires.
 
     Args:
-        lifetime_s: lifetime of a secret.
-        max_count: limit of valid secrets; a further one replaces the oldest.
+        lasts_s: lifetime of a secret.
+        most: limit of valid secrets; a further one replaces the oldest.
         now_s: clock that never steps.
     """
 

@@ -395,8 +395,8 @@ async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors
 
     Args:
         listening: listening socket.
-        make_protocol: creates a protocol for each connection.
-        limiter: limiter of connections.
+        make: creates a protocol for each connection.
+        doors: limiter of connections.
     """
     loop = asyncio.get_running_loop()
     listening.setblocking(False)

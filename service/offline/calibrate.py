@@ -54,9 +54,9 @@ def calibrate_recordings(
     Args:
         recordings: recordings by serial.
         name: display name.
-        reference_name: name of the force sensor.
-        reference_delay: delay of its readings behind the force, in seconds.
-        on_progress: called with the result of every tile.
+        reference: name of the force sensor.
+        delay: delay of its readings behind the force, in seconds.
+        progress: called with the result of every tile.
 
     Raises:
         CalibrationError: no tile has a curve.

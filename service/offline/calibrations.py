@@ -60,8 +60,8 @@ def find_calibration(
         parts_seed: seed of the parts on the emulated rig.
         family: family of these parts.
         repeatability: standard deviation between their loadings; None: that of the rig's scene.
-        cache_folder: folder of the rig's results; None: the user's cache.
-        on_progress: called before slow steps.
+        cache: folder of the rig's results; None: the user's cache.
+        progress: called before slow steps.
 
     Raises:
         CalibrationError: no such calibration, or a tile is missing in it.

@@ -71,8 +71,8 @@ def write_comparison(
     `series.parquet` is not written if it would exceed `ROWS_MAX`.
 
     Args:
-        session_path: the session's frames file.
-        reference_path: the reference file.
+        source: the session's frames file.
+        reference: the reference file.
         options: options of the comparison.
         limits: limits of figures' means, by name.
         folder: folder to write to.

@@ -78,7 +78,7 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         bus: the bus.
         clock: virtual or real clock.
         scene: expected parts; None: accept any.
-        requested_hz: requested frames per second; 0: the highest possible.
+        asked_hz: requested frames per second; 0: the highest possible.
 
     Raises:
         BusFaultError: the bus itself does not work.

@@ -58,7 +58,7 @@ class FindingsOf:
     """Accumulator of a summary over consecutive frames with estimates.
 
     Args:
-        has_truth: True if the columns contain the truth, and perhaps `PLATE_COLUMN`.
+        judging: True if the columns contain the truth, and perhaps `PLATE_COLUMN`.
     """
 
     def __init__(self, *, judging: bool) -> None:

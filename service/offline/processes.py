@@ -52,8 +52,8 @@ def spread(
     Args:
         work: a module-level function, which returns expected failures as results.
         tasks: arguments of `work`; a task that returns `Unfinished` is submitted again.
-        process_count: number of processes; 1: run in this process.
-        initializer: a module-level function, called first in every process.
+        jobs: number of processes; 1: run in this process.
+        begin: a module-level function, called first in every process.
     """
     if jobs == 1:
         for task in tasks:

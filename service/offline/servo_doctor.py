@@ -40,7 +40,7 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
     Args:
         port: serial port.
         clock: a real clock.
-        expected: the scene's servo; None: any with id 1.
+        wanted: the scene's servo; None: any with id 1.
     """
     servo_id = wanted.id if wanted is not None else 1
     rates = dict.fromkeys((*((wanted.baudrate,) if wanted is not None else ()), *BAUDRATES))

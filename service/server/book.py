@@ -146,7 +146,7 @@ class SessionBook:
     Args:
         folder: folder of the sessions.
         trash: deleted sessions.
-        on_change: called with every session that changed.
+        changed: called with every session that changed.
     """
 
     def __init__(
@@ -255,7 +255,7 @@ class SessionBook:
 
         Args:
             session_id: id of the session.
-            if_revision: expected `session_revision`; None: any.
+            only_if: expected `session_revision`; None: any.
             changes: new values by name.
 
         Raises:
@@ -353,8 +353,8 @@ def expect(wanted: str | None, found: str, what: str) -> None:
     """Refuse a change if the client has seen another revision.
 
     Args:
-        expected: revision that the client has seen; None: any.
-        actual: present revision.
+        wanted: revision that the client has seen; None: any.
+        found: present revision.
         what: description of the object, for the error.
 
     Raises:

@@ -38,9 +38,9 @@ class Recorder:
     """Recording on the nodes of a server.
 
     Args:
-        store: sessions of the server.
+        book: sessions of the server.
         nodes: nodes to record on.
-        sealer: ends and seals sessions.
+        settling: ends and seals sessions.
     """
 
     def __init__(self, book: SessionBook, nodes: ServerNodes, settling: Settling) -> None:
@@ -159,7 +159,7 @@ class Recorder:
 
         Args:
             session_id: id of the session.
-            if_revision: expected `session_revision`; None: any.
+            only_if: expected `session_revision`; None: any.
 
         Raises:
             UnknownError: no session has this id.

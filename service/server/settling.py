@@ -36,9 +36,9 @@ class Settling:
     """Finds the ends of sessions and seals them.
 
     Args:
-        store: sessions to seal.
+        book: sessions to seal.
         nodes: nodes with the sessions' frames.
-        request_resend: called with a node that may still have frames that are damaged here.
+        ask_again: called with a node that may still have frames that are damaged here.
         exact: True: estimates are not rounded.
     """
 
@@ -154,7 +154,7 @@ class Settling:
         Args:
             node: node of the journal.
             error: error with the frames' numbers.
-            reader: reader that found the damage, for the log.
+            whose: reader that found the damage, for the log.
         """
         folder = Path(error.where).parent
         for stream in node.streams.values():

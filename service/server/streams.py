@@ -211,7 +211,7 @@ class ServerStream:
 
         Args:
             needed: frames that sessions need.
-            include_unneeded: request all missing frames; False: only those in `needed`.
+            all_of_it: request all missing frames; False: only those in `needed`.
         """
         if self.node_has is None:
             return Intervals()

@@ -40,7 +40,7 @@ class Takes:
 
     Args:
         recorder: starts and stops sessions.
-        store: all sessions.
+        book: all sessions.
         nodes: all nodes.
     """
 
@@ -74,7 +74,7 @@ class Takes:
             subject: of each session.
             notes: of each session.
             tags: of each session.
-            request: request with its idempotency key; None: without a key.
+            asked: request with its idempotency key; None: without a key.
 
         Raises:
             StateError: no node could be recorded.

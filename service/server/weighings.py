@@ -322,7 +322,7 @@ class Weighings:
         while self._fits.is_busy:
             await asyncio.sleep(_LOOK_S)
         plan = weighing.plan
-        fit = self._fits.start(plan.name, [weighing.session_id], {"reference": plan.reference})
+        fit = self._fits.start(plan.name, [weighing.session_id], {"sensor": plan.reference})
         try:
             while fit.state == "running":
                 await asyncio.sleep(_LOOK_S)

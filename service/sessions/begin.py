@@ -30,7 +30,7 @@ def begun(
         part: first part.
         scene_content: content of the node's scene file.
         calibration: calibration in use at the beginning.
-        fields: further fields of a session, or other values of the above.
+        content: further fields of a session, or other values of the above.
     """
     facts: dict[str, Any] = {
         "id": new_session_id(datetime.now(UTC)),

@@ -51,7 +51,7 @@ class Series:
 
         Args:
             begin_ns: time of the session's first frame.
-            time_slice: time interval; its columns are ignored.
+            part: time interval; its columns are ignored.
             points: least number of bins.
 
         Returns:

@@ -67,8 +67,8 @@ def around_in(
     Args:
         journal: journal of the stream.
         t_ns: the time, node's UTC.
-        min_seq: earlier numbers do not count; the last is `min_seq` - 1 if there is none.
-        wait_for_missing: ignored, since nothing is cached here.
+        at_least: earlier numbers do not count; the last is `min_seq` - 1 if there is none.
+        waiting: ignored, since nothing is cached here.
 
     Returns:
         Both numbers; None while the stream has not passed the time.
@@ -96,7 +96,7 @@ def at_stop(session: Session, streams: Streams, *, waiting: bool = False) -> Ses
     Args:
         session: the session.
         streams: facts by stream id, for all of its parts.
-        wait_for_missing: keep a part open while frames closer to the stop may come.
+        waiting: keep a part open while frames closer to the stop may come.
 
     Raises:
         DamagedFramesError: the frames at the stop are damaged.

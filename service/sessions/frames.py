@@ -95,9 +95,9 @@ def raw_from(
     """Yield frames from the journals in order, with the column `part` only.
 
     Args:
-        inputs: inputs of the session.
-        first_part: number of the first part.
-        first_seq: frames of this part before this number are left out.
+        sources: inputs of the session.
+        number: number of the first part.
+        seq: frames of this part before this number are left out.
     """
     for i, part in list(enumerate(sources.session.parts))[number:]:
         journal = sources.journals.get(part.boot_id)

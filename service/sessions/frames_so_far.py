@@ -28,9 +28,9 @@ class FramesSoFar:
     """Slice of an unsealed session.
 
     Args:
-        preview: preview of the session.
-        inputs: present inputs.
-        time_slice: time interval.
+        so_far: preview of the session.
+        sources: present inputs.
+        part: time interval.
 
     Attributes:
         notes: file metadata of the estimates; known after `make_content`.

@@ -83,8 +83,8 @@ class Milestones:
         """Add a checkpoint; without effect if the disk is full.
 
         Args:
-            checkpoint: checkpoint behind all present ones.
-            state: state of the estimator; None without estimates.
+            place: checkpoint behind all present ones.
+            memory: state of the estimator; None without estimates.
         """
         if memory is not None:
             content = io.BytesIO()
@@ -113,9 +113,9 @@ class Milestones:
         """Resume estimates from a checkpoint, or from one before it if that cannot be read.
 
         Args:
-            checkpoints: valid checkpoints.
-            index: index of the checkpoint.
-            inputs: inputs for which the checkpoints are valid.
+            places: valid checkpoints.
+            at: index of the checkpoint.
+            sources: inputs for which the checkpoints are valid.
 
         Returns:
             Index of the checkpoint used; and the stream, None without estimates.

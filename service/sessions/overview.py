@@ -123,7 +123,7 @@ def overview_of_session(
 
     Args:
         session: frames of the session, open for slices.
-        time_slice: time interval; its columns are ignored.
+        part: time interval; its columns are ignored.
         points: least number of bins.
         frames_sha256: hash of the file of frames.
 

@@ -133,8 +133,8 @@ class EstimateStream:
         """Yield frames with their extra columns and estimates, rounded, in order, every frame once.
 
         Args:
-            batches: next frames.
-            is_final: True: no more frames will come; else `state_dict` has the frames that wait for
+            pieces: next frames.
+            ends: True: no more frames will come; else `state_dict` has the frames that wait for
                 their look-ahead.
 
         Raises:

@@ -103,9 +103,9 @@ def recover(
 
     Args:
         data: data folder; the caller holds its lock.
-        make_sessions: create sessions for frames that belong to no session.
-        abandon_missing: on a server's folder, seal frames that its nodes have not sent as lost.
-        report_step: called with a description of each step.
+        streams: create sessions for frames that belong to no session.
+        give_up: on a server's folder, seal frames that its nodes have not sent as lost.
+        tell: called with a description of each step.
         now: returns the time for ids of new sessions.
 
     Raises:

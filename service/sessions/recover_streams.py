@@ -113,8 +113,8 @@ def open_streams(
 
     Args:
         data: the data folder.
-        report_step: called with a description of each step.
-        is_node_folder: True: a node's own folder.
+        tell: called with a description of each step.
+        is_local: True: a node's own folder.
 
     Returns:
         Streams by node and stream id, and failures as text.

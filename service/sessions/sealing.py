@@ -20,7 +20,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     """Write the session's files; return the sealed session.
 
     Args:
-        inputs: inputs to seal; every part is closed.
+        sources: inputs to seal; every part is closed.
         folder: folder of the session.
         ledger: final ledger.
 

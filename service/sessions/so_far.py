@@ -37,7 +37,7 @@ class SoFar:
     """Estimates of one unsealed session up to some frame.
 
     Args:
-        inputs: inputs of the session.
+        sources: inputs of the session.
         folder: folder on the disk for states of estimators (`service.sessions.checkpoints`).
     """
 

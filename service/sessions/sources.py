@@ -109,9 +109,9 @@ def sources_of(
     Args:
         session: the session.
         streams: facts by stream id, for all of its parts.
-        load_tares: returns the tares of its node; None: there is no history.
+        tares: returns the tares of its node; None: there is no history.
         emulated: True: its frames are emulated; None: unknown.
-        default_array: array if no stream describes one.
+        no_array: array if no stream describes one.
         exact: True: estimates are not rounded.
     """
     infos = [streams[part.boot_id].info for part in session.parts]

@@ -109,7 +109,7 @@ def stances_of_session(
     Args:
         folder: folder of the session.
         frames_sha256: hash of the file of frames; computed if None.
-        store: store stances that had to be computed, if the folder is writable.
+        keep: store stances that had to be computed, if the folder is writable.
 
     Raises:
         UnknownError: it has no estimates.

@@ -126,7 +126,7 @@ def asked_with(key: str | None, what: str, body: BaseModel) -> Asked | None:
 
     Args:
         key: its `Idempotency-Key`, with or without quotes.
-        kind: kind of the request.
+        what: kind of the request.
         body: parsed body, so that its spelling does not matter.
     """
     if key is None:

@@ -235,7 +235,7 @@ async def start_fit(body: StartFit, server: ServerState, response: Response) -> 
 
     The job runs beside the server; poll it for its progress.
     """
-    options = {"reference": body.reference}
+    options = {"sensor": body.reference}
     if body.reference_delay_ms is not None:
         options["reference_delay_ms"] = repr(body.reference_delay_ms)
         options["reference_delay_sigma_ms"] = repr(body.reference_delay_sigma_ms)

@@ -50,7 +50,7 @@ def spread_over_cluster(
         work: a module-level function, which returns expected failures as results.
         tasks: arguments of `work`, consumed only as threads become free. A task that returns
             `Unfinished` is submitted again, to any worker.
-        scheduler_address: the scheduler's, such as tcp://host:8786.
+        address: the scheduler's, such as tcp://host:8786.
 
     Raises:
         MissingExtraError: Dask is not installed.

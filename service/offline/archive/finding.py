@@ -38,8 +38,8 @@ def find_sessions(places: Sequence[str], mirror: Path | None = None) -> Archive:
     """Find all sealed sessions at some locations.
 
     Args:
-        locations: paths, globs or URIs; see `service.offline.archive.locations`.
-        download_folder: empty folder for metadata copied from object stores; required for
+        places: paths, globs or URIs; see `service.offline.archive.locations`.
+        mirror: empty folder for metadata copied from object stores; required for
             remote sessions.
 
     Raises:

@@ -33,7 +33,7 @@ def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
 
     Args:
         path: the file.
-        allowed_columns: allowed columns; `session` is required.
+        known: allowed columns; `session` is required.
 
     Raises:
         UsageError: it cannot be read, or has other columns; raised before the first row.

@@ -36,7 +36,7 @@ class Pieces:
         """Open the folder of the chunks; files added to it are published when the block succeeds.
 
         Args:
-            suffixes: suffixes of the files to load; None: all.
+            endings: suffixes of the files to load; None: all.
 
         Raises:
             StorageError: chunks cannot be read or written.

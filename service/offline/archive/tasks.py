@@ -52,7 +52,7 @@ class Task(Protocol):
 
         Args:
             source: the session's folder or file.
-            result_folder: empty folder for the result's files; the caller makes them durable.
+            work: empty folder for the result's files; the caller makes them durable.
 
         Returns:
             Report of the task, as JSON values.
@@ -77,7 +77,7 @@ class LongTask(Task, Protocol):
 
         Args:
             source: as for `run`.
-            chunks_folder: folder of the chunks; the new one is written to it.
+            folder: folder of the chunks; the new one is written to it.
 
         Returns:
             False if all chunks existed already.

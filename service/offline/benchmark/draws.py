@@ -70,8 +70,8 @@ def time_rungs(
 
     Args:
         recording: recording that is estimated repeatedly.
-        model_sets: model sets to time.
-        frames_per_repetition: frames per repetition, by mode.
+        rungs: model sets to time.
+        frames: frames per repetition, by mode.
         repetitions: number of repetitions.
 
     Returns:
@@ -188,7 +188,7 @@ def record(
         scene: scene to run.
         seconds: duration; None: the scene's, or `SECONDS` if it has no end.
         draw: seed of tiles and noise.
-        on_progress: called before slow steps.
+        progress: called before slow steps.
 
     Raises:
         FootTileError: scene or calibration is not usable.

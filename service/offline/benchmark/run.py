@@ -107,7 +107,7 @@ def run_bench(options: BenchOptions, tell: Callable[[str], None]) -> Bench:
 
     Args:
         options: options of the benchmark.
-        on_progress: called with progress messages.
+        tell: called with progress messages.
 
     Raises:
         FootTileError: every draw of a scene failed.

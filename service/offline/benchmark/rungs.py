@@ -50,9 +50,9 @@ def rungs(
     `list_missing_models`.
 
     Args:
-        scene_models: models of the scene, with `static`.
-        all_models: all models, in order of application.
-        extra_models: further models that array and calibration support.
+        models_of_scene: models of the scene, with `static`.
+        existing: all models, in order of application.
+        offered: further models that array and calibration support.
     """
     whole = tuple(name for name in existing if name in models_of_scene)
     later = [name for name in existing if name not in (*FOUNDATION, *BY_WHAT_MATTERS)]

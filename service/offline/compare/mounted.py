@@ -150,10 +150,10 @@ def fit_mount(
     Args:
         pairs: our frames with the reference, its zero removed.
         force_n: (n, tiles), forces of the load-bearing tiles.
-        tilt_loss: (n, tiles), 1 - cos of the angle between tile axis and vertical; NaN: unknown.
+        tilted: (n, tiles), 1 - cos of the angle between tile axis and vertical; NaN: unknown.
         serials: serials of the tiles.
         per_tile: fit a gain for each tile instead of one for all.
-        fit_shear: fit the shear coefficient too.
+        shear: fit the shear coefficient too.
         reference_gain_sigma: standard uncertainty of the reference's gain.
 
     Raises:

@@ -98,7 +98,7 @@ def cop_notes(pairs: Pairs, places_m: Floats) -> list[str]:
 
     Args:
         pairs: our frames with the reference.
-        tile_positions_m: (tiles, 2), positions of the load-bearing tiles in the foot frame.
+        places_m: (tiles, 2), positions of the load-bearing tiles in the foot frame.
 
     Raises:
         ComparisonError: the COP is in another unit.

@@ -103,7 +103,7 @@ def even(
         step_s: time between two steps.
         edge_steps: steps kept at either side of a long gap.
         gap_s: shortest long gap; a long gap is also longer than its edges.
-        range_s: begin and end of the returned range.
+        within_s: begin and end of the returned range.
 
     Raises:
         ComparisonError: more than `STEPS_MAX` steps would result.
@@ -148,7 +148,7 @@ def smooth(
         width_s: standard deviation of the window.
         step_s: step of the result; at most half the width.
         margin_s: distance from any gap, beyond the window, that known samples keep.
-        range_s: begin and end of the returned range.
+        within_s: begin and end of the returned range.
     """
     reach = round((3.0 * width_s + margin_s) / step_s)
     # The window spans four widths per side: no known sample depends on values beyond an edge.

@@ -74,7 +74,7 @@ def trials_of(
     Args:
         t_ns: (n,), UTC of the frames.
         part: (n,), session part of the frames.
-        markers: markers in any order.
+        marks: markers in any order.
     """
     if marks:
         ordered = sorted(marks, key=lambda mark: mark.t_ns)

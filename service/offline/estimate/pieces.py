@@ -78,11 +78,11 @@ def make_piece(
 
     Args:
         source: the session.
-        chunks_folder: folder with the earlier chunks, at least their `NEEDED_SUFFIXES`; the new
+        folder: folder with the earlier chunks, at least their `NEEDED_SUFFIXES`; the new
             chunk is written to it.
         request: options of the estimate.
-        chunk_frames: approximate number of frames; row groups are not split.
-        on_remark: called with each remark.
+        piece_frames: approximate number of frames; row groups are not split.
+        remark: called with each remark.
 
     Returns:
         False if all chunks existed already.

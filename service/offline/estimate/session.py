@@ -71,8 +71,8 @@ def estimate_session(
         source: the session.
         out: the session to write; may be the same file unless a part is estimated.
         request: options of the estimate.
-        on_remark: called with each remark.
-        with_findings: True to compute findings, which doubles the run time.
+        remark: called with each remark.
+        is_judged: True to compute findings, which doubles the run time.
 
     Raises:
         FootTileError: the session, scene, calibration or tare is not usable, or the part has no
@@ -121,11 +121,11 @@ def write_estimated(
 
     Args:
         out: the file.
-        prepared_estimate: the resolved request.
+        what: the resolved request.
         notes: notes of the session.
         stream: the estimator; its plan must exist once the first batch is yielded.
-        batches: all batches with their columns.
-        on_remark: called if the stances cannot be written.
+        pieces: all batches with their columns.
+        remark: called if the stances cannot be written.
 
     Returns:
         Number of frames; with none, no file is written.

@@ -51,7 +51,7 @@ class LiveEstimates:
         info: the array.
         calibration: calibration of its tiles; None if there is none.
         tare: tare in force.
-        previous: former estimator of this node; if it was of the same stream, its epochs are
+        before: former estimator of this node; if it was of the same stream, its epochs are
             copied.
     """
 

@@ -129,7 +129,7 @@ class TareKeeper:
 
         Args:
             journal: journal of the stream.
-            get_obtainable: returns the frames that the node can still send, which is slow.
+            may_come: returns the frames that the node can still send, which is slow.
 
         Raises:
             StorageError: a tare cannot be stored; it is not in force then, and retried.

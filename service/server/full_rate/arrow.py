@@ -36,7 +36,7 @@ class Encoder:
 
     Args:
         info: array of the stream.
-        column_names: names of quantities (`force_n`) or of one tile's (`force_n_0`); none: all.
+        asked: names of quantities (`force_n`) or of one tile's (`force_n_0`); none: all.
 
     Raises:
         UsageError: no column has this name.
@@ -62,7 +62,7 @@ class Encoder:
 
         Args:
             rows: the frames.
-            cache: encoded messages of the same buffer, from this reader and others.
+            shared: encoded messages of the same buffer, from this reader and others.
         """
         seq = rows.estimated[0].seq
         for begin in range(0, len(seq), ROWS_MAX):

@@ -44,7 +44,7 @@ class KnownStream:
         node: the node.
         boot_id: id of the stream.
         stream: stored stream; None: nothing yet.
-        needed_frames: returns the frames that sessions need of the node, by stream id.
+        needed: returns the frames that sessions need of the node, by stream id.
     """
 
     def __init__(

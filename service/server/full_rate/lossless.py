@@ -44,8 +44,8 @@ class Lossless:
     """Position of a reader that receives every frame.
 
     Args:
-        buffer: buffer of the node.
-        find_stream: returns the present state of a stream; None: unknown, or no longer known.
+        memory: buffer of the node.
+        look: returns the present state of a stream; None: unknown, or no longer known.
         position: first frame to send; None: the next one.
     """
 

@@ -50,7 +50,7 @@ class NodeMemory:
     """Newest batches of one node, and the readers that wait for the next.
 
     Args:
-        recompute_turn: semaphore: one reader recomputes at a time, so that live estimation has a
+        turn: semaphore: one reader recomputes at a time, so that live estimation has a
             core.
         bytes_max: size limit.
     """

@@ -24,8 +24,8 @@ class Newest:
     """Position of a reader that drops old frames.
 
     Args:
-        buffer: buffer of the node.
-        find_stream: returns the present state of a stream; None: unknown, or no longer known.
+        memory: buffer of the node.
+        look: returns the present state of a stream; None: unknown, or no longer known.
         position: first frame to send; None: the next one.
         queue_ns: age limit of waiting frames; None: only the newest batch is sent.
     """

@@ -54,11 +54,11 @@ class Reader:
 
     Args:
         node: the node.
-        buffer: buffer of the node.
+        memory: buffer of the node.
         policy: rule for dropping frames.
         position: first frame to send; None: the next one.
-        needed_frames: returns the frames that sessions need of the node, by stream id.
-        invalidate_damaged: called with frames that are damaged on disk.
+        needed: returns the frames that sessions need of the node, by stream id.
+        drop_damaged: called with frames that are damaged on disk.
     """
 
     def __init__(

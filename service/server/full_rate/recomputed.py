@@ -67,7 +67,7 @@ def estimated(
         info: array of the stream.
         changes: changes of calibration and tare, in order; frames before the first are not
             estimated.
-        is_final: True: no more frames will come; else frames that wait for their look-ahead are
+        ends: True: no more frames will come; else frames that wait for their look-ahead are
             left out.
     """
     run: EstimateRun | None = None
@@ -111,7 +111,7 @@ class Recomputed:
         node: node of the stream.
         stream: stream with a journal.
         position: first frame.
-        is_final: True: no more frames of this stream will come.
+        ends: True: no more frames of this stream will come.
 
     Raises:
         StorageError: the journal cannot be read.

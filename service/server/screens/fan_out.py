@@ -143,9 +143,9 @@ class Hub:
         """Add a subscriber to events from now on, of all nodes or one.
 
         Args:
-            socket: websocket of the subscriber.
+            outlet: websocket of the subscriber.
             rate_hz: greatest update rate, 1 to 60.
-            node_filter: node of interest; None: all.
+            only: node of interest; None: all.
         """
         key = only, max(rate for rate in RATES_HZ if rate <= rate_hz)
         if key not in self._feeds:

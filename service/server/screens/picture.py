@@ -103,7 +103,7 @@ class Summary:
     """Content that is still to be sent; its size does not grow with time.
 
     Args:
-        node_filter: node of interest; None: all.
+        only: node of interest; None: all.
     """
 
     def __init__(self, only: str | None = None) -> None:

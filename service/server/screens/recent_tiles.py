@@ -28,7 +28,7 @@ class RecentTiles:
 
     Args:
         boot_id: stream of the frames.
-        tile_count: number of tiles.
+        tiles: number of tiles.
     """
 
     def __init__(self, boot_id: str, tiles: int) -> None:

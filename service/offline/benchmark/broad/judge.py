@@ -34,7 +34,7 @@ def judged(
 
     Args:
         columns: `EVALUATED_COLUMNS` of every frame of the recording.
-        find_unsaturated: returns `find_unsaturated_tiles`, (n, tiles); called only if needed,
+        below_end: returns `find_unsaturated_tiles`, (n, tiles); called only if needed,
             because it takes as long as the recording.
         lag_ms: look-ahead of the estimates.
     """

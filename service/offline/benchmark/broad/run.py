@@ -57,7 +57,7 @@ def run_broad(options: BroadOptions, tell: Callable[[str], None]) -> BroadBench:
 
     Args:
         options: options of the benchmark.
-        on_progress: called with the expected run time and progress.
+        tell: called with the expected run time and progress.
 
     Raises:
         StorageError: results cannot be written.
