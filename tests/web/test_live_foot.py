@@ -25,10 +25,10 @@ OF_THEIR_FORCE = """async () => {
   const shades = shadesOf(document.querySelector("#foot"));
   const most = Number.parseFloat(document.querySelector("#foot .heat-legend text").textContent);
   const tiles = [...document.querySelectorAll("#bars .tile")];
-  const marks = [...document.querySelectorAll("#foot .mark .dome")];
+  const symbols = [...document.querySelectorAll("#foot .tile-symbol .dome")];
   const near = (fill, share) =>
     [-1, 0, 1].some((by) => shadeOf(shades, share + by / 32).fill === fill);
-  return marks.length === 2 && marks.every((dome, i) =>
+  return symbols.length === 2 && symbols.every((dome, i) =>
     near(dome.getAttribute("fill"), Number(tiles[i].dataset.value) / most));
 }"""
 """Is each tile of the picture of the colour of its force? One step of the colours is let pass."""
@@ -142,7 +142,7 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#foot rect.dome")).to_have_count(64)
         expect(page.locator("#range")).to_have_text("Range: automatic")
-        number = page.locator("#foot .mark .name").first
+        number = page.locator("#foot .tile-symbol .name").first
         expect(number).to_have_text("12")
         cell = page.locator("#foot rect.dome").first.bounding_box()
         assert cell is not None
@@ -172,7 +172,8 @@ def test_the_first_screen_of_a_phone_has_what_matters(
         if height == 844:
             assert bottom_of(page, "#bars") <= bar["y"]
         rows = {
-            round(top_of(page, f"#{name}")) for name in ("tare", "record", "stop", "mark", "fields")
+            round(top_of(page, f"#{name}"))
+            for name in ("tare", "record", "stop", "marker", "fields")
         }
         assert len(rows) == 1
         expect(page.locator("#session-name")).to_be_hidden()

@@ -56,7 +56,9 @@ def test_what_is_too_new_is_deleted_in_these_tests(server: Running, open_page: O
 
 
 @pytest.mark.parametrize(
-    "path", ["docs/session-page.md", "CONTRIBUTING.md", "web/guard.js"], ids=["document", "contributing", "page"]
+    "path",
+    ["docs/session-page.md", "CONTRIBUTING.md", "web/guard.js"],
+    ids=["document", "contributing", "page"],
 )
 def test_the_oldest_browsers_are_the_same_everywhere(path: str) -> None:
     text = " ".join((ROOT / path).read_text("utf-8").split())
@@ -87,8 +89,8 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
         page.click("#record")
         expect(page.locator("#recordings li")).to_have_count(1)
         play.force_n = 8.0
-        page.click("#mark")
-        expect(page.locator("#notices")).to_contain_text("Marked")
+        page.click("#marker")
+        expect(page.locator("#notices")).to_contain_text("Marker")
         page.click("#as-traces")
         expect(page.locator("#tile-traces")).to_be_visible()
         until(lambda: scripted.running.sessions()[0]["frames"] > 300)
@@ -103,7 +105,7 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
         expect(page).to_have_url(re.compile("from="))
         page.click("#zoom-all")
         expect(page).not_to_have_url(re.compile("from="))
-        expect(page.locator("#marks-list li")).to_have_count(1)
+        expect(page.locator("#markers-list li")).to_have_count(1)
         expect(page.locator("#stance-line")).to_be_visible()
         page.click("#ledger-card summary")
         page.click("#verify")
@@ -114,8 +116,8 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
         page.goto(f"{address}/nodes")
         page.click("#record-all")
         expect(page.locator("#take-text")).to_be_visible()
-        page.click("#mark-all")
-        expect(page.locator("#notices")).to_contain_text("Marked")
+        page.click("#marker-all")
+        expect(page.locator("#notices")).to_contain_text("Marker")
         page.click("#stop-all")
         expect(page.locator("#take-text")).to_be_hidden()
     expect(page.locator("#guard")).to_have_count(0)

@@ -133,7 +133,7 @@ def test_the_foot_at_the_cursor_is_the_frame_of_the_file(
         expect(page.locator("#replay[data-waiting=false]")).to_have_count(1)
         page.keyboard.press("ArrowRight")
         shows(page, stored, row)
-    expect(page.locator("#replay-lag")).to_contain_text("the 100 ms behind it")
+    expect(page.locator("#replay-lag")).to_contain_text("100 ms of look-ahead")
 
 
 def test_the_frames_were_worth_comparing(stored: dict[str, np.ndarray]) -> None:
@@ -265,7 +265,7 @@ def test_without_a_frame_near_the_cursor_no_other_one_is_shown(
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 60)
     replay = page.locator("#replay")
     expect(replay).to_have_attribute("data-none", "true")
-    expect(page.locator("#replay-at")).to_have_text("No frame was recorded here.")
+    expect(page.locator("#replay-at")).to_have_text("No frame here")
     expect(page.locator("#grf")).to_have_attribute("data-value", "")
     expect(page.locator("#cop")).to_have_attribute("data-x-m", "")
     page.keyboard.press("ArrowRight")
