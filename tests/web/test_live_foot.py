@@ -84,12 +84,12 @@ def test_tiles_have_the_colour_of_their_force_and_the_range_says_which_it_is(
         page.wait_for_function(OF_THEIR_FORCE)
         before = top.text_content()
         page.click("#range")
-        expect(page.locator("#range")).to_have_text("Range: automatic")
+        expect(page.locator("#range")).to_have_text("Range: auto")
         expect(top).not_to_have_text(before or "")
         expect(page.locator("#bars .scale").first).not_to_have_text(fixed)
         page.wait_for_function(OF_THEIR_FORCE)
         page.reload()
-        expect(page.locator("#range")).to_have_text("Range: automatic")
+        expect(page.locator("#range")).to_have_text("Range: auto")
 
 
 def test_the_centre_of_pressure_draws_a_trail_of_two_seconds(
@@ -141,7 +141,7 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         page.select_option("#node-select", "grid")
         expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#foot rect.dome")).to_have_count(64)
-        expect(page.locator("#range")).to_have_text("Range: automatic")
+        expect(page.locator("#range")).to_have_text("Range: auto")
         number = page.locator("#foot .tile-symbol .name").first
         expect(number).to_have_text("12")
         cell = page.locator("#foot rect.dome").first.bounding_box()

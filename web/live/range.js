@@ -36,7 +36,7 @@ export class Range {
   }
 
   show() {
-    if (this.button) setText(this.button, this.automatic ? "Range: automatic" : "Range: fixed");
+    if (this.button) setText(this.button, this.automatic ? "Range: auto" : "Range: fixed");
   }
 
   /** Return the full scale of a tile's bar. */
