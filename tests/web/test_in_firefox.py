@@ -1,4 +1,4 @@
-"""The main path once more in Firefox: watch, record, mark, stop, look back, download."""
+"""The main path once more in Firefox: watch, record, set a marker, stop, look back, download."""
 
 from __future__ import annotations
 

@@ -39,10 +39,10 @@ PICTURES = """async () => {
   let drawn = 0;
   const pace = new Pace(() => { drawn += 1; });
   const frame = () => new Promise(requestAnimationFrame);
-  for (let i = 0; i < 5; i++) pace.ask();
+  for (let i = 0; i < 5; i++) pace.request();
   await frame();
   const first = drawn;
-  pace.ask();
+  pace.request();
   await frame();
   return [first, drawn];
 }"""

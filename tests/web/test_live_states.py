@@ -101,7 +101,7 @@ def test_a_node_out_of_reach_is_silent_on_the_page_and_then_away(
     assert any("connected but sends no frames" in text for text in page.evaluate("window.frozen"))
 
 
-def test_what_follows_a_labelled_mark_is_a_shortcut_again(
+def test_what_follows_a_labelled_marker_is_a_shortcut_again(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.node.record(name="walk")

@@ -88,7 +88,7 @@ def test_bars_and_grf_follow_a_known_load(known: Field, open_page: OpenPage) -> 
     assert value_of(page, "T04") > value_of(page, "T02") > value_of(page, "T01")
 
 
-def test_record_mark_stop_download(known: Field, open_page: OpenPage, tmp_path: Path) -> None:
+def test_record_marker_stop_download(known: Field, open_page: OpenPage, tmp_path: Path) -> None:
     page = open_page(known.url)
     expect(page.locator("body")).to_have_attribute("data-live", "true")
     page.fill("#session-name", "mud & <b>stones</b>")
@@ -204,8 +204,8 @@ def test_saturated_and_silent_tiles_cannot_be_mistaken_for_values(
         expect(page.locator("#grf-bound")).to_have_text("at least")
         at_least_n = float(page.inner_text("#grf"))
         assert 20.0 < at_least_n < 110.0
-        expect(page.locator("#grf-sigma")).to_have_text("(T02 missing, T03 beyond its range)")
-        expect(page.locator("#cop")).to_have_text("no COP: T02 missing, T03 beyond its range")
+        expect(page.locator("#grf-sigma")).to_have_text("(T02 missing, T03 saturated)")
+        expect(page.locator("#cop")).to_have_text("No COP: T02 missing, T03 saturated")
         for serial in ("T01", "T04"):  # the others go on
             expect(page.locator(f'#bars [data-serial="{serial}"]')).to_have_attribute(
                 "data-state", "ok"

@@ -129,7 +129,7 @@ def test_figures_of_a_comparison_are_said_in_words_with_limits_met_or_missed(
     expect(page).not_to_have_url(re.compile("against="))
 
 
-def test_another_session_is_laid_over_by_start_contact_or_mark_and_says_how_far_it_moved(
+def test_another_session_is_laid_over_by_start_contact_or_marker_and_says_how_far_it_moved(
     compared: Recording, other: Recording, open_page: OpenPage
 ) -> None:
     since_s, grf_n = grf(other)

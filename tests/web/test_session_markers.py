@@ -68,7 +68,7 @@ def drag_in_plots(page: Page, from_px: float, to_px: float) -> None:
     page.mouse.up()
 
 
-def test_a_mark_is_renamed_moved_to_the_cursor_dragged_and_removed(
+def test_a_marker_is_renamed_moved_to_the_cursor_dragged_and_removed(
     session: Recording, open_page: OpenPage
 ) -> None:
     page = opened(session, open_page)
@@ -134,7 +134,7 @@ def test_what_people_say_is_changed_and_the_second_of_two_is_told(
     assert markers(session)[0]["label"] == "water"
 
 
-def test_a_viewer_drags_no_mark_and_is_offered_to_change_none(
+def test_a_viewer_drags_no_marker_and_is_offered_to_change_none(
     script: Callable[..., Scripted], open_page: OpenPage
 ) -> None:
     server = script(token=TOKEN)
@@ -159,7 +159,7 @@ def test_it_says_what_became_of_every_frame(session: Recording, open_page: OpenP
     page.click("#ledger-card summary")
     said = page.locator("#ledger")
     now = session.now()
-    expect(said).to_contain_text(f"{now['frames']:,} frames are in it.")
+    expect(said).to_contain_text(f"{now['frames']:,} frames recorded.")
     expect(said).to_contain_text("none is lost")
     expect(said).to_contain_text(now["sha256"])
     assert complaints(page) == []

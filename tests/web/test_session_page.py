@@ -77,17 +77,17 @@ def test_the_page_says_what_the_session_is_and_what_is_drawn(
     about = page.locator("#about")
     for fact in ("bench", "leg 2", "#wet", f"{int(walk.now()['frames']):,}"):
         expect(about).to_contain_text(fact)
-    expect(page.locator("header")).to_contain_text("40 frames: the link was down for longer")
+    expect(page.locator("header")).to_contain_text("40 frames: link down longer")
     plots = settled(page)
     assert (plots.get_attribute("data-panels") or "").split()[:3] == ["grf", "tile-0", "tile-1"]
     legend = page.locator("#legend")
     expect(legend.locator("[data-kind=lost]")).to_have_text("frames lost")
-    expect(legend.locator("[data-kind=saturated]")).to_contain_text("a tile is saturated")
+    expect(legend.locator("[data-kind=saturated]")).to_contain_text("tile saturated")
     assert summary(page, "missing") == LOST
     expect(page.locator("#markers-list")).to_contain_text(LABEL)
     since_s, _ = grf(walk)
-    mark_s = page.locator("#markers-list li").get_attribute("data-time-s")
-    assert float(mark_s or "nan") == pytest.approx(since_s[700], abs=1e-4)
+    marker_s = page.locator("#markers-list li").get_attribute("data-time-s")
+    assert float(marker_s or "nan") == pytest.approx(since_s[700], abs=1e-4)
     # Where nothing is wrong nothing is drawn to be.
     page.goto(url_of(walk, "?from=0.5&to=1.5"))
     settled(page)

@@ -152,7 +152,7 @@ def test_paths_of_the_centre_of_pressure_are_coloured_by_time_or_by_stance(
     assert canvas.screenshot() != by_time
 
 
-def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
+def test_a_marker_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
     walk: Recording, open_page: OpenPage
 ) -> None:
     page = open_page(url_of(walk, "?from=1&to=1.2"))

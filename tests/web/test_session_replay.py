@@ -234,14 +234,14 @@ def test_of_a_long_session_few_slices_are_kept(session: Recording, open_page: Op
           const { Bins } = await import('/static/session/bins.js');
           const api = await import('/static/common/api.js');
           const whole = new Bins(await api.overview(id, { points: 50 }), { from: -1, to: 1e9 });
-          let come = () => {};
+          let loaded = () => {};
           const failed = (error) => { throw error; };
-          const samples = new Samples(id, whole, 1e9, { come: () => come(), failed });
+          const samples = new Samples(id, whole, 1e9, { loaded: () => loaded(), failed });
           let most = 0;
           for (let t = 0; t < whole.durationS; t += samples.sliceS) {
             while (!samples.at(t).known) {
-              const next = new Promise((done) => { come = done; });
-              samples.want(t, 0);
+              const next = new Promise((done) => { loaded = done; });
+              samples.request(t, 0);
               if (!samples.at(t).known) await next;
             }
             most = Math.max(most, samples.slices.size);

@@ -47,7 +47,7 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
         assert [event["label"] for event in events] == ["a stone"]
 
 
-def test_a_mark_that_is_set_while_the_server_is_away_has_the_instant_of_the_press(
+def test_a_marker_that_is_set_while_the_server_is_away_has_the_instant_of_the_press(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.node.record(name="walk")
@@ -169,7 +169,7 @@ def test_a_phone_has_room_for_several_recordings_and_all_buttons(
             expect(page.locator(button)).to_be_in_viewport()
 
 
-def test_a_session_shows_how_many_marks_it_has_and_its_downloads_have_them(
+def test_a_session_shows_how_many_markers_it_has_and_its_downloads_have_them(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.recorded("walk")
