@@ -160,6 +160,6 @@ def test_it_says_what_became_of_every_frame(session: Recording, open_page: OpenP
     said = page.locator("#ledger")
     now = session.now()
     expect(said).to_contain_text(f"{now['frames']:,} frames recorded.")
-    expect(said).to_contain_text("none is lost")
+    expect(said).to_contain_text("complete from first to last")
     expect(said).to_contain_text(now["sha256"])
     assert complaints(page) == []

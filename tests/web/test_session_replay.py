@@ -116,7 +116,12 @@ def shows(page: Page, stored: dict[str, np.ndarray], row: int) -> None:
             )
             expect(bar.locator(".sigma")).to_have_text(f"± {1.96 * sigma_n:.1f}")
     angle_deg = np.degrees(float(stored["angle_rad"][row]))
-    said = (page.locator("#angle").text_content() or "").replace("\u2212", "-").removesuffix("°")
+    said = (
+        (page.locator("#angle").text_content() or "")
+        .replace("\u2212", "-")
+        .removeprefix("Foot angle ")
+        .removesuffix("°")
+    )
     assert float(said) == pytest.approx(angle_deg, abs=0.051)
     contact = {0: "false", 1: "true"}.get(stored["contact"][row], "")
     expect(page.locator("#contact")).to_have_attribute("data-contact", contact)

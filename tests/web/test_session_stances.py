@@ -240,7 +240,7 @@ def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> No
     page = opened(open_page, hops, **PHONE)
     hint = page.locator("#readout-hint")
     assert "Read values: touch" in hint.inner_text()
-    assert "press" not in hint.inner_text()
+    assert "wheel" not in hint.inner_text()
     for path in (f"/sessions/{hops.id}", "/nodes", "/"):
         page.goto(f"{hops.running.url}{path}")
         page.tap("#help")
@@ -248,7 +248,7 @@ def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> No
         assert page.evaluate(_KEYS_SHOWN) == 0, path
         assert complaints(page) == []
     desk = opened(open_page, hops)
-    assert "press" in desk.locator("#readout-hint").inner_text()
+    assert "wheel" in desk.locator("#readout-hint").inner_text()
     desk.keyboard.press("?")
     assert desk.evaluate(_KEYS_SHOWN) > 6
 
