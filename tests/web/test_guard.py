@@ -231,5 +231,5 @@ def test_a_page_that_was_put_aside_connects_again_and_tells_of_another_version(
         page.evaluate("dispatchEvent(new PageTransitionEvent('pageshow', { persisted: true }))")
         expect(page.locator("#notices")).to_contain_text("to FootTile 99.0")
         expect(page.locator("body[data-live=true]")).to_have_count(1)
-        page.click("#notices button:has-text('Load again')")
+        page.click("#notices button:has-text('Reload')")
         expect(page.locator("#notices")).to_be_empty()
