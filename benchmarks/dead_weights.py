@@ -21,9 +21,9 @@ from devices.emulation.surroundings import Surroundings
 from devices.errors import CalibrationError
 from devices.scene.emulated import Family
 from service.estimation.fitting.bench.indentation import Indentation
-from service.estimation.fitting.bench.weights import STANDARD_GRAVITY_M_S2
 from service.estimation.fitting.weights_fit import fit_weights
 from service.estimation.models.static import StaticCurves
+from service.estimation.weights import STANDARD_GRAVITY_M_S2
 from service.offline.calibrations import bench_scene
 
 FIVE_G = (200.0, 500.0, 1000.0, 1500.0, 2000.0)

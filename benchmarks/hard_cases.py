@@ -1,7 +1,8 @@
 """What an estimate makes of tiles that are wrong and answer all the same, and of healthy ones.
 
     python benchmarks/hard_cases.py [--out docs/results/hard_cases.md]
-    python benchmarks/hard_cases.py --healthy HOURS [--lost SHARE] [--data DIR]
+    python benchmarks/hard_cases.py --healthy HOURS [--lost SHARE,SHARE] [--feet NAME,NAME]
+        [--data DIR]
 
 Each case is a fault of an emulated foot of four tiles that walks on the spot: half sines of 0.6 s,
 each as heavy as it likes. Its frames are estimated live (10 ms of look-ahead) twice, with the watch
@@ -9,7 +10,8 @@ and without. Wrong is a GRF that is off by more than 1 N and by more than 1.96 o
 
 With `--healthy` no fault is there, and every flag is a false alarm: built-in scenes and recorded
 loads, over and over again, for so long each, with white noise, with noise correlated over 10 ms,
-and with repeatability 0.03; with `--lost` less a share of frames.
+and with repeatability 0.03; with `--lost` less shares of the frames, a line for each. The bound is
+that of alarms an hour with 95 % confidence; the evidence is the highest for a clip.
 """
 
 from __future__ import annotations
@@ -17,9 +19,10 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +63,7 @@ LADDERS = {
     "whole": ("unwrap", "gas", "static", "skew", "denoise", "hysteresis", "rubber"),
 }
 WARM = ("unwrap", "temperature", *LADDERS["whole"][1:])
+MUD = ("unwrap", "temperature", "ambient", *LADDERS["whole"][1:])
 JUDGED = EstimateStatus.STUCK | EstimateStatus.CLIPPED | EstimateStatus.BASELINE_LOST
 BEGIN_S = 5.3
 """When most faults begin, in the middle of a step."""
@@ -105,7 +109,7 @@ def plan_of(recorded: Recorded, models: Sequence[str], *, blind: bool = False) -
     info, calibration = recorded.info, recorded.calibration
     tare = take_tare(recorded.frames, Compensation(info.tiles), calibration, info.serials)
     plan = make_plan(info, calibration, tare, models=models, lag_ms=LAG_MS)
-    return replace(plan, watch=None) if blind else plan
+    return replace(plan, watch=None) if blind else plan  # ANY: fields of EstimationPlan
 
 
 def walk(seconds: float) -> LoadTrace:
@@ -213,15 +217,21 @@ def _wrong(e: Estimates, true_n: Floats) -> Bools:
 NOISES: tuple[dict[str, Any], ...] = ({}, {"correlated_ms": 10.0}, {"repeatability": 0.03})
 
 
-def healthy_feet(data: Path, seed: int) -> Iterator[tuple[str, Scene, EmulatedFoot]]:
-    """Feet that nothing is wrong with, without an end."""
+def healthy_feet(
+    data: Path, seed: int, feet: Sequence[str]
+) -> Iterator[tuple[str, Scene, EmulatedFoot]]:
+    """Yield feet that nothing is wrong with, without an end: those of these names, or all."""
     for name, load in (
         ("insole", "insole_walk_left.csv"),
         ("insole", "insole_walk_right.csv"),
         ("rolling", None),
+        ("poppy", None),
+        ("mud", None),
         ("standing", None),
         ("standing", "squat_jump_plate1.csv"),
     ):
+        if feet and (load or name) not in feet:
+            continue
         content = load_scene(name).model_dump(mode="python", exclude_none=True)
         emulation = content["emulation"] | NOISES[seed % len(NOISES)]
         scene = Scene.model_validate(content | {"emulation": emulation})
@@ -260,53 +270,92 @@ def converted(
         yield FrameBatch(**columns)
 
 
-def without(frames: Iterable[FrameBatch], share: float, seed: int) -> Iterator[FrameBatch]:
-    """But for this share, and for all of the lead."""
-    rng = np.random.default_rng(seed)
-    for batch in frames:
-        begins = rng.random(len(batch)) < share / AT_A_TIME
-        lost = np.convolve(begins, np.ones(AT_A_TIME))[: len(batch)] > 0
-        yield batch.select(~lost | (batch.frame_status & FrameStatus.LEAD != 0))
+def without(batch: FrameBatch, share: float, rng: np.random.Generator) -> FrameBatch:
+    """Return a batch but for this share of its frames; its lead is whole."""
+    begins = rng.random(len(batch)) < share / AT_A_TIME
+    lost = np.convolve(begins, np.ones(AT_A_TIME))[: len(batch)] > 0
+    return batch.select(~lost | (batch.frame_status & FrameStatus.LEAD != 0))
 
 
-def healthy(data: Path, hours: float, lost: float) -> Iterator[str]:
-    """A line for each kind of foot: how long, and how many alarms."""
-    found: dict[str, list[float]] = {}
+def healthy(
+    data: Path, hours: float, shares: Sequence[float], feet: Sequence[str]
+) -> Iterator[str]:
+    """Yield a line for each foot and share of lost frames: hours, alarms, bound, evidence."""
+    found: dict[tuple[str, float], Alarms] = {}
     for seed in range(len(NOISES)):
-        for name, scene, foot in healthy_feet(data, seed):
+        for name, scene, foot in healthy_feet(data, seed, feet):
             recorded = record(scene, replace(foot, seed=0), 3.0)
-            frames = without(converted(scene, foot, recorded.info, hours), lost, seed)
-            count_alarms(recorded, frames, found, name)
-            print(name, NOISES[seed], found[name], file=sys.stderr, flush=True)
+            frames = converted(scene, foot, recorded.info, hours)
+            # Mud presses on all tiles: without its own ladder their baselines are lost.
+            ladders = [MUD] if name == "mud" else list(LADDERS.values())
+            counts = [found.setdefault((name, share), Alarms()) for share in shares]
+            count_alarms(recorded, frames, shares, counts, ladders, seed)
+            print(name, NOISES[seed], counts, file=sys.stderr, flush=True)
     yield from alarm_lines(found)
+
+
+@dataclass
+class Alarms:
+    """Hours of healthy frames, onsets of each flag of `JUDGED`, highest evidence for a clip."""
+
+    hours: float = 0.0
+    onsets: Counter[EstimateStatus] = field(default_factory=Counter)
+    evidence: float = 0.0
+
+    def __add__(self, other: Alarms) -> Alarms:
+        """Return both together."""
+        return Alarms(
+            self.hours + other.hours,
+            self.onsets + other.onsets,
+            max(self.evidence, other.evidence),
+        )
 
 
 def count_alarms(
     recorded: Recorded,
     frames: Iterable[FrameBatch],
-    found: dict[str, list[float]],
-    name: str,
+    shares: Sequence[float],
+    found: Sequence[Alarms],
+    ladders: Sequence[Sequence[str]],
+    seed: int,
 ) -> None:
-    """Add hours, and onsets of each flag under both ladders."""
-    counts = found.setdefault(name, [0.0] * 4)
-    estimators: list[Estimator] = []
+    """Add hours, onsets and evidence of these frames to each share that is lost."""
+    rngs = [np.random.default_rng(seed) for _ in shares]
+    estimators: list[list[Estimator]] = []
     for batch in frames:
-        counts[0] += len(batch) / recorded.info.nominal_rate_hz / 3600.0
         if not estimators:
             first = replace(recorded, frames=batch)
-            estimators = [Estimator(plan_of(first, models)) for models in LADDERS.values()]
-        for estimator in estimators:
-            part = estimator.step(batch)
-            for k, bit in enumerate(JUDGED, start=1):
-                there = (part.estimate_status & bit) != 0
-                counts[k] += float((np.diff(there.astype(int), prepend=0) == 1).sum())
+            estimators = [[Estimator(plan_of(first, m)) for m in ladders] for _ in shares]
+        for share, rng, alarms, of_share in zip(shares, rngs, found, estimators, strict=True):
+            alarms.hours += len(batch) / recorded.info.nominal_rate_hz / 3600.0
+            taken = without(batch, share, rng)
+            for estimator in of_share:
+                status = estimator.step(taken).estimate_status
+                for bit in JUDGED:
+                    there = ((status & bit) != 0).astype(int)
+                    alarms.onsets[bit] += int((np.diff(there, prepend=0) == 1).sum())
+                states = estimator._tile_states  # noqa: SLF001  # no estimate says how near a clip was
+                evidence = float(states["clipping"]["evidence"].max())
+                alarms.evidence = max(alarms.evidence, evidence)
 
 
-def alarm_lines(found: dict[str, list[float]]) -> Iterator[str]:
-    """The table's lines, and their sum."""
-    found = {**found, "all": [sum(column) for column in zip(*found.values(), strict=True)]}
-    for name, (hours, *alarms) in found.items():
-        yield f"| {name} | {hours:.2f} | {' | '.join(f'{n:.0f}' for n in alarms)} |"
+def most_per_hour(alarms: int, hours: float) -> float:
+    """Return the upper bound of a rate, 95 % (Wilson and Hilferty 1931); 3 / hours for none."""
+    k = alarms + 1
+    return float(k * (1.0 - 1.0 / (9.0 * k) + 1.645 / (3.0 * math.sqrt(k))) ** 3 / hours)
+
+
+def alarm_lines(found: dict[tuple[str, float], Alarms]) -> Iterator[str]:
+    """Yield the table's lines, and their sum."""
+    every = ("all", math.nan), sum(found.values(), Alarms())
+    for (name, share), alarms in [*found.items(), every]:
+        counts = [alarms.onsets[bit] for bit in JUDGED]
+        bound = most_per_hour(alarms.onsets[EstimateStatus.CLIPPED], alarms.hours)
+        lost = "-" if math.isnan(share) else f"{100 * share:g} %"
+        yield (
+            f"| {name} | {lost} | {alarms.hours:.2f} | {' | '.join(map(str, counts))} "
+            f"| < {bound:.2f} | {alarms.evidence:.1f} |"
+        )
 
 
 def main() -> None:
@@ -315,12 +364,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--healthy", type=float, default=0.0, metavar="HOURS")
-    parser.add_argument("--lost", type=float, default=0.0, metavar="SHARE")
+    parser.add_argument("--lost", default="0", metavar="SHARE,SHARE")
+    parser.add_argument("--feet", default="", metavar="NAME,NAME")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     options = parser.parse_args()
     if options.healthy:
-        print("| foot | hours | stuck | clipped | baseline_lost |\n|---|--:|--:|--:|--:|")
-        print("\n".join(healthy(options.data, options.healthy, options.lost)))
+        print("| foot | lost | hours | stuck | clipped | baseline_lost | clipped/h | evidence |")
+        print("|---|--:|--:|--:|--:|--:|--:|--:|")
+        shares = [float(share) for share in options.lost.split(",")]
+        feet = options.feet.split(",") if options.feet else []
+        print("\n".join(healthy(options.data, options.healthy, shares, feet)))
         return
     table = [
         "| case | ladder | worst error N | wrong and silent before | now | flags | first after s "

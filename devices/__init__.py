@@ -1,1 +1,1 @@
-"""What the hardware is, how it is asked, and its emulation. No network, no Arrow, no commands."""
+"""Hardware drivers, acquisition and emulation. No network, no Arrow, no commands."""

@@ -1,7 +1,7 @@
-"""The paced loop: frames of an array, with the servo's position, in batches.
+"""Paced acquisition loop: batches of frames of an array, with the servo's position.
 
-Clock and sleep are injected; a batch is handed over every 25 ms or so. A slow consumer cannot
-be waited for here: it must be quick, and what was missed is counted and flagged.
+Clock and sleep are injected. A batch is yielded about every 25 ms. The consumer must be quick: the
+loop does not wait for it, but counts and flags the slots that it missed.
 """
 
 from __future__ import annotations
@@ -29,35 +29,38 @@ from devices.frames import (
 from devices.temperature import HeldTemperature, hold_temperature
 
 BATCH_NS = 25_000_000
-"""Length of a batch: at 10 ms two fifths of a message would be header (performance.md)."""
+"""Duration of a batch. At 10 ms two fifths of a message would be header (performance.md)."""
 
 STALLED_AFTER = 3
-"""A loop without a set rate was stalled, which is flagged, if it misses so many slots at once.
+"""Slots missed at once from which a loop without a set rate counts as stalled and is flagged.
 
-By so many periods it may be ahead of its slots, too: that makes up for frames that take longer.
+The loop may also be ahead of its slots by as many periods, which makes up for longer frames.
 """
 
-_BATCH_FRAMES_MAX = 64  # more than any schedule takes in `BATCH_NS`; columns are made for so many
-_AGE_MAX_US = 2**31 - 1  # an int32 holds no more
+_BATCH_FRAMES_MAX = 64  # rows allocated for a batch; more than any schedule takes in `BATCH_NS`
+_AGE_MAX_US = 2**31 - 1  # the limit of int32
 
 
 class ServoSource(Protocol):
-    """Where the newest servo position comes from; the tile loop never waits for it."""
+    """Source of the newest servo position. The tile loop never waits for it."""
 
     def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
-        """Position in counts and its sample instant, newest known at `t_mono_ns`; None so far."""
+        """Return the newest position known at `t_mono_ns`, in counts, and its sample instant.
+
+        None before the first reading.
+        """
 
     @property
     def stale_after_ns(self) -> int:
-        """Age from which a position is older than it should be."""
+        """Age in ns above which a position is flagged as stale."""
 
     @property
     def is_turn_known(self) -> bool:
-        """Are the whole turns known of the position that `latest` gave last?"""
+        """True if the number of whole turns in the last returned position is known."""
 
 
 class FrameRow(NamedTuple):
-    """One frame as it is taken: a row of the columns of `FrameBatch`."""
+    """One new frame: a row of the columns of `FrameBatch`."""
 
     seq: int
     t_mono_ns: int
@@ -73,26 +76,28 @@ class FrameRow(NamedTuple):
 
 
 class FrameKeeper(Protocol):
-    """Receives every frame as it is taken, before its batch is whole."""
+    """Sink that receives every frame at once, before its batch is complete."""
 
     def put(self, frame: FrameRow) -> None:
-        """Keep one frame; quick, for the loop waits."""
+        """Store one frame. It must be quick: the loop waits."""
 
 
 class Acquisition:
-    """One stream of frames: `seq` counts from 0, `t_ns` is `t_mono_ns` plus one fixed anchor.
+    """Acquisition loop of one stream: `seq` counts from 0, `t_ns` is `t_mono_ns` plus an offset.
+
+    The offset is fixed for the stream.
 
     Args:
-        array: what is scanned.
-        tiles: as it identified them.
-        clock: virtual or real.
-        anchor: the stream's UTC.
-        rate_hz: frames a second; 0: as fast as the schedule allows.
-        expected_hz: what rate that is, to count slots that were not sampled; 0: do not count.
-        servo: its position goes with the frames.
-        is_new: the array was identified again in a running node: the first frame says so.
-        keeper: keeps frames while their batch is being filled. Readings that are out of range are
-            flagged when a batch is whole, see `RangeFlag`.
+        array: array to scan.
+        tiles: its identified tiles.
+        clock: virtual or real clock.
+        anchor: UTC anchor of the stream.
+        rate_hz: frame rate; 0: as fast as the schedule allows.
+        expected_hz: expected rate without a set rate, to count missed slots; 0: do not count.
+        servo: source of the position stored with each frame.
+        is_new: the array was identified again in a running node; flagged in the first frame.
+        keeper: stores frames while their batch is being filled. Readings out of range are flagged
+            later, when a batch is complete (`RangeFlag`).
         lead_end_ns: as the attribute.
     """
 
@@ -111,9 +116,9 @@ class Acquisition:
         lead_end_ns: int | None = None,
     ) -> None:
         self.missed_slots = 0
-        """Slots that were not sampled, because the loop was late.
+        """Number of slots not sampled because the loop was late.
 
-        Slots follow one another in the set rate, or without one in the expected rate.
+        The slots follow the set rate, else the expected rate.
         """
         self._array = array
         self._clock = clock
@@ -124,14 +129,14 @@ class Acquisition:
         self._is_new = is_new
         self._keeper = keeper
         self.lead_end_ns = lead_end_ns
-        """Frames before this instant are the lead of an emulated load; None: there is none."""
+        """End of the lead of an emulated load: earlier frames are flagged; None: no lead."""
         self._range = RangeFlag(tiles)
         self._next_seq = 0
         self._last_t_mono_ns = 0
         array.begin()
 
     def run(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
-        """Take frames until `stop()` is true, which is asked before every frame.
+        """Acquire frames until `stop()`, evaluated before every frame, returns True.
 
         Yields:
             Batches of at least one frame; the last one may be short.
@@ -160,7 +165,7 @@ class Acquisition:
                     self.missed_slots += late
                     if late >= STALLED_AFTER:
                         frame_status |= FrameStatus.OVERRUN
-                    # One that is a little late in each frame misses slots, too: lateness adds up.
+                    # A loop that is a little late in each frame misses slots, too.
                     slot_ns += (late + 1) * self._expected_ns
                     slot_ns = min(slot_ns, now_ns + STALLED_AFTER * self._expected_ns)
                 self._fill(columns, row, self._array.scan(), frame_status)
@@ -178,7 +183,7 @@ class Acquisition:
             )
         ]
         first = next((i for i, padc in enumerate(scan.padc) if padc != NOT_READ), 0)
-        # Never back: a tile left out for a frame keeps its earlier sample.
+        # Monotonic: the sample of a tile that was skipped in this frame is older.
         t_mono_ns = max(samples_ns[first], self._last_t_mono_ns + 1)
         self._last_t_mono_ns = t_mono_ns
         if self._is_new:
@@ -198,7 +203,7 @@ class Acquisition:
                     frame_status |= FrameStatus.SERVO_TURN_UNKNOWN
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
-        # Positional, and unpacked by the keeper: this runs for every frame.
+        # Positional for speed: this runs for every frame.
         frame = FrameRow(
             self._next_seq,
             t_mono_ns,
@@ -225,10 +230,10 @@ class Acquisition:
 
 
 class RangeFlag:
-    """Flags readings that are out of the chips' range, in frames that come in order.
+    """Detector of readings outside the chips' pressure range, for batches in order.
 
-    Raw counts are kept as read. A part pressed past its range falls through zero and comes back
-    near full count (hardware.md 1.3), so both ends are out of range.
+    Raw counts stay as read. Beyond its range a part's count falls through zero and wraps to near
+    full count (hardware.md 1.3), so both ends are out of range.
     """
 
     def __init__(self, tiles: tuple[TileInfo, ...]) -> None:
@@ -236,7 +241,7 @@ class RangeFlag:
         self._temperature: HeldTemperature | None = None
 
     def flag(self, batch: FrameBatch) -> None:
-        """Set `over_range` in the batch's own status."""
+        """Set the flag `OVER_RANGE` in the batch, in place."""
         held, self._temperature = hold_temperature(batch, self._temperature)
         kpa = self._compensation.readable_kpa(held)
         outside = (kpa > PRESSURE_MAX_KPA) | (kpa < PRESSURE_MIN_KPA) | (batch.padc <= 1)

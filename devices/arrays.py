@@ -1,4 +1,4 @@
-"""Numpy arrays as they pass between modules: their types, and records of arrays of one length."""
+"""Numpy array types, and records of arrays of one length."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ Bools = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Arrays:
-    """Base of records whose fields are all arrays with the same first axis."""
+    """Base class of records whose fields are all arrays with the same first axis."""
 
     def rows(self, start: int, stop: int) -> Self:
-        """Rows `start` to `stop` as views, nothing copied."""
-        # Not by `fields`, which takes longer than the views: this is done for every message.
+        """Return rows `start` to `stop` as views."""
+        # `vars`, because `fields` takes longer than the views; this runs for every message.
         return type(self)(**{name: column[start:stop] for name, column in vars(self).items()})
 
     def select(self, which: Bools | Ints) -> Self:
-        """The rows that a mask marks, or those of these numbers, copied."""
+        """Return a copy of the rows selected by a mask or by row numbers."""
         return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
     def copy(self) -> Self:
-        """The same, in arrays of its own that may be written to."""
+        """Return a deep copy, with writable arrays."""
         return type(self)(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
     def is_same(self, other: Self) -> bool:
-        """Are all values of the other the same? NaN is the same as NaN."""
+        """Return whether all values are equal; NaN equals NaN."""
         return all(
             np.array_equal(getattr(self, f.name), getattr(other, f.name), equal_nan=True)
             for f in fields(self)
@@ -42,7 +42,7 @@ class Arrays:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """One record of all `parts`, in their order.
+        """Join `parts` along the first axis, in order.
 
         Raises:
             ValueError: no part, or arrays of different width.

@@ -1,11 +1,10 @@
-"""Recursions over time, compiled: a Python loop per frame does not do ten million of them.
+"""JIT compilation (numba) of recursions over time, for recordings of ten million frames.
 
-Compiled without fast-math, so that a loop gives the same bits as the same arithmetic in Python,
-however a recording is cut into batches. A division by zero is infinite or NaN, as in numpy, and no
-exception.
+Without fast-math, so that compiled code gives the same bits as Python, however a recording is split
+into batches. A division by zero gives infinity or NaN, as in numpy, and no exception.
 
-Machine code is kept with a digest of all that it was made of: numba itself looks at the file of the
-function alone, and would go on running what has since been mended in a file that it calls.
+Machine code is cached on disk under a digest of all its source code. numba's own cache checks only
+the file of the function, and would run stale code after a change in a file that it calls.
 """
 
 from __future__ import annotations
@@ -26,35 +25,38 @@ from numba.core import serialize
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 F = TypeVar("F", bound=Callable[..., Any])
-_asking = threading.local()
+_thread_state = threading.local()
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 class NotKeptError(Exception):
-    """Machine code is not there yet; to compile it takes some ten seconds."""
+    """The function is not in the cache of machine code. Compilation takes some ten seconds."""
 
 
 @contextlib.contextmanager
 def only_kept() -> Iterator[None]:
-    """Nothing is compiled in this thread while the block runs: what is not kept is an error.
+    """Context manager: forbid compilation in this thread; only cached machine code runs.
 
     Raises:
-        NotKeptError: something would have to be.
+        NotKeptError: a called function is not in the cache.
     """
-    _asking.only_kept = True
+    _thread_state.cached_only = True
     try:
         yield
     finally:
-        _asking.only_kept = False
+        _thread_state.cached_only = False
 
 
 def compiled(function: F) -> F:
-    """`function` as machine code, made at its first call and kept on disk where that can be."""
+    """Compile `function` at its first call; cache the machine code on disk where possible."""
     return _compiled(function, forceinline=False)
 
 
 def inlined(function: F) -> F:
-    """The same for parts of one that take many arrays: counting references costs more than they."""
+    """Compile `function` inline into compiled callers.
+
+    For short functions with many array arguments, whose reference counting costs more than they do.
+    """
     return _compiled(function, forceinline=True)
 
 
@@ -62,20 +64,20 @@ def _compiled(function: F, *, forceinline: bool) -> F:
     dispatcher: Any = numba.njit(forceinline=forceinline, **_OPTIONS)(function)
     if not has_cache_folder():
         return cast("F", dispatcher)
-    with contextlib.suppress(RuntimeError):  # nowhere to keep it: no home, read-only installation
-        # As numba.njit(cache=True) does, which stops at a cache that it cannot read or write.
+    with contextlib.suppress(RuntimeError):  # no cache folder: no home, read-only installation
+        # As numba.njit(cache=True), which fails if the cache cannot be read or written.
         dispatcher._cache = _Kept(function)  # noqa: SLF001  # numba's own seam
     return cast("F", dispatcher)
 
 
 def has_cache_folder() -> bool:
-    """Is there a place for machine code? Without a home numba would make a folder named "~"."""
+    """Return whether machine code can be cached. Without a home numba makes a folder named "~"."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~")
     return bool(os.environ.get("NUMBA_CACHE_DIR")) or os.path.isabs(home)
 
 
 class _Kept(FunctionCache):
-    """Machine code on disk; a full disk, or a file that a power cut left, costs a second."""
+    """Cache of machine code on disk. Write errors and damaged files only cost a recompilation."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]  # numba has no types
@@ -85,7 +87,7 @@ class _Kept(FunctionCache):
 
     @cached_property
     def _made_of(self) -> str:
-        return _digest(self._py_func)  # not before the first call: what it calls may come later
+        return _digest(self._py_func)  # at the first call: its callees may be defined later
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         key = super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]  # numba has no types
@@ -98,21 +100,20 @@ class _Kept(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             kept = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # likewise
-        except Exception:  # there is nothing that a garbled pickle may not raise
+        except Exception:  # a damaged pickle may raise anything
             with contextlib.suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]  # it is written again
             kept = None
-        if kept is None and getattr(_asking, "only_kept", False):
+        if kept is None and getattr(_thread_state, "cached_only", False):
             raise NotKeptError(self._name)
         return kept
 
 
 class _Files(IndexDataCacheFile):
-    """An index and its files, of which each says itself what it is, and proves it.
+    """Index and data files of the cache; each data file holds its key and a checksum.
 
-    The index is written first. If the file is not, because the disk is full or the process killed,
-    or if two processes write at once, then it points to machine code of something else, which would
-    run.
+    numba writes the index first. If the disk is full, the process is killed, or two processes write
+    at once, the index may point to machine code of another function.
     """
 
     def save(self, key: Any, data: Any) -> None:
@@ -126,12 +127,12 @@ class _Files(IndexDataCacheFile):
         size = hashlib.sha256().digest_size
         if hashlib.sha256(kept[size:]).digest() != kept[:size]:
             return None
-        stamp, of, data = pickle.loads(kept[size:])  # noqa: S301  # as numba does, and what we wrote
-        return data if (stamp, of) == (self._source_stamp, key) else None
+        stamp, saved_key, data = pickle.loads(kept[size:])  # noqa: S301  # as numba; our own file
+        return data if (stamp, saved_key) == (self._source_stamp, key) else None
 
 
 def _digest(function: Callable[..., Any]) -> str:
-    """Of a function's code, of all compiled functions that it reaches, and of their constants."""
+    """Hash a function's code, all compiled functions that it calls, and their constants."""
     digest, seen, left = hashlib.sha256(repr(_OPTIONS).encode()), set(), [function]
     while left:
         each = left.pop()
@@ -159,7 +160,7 @@ def _add(digest: Any, *parts: bytes) -> None:
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
-    """Of a function, and of those within it."""
+    """Yield a code object and all code objects nested in it."""
     yield code
     for value in code.co_consts:
         if isinstance(value, CodeType):
@@ -167,7 +168,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _globals_of(function: Callable[..., Any], names: tuple[str, ...]) -> Iterator[Any]:
-    """What names stand for in its module, and in modules that they name."""
+    """Yield the values of global `names`; for a module, the values of `names` within it."""
     for name in names:
         value = function.__globals__.get(name)
         if isinstance(value, ModuleType):

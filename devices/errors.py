@@ -1,15 +1,15 @@
-"""Every error FootTile raises on purpose.
+"""Errors that FootTile raises on purpose.
 
     FootTileError
      +-- SceneError            (ValueError)    a scene file is wrong; exit code 2
      +-- UsageError            (ValueError)    a command's options do not fit together; exit code 2
-     |    +-- MissingExtraError                this installation lacks a package for what is asked
+     |    +-- MissingExtraError                the installation lacks a required package
      +-- LoadTraceError        (ValueError)    a load trace cannot be pressed on the tiles
      +-- I2cError              (OSError)
      |    +-- NoAcknowledgeError               no answer at an address
      |    +-- BusFaultError                    the bus itself failed: time-out, arbitration, reset
      |    |    +-- BusLostError                the adapter went away: unplugged, driver unbound
-     |    +-- BusMisuseError                   the adapter cannot do what we asked: our bug
+     |    +-- BusMisuseError                   the adapter cannot do this transfer: our bug
      |    +-- BusSetupError                    no such bus, no permission
      +-- TileSetupError                        a tile's coefficients are absent or implausible
      +-- SpiError              (OSError)       a transfer over SPI failed
@@ -21,11 +21,11 @@
      |    +-- ServoTimeoutError (TimeoutError) a servo did not answer in time
      |    +-- ServoPacketError  (ValueError)   bytes that are no valid packet
      |    +-- ServoStatusError                 the servo answered with an error number
-     +-- FileFormatError       (ValueError)    a file is not what it should be
-     |    +-- DamagedFileError                 a file is not what was written
-     |    +-- DamagedFramesError               frames on disk are not those that were written
+     +-- FileFormatError       (ValueError)    a file is absent, unreadable or of another kind
+     |    +-- DamagedFileError                 a file's hash does not match
+     |    +-- DamagedFramesError               frames on disk do not match their checksum
      +-- StorageError          (OSError)       a file cannot be written or read: disk full, not ours
-     |    +-- FolderGoneError                  the folder that it writes to is not there any more
+     |    +-- FolderGoneError                  the folder was moved, deleted or unmounted
      +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
      +-- TareError             (ValueError)    no interval to tare on
      +-- ComparisonError       (ValueError)    a reference cannot be compared with a session
@@ -34,11 +34,11 @@
      |    +-- WorkerLostError                  processes that worked on a task were killed
      +-- UnknownError          (LookupError)   no such node, session, tare
 
-Every error keeps its facts: `what` happened, `where`, what was `expected`, and the `remedy`. Those
-that a stranger would catch by a built-in type are that type too. In a running stream a fault is a
-status bit and a NaN (see `devices.frames`); these errors stop a command, never a stream.
+Every error has four facts: `what` happened, `where`, the `expected` state, and the `remedy`. Many
+errors are also a built-in type, so that callers can catch that. In a running stream a fault is a
+flag and a NaN (see `devices.frames`); these errors stop a command, never a stream.
 
-`needs_extra` stands where packages are imported that not every installation has.
+`needs_extra` guards the import of optional packages.
 """
 
 from __future__ import annotations
@@ -56,21 +56,23 @@ OUR_PACKAGES = ("devices", "storage", "service", "foottile")
 
 @contextmanager
 def needs_extra(extra: Extra, what: str, *, remedy: str = "") -> Iterator[None]:
-    """Where packages of an extra are imported: a `with` block, or the decorator of a function.
+    """Turn a failed import of an optional package into an error that names its extra.
+
+    Use as a `with` block around the imports, or as the decorator of a function.
 
     Args:
-        extra: the extra of `pyproject.toml` that brings them.
-        what: does not work without them; the error's text begins with it.
-        remedy: what else helps.
+        extra: extra of `pyproject.toml` that installs the packages.
+        what: feature that needs the packages; the error's text begins with it.
+        remedy: remedy, instead of the command that installs the extra.
 
     Raises:
-        MissingExtraError: one of them is not installed.
+        MissingExtraError: a package is not installed.
     """
     try:
         yield
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        if package in OUR_PACKAGES:  # a mistake of ours, which no package mends
+        if package in OUR_PACKAGES:  # our own bug, not a missing package
             raise
         raise MissingExtraError(
             f"{what} needs {package}, which is not installed",
@@ -85,9 +87,9 @@ class _Facts(TypedDict, total=False):
 
 
 class FootTileError(Exception):
-    """Base of all errors; composes its text, which can be shown, from the facts it keeps.
+    """Base class of all errors. Its text is composed of its facts and safe to print.
 
-    `exit_code` is what the command line returns for it (1 failed, 2 usage).
+    `exit_code` is the exit code of the command line (1 failed, 2 usage).
     """
 
     exit_code = 1
@@ -109,11 +111,11 @@ class FootTileError(Exception):
         return printable(text)
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Keyword-only facts must survive pickling between processes.
+        # Keyword-only arguments must survive pickling between processes.
         return (_rebuild, (type(self), self.facts()))
 
     def facts(self) -> dict[str, object]:
-        """The facts of this error by name."""
+        """Return the facts of this error by name."""
         return {name: getattr(self, name) for name in self.fact_names}
 
 
@@ -122,7 +124,7 @@ def _rebuild(kind: type[FootTileError], facts: dict[str, str]) -> FootTileError:
 
 
 class _SystemError(FootTileError, OSError):
-    """What the operating system refused; `errno` is its number, None where it gave none."""
+    """Error of the operating system; `errno` is its number, or None."""
 
     fact_names = (*FootTileError.fact_names, "errno")
 
@@ -144,7 +146,7 @@ class UsageError(FootTileError, ValueError):
 
 
 class MissingExtraError(UsageError):
-    """This installation lacks a package for what is asked; an extra brings it."""
+    """The installation lacks a package that the command needs; an extra installs it."""
 
 
 class LoadTraceError(FootTileError, ValueError):
@@ -196,7 +198,7 @@ class ServoError(FootTileError):
 
 
 class ServoSetupError(ServoError):
-    """The servo cannot be used as the scene says: another model, firmware or baud rate."""
+    """The servo does not match the scene: another model, firmware or baud rate."""
 
 
 class ServoLostError(ServoSetupError):
@@ -220,11 +222,11 @@ class FileFormatError(FootTileError, ValueError):
 
 
 class DamagedFileError(FileFormatError):
-    """A file is not what was written: its hash is of other bytes, or it is no file at all."""
+    """A file's hash does not match, or it is no regular file."""
 
 
 class OtherVersionError(FileFormatError):
-    """A file that is made from others has the columns of another version: it is made again."""
+    """A derived file has the columns of another version and must be made again."""
 
 
 class DamagedFramesError(FileFormatError):
@@ -241,19 +243,19 @@ class DamagedFramesError(FileFormatError):
 
 
 class StorageError(_SystemError):
-    """A file cannot be written, or not be read now, for what it is not itself to blame.
+    """A file cannot be written or read, although its content is not the cause.
 
-    The disk is full, read-only, or gone; it is another user's; memory or descriptors are used up.
-    `errno` is the system's.
+    The disk is full, read-only, or gone; the file is another user's; memory or descriptors are used
+    up. `errno` is the system's.
     """
 
 
 class FolderGoneError(StorageError):
-    """A folder was moved, deleted or unmounted under the process that writes in it."""
+    """A folder was moved, deleted or unmounted while a process writes in it."""
 
 
 class CalibrationError(FootTileError, ValueError):
-    """A calibration is absent, unphysical, or does not cover the tiles it is asked for."""
+    """A calibration is absent, unphysical, or does not cover the array's tiles."""
 
 
 class TareError(FootTileError, ValueError):
@@ -269,15 +271,15 @@ class LinkError(FootTileError, ConnectionError):
 
 
 class StateError(FootTileError):
-    """What is asked for does not fit the present state: recording already, node away."""
+    """The request does not fit the present state: recording already, node away."""
 
 
 class ChangedError(StateError):
-    """Somebody else has changed it meanwhile."""
+    """Another client changed the resource in the meantime."""
 
 
 class WorkerLostError(StateError):
-    """Processes that worked on a task were killed, again and again."""
+    """The processes that worked on a task were killed repeatedly."""
 
 
 class UnknownError(FootTileError, LookupError):

@@ -1,7 +1,7 @@
-"""What the facts about a node are made of: numbers within reason, and texts that can be shown.
+"""Validated field types of pydantic models: bounded numbers and printable texts.
 
-They come from scene files, from chips, from files and from the network. What breaks these bounds is
-refused where it comes in, so that no reader has to think of it.
+Values come from scene files, chips, stored files and the network. They are validated at the input,
+so that later code may rely on the bounds.
 """
 
 from __future__ import annotations
@@ -12,29 +12,29 @@ from typing import Annotated
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 T_NS_END = 7_258_118_400_000_000_000
-"""1 January 2200: no frame is taken then. The first instant is in 1970, where clocks begin."""
+"""Upper bound of UTC: 1 January 2200. The lower bound is 1970."""
 T_MONO_NS_END = 2**60
-"""36 years since a machine was started; sums and differences with `T_NS_END` fit 64 bits."""
+"""Upper bound of CLOCK_MONOTONIC, 36 years; sums and differences with `T_NS_END` fit 64 bits."""
 OFFSET_NS_END = T_MONO_NS_END + T_NS_END
-"""No two instants are further apart."""
+"""Upper bound of the difference of two instants."""
 SEQ_END = 2**53
-"""No stream has so many frames; below it every reader of JSON is exact, browsers too (RFC 8259)."""
+"""Upper bound of frame numbers; below it JSON numbers are exact, in browsers too (RFC 8259)."""
 TILES_MAX = 64
 """Eight multiplexers of eight channels."""
 MODELS_MAX = 64
 RATE_HZ_MIN = 1e-3
-"""A frame in a quarter of an hour."""
+"""Lowest frame rate: a frame in a quarter of an hour."""
 
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Control characters but line break and tab, and halves of surrogate pairs, which UTF-8 lacks."""
+"""Control characters except line break and tab, and lone surrogates, which UTF-8 cannot encode."""
 
 
 def can_be_shown(text: str) -> str:
-    """The text, if it has no control character but line break and tab.
+    """Check that a text has no control character except line break and tab, and return it.
 
     Raises:
-        ValueError: it has one: in a log that would be a line of its own, or worse.
+        ValueError: it has one, which could forge a line of a log.
     """
     if found := _CONTROL.search(text):
         raise ValueError(f"has the control character U+{ord(found[0]):04X}")
@@ -42,18 +42,19 @@ def can_be_shown(text: str) -> str:
 
 
 _MISLEADING = re.compile("[\u202a-\u202e\u2066-\u2069\ufeff\ufffe\uffff]")
-"""Overrides of the direction of writing, byte order marks, no characters.
+"""Bidirectional overrides, byte order marks and noncharacters.
 
-Joiners and other marks without width stay: Persian, Hindi and emoji are written with them.
+Joiners and other zero-width marks are allowed: Persian, Hindi and emoji need them.
 """
 
 
 def check_new_text(text: str) -> str:
-    """Return a text that somebody sets; files of older versions may hold others.
+    """Check a text that a user sets, and return it.
+
+    Stricter than for stored texts: files of older versions may hold such characters.
 
     Raises:
-        ValueError: it has a character that a reader does not see, or that makes it look like
-            another text.
+        ValueError: it has an invisible or misleading character.
     """
     if found := _MISLEADING.search(text):
         raise ValueError(f"has the character U+{ord(found[0]):04X}, which cannot be seen")
@@ -61,10 +62,10 @@ def check_new_text(text: str) -> str:
 
 
 def check_new_name(text: str) -> str:
-    """Return a name that somebody sets: one line, and a text as of `check_new_text`.
+    """Check a name that a user sets, and return it: one line, else as for `check_new_text`.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not such a name.
     """
     return check_new_text(_is_one_line(text))
 
@@ -76,14 +77,14 @@ def _is_one_line(text: str) -> str:
 
 
 Label = Annotated[str, Field(max_length=200), AfterValidator(_is_one_line)]
-"""A name: one line without control characters."""
+"""Name: one line without control characters."""
 Text = Annotated[str, Field(max_length=10_000), AfterValidator(can_be_shown)]
-"""Words for people."""
+"""Text for people, of one or more lines."""
 Metres = Annotated[float, Field(ge=-10.0, le=10.0)]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
 Count = Annotated[int, Field(ge=0, lt=SEQ_END)]
 Seq = Annotated[int, Field(ge=0, lt=SEQ_END)]
-"""Number of a frame in its stream."""
+"""Frame number in a stream."""
 TNs = Annotated[int, Field(ge=0, lt=T_NS_END)]
 """UTC in ns since 1970."""
 TMonoNs = Annotated[int, Field(gt=-T_MONO_NS_END, lt=T_MONO_NS_END)]
@@ -93,6 +94,6 @@ OffsetNs = Annotated[int, Field(gt=-OFFSET_NS_END, lt=OFFSET_NS_END)]
 
 
 class Facts(BaseModel):
-    """Base of what is said: no unknown key, no number that JSON cannot write."""
+    """Base class of strict models: frozen, no unknown keys, no NaN or infinity."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

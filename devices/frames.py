@@ -1,8 +1,8 @@
-"""What a node measures: frames in batches, the flags they carry, and the array they came from.
+"""Raw data of a node: frames in batches, their flags, and the description of their array.
 
-A `FrameBatch` is the one form of data between driver, disk, wire and estimator: contiguous numpy
-columns, time first. There is no single-frame class. Counts are kept as read; what was not read is
-`NOT_READ`, what is not known is NaN, never zero and never the last value.
+Driver, disk, wire and estimator all exchange a `FrameBatch`: contiguous numpy columns, time first.
+Counts stay as read. A missing count is `NOT_READ`, an unknown number is NaN, never zero and never
+the last value.
 """
 
 from __future__ import annotations
@@ -30,49 +30,50 @@ from devices.facts import (
 NOT_READ = 65535
 NO_SERVO_COUNTS = -(2**31)
 NO_SERVO_AGE = -1
+SAME_PLACE_M = 1e-6
+"""Tiles that differ by no more along an axis stand in one row."""
 
 
 class TileStatus(IntFlag):
-    """Bits of `FrameBatch.status`, one value per tile and frame."""
+    """Flags of a tile in a frame; bits of `FrameBatch.status`."""
 
     NO_ANSWER = 1
     """The tile did not acknowledge; its counts are `NOT_READ`."""
     STALE = 2
-    """The same two words came again and again: the part must have stopped converting."""
+    """The readings no longer change: the part must have stopped converting."""
     RETRIED = 4
-    """It took a second attempt, or a third reading, in this frame; the reading is good."""
+    """The reading is good, but took a second attempt or a third reading."""
     IMPLAUSIBLE = 8
-    """No part gives these words, or they could not be confirmed, or another part gave them."""
+    """Impossible counts, counts that could not be confirmed, or counts of another part."""
     OVER_RANGE = 16
-    """Outside the chip's 50 to 115 kPa, or at the end of its counts."""
+    """Pressure outside the chip's 50 to 115 kPa, or a count at the end of its range."""
     NOT_CONVERTED = 32
-    """Zeros, as the registers of a part that was just powered up, or no conversion that was
-    finished in this frame."""
+    """Zeros, as after power-up of the part, or no conversion finished in this frame."""
 
     UNUSABLE = NO_ANSWER | STALE | IMPLAUSIBLE | NOT_CONVERTED
-    """No pressure can be computed from this tile in this frame."""
+    """Mask of the flags without a usable pressure."""
 
 
 class FrameStatus(IntFlag):
-    """Bits of `FrameBatch.frame_status`, one value per frame."""
+    """Flags of a frame; bits of `FrameBatch.frame_status`."""
 
     OVERRUN = 1
     """The frame began after its slot had passed; slots before it were missed."""
     SERVO_STALE = 2
     """The newest servo position is older than it should be."""
     BUS_FAULT = 4
-    """The bus itself failed in this frame (not one tile)."""
+    """The bus itself failed in this frame, not one tile."""
     LEAD = 8
-    """Taken before a load trace begins: the foot is unloaded."""
+    """The frame precedes a load trace: the foot is unloaded."""
     NEW_ARRAY_INFO = 16
     """The array was identified again before this frame."""
     SERVO_TURN_UNKNOWN = 32
-    """The servo restarted or its count leapt: the position may be off by whole turns."""
+    """The servo restarted or its count jumped: the position may be off by whole turns."""
 
 
 @dataclass(frozen=True)
 class FrameBatch(Arrays):
-    """n frames of an array of tiles, in the order they were taken.
+    """Batch of n frames of an array, in time order.
 
     Attributes:
         seq: uint64[n], number of the frame in its stream, from 0.
@@ -134,11 +135,11 @@ FRAME_COLUMNS: dict[str, tuple[np.dtype[Any], bool]] = {
     "frame_status": (np.dtype(np.uint8), False),
     "reference_force_n": (np.dtype(np.float32), False),
 }
-"""Type of every column, and whether it has one value per tile."""
+"""Data type of every column, and whether it has one value per tile."""
 
 
 def zero_columns(n: int, tiles: int) -> dict[str, np.ndarray]:
-    """Columns of n frames, to be filled in."""
+    """Allocate zeroed columns for n frames."""
     return {
         name: np.zeros((n, tiles) if per_tile else n, dtype)
         for name, (dtype, per_tile) in FRAME_COLUMNS.items()
@@ -149,7 +150,7 @@ _Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class TileInfo(Facts):
-    """One tile as found on the bus at start-up."""
+    """Tile as identified on the bus at start-up."""
 
     serial: Label
     mux: Annotated[int, Field(ge=0, le=0x7F)]
@@ -161,12 +162,12 @@ class TileInfo(Facts):
     z_m: Metres
     reference: bool
     conversion_ms: Annotated[float, Field(gt=0, le=1000)]
-    """Conversion time as measured, else the data sheet's typical 1.6 ms. The sample is taken to lie
-    a quarter into it."""
+    """Conversion time as measured, else the data sheet's typical 1.6 ms. The sample instant is
+    taken to be a quarter into it."""
 
 
 class ServoInfo(Facts):
-    """The servo whose position goes with the frames, and how it becomes the segment's angle."""
+    """Servo of a stream, and the conversion of its position to the segment's angle."""
 
     model: Label
     counts_per_turn: Annotated[int, Field(gt=0, lt=2**31)]
@@ -174,11 +175,11 @@ class ServoInfo(Facts):
     sign: Literal[-1, 1]
     ratio: _Factor
     ankle_travel_m_per_rad: _Factor | None
-    """How far the ankle moves forward per radian (radius of a rolling foot); None: not known."""
+    """Forward travel of the ankle per radian (radius of a rolling foot); None: not known."""
 
 
 class ArrayInfo(Facts):
-    """Everything a reader of the frames needs to know of the array. Travels as JSON with them."""
+    """Description of an array, sent as JSON with its frames."""
 
     node: Label
     boot_id: Label
@@ -200,9 +201,9 @@ class ArrayInfo(Facts):
         return self
 
     def has_same_tiles_as(self, other: ArrayInfo) -> bool:
-        """Are these the same chips in the same places?
+        """Return whether both arrays have the same chips in the same places.
 
-        Conversion times are measured at each start and differ by some microseconds.
+        Conversion times are ignored: they are measured at each start and differ by microseconds.
         """
 
         def places(info: ArrayInfo) -> list[TileInfo]:
@@ -212,5 +213,19 @@ class ArrayInfo(Facts):
 
     @property
     def serials(self) -> tuple[str, ...]:
-        """Serials in the order of the tiles in a frame."""
+        """Serials of the tiles, in frame order."""
         return tuple(tile.serial for tile in self.tiles)
+
+    @property
+    def row_place_m(self) -> tuple[float | None, float | None]:
+        """Place along x and y of the row in which all loaded tiles stand; None without such a row.
+
+        A row measures no centre of pressure along the axis that it has a place on.
+        """
+
+        def common(places_m: list[float]) -> float | None:
+            is_row = bool(places_m) and max(places_m) - min(places_m) <= SAME_PLACE_M
+            return places_m[0] if is_row else None
+
+        loaded = [tile for tile in self.tiles if not tile.reference]
+        return common([tile.x_m for tile in loaded]), common([tile.y_m for tile in loaded])

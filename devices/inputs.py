@@ -1,4 +1,4 @@
-"""Files that a user names: read if they are files, and no longer than they can be meant to be."""
+"""Reading of files that a user names: regular files of bounded size only."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from errno import EFBIG, EINVAL
 from pathlib import Path
 
 TEXT_BYTES_MAX = 16 << 20
-"""No scene, calibration or settings file is longer by far."""
+"""Size limit of text files; scenes, calibrations and settings are far shorter."""
 
 
 def check_file(path: Path, *, bytes_max: int | None = None) -> None:
-    """Refuse what reading would wait for, or never end with.
+    """Check that a path is a regular file, whose reading neither blocks nor goes on for ever.
 
     Raises:
-        OSError: it is not there, a folder, pipe or device, or longer than `bytes_max`.
+        OSError: it is missing, a folder, pipe or device, or longer than `bytes_max`.
     """
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
@@ -32,13 +32,13 @@ def read_bytes(path: Path, *, bytes_max: int) -> bytes:
         OSError: as for `check_file`, or it cannot be read.
     """
     check_file(path, bytes_max=bytes_max)
-    # It may have become another one since: a pipe is not waited for, and no more is read than fits.
+    # The path may have been replaced since: O_NONBLOCK for a pipe, and a bounded read.
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         return file.read(bytes_max)
 
 
 def read_text(path: Path, *, bytes_max: int = TEXT_BYTES_MAX) -> str:
-    """Read all of a text file, as editors save it (`decode_text`).
+    """Read all of a text file (`decode_text`).
 
     Raises:
         OSError: as for `check_file`, or it cannot be read.
@@ -48,9 +48,7 @@ def read_text(path: Path, *, bytes_max: int = TEXT_BYTES_MAX) -> str:
 
 
 def decode_text(content: bytes) -> str:
-    """Return a text in UTF-8, or in the Unicode that its byte order mark states.
-
-    Editors and shells of Windows write that mark, which is no part of the text.
+    """Decode UTF-8 or UTF-16, with or without a byte order mark, as Windows editors write it.
 
     Raises:
         UnicodeDecodeError: it is no text.
@@ -58,7 +56,7 @@ def decode_text(content: bytes) -> str:
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16")
     head = content[:1000]
-    if b"\0" in head:  # UTF-16 without a mark: every other byte of plain text is zero
+    if b"\0" in head:  # UTF-16 without a mark: every second byte of plain text is zero
         even, odd = head[::2].count(0), head[1::2].count(0)
         if odd > 9 * even and 4 * odd > len(head):
             return content.decode("utf-16-le")

@@ -1,6 +1,6 @@
-"""What a paced loop asks of Linux: sharp timers, priority, and whether the date is known.
+"""Linux settings for a paced loop: timer slack, real-time priority, clock synchronisation.
 
-Each is a wish: where the kernel refuses, the loop still runs, only less evenly (performance.md:
+All are optional: where the kernel refuses, the loop still runs, with more jitter (performance.md:
 timer slack of 1 us halves the median lateness of a sleep).
 """
 
@@ -19,12 +19,12 @@ _FIFO_PRIORITY = 50  # above ordinary work, level with threaded interrupts
 
 
 def sharpen_timers(slack_ns: int = 1_000) -> bool:
-    """Let this thread's sleeps end within `slack_ns`, not 50 us; return if that was granted."""
+    """Set the timer slack of this thread (default 50 us); return whether the kernel accepts it."""
     return bool(_libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) == 0)
 
 
 def run_before_others() -> bool:
-    """Run this thread with SCHED_FIFO; whether that was permitted (root, or an rtprio limit)."""
+    """Run this thread with SCHED_FIFO; return whether it is permitted (root, or rtprio limit)."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
     except OSError:
@@ -33,23 +33,22 @@ def run_before_others() -> bool:
 
 
 def spare_what_is_loaded() -> None:
-    """Have Python's collector leave alone what there is so far: modules, which last.
+    """Exclude all present objects (mostly modules) from garbage collection.
 
-    A whole collection holds all threads up while it looks at every object: 55 ms for the hundred
-    thousand of a server that has only begun, on a fast machine. Call it once a process, before the
-    work begins that must not wait.
+    A full collection stops all threads while it visits every object: 55 ms for the hundred thousand
+    of a server at its start, on a fast machine. Call it once a process, before time-critical work.
     """
     gc.collect()
     gc.freeze()
 
 
 def end_with_parent() -> None:
-    """Make the kernel terminate this process when its parent dies, however it dies."""
+    """Make the kernel terminate this process when its parent dies."""
     _libc().prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
 def clock_is_set() -> bool:
-    """Whether anything (NTP, a laptop) has set this machine's date, as the kernel knows it.
+    """Return whether the kernel reports the wall clock as set (by NTP or a laptop).
 
     A Raspberry Pi has no battery clock: until it is set, its UTC is a guess.
     """

@@ -1,7 +1,7 @@
-"""The calibration rig's reference force: a load cell's amplifier, read through an MCP3208.
+"""Reference force of a calibration rig: a load cell's amplifier, read through an MCP3208.
 
-The scene says what a volt means. The scale of the paper's sensor and amplifier is not known
-(hardware.md 6), so there is no default for it.
+The scene gives the newtons per volt. The scale of the paper's sensor and amplifier is not known
+(hardware.md 6), so there is no default.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from devices.scene.hardware import ReferenceScene
 
 
 class ReferenceForce:
-    """Force on the reference sensor. It never raises: a frame goes on without it."""
+    """Reference force sensor. A failed reading is NaN and never an exception."""
 
     def __init__(self, adc: Mcp3208, scene: ReferenceScene) -> None:
         self.failures = 0
-        """Readings that failed: no transfer, or no converter."""
+        """Number of failed readings: no transfer, or no converter."""
         self.on_rail = 0
-        """Readings at either end of the converter, which say nothing about a force."""
+        """Number of readings at either end of the converter's range, which are no force."""
         self.trouble = ""
-        """Why the last reading gave no force, in words; empty if it gave one."""
+        """Reason why the last reading gave no force; empty if it gave one."""
         self._adc = adc
         self._channel = scene.channel
         self._zero_v = scene.zero_v
@@ -32,8 +32,8 @@ class ReferenceForce:
     def read_n(self) -> float:
         """Convert now and return the force in newtons.
 
-        NaN if the reading failed or is at either rail: an amplifier that is open, shorted or
-        overloaded must never become a plausible force.
+        NaN if the reading failed or is at either rail: an open, shorted or overloaded amplifier
+        must never give a plausible force.
         """
         try:
             counts = self._adc.read_counts(self._channel)

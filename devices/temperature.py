@@ -1,8 +1,9 @@
-"""The temperature of frames that did not read it: that of the frame before, for a second.
+"""Zero-order hold of the tiles' temperature, for at most a second.
 
-An array may read `tadc` in every k-th frame only. The conversion is worth nothing without it, but
-a chip's temperature does not change in a second by what a count of it matters (0.04 kPa). The
-frames keep `NOT_READ`, so its age is always known; only who computes pressures fills it in.
+An array may read `tadc` in every k-th frame only. A pressure cannot be computed without it, but a
+chip's temperature changes in a second by less than matters (0.04 kPa per count). Stored frames keep
+`NOT_READ`, so the age of a temperature is always known; only the computation of pressures fills it
+in.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from devices.arrays import Times
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 
 HELD_NS = 1_000_000_000
-"""An older temperature is no temperature."""
+"""Longest hold; an older temperature is not used."""
 
 
 @dataclass(frozen=True)
 class HeldTemperature:
-    """The last temperature of each tile and when it was read; `NOT_READ` for none.
+    """Last temperature of each tile and its instant; `NOT_READ` for none.
 
     Attributes:
         tadc: uint16[tiles].
@@ -35,13 +36,16 @@ class HeldTemperature:
 def hold_temperature(
     frames: FrameBatch, held: HeldTemperature | None = None
 ) -> tuple[FrameBatch, HeldTemperature]:
-    """Frames in which every tile has the newest temperature that is not too old.
+    """Fill in missing temperatures with the last one of each tile, if it is not too old.
 
-    Any split of a stream into batches gives the same, if `held` is handed on.
+    The result does not depend on the split of a stream into batches, if `held` is passed on.
 
     Args:
         frames: n frames in order.
-        held: from the frames before.
+        held: state returned for the previous frames.
+
+    Returns:
+        The filled frames, and the state for the next ones.
     """
     tiles = frames.tile_count
     if held is None:
@@ -53,9 +57,9 @@ def hold_temperature(
     unusable = (frames.status & np.uint8(TileStatus.UNUSABLE)) != 0
     missing = frames.tadc == NOT_READ
     known = ~(missing | unusable)
-    if known.all():  # as nearly always: nothing has to be looked up
+    if known.all():  # the usual case
         return frames, HeldTemperature(frames.tadc[-1].copy(), np.full(tiles, frames.t_mono_ns[-1]))
-    # Row 0 is what came before; every row then looks up the last one that is known.
+    # Row 0 is the held state; every row then looks up the last known one.
     tadc = np.concatenate([held.tadc[None], frames.tadc])
     t_mono_ns = np.concatenate(
         [held.t_mono_ns[None], np.broadcast_to(frames.t_mono_ns[:, None], frames.tadc.shape)]

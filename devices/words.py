@@ -1,10 +1,10 @@
-"""Words that can be shown, wherever they come from: names of files, contents, other people."""
+"""Escaping of untrusted text (file names, file contents, network) for terminals and logs."""
 
 from __future__ import annotations
 
 
 def is_utf8(text: str) -> bool:
-    """Is it text that JSON, Arrow and a network can carry? The names of some files are not."""
+    """Return whether a text can be encoded as UTF-8. The names of some files cannot."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -13,14 +13,14 @@ def is_utf8(text: str) -> bool:
 
 
 def printable(text: str, *, keeps_lines: bool = False) -> str:
-    r"""Return text that a terminal shows and does not obey, and that UTF-8 can carry.
+    r"""Escape control characters, so that a terminal prints the text and UTF-8 can encode it.
 
-    Whatever is not printable is shown as an escape: `\x1b`, `\u202e`. A byte of a file's name that
-    is no UTF-8 is a lone surrogate in Python: it is shown as `\udcff`.
+    Unprintable characters become escapes: `\x1b`, `\u202e`. A byte of a file name that is not UTF-8
+    is a lone surrogate in Python: it becomes `\udcff`.
 
     Args:
-        text: from anywhere.
-        keeps_lines: line breaks, tabs and runs of spaces stay; else it becomes one line.
+        text: untrusted text.
+        keeps_lines: keep line breaks, tabs and runs of spaces; else join all to one line.
     """
     if not keeps_lines:
         text = " ".join(text.split())

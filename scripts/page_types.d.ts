@@ -23,6 +23,36 @@ interface NodeCalibration {
   calibration: { id: string; name: string; absolute_scale: "measured" | "assumed" } | null;
 }
 
+/** Node as the page of the guided calibration uses it. */
+interface LiveNode { node: string; connected: boolean; tiles: Tile[] }
+
+/** Body of POST /nodes/NODE/weighing. */
+interface WeighingPlan {
+  tiles: string[]; weights: string[]; method: string; within_percent?: number; reference?: string; name?: string;
+}
+
+/** Pressure of a held weight: mean, spread and drift. */
+interface Repeatability { mean_kpa: number; spread_kpa: number; settle_kpa: number }
+
+/** Fitted curve of a tile. */
+interface TileResult {
+  serial: string; band: { gauge_kpa: number; force_n: number; half_width_n: number }[];
+  weights: {
+    weight: string; force_n: number; gauge_kpa: number; noise_kpa: number; settle_kpa: number; residual_n: number; half_width_n: number;
+  }[];
+}
+
+/** Of GET /nodes/NODE/weighing. */
+interface Weighing {
+  session_id: string; state: "weighing" | "fitting" | "done" | "failed"; tiles: { serial: string; held: Repeatability[] }[];
+  weights: string[]; method: string; reference: string; name: string; tile: string; step: string; prompt: string;
+  left_s: number | null; warning: string | null; problem: string | null; pressure_kpa: number | null; recent_kpa: number[];
+  rest_kpa: number | null; repeatability: Repeatability | null;
+  result: {
+    calibration_id: string; name: string; date: string; tiles: TileResult[]; refused: Record<string, string>; misfit: string | null;
+  } | null;
+}
+
 /** Machine that requests to connect under the name of a node. */
 interface Replacement { fingerprint: string; address: string }
 

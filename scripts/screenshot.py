@@ -30,8 +30,8 @@ TOKEN = os.environ.setdefault("FOOTTILE_TOKEN", secrets.token_urlsafe(18))
 
 
 @contextmanager
-def demo(*options: str) -> Iterator[str]:
-    """A demo, once its foot is tared: the address of its server."""
+def demo(*options: str, is_tared: bool = True) -> Iterator[str]:
+    """A demo, once its foot is tared, or connected: the address of its server."""
     with tempfile.TemporaryDirectory() as data:
         running = subprocess.Popen(
             [*COMMAND, "demo", "--port=0", f"--data={data}", *options],
@@ -41,7 +41,8 @@ def demo(*options: str) -> Iterator[str]:
         try:
             assert running.stdout is not None
             url = running.stdout.readline().split()[-1].partition("#")[0]
-            while not any(node["tare"] for node in httpx.get(f"{url}api/v1/nodes").json()["items"]):
+            ready = "tare" if is_tared else "last_seq"
+            while not any(node[ready] for node in httpx.get(f"{url}api/v1/nodes").json()["items"]):
                 time.sleep(0.2)
             yield url
         finally:
@@ -131,6 +132,49 @@ def nodes(browser: Browser) -> None:
             other.wait(30)
 
 
+ONE_TILE = """
+name = "one-tile"
+models = ["unwrap", "static", "skew", "denoise"]
+[[tile]]
+serial = "T01"
+mux = 0x70
+channel = 0
+x_m = 0
+y_m = 0
+z_m = -0.15
+[ground]
+kind = "plate"
+"""
+
+
+CALIBRATE_STAGES = {
+    # While the third weight is held.
+    "hold": "body:has(#steps li li:nth-child(2)[data-state=done]) #instruction[data-step=holding]",
+    "result": "#accept",
+}
+
+
+def calibrate(browser: Browser) -> None:
+    """The guided calibration: a weight that is held, and the result."""
+    with tempfile.TemporaryDirectory() as folder:
+        scene, load = Path(folder) / "one.toml", Path(folder) / "weights.csv"
+        scene.write_text(ONE_TILE)
+        rows = ["time_s,cell1_n"]
+        for number, force_n in enumerate((1.961, 4.903, 9.807, 14.710, 19.613)):
+            t_s = 20 * number
+            rows += [f"{t_s},0", f"{t_s + 8},0", f"{t_s + 8.5},{force_n}", f"{t_s + 19},{force_n}"]
+        load.write_text("\n".join([*rows, "99.5,0", "130,0", ""]))
+        with demo(f"--scene={scene}", f"--load={load}", "--lead-s=60", is_tared=False) as url:
+            page = browser.new_page(viewport={"width": 1100, "height": 670})
+            page.goto(f"{url}calibrate#token={TOKEN}")
+            page.fill("#within", "0.5")
+            page.click("#start")
+            for stage, at in CALIBRATE_STAGES.items():
+                page.wait_for_selector(at, timeout=240_000)
+                time.sleep(2.0)
+                save(page, f"calibrate-{stage}")
+
+
 def save(page: Page, name: str) -> None:
     """Write a picture, and say where."""
     path = FOLDER / f"{name}.png"
@@ -149,6 +193,7 @@ def main() -> None:
         live(browser)
         session(browser)
         nodes(browser)
+        calibrate(browser)
         browser.close()
 
 

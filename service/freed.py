@@ -1,7 +1,7 @@
-"""What a process of ours has freed goes back to the system.
+"""Memory allocation that returns freed memory to the system.
 
-Left to themselves Arrow's allocator and glibc's keep for each of their threads what it has ever
-used: a server that had answered 400 zooms into ten hours of 8 tiles held 80 MB of it.
+By default the allocators of Arrow and glibc retain each thread's peak: a server that had answered
+400 zooms into ten hours of 8 tiles held 80 MB.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ _M_ARENA_MAX = -8  # malloc.h of glibc
 
 
 def give_back_freed() -> None:
-    """One heap for all threads, Arrow's too.
+    """Use one heap of the system's allocator for all threads, and for Arrow.
 
-    Call it before pyarrow is imported, which chooses its allocator then, and before there are other
-    threads. Processes that are started from here have Arrow's choice as well.
+    Call it before pyarrow is imported, which then chooses its allocator, and before other threads
+    start. Child processes inherit the choice for Arrow.
     """
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:  # other C libraries have none, and one heap
+    if mallopt is not None:  # other C libraries lack it, and have one heap
         mallopt(_M_ARENA_MAX, 1)

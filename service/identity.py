@@ -1,9 +1,9 @@
-"""Proof that a node is the machine that had its name before.
+"""Proof that a node is the machine that had its name before (HMAC challenge-response).
 
 Stream ids are public: every viewer reads them at `GET /nodes`. So each node shares a secret with
-each server. The node makes it at first contact and keeps it on its disk before it sends it; the
-server keeps it before it answers with welcome. Afterwards only `make_proof` crosses the link, made
-with a nonce of this connection. Only a person replaces a secret.
+each server. At first contact the node creates it and stores it on disk before it sends it; the
+server stores it before it answers with welcome. Afterwards only a proof is sent (`make_proof`),
+with a nonce of the connection. Only a person may replace a secret.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ _FINGERPRINT_GROUPS = 4
 
 
 def make_secret() -> str:
-    """Return 32 random bytes as hex digits; of a nonce, too."""
+    """Generate 32 random bytes as hex digits, for a secret or a nonce."""
     return secrets.token_hex(_BYTES)
 
 
 def make_proof(secret: str, challenge: Challenge, node: str) -> str:
-    """Return the proof, as hex digits, that a node has the secret that it shares with a server.
+    """Compute the proof that a node has the shared secret: HMAC-SHA-256 in hex digits.
 
     Args:
-        secret: of this node and this server.
-        challenge: as the server sent it on this connection.
+        secret: secret of this node and this server.
+        challenge: the server's challenge on this connection.
         node: name of the node.
     """
-    said = f"{SUBPROTOCOL} {PROTOCOL} {challenge.server_id} {challenge.nonce} {node}"
-    return hmac.new(bytes.fromhex(secret), said.encode(), hashlib.sha256).hexdigest()
+    content = f"{SUBPROTOCOL} {PROTOCOL} {challenge.server_id} {challenge.nonce} {node}"
+    return hmac.new(bytes.fromhex(secret), content.encode(), hashlib.sha256).hexdigest()
 
 
 def is_proven(secret: str, challenge: Challenge, node: str, answer: Proof) -> bool:
-    """Return whether an answer comes from the machine with this secret.
+    """Return whether an answer proves the secret.
 
-    A machine that was accepted a moment ago may still send the secret itself: it counts as well.
+    The secret itself is valid as well: a machine accepted a moment ago may still send it.
     """
     if answer.secret is not None and hmac.compare_digest(answer.secret, secret):
         return True
@@ -47,6 +47,6 @@ def is_proven(secret: str, challenge: Challenge, node: str, answer: Proof) -> bo
 
 
 def fingerprint_of(secret: str) -> str:
-    """Return 16 hex digits, in groups, by which a person tells two machines apart."""
+    """Compute a secret's fingerprint for people: 16 hex digits, in groups."""
     digits = hashlib.sha256(bytes.fromhex(secret)).hexdigest()
     return "-".join(digits[4 * i : 4 * i + 4] for i in range(_FINGERPRINT_GROUPS))

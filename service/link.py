@@ -1,28 +1,28 @@
-"""The link between node and server, `foottile.v1`: what each side says, and why it hangs up.
+"""Protocol between node and server, `foottile.v1`: messages, checksums, close codes.
 
     node                                  server
     identify (its name)              -->
                                      <--  challenge (a nonce)
-    proof, hello (what it has)       -->
-                                     <--  welcome (what the server lacks, what sessions need)
+    proof, hello (stored frames)     -->
+                                     <--  welcome (missing frames, retention request)
     stream, then Arrow messages      -->
-                                     <--  ack (what is on the server's disk)
-                                     <--  wanted (what sessions need now)
+                                     <--  ack (frames on the server's disk)
+                                     <--  wanted (retention request)
     probe                            <->  probe        eight at a time, for the clocks' offset
     clock, status, lost              -->
 
 Text messages are JSON with a `type`; a binary message is a record batch (`storage.wire`) of the
-stream that the node named last. Newest frames go first; what the server lacks of the past, of this
-stream and of earlier ones, follows behind them. The node forgets nothing that a session needs and
-that is not acknowledged; a new connection begins with identify again. Frames may come twice and in
-any order: a server takes each (stream, seq) once.
+stream named last. The newest frames are sent first; older frames that the server misses, of this
+stream and of earlier ones, follow. The node retains all frames that a session needs until they are
+acknowledged; a new connection begins with identify again. Frames may arrive twice and in any order:
+a server stores each (stream, seq) once.
 
 A node proves that it is the machine that had its name before: `service.identity`.
 
-Every message carries a CRC-32 (zlib), because neither websockets nor Arrow notice a flipped bit:
-the last four bytes of a binary message, little endian, of all before; the last field of a text
-message, `"crc32"` with eight hex digits, of the text before its comma. A message that does not
-agree with it ends the connection, and what was in it is sent once more.
+Every message has a CRC-32 (zlib), because neither websockets nor Arrow detect a flipped bit: the
+last four bytes of a binary message, little endian, over all before; the last field of a text
+message, `"crc32"` with eight hex digits, over the text before its comma. A message with a wrong
+CRC-32 ends the connection, and its content is sent again.
 """
 
 from __future__ import annotations
@@ -56,27 +56,27 @@ PROTOCOL = 3
 INGEST_PATH = "/api/v1/ingest"
 LIVE_PATH = "/api/v1/live"
 MESSAGE_BYTES_MAX = 1 << 20
-"""Longest message either side takes. A batch of 64 tiles is 0.1 MB."""
+"""Longest message that either side accepts. A batch of 64 tiles is 0.1 MB."""
 SILENCE_S = 5.0
-"""A side that has heard nothing for this long takes the link for dead."""
+"""Timeout of the link: a side closes it after receiving nothing for so long."""
 PROBES = 8
 _REASON_BYTES_MAX = 123
 _CHECK_BYTES = 4
 _CHECKED = re.compile(r'(\{.*),"crc32":"([0-9a-f]{8})"\}', re.DOTALL)
 
 _PAIRS_MAX = 1 << 14
-"""Intervals in a list: a gap every ten seconds for two days."""
+"""Most intervals in a list: a gap every ten seconds for two days."""
 _STREAMS_MAX = 256
 _REASONS_MAX = 32
 _TROUBLES_MAX = 1000
 UNCERTAINTY_MAX_NS = 60_000_000_000
-"""No probe that took longer tells anything."""
+"""Longest round trip, halved, of a usable probe."""
 BOOT_ID = r"[0-9a-f]{32}"
 _AnySeq = Annotated[int, Field(ge=0, le=NO_END)]
-"""Of a frame, or after the last that there can be."""
+"""Frame number, or the end after the last possible one."""
 
 BootId = Annotated[str, Field(pattern=f"^{BOOT_ID}$")]
-"""Name of a stream."""
+"""Id of a stream."""
 _Hex256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -89,24 +89,24 @@ class Close(IntEnum):
     RESTART = 1012
     TRY_LATER = 1013
     REFUSED = 4001
-    """What was said arrived whole, and cannot be."""
+    """Valid message, invalid content."""
     WRONG_VERSION = 4002
     MALFORMED = 4004
-    """What was said was damaged on its way."""
+    """Message damaged in transit."""
     SILENT = 4005
     TOO_SLOW = 4008
     NAME_TAKEN = 4009
     SUPERSEDED = 4010
     NO_STREAM = 4011
-    """A stream that was asked for is not here, or not any more."""
+    """A requested stream does not exist, or no longer."""
     UNREADABLE = 4012
-    """Frames that are kept cannot be read, and that will not mend by itself."""
+    """Stored frames cannot be read, permanently."""
     WRONG_IDENTITY = 4013
-    """The name belongs to another machine, until a person accepts this one."""
+    """The node's name belongs to another machine, until a person accepts this one."""
 
 
 class HangUp(Exception):  # noqa: N818  # no error: how a connection ends
-    """Raised by whoever serves a connection to end it with a code and a reason."""
+    """Request of a connection's handler to close it with a code and a reason."""
 
     def __init__(self, code: Close, reason: str) -> None:
         super().__init__(reason)
@@ -118,7 +118,7 @@ def _rise(pairs: tuple[tuple[int, int | None], ...]) -> tuple[tuple[int, int | N
     end: int | None = -1
     for first, last in pairs:
         if end is None or first <= end or (last is not None and last < first):
-            raise ValueError("intervals have to rise, and none may be empty")
+            raise ValueError("intervals must be rising and not empty")
         end = last
     return pairs
 
@@ -132,14 +132,14 @@ def _are_none_empty(
 
 
 Pairs = Annotated[tuple[tuple[Seq, Seq], ...], Field(max_length=_PAIRS_MAX), AfterValidator(_rise)]
-"""Numbers as closed intervals, in order."""
+"""Frame numbers as closed intervals, in order."""
 PairsByReason = Annotated[
     dict[Annotated[str, Field(pattern=r"^[a-z_]{1,40}$")], Pairs], Field(max_length=_REASONS_MAX)
 ]
 
 
 class Identify(Facts):
-    """First message: which node connects."""
+    """First message: name of the connecting node."""
 
     type: Literal["identify"] = "identify"
     protocol: Count
@@ -156,11 +156,12 @@ class Challenge(Facts):
     nonce: _Hex256
     """Random, for this connection only."""
     is_known: bool
-    """Does the server have a secret of this node? If not, it takes the one that the node sends."""
+    """True if the server has a secret of this node; else it accepts the secret that the node sends.
+    """
 
 
 class Proof(Facts):
-    """Answer to `challenge`. A node whose disk keeps no secret sends neither field."""
+    """Answer to `challenge`. A node whose disk cannot store a secret sends neither field."""
 
     type: Literal["proof"] = "proof"
     proof: _Hex256 | None = None
@@ -170,53 +171,53 @@ class Proof(Facts):
 
 
 class EarlierStream(Facts):
-    """An ended stream of this node, if the node still has frames of it or knows losses."""
+    """Ended stream of which the node still stores frames, or has lost some."""
 
     array_info: ArrayInfo
     held: Pairs
-    """What it has."""
+    """Frames stored on the node."""
     next_seq: Seq
-    """The number after the last frame that it knows of."""
+    """Number after the last known frame."""
     lost: PairsByReason = Field(default={})
-    """Numbers that it should have and does not have, by reason."""
+    """Frames lost on the node, by reason."""
     unsynced_tail_max: Count = 0
-    """How many more frames there may have been: its power failed. 0: it ended in order, or was
-    killed, which loses nothing."""
+    """Upper bound of further frames at the end, lost in a power failure. 0: the stream ended in
+    order, or its process was killed, which loses no frames."""
     missed_slots: Count = 0
     t_ns_first: TNs = 0
-    """Instant of the oldest frame that it has, in the node's UTC."""
+    """Instant of the oldest stored frame, in the node's UTC."""
 
 
 class Hello(Facts):
-    """Who the node is, and what it can give."""
+    """Description of the node and of its streams."""
 
     type: Literal["hello"] = "hello"
     protocol: Count
     array_info: ArrayInfo
     held: Pairs
-    """What it has of its present stream."""
+    """Frames of the present stream stored on the node."""
     next_seq: Seq
-    """The number of the next frame to be taken."""
+    """Number of the next frame."""
     t_mono_ns: TMonoNs
-    """The clock that stamps its frames, read when this message was made."""
+    """CLOCK_MONOTONIC of the node when it composed this message."""
     lost: PairsByReason = Field(default={})
-    """Numbers of its present stream that it should have and does not have, by reason."""
+    """Lost frames of the present stream, by reason."""
     t_ns_first: TNs = 0
-    """Instant of the oldest frame that it has of its present stream, in its UTC; 0: it has none."""
+    """Instant of the oldest stored frame of the present stream, in the node's UTC; 0: none."""
     scene: SceneContent
-    """The scene file's content."""
+    """Content of the scene file."""
     emulated: bool
     calibration: Calibration | None
     calibration_problem: Text | None
-    """Why there is none."""
+    """Reason why there is no calibration."""
     earlier: Annotated[tuple[EarlierStream, ...], Field(max_length=_STREAMS_MAX)] = ()
-    """Its streams before this one, oldest first."""
+    """Earlier streams, oldest first."""
     has_more: bool = False
-    """Are there more, which did not fit? They are announced once these are delivered."""
+    """True if further earlier streams did not fit. They are announced once these are delivered."""
 
 
 class StreamNumbers(Facts):
-    """Numbers of one stream."""
+    """Frame numbers of one stream."""
 
     boot_id: BootId
     numbers: Annotated[
@@ -224,33 +225,33 @@ class StreamNumbers(Facts):
         Field(max_length=2 * _PAIRS_MAX),
         AfterValidator(_are_none_empty),
     ]
-    """The most urgent first. An interval without an end goes on with every frame to come."""
+    """Intervals, the most urgent first. An interval without an end includes all future frames."""
 
 
 class Wanted(Facts):
-    """What sessions need: the node keeps it until it is acknowledged, whatever its age."""
+    """Retention request: frames for the node to retain until acknowledged, whatever their age."""
 
     type: Literal["wanted"] = "wanted"
     streams: tuple[StreamNumbers, ...]
-    """Not yet sealed, by stream."""
+    """Frames of sessions that are not yet sealed, by stream."""
     recording: bool
-    """Is a session being recorded, so that a stream that begins now belongs to it from its first
-    frame on?"""
+    """True while a session is being recorded: a new stream belongs to it from its first frame on.
+    """
 
 
 class Welcome(Facts):
-    """What the server lacks, and what sessions need."""
+    """Acceptance of the node, with the frames that the server misses and a retention request."""
 
     type: Literal["welcome"] = "welcome"
     protocol: Count
     lacks: tuple[StreamNumbers, ...]
-    """Of the present stream everything that the node has and the server has not, of earlier ones
-    what sessions need. The present stream's last interval has no end."""
+    """Missing frames: of the present stream all that the node stores and the server does not, of
+    earlier ones those of sessions. The present stream's last interval has no end."""
     wanted: Wanted
 
 
 class Ack(Facts):
-    """These frames are on the server's disk: the node may forget them."""
+    """Acknowledgement that frames are on the server's disk: the node may delete them."""
 
     type: Literal["ack"] = "ack"
     boot_id: BootId
@@ -265,34 +266,34 @@ class Ack(Facts):
 
 
 class FramesOf(Facts):
-    """The frames that follow are of this stream."""
+    """Selection of the stream of all following frames."""
 
     type: Literal["stream"] = "stream"
     boot_id: BootId
 
 
 class Probe(Facts):
-    """Asks for the server's clock; comes back with it."""
+    """Request for the server's clock, and its answer."""
 
     type: Literal["probe"] = "probe"
     id: Seq
     server_t_ns: TNs | None = None
-    """The server's UTC; None on the way there."""
+    """The server's UTC; None in the request."""
 
 
 class ClockRow(Facts):
-    """The best of eight probes. An offset that was not measured is not sent."""
+    """Clock offset by the best of eight probes. A failed measurement is not sent."""
 
     type: Literal["clock"] = "clock"
     t_mono_ns: TMonoNs
     server_minus_node_ns: OffsetNs
-    """The server's UTC minus the `t_ns` that a frame taken now would have."""
+    """The server's UTC minus the `t_ns` of a frame at the same instant."""
     uncertainty_ns: Annotated[int, Field(ge=0, le=UNCERTAINTY_MAX_NS)]
-    """Half the round trip: the server's reading lies somewhere in it."""
+    """Half the round trip, which contains the server's reading."""
 
 
 class Lost(Facts):
-    """All that the node has lost of its present stream so far; sent whenever that changes."""
+    """All lost frames of a stream; sent whenever they change."""
 
     type: Literal["lost"] = "lost"
     boot_id: BootId
@@ -300,19 +301,19 @@ class Lost(Facts):
 
 
 class Status(Facts):
-    """What the node counts beside its frames; each second."""
+    """Counters and warnings of the node; each second."""
 
     type: Literal["status"] = "status"
     missed_slots: Count
     backlog_frames: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Frames that the server lacks and the node has; they are sent after the newest ones."""
+    """Backlog: frames still to be sent after the newest ones."""
     troubles: Annotated[tuple[Text, ...], Field(max_length=_TROUBLES_MAX)] = ()
-    """What is wrong with the array or with the node's disk now, in words."""
+    """Present warnings about the array or the node's disk."""
     counts: Annotated[
         dict[Label, Annotated[dict[Label, Count], Field(max_length=_REASONS_MAX)]],
         Field(max_length=_TROUBLES_MAX),
     ] = Field(default={})
-    """How often what went wrong in this stream, by serial and reason."""
+    """Fault counts of this stream, by serial and reason."""
 
 
 SaidByNode = Identify | Proof | Hello | FramesOf | Probe | ClockRow | Status | Lost
@@ -324,14 +325,14 @@ FromServer: TypeAdapter[SaidByServer] = TypeAdapter(
 
 
 def understood(messages: TypeAdapter[_T], text: str) -> _T:
-    """A message of one side; it can be written down, and read back as the same.
+    """Parse and validate a message.
 
     Args:
         messages: `FromNode` or `FromServer`.
-        text: without its checksum.
+        text: JSON without its checksum.
 
     Raises:
-        LinkError: it is no such message, or holds what cannot be.
+        LinkError: it is no such message, or a value is out of bounds.
     """
     try:
         # Strict: true is not 1, and "1" neither.
@@ -343,16 +344,16 @@ def understood(messages: TypeAdapter[_T], text: str) -> _T:
 
 
 def say(message: BaseModel) -> str:
-    """A message as text, with its checksum."""
+    """Encode a message as JSON with its checksum."""
     body = message.model_dump_json()[:-1]
     return f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}'
 
 
 def heard(text: str | bytes) -> str:
-    """A text message without its checksum.
+    """Verify the checksum of a text message and return the JSON without it.
 
     Raises:
-        LinkError: they do not agree, or there is none.
+        LinkError: the checksum is wrong or missing.
     """
     text = text.decode(errors="replace") if isinstance(text, bytes) else text
     found = _CHECKED.fullmatch(text)
@@ -362,15 +363,15 @@ def heard(text: str | bytes) -> str:
 
 
 def with_check(payload: bytes) -> bytes:
-    """A binary message: frames with their checksum."""
+    """Append the checksum to encoded frames, for a binary message."""
     return payload + zlib.crc32(payload).to_bytes(_CHECK_BYTES, "little")
 
 
 def checked(message: bytes) -> bytes:
-    """The frames of a binary message.
+    """Verify the checksum of a binary message and return the encoded frames.
 
     Raises:
-        FileFormatError: they do not agree with their checksum.
+        FileFormatError: the checksum is wrong or missing.
     """
     payload, check = message[:-_CHECK_BYTES], message[-_CHECK_BYTES:]
     if len(check) < _CHECK_BYTES or zlib.crc32(payload) != int.from_bytes(check, "little"):
@@ -381,7 +382,7 @@ def checked(message: bytes) -> bytes:
 
 
 def close_reason(text: str) -> str:
-    """A reason as a close frame and a log can carry it: 123 bytes (RFC 6455 5.5) in one line."""
+    """Format a reason for a close frame and a log: 123 bytes (RFC 6455 5.5) in one line."""
     text = without_folders(text)
     plain = "".join(char if char.isprintable() else "?" for char in text[:_REASON_BYTES_MAX])
     return plain.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")

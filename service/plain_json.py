@@ -1,4 +1,4 @@
-"""Results as JSON: what is not finite is null, a dataclass an object."""
+"""Conversion of results to JSON: non-finite numbers to null, dataclasses to objects."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 
 
 def plain(value: Any) -> Any:
-    """A result as JSON can hold it: what is not finite is null, a dataclass an object.
+    """Convert a result to JSON values: non-finite numbers to null, dataclasses to objects.
 
-    A dataclass with a method `as_dict` is what that says.
+    An object with a method `as_dict` is converted by that.
     """
     if hasattr(value, "as_dict"):
         return plain(value.as_dict())
@@ -29,5 +29,5 @@ def plain(value: Any) -> Any:
 
 
 def json_text(value: object) -> str:
-    """A JSON document of any result."""
+    """Format any result as a JSON document."""
     return json.dumps(plain(value), indent=2, allow_nan=False) + "\n"

@@ -1,7 +1,7 @@
-"""Paths of this machine, which are nobody's business who only may read what a server shows.
+"""Removal of private paths of this machine from messages to clients.
 
-A server registers its data folder. In what it sends, paths below it begin there; its log and local
-commands name them whole.
+A server registers its data folder. In its messages paths are relative to that folder; its log and
+local commands show whole paths.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pydantic import AfterValidator
 from devices.words import printable
 
 _folders: list[str] = []
-"""Longest first, as they may be written in a message."""
+"""Spellings of private folders, longest first."""
 
 
 def register_folder(folder: Path) -> None:
-    """Have `without_folders` leave out this folder from now on."""
+    """Register a folder, to be removed by `without_folders`."""
     for path in (folder, folder.absolute(), folder.resolve()):
         for text in (str(path), printable(str(path))):
             if len(text) > 1 and text not in _folders:  # "/" and "." are in every path
@@ -27,7 +27,7 @@ def register_folder(folder: Path) -> None:
 
 
 def without_folders(text: str) -> str:
-    """Return a message in which paths begin at the data folder, as anybody may read it."""
+    """Return a message with paths relative to the registered folders."""
     for folder in _folders:
         if folder in text:
             text = text.replace(f"{folder}/", "").replace(folder, "the data folder")
@@ -35,4 +35,4 @@ def without_folders(text: str) -> str:
 
 
 ShownText = Annotated[str, AfterValidator(without_folders)]
-"""A message that a server sends: what is wrong, what to do."""
+"""Message of a server without private paths."""

@@ -1,4 +1,4 @@
-"""Sessions of a server into folders: downloaded verified, whole or a slice."""
+"""Verified downloads of a server's sessions into folders, whole or a slice."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ _AGAIN = "Run the same command again"
 
 
 def refuse_data_folder(folder: Path) -> None:
-    """Refuse to write where a server or node keeps this session, or others.
+    """Refuse to write into a data folder of a server or node.
 
-    What was pulled before is written again; its `session.json` is set aside if it is damaged.
+    A folder of an earlier download is accepted; a damaged `session.json` in it is set aside.
 
     Args:
-        folder: of one session, perhaps not there yet.
+        folder: folder of one session; need not exist.
 
     Raises:
-        UsageError: it is theirs.
-        StorageError: what is damaged cannot be set aside.
+        UsageError: the folder belongs to a server or node.
+        StorageError: a damaged file cannot be set aside.
     """
     remedy = "Choose a folder of your own with --out"
     for place in (folder.resolve(), *folder.resolve().parents[:4]):
@@ -66,7 +66,7 @@ def refuse_data_folder(folder: Path) -> None:
         content = json.loads(read_checked(path).text)
     except FileNotFoundError:
         return
-    except ValueError:  # a DamagedFileError is one
+    except ValueError:  # includes DamagedFileError
         set_aside(path)
         return
     if not isinstance(content, dict) or "complete" not in content:
@@ -77,17 +77,19 @@ def refuse_data_folder(folder: Path) -> None:
 def pull(server: foottile.Server, session_id: str, out: Path) -> dict[str, Any]:
     """Download a sealed session into the folder `out`/`session_id`.
 
+    A partial download is resumed.
+
     Returns:
-        Where it is, and what is known of it.
+        The session's metadata, with `path` and `resumed_bytes`.
 
     Raises:
-        foottile.NoAnswerError: the server does not answer, or the download broke off.
-        foottile.UnknownError: it has no such session.
+        foottile.NoAnswerError: the server does not answer, or the download was interrupted.
+        foottile.UnknownError: the server does not have the session.
         foottile.ConflictError: the session is not sealed.
-        foottile.DamagedError: what came is not what the server has.
+        foottile.DamagedError: the download differs from the server's file.
         foottile.FootTileError: another refusal by the server.
-        UsageError: that is no id, or a folder in which a server or node keeps its sessions.
-        StorageError: it cannot be written.
+        UsageError: the id is not valid, or the folder belongs to a server or node.
+        StorageError: a file cannot be written.
     """
     session = _facts(server, session_id)
     if session["sha256"] is None:
@@ -123,21 +125,19 @@ def pull_made(
     options: FormatOptions = NO_OPTIONS,
     clock: ClockName = "node",
 ) -> dict[str, Any]:
-    """Download a session, or some seconds or columns of it, in some format.
+    """Download a session or a slice in any format, as one file in the folder `out`.
 
-    It is one file in the folder `out`.
-
-    The server reads, and sends, no more than that. A slice has no hash of its own: its pages'
-    checksums prove it if it is Parquet, and its metadata say what it was made of.
+    The server reads and sends only the slice. A slice has no hash: a Parquet file is verified by
+    its pages' checksums, and its metadata state the session.
 
     Returns:
-        Where it is, and what is known of its session.
+        The session's metadata, with `path` and `bytes`.
 
     Raises:
-        foottile.DamagedError: what came cannot be read.
+        foottile.DamagedError: the download cannot be read.
         foottile.FootTileError: the server does not answer, or refuses.
-        UsageError: that is no id, or a folder in which a server or node keeps its sessions.
-        StorageError: it cannot be written.
+        UsageError: the id is not valid, or the folder belongs to a server or node.
+        StorageError: the file cannot be written.
     """
     session = _facts(server, session_id)
     url = f"/sessions/{session_id}/data"
@@ -153,15 +153,15 @@ def pull_take(
     to: Format,
     options: FormatOptions = NO_OPTIONS,
 ) -> dict[str, Any]:
-    """Download all sessions of a take, or some seconds of each, as one file in `out`.
+    """Download all sessions of a take, or a slice of each, as one file in the folder `out`.
 
     Returns:
-        Where it is, and what is known of the take.
+        The take's metadata, with `complete`, `path` and `bytes`.
 
     Raises:
         foottile.FootTileError: the server does not answer, or refuses.
-        UsageError: that is a folder in which a server or node keeps its sessions.
-        StorageError: it cannot be written.
+        UsageError: the folder belongs to a server or node.
+        StorageError: the file cannot be written.
     """
     url = f"/takes/{quote(take_id, safe='')}"
     take = server.http.get(url)
@@ -188,7 +188,7 @@ def _pull_made(
     query: dict[str, object] = {"format": to.name, "start_s": part.start_s, "end_s": part.end_s}
     query["columns"], query["clock"] = ",".join(part.columns) or None, clock
     query |= options.model_dump(mode="json")
-    # Under a name of its own until it is proven: who is cut off begins anew.
+    # A temporary name until the file is verified: an interrupted download begins anew.
     partial = temporary_of(path)
     try:
         with (
@@ -198,13 +198,11 @@ def _pull_made(
             partial.open("xb") as file,
         ):
             _write(answer, file)
-        # Of other formats the connection says whether they came to their end.
+        # For other formats, only the connection detects truncation.
         report = verify_export(partial) if to.name in PROVEN else None
         if to.name in PROVEN and (report is None or report.problems):
             why = "it cannot be read" if report is None else report.problems[0]
-            raise foottile.DamagedError(
-                f"{server.url}: the slice did not come whole: {why}. {_AGAIN}"
-            )
+            raise foottile.DamagedError(f"{server.url}: the slice is incomplete: {why}. {_AGAIN}")
         with storage_errors(path):
             partial.replace(path)
             sync_folder(path.parent)
@@ -214,22 +212,25 @@ def _pull_made(
 
 
 def _facts(server: foottile.Server, session_id: str) -> Mapping[str, Any]:
-    """What the server says of it; what is no id would be a folder elsewhere."""
+    """Return the session's metadata; refuse an invalid id, which could name another folder."""
     if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
         raise UsageError(
-            f"{session_id!r} is no session id", remedy="List them with `foottile sessions`"
+            f"{session_id!r} is not a session id", remedy="List them with `foottile sessions`"
         )
     return server.session(session_id).facts
 
 
 def _download(server: foottile.Server, session: Mapping[str, Any], path: Path) -> int:
-    """Download to a partial file that is kept if it breaks off; bytes that were there."""
+    """Download the frames, resuming a partial file; return the number of resumed bytes.
+
+    An interrupted download leaves its partial file.
+    """
     partial = path.with_name(f".{path.name}.part")
-    have = partial.stat().st_size if partial.is_file() else 0
+    partial_bytes = partial.stat().st_size if partial.is_file() else 0
     headers = {"Accept-Encoding": "identity"}
-    if have:
-        headers |= {"Range": f"bytes={have}-", "If-Range": f'"{session["sha256"]}"'}
-    resumed = have
+    if partial_bytes:
+        headers |= {"Range": f"bytes={partial_bytes}-", "If-Range": f'"{session["sha256"]}"'}
+    resumed = partial_bytes
     try:
         with (
             _to_do_again(f"{_AGAIN}: it goes on where it stopped"),
@@ -237,18 +238,16 @@ def _download(server: foottile.Server, session: Mapping[str, Any], path: Path) -
                 f"/sessions/{session['id']}/data", {"format": "parquet"}, headers=headers
             ) as answer,
         ):
-            resumed = have if answer.status_code == HTTPStatus.PARTIAL_CONTENT else 0
+            resumed = partial_bytes if answer.status_code == HTTPStatus.PARTIAL_CONTENT else 0
             with storage_errors(partial), partial.open("ab" if resumed else "wb") as file:
                 _write(answer, file)
     except foottile.FootTileError as error:
-        # All of it is here already, and only its name was lacking.
-        if not have or error.status != HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+        # The partial file may be complete already, but not renamed.
+        if not partial_bytes or error.status != HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
     if sha256_of(partial) != session["sha256"]:
         partial.unlink()
-        raise foottile.DamagedError(
-            f"{path}: what was downloaded has not the hash that the server states. {_AGAIN}"
-        )
+        raise foottile.DamagedError(f"{path}: the file differs from the server's hash. {_AGAIN}")
     with storage_errors(path):
         partial.replace(path)
         sync_folder(path.parent)
@@ -256,7 +255,7 @@ def _download(server: foottile.Server, session: Mapping[str, Any], path: Path) -
 
 
 def _write(answer: httpx.Response, file: IO[bytes]) -> None:
-    """Write an answer to a file, on the disk."""
+    """Write a response to a file and sync it to disk."""
     for chunk in answer.iter_bytes(_CHUNK):
         file.write(chunk)
     file.flush()
@@ -276,9 +275,9 @@ def _pull_table(server: foottile.Server, url: str, path: Path) -> None:
         with server.http.stream(url, {"format": "parquet"}) as answer:
             content = answer.read()
     except foottile.UnknownError:
-        return  # taken away, or an older server that has none
+        return  # removed, or an older server without it
     if not content.startswith(_PARQUET):
-        return  # an older server, which knows no format but JSON here
+        return  # an older server, which sends only JSON here
     try:
         table_of(content, where=path.name)
     except DamagedFileError as error:

@@ -1,7 +1,7 @@
-"""A scene file's content as it travels and is kept: any JSON, within bounds, written as it is read.
+"""Scene file's content in messages and sessions: any JSON within bounds, stored unchanged.
 
-Server and sessions only keep it for people and for `foottile node`; what it means is said in
-`devices.scene`.
+Server and sessions only store it, for people and for `foottile node`; `devices.scene` interprets
+it.
 """
 
 from __future__ import annotations

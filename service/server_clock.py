@@ -1,7 +1,8 @@
-"""The server's UTC: read once, then carried on by a clock that never steps.
+"""Server's UTC: read once, then continued by a clock that never steps.
 
-Sessions begin and end, and nodes' clocks are compared, by this one. If NTP sets the machine's date
-while the server runs, these instants keep their distances; the new date counts from the next start.
+It times the begin and end of sessions, and is the reference for nodes' clocks. If NTP sets the
+machine's date while the server runs, intervals stay correct; the new date applies from the next
+start.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import time
 
 
 def _boot_ns() -> int:
-    # Unlike CLOCK_MONOTONIC it goes on while a laptop sleeps.
+    # Unlike CLOCK_MONOTONIC it continues during suspend.
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
@@ -18,5 +19,5 @@ _OFFSET_NS = time.time_ns() - _boot_ns()
 
 
 def utc_ns() -> int:
-    """Nanoseconds since 1970 in UTC, as this server counts them."""
+    """Return the server's UTC in nanoseconds since 1970."""
     return _OFFSET_NS + _boot_ns()

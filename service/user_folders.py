@@ -1,4 +1,4 @@
-"""Folders of the user that a process runs as: named by an option, else where the system has them.
+"""Folders of the user of the process: named by an option, else the system's default.
 
 A service may have no home: `docker run --user 12345`, `DynamicUser=` of systemd, an empty
 environment.
@@ -16,16 +16,16 @@ Kind = Literal["data", "state", "cache"]
 
 
 def user_folder(kind: Kind, given: Path | None, option: str) -> Path:
-    """Return the folder that an option names, or the user's own; it need not be there yet.
+    """Return the folder that an option names, else the user's default; it need not exist.
 
     Args:
-        kind: of what is kept in it.
-        given: value of the option. A leading `~` is the home, which no shell puts in place of it in
-            `--data=~/x`, in an environment file or in a unit of systemd.
-        option: its name, for the error.
+        kind: kind of its content.
+        given: value of the option. A leading `~` is replaced by the home, as shells do not do that
+            in `--data=~/x`, in an environment file or in a unit of systemd.
+        option: name of the option, for the error.
 
     Raises:
-        UsageError: no home is known, or nothing can be written there.
+        UsageError: no home is known, or the folder cannot be written.
     """
     if given is not None:
         try:
@@ -45,23 +45,24 @@ def user_folder(kind: Kind, given: Path | None, option: str) -> Path:
 
 
 def _default(kind: Kind) -> Path | None:
-    """Return the user's folder; None: there is no home, which platformdirs says in two ways."""
+    """Return the user's default folder; None without a home."""
     import platformdirs
 
-    of = {
+    default_of = {
         "data": platformdirs.user_data_path,
         "state": platformdirs.user_state_path,
         "cache": platformdirs.user_cache_path,
     }
     try:
-        folder = of[kind]("foottile")
+        folder = default_of[kind]("foottile")
     except RuntimeError:
         return None
+    # Without a home platformdirs raises, or returns a relative path.
     return folder if folder.is_absolute() else None
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Is it there, or can it be made?"""
+    """Return whether the folder exists or can be created."""
     if folder.exists():
         return True
     above = next(each for each in folder.parents if each.exists())

@@ -1,4 +1,4 @@
-"""Which FootTile this is."""
+"""Version of FootTile."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SOFTWARE = f"foottile {version('foottile')}"
 
 @cache
 def exact_software() -> str:
-    """The version with a hash of its own source: two that say the same give the same numbers."""
+    """Return the version with a hash of the source code, for exact reproducibility."""
     digest = hashlib.sha256()
     for name in ("devices", "storage", "service"):
         folder = Path(str(import_module(name).__file__)).parent

@@ -1,8 +1,8 @@
-"""Arrow without pandas, which it would load in every process of ours, and which none of them uses.
+"""Start of pyarrow without pandas, which no process of ours uses.
 
-Where pandas is installed, pyarrow imports it for the first array that a process makes, to know
-pandas' types when it meets them: 0.45 s of CPU and 35 MB. It looks for it only once. Who calls
-`to_pandas` afterwards has it imported then, as ever.
+Where pandas is installed, pyarrow imports it when a process makes its first array, to recognise
+pandas types: 0.45 s of CPU and 35 MB. It tries only once. A later call of `to_pandas` still imports
+pandas.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import pyarrow as pa
 
 
 class _NoPandas(MetaPathFinder):
-    """Stands before all other finders, and says that there is none."""
+    """Import finder, before all others, that reports pandas as missing."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -28,7 +28,7 @@ class _NoPandas(MetaPathFinder):
 
 
 def leave_pandas_out() -> None:
-    """Have pyarrow look for pandas now, in vain; if it is loaded already, all stays as it is."""
+    """Make pyarrow's one attempt to import pandas fail; no effect if pandas is loaded already."""
     if "pandas" in sys.modules:
         return
     finder = _NoPandas()

@@ -1,10 +1,10 @@
-"""What an Arrow message says of itself, looked at before anything of it is decoded.
+"""Bounded parser of Arrow message headers, used before Arrow decodes the message.
 
-A record batch of 68 kB may say that its buffers are compressed and hold 2 GB, and the Arrow library
-would believe it: it has no option that refuses this. So the header is read here first. It is a
-flatbuffer, whose form `pyarrow` has checked by then; of its tables only these fields are needed
-(Arrow columnar format, `Message.fbs`), which is less than what a generated reader would bring, and
-the `flatbuffers` package checks no bounds in Python. Every read is bounded.
+A record batch of 68 kB may state that its buffers are compressed and hold 2 GB, and Arrow would
+allocate them: it has no option that refuses this. So the header is read here first. It is a
+flatbuffer, whose form `pyarrow` has checked by then; only these fields of its tables are needed
+(Arrow columnar format, `Message.fbs`), which is less code than a generated reader, and the
+`flatbuffers` package checks no bounds in Python. Every read is bounded.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 
 RECORD_BATCH = 3
-"""In `MessageHeader`; 2 is a dictionary, 1 a schema."""
+"""Type code of a record batch in `MessageHeader`; 2 is a dictionary, 1 a schema."""
 _HEADER_TYPE, _HEADER, _BODY_LENGTH = 1, 2, 3
 _LENGTH, _NODES, _BUFFERS, _COMPRESSION, _VARIADIC = range(5)
 _PAIR = struct.Struct("<qq")
@@ -23,16 +23,16 @@ _PAIRS_MAX = 1024
 
 
 class HeaderError(ValueError):
-    """The header says what no header of ours does."""
+    """Header that no message of ours has."""
 
 
 @dataclass(frozen=True)
 class BatchHeader:
-    """A record batch's description of itself.
+    """Header of a record batch.
 
     Attributes:
-        rows: how many.
-        nodes: rows and nulls of each column, those inside of lists after their list.
+        rows: number of rows.
+        nodes: rows and nulls of each column; the values of a list follow their list.
         buffers: offset and length of each buffer in the body.
         body_bytes: length of the body.
     """
@@ -44,10 +44,10 @@ class BatchHeader:
 
 
 def read_header(message: pa.ipc.Message) -> BatchHeader:
-    """What a message says of itself.
+    """Parse the header of a message.
 
     Raises:
-        HeaderError: it is no record batch, or one that is compressed or otherwise unlike ours.
+        HeaderError: it is no record batch, or is compressed or otherwise unlike ours.
     """
     content = message.metadata.to_pybytes()
     try:
@@ -70,7 +70,7 @@ def read_header(message: pa.ipc.Message) -> BatchHeader:
 
 
 class _Table:
-    """A table of a flatbuffer: a list of where its fields are stands before it."""
+    """Flatbuffer table; a list of field offsets precedes it."""
 
     def __init__(self, content: bytes, at: int) -> None:
         self._content = content
@@ -82,20 +82,20 @@ class _Table:
         self._count = (size - 4) // 2
 
     def has(self, field: int) -> bool:
-        """Is the field there?"""
+        """Return whether the table has the field."""
         return bool(self._offset(field))
 
     def number(self, field: int, form: str) -> int:
-        """A number; 0 if it is not there."""
+        """Return a number; 0 if the field is missing."""
         offset = self._offset(field)
         return int(struct.unpack_from(form, self._content, self._at + offset)[0]) if offset else 0
 
     def table(self, field: int) -> _Table:
-        """A table."""
+        """Return a nested table."""
         return _Table(self._content, self._pointed(field))
 
     def pairs(self, field: int) -> tuple[tuple[int, int], ...]:
-        """A list of structs of two 64-bit numbers."""
+        """Return a list of structs of two 64-bit numbers."""
         at = self._pointed(field)
         count = _u32(self._content, at)
         if count > _PAIRS_MAX:
@@ -110,7 +110,7 @@ class _Table:
 
     def _pointed(self, field: int) -> int:
         if not (offset := self._offset(field)):
-            raise HeaderError("its header lacks a part")
+            raise HeaderError("its header lacks a field")
         return self._at + offset + _u32(self._content, self._at + offset)
 
 

@@ -1,9 +1,9 @@
-"""JSON files that prove themselves: the last key is a hash of all text before it.
+"""JSON files with a checksum: the last key is a SHA-256 of all text before it.
 
-Every file of ours whose content can change a number, or what is asked of a node, is written and
-read here. Older versions wrote no hash: such a file is read if it is JSON, called unproven, and has
-one when it is next written. A file that lost part of its hash, or all of its end, is damaged, not
-old; who edits one by hand deletes the line with the hash.
+Every JSON file of ours that can change a number, or what a node must retain, is written and read
+here. Older versions wrote no checksum: such a file is read if it is JSON, is reported as unproven,
+and gets a checksum when it is next written. A file that lost part of its checksum, or all of its
+end, is damaged, not old. To edit a file by hand, delete the line with the checksum.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from devices.errors import DamagedFileError
 from storage.durable import read_whole, write_whole
 
 CHECK = "check"
+"""Key of the checksum."""
 _BEFORE, _AFTER = b',\n "check": "', b'"\n}'
 _END = re.compile(re.escape(_BEFORE) + rb"([0-9a-f]{64})" + re.escape(_AFTER) + rb"\Z")
 _TAIL_BYTES = len(_BEFORE) + 64 + len(_AFTER)
@@ -27,81 +28,80 @@ _DIGITS_AT_END = re.compile(rb'"[0-9a-f]{64}"\s*\}\s*\Z')
 
 @dataclass(frozen=True)
 class Checked:
-    """What a file holds."""
+    """Content of a JSON file, and whether a checksum proves it."""
 
     text: bytes
-    """A JSON object without its hash; of an older version perhaps a list."""
+    """JSON object without its checksum; of an older version perhaps a list."""
     is_proven: bool
-    """False: it states no hash, so it may have changed since an older version wrote it."""
+    """False: an older version wrote it without a checksum, so a change cannot be seen."""
 
 
 def write_checked(path: Path, text: bytes, *, mode: int = 0o666) -> None:
-    """Write a JSON object with its hash, whole or not at all.
+    """Write a JSON object with its checksum, atomically.
 
     Args:
-        path: the file; one that is there is replaced.
+        path: the file; an existing one is replaced.
         text: a JSON object with at least one key, and without "check".
-        mode: permissions, of which the umask takes its share.
+        mode: permissions before the umask.
 
     Raises:
-        StorageError: the disk is full or not writable; raises as `whole_file`.
+        StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
     """
     write_whole(path, with_check(text), mode=mode)
 
 
 def read_checked(path: Path) -> Checked:
-    """Read a JSON object. Whether it has the keys that it should is for the caller to say.
+    """Read a JSON file and verify its checksum; the caller checks its keys.
 
     Raises:
-        FileNotFoundError: there is none.
-        DamagedFileError: its hash is of another text, or it states none and is no JSON, or it is no
-            file.
+        FileNotFoundError: there is no such file.
+        DamagedFileError: its checksum is wrong, or it has none and is no JSON, or it is no file.
         StorageError: it cannot be read now.
     """
     return checked(read_whole(path), where=str(path))
 
 
 def checked(text: bytes, *, where: str) -> Checked:
-    """The same for a text that was read already.
+    """Verify the checksum of JSON text and return the text without it.
 
     Raises:
-        DamagedFileError: its hash is of another text, or it states none and is no JSON.
+        DamagedFileError: its checksum is wrong, or it has none and is no JSON.
     """
     found = is_unchanged(text)
     if found is False:
         raise DamagedFileError(
-            "it was changed: its text is not what its hash is of",
+            "it was changed: its text does not match its hash",
             where=where,
             expected="the bytes as they were written",
         )
     if found is True:
         return Checked(without_check(text), is_proven=True)
-    # Who deletes the last line by hand leaves the comma before it.
+    # Deleting the last line by hand leaves the comma before it.
     text = _LAST_COMMA.sub(b"\n}", text)
     _check_json(text, where=where)
     return Checked(text, is_proven=False)
 
 
 def _check_json(text: bytes, *, where: str) -> None:
-    """A text without its end states no hash, and zeros do not: only JSON may be an old file."""
+    """Refuse a text without a checksum that is no JSON: it was cut off or zeroed."""
     if not text.strip():
         raise DamagedFileError("it is empty", where=where, expected="a JSON object")
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise DamagedFileError(
-            f"it is not whole: it states no hash and is no JSON ({error})",
+            f"it is not whole: it has no hash and is no JSON ({error})",
             where=where,
             expected="a JSON object",
         ) from error
     if not isinstance(content, dict | list):
         raise DamagedFileError(
-            f"it states no hash and holds {text[:40]!r}", where=where, expected="a JSON object"
+            f"it has no hash and holds {text[:40]!r}", where=where, expected="a JSON object"
         )
 
 
 def with_check(text: bytes) -> bytes:
-    """The object with its hash as the last key.
+    """Return the JSON object with its checksum as the last key.
 
     Args:
         text: a JSON object with at least one key, and without this one.
@@ -111,13 +111,13 @@ def with_check(text: bytes) -> bytes:
 
 
 def without_check(text: bytes) -> bytes:
-    """The object without its hash; the same bytes if it carries none."""
+    """Return the JSON object without its checksum; the same bytes if it has none."""
     end = _END.search(text)
     return text if end is None else text[: end.start()] + b"\n}"
 
 
 def is_unchanged(text: bytes) -> bool | None:
-    """Does the text have the hash that it states? None if it never stated one."""
+    """Return whether the text's checksum is right; None if it never had one."""
     end = _END.search(text)
     if end is None:
         return False if _had_check(text) else None
@@ -125,5 +125,5 @@ def is_unchanged(text: bytes) -> bool | None:
 
 
 def _had_check(text: bytes) -> bool:
-    """Does it end like a text with a hash, of which a byte is another one, or missing, or more?"""
+    """Return whether the end looks like a checksum with a byte changed, missing or added."""
     return b'"check":' in text[-2 * _TAIL_BYTES :] or _DIGITS_AT_END.search(text) is not None

@@ -1,8 +1,7 @@
-"""Small Parquet tables that prove themselves: events and clocks beside a session's frames.
+"""Small Parquet tables with a hash of their bytes, such as markers and clocks of a session.
 
-The hash of their bytes is in the footer (`storage.file_hash`), and every page has a checksum. Older
-versions wrote neither: such a table is read and called unproven, and has both when it is next
-written.
+The hash is in the footer (`storage.parquet_hash`), and every page has a checksum. Older versions
+wrote neither: such a table is read and reported as unproven, and gets both at the next write.
 """
 
 from __future__ import annotations
@@ -30,30 +29,30 @@ from storage.file_hash import (
 
 @dataclass(frozen=True)
 class CheckedTable:
-    """What a file holds."""
+    """Table read from a file, and whether a hash proves it."""
 
     table: pa.Table
     is_proven: bool
-    """False: it states no hash, so it may have changed since an older version wrote it."""
+    """False: an older version wrote it without a hash, so a change cannot be seen."""
 
 
 def write_table(
     path: Path, table: pa.Table, *, is_plain: bool = False, group_rows: int | None = None
 ) -> None:
-    """Write a table with its hash, whole or not at all.
+    """Write a table with its hash, atomically.
 
     Args:
-        path: of the file; one that is there is replaced.
-        table: what it is to hold.
-        is_plain: neither compressed nor with dictionaries, of which a table of few rows has little:
-            it is read in less than half of the time.
-        group_rows: of a row group at most; None: as many as there are, nearly.
+        path: the file; an existing one is replaced.
+        table: its content.
+        is_plain: write without compression and dictionaries, which save little in a table of few
+            rows: reading takes less than half of the time.
+        group_rows: most rows of a row group; None: nearly all rows in one.
 
     Raises:
-        StorageError: the disk is full or not writable; raises as `whole_file`.
+        StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
     """
-    said = {**(table.schema.metadata or {}), FORMAT_KEY: FORMAT}
-    table = table.replace_schema_metadata(said)
+    metadata = {**(table.schema.metadata or {}), FORMAT_KEY: FORMAT}
+    table = table.replace_schema_metadata(metadata)
     sink = io.BytesIO()
     compression = "none" if is_plain else "zstd"
     options: dict[str, Any] = {"compression": compression, "use_dictionary": not is_plain}
@@ -65,34 +64,34 @@ def write_table(
 
 
 def read_table(path: Path) -> CheckedTable:
-    """Read a table. Whether it has the columns that it should is for the caller to say.
+    """Read a table and verify its hash; the caller checks its columns.
 
     Raises:
-        FileNotFoundError: there is none.
-        DamagedFileError: its hash is of other bytes, or it is no table.
+        FileNotFoundError: there is no such file.
+        DamagedFileError: its hash is wrong, or it is no table.
         StorageError: it cannot be read now.
     """
     return table_of(read_whole(path), where=str(path))
 
 
 def table_of(content: bytes, *, where: str) -> CheckedTable:
-    """The same for a file's content.
+    """Parse a table from a file's content and verify its hash.
 
     Raises:
-        DamagedFileError: its hash is of other bytes, or it is no table.
+        DamagedFileError: its hash is wrong, or it is no table.
     """
     hashes = hashes_of(content)
     check_hash(hashes, {}, where=where)
     try:
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True) as file:
-            # On this thread: one of Arrow's might let go of `content` last, and to do that while
-            # the interpreter ends aborts the process.
+            # On this thread: if one of Arrow's released `content` last while the interpreter ends,
+            # the process would abort.
             table = file.read(use_threads=False)
             table.validate(full=True)
-            said = table.schema.metadata or {}
+            metadata = table.schema.metadata or {}
     except Exception as error:  # damaged bytes may cause any error
         raise DamagedFileError(
             f"cannot be read as a table: {' '.join(str(error).split())[:300]}", where=where
         ) from error
-    check_hash(hashes, said, where=where)
+    check_hash(hashes, metadata, where=where)
     return CheckedTable(table, is_proven=hashes is not None)

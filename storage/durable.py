@@ -1,8 +1,8 @@
-"""Writing so that it stays written: whole files or none, synced, and errors a user can act on.
+"""Crash-safe files: atomic writes, folder locks, and setting damaged files aside.
 
-Here also: reading such files without following links or waiting for pipes; the lock of a folder,
-since two processes that write in it would each undo what the other does; and setting aside what is
-damaged, since a file that cannot be trusted is still somebody's.
+A file is written whole or not at all, and synced. Reading follows no links and waits for no pipes.
+The lock of a folder keeps out a second process, which would undo what the first one does. A damaged
+file is renamed, never deleted: its owner may still need it.
 """
 
 from __future__ import annotations
@@ -32,42 +32,42 @@ _TEMPORARY = re.compile(
 _OLDER_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
 _NO_LONGER = {"Z", "X"}
 _STARTED_FIELD = 19
-"""Field of /proc/PID/stat, counted after the name: when the process started."""
+"""Index of the start time in /proc/PID/stat, counted after the name."""
 
 
 def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
-    """Write a file, whole or not at all; it is on the disk when this returns.
+    """Write a file atomically; it is on the disk when this returns.
 
     Args:
-        path: the file; one that is there is replaced.
-        content: all of it.
-        mode: permissions, of which the umask takes its share.
+        path: the file; an existing one is replaced.
+        content: the whole content.
+        mode: permissions before the umask.
 
     Raises:
-        StorageError: the disk is full or not writable; raises as `whole_file`.
+        StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
     """
     with whole_file(path, mode=mode) as file:
         file.write(content)
 
 
 _NO_FILE = (errno.ELOOP, errno.EIO, errno.EBADMSG)
-"""What is said of a file that is none, or that its disk has lost; it says so again next time."""
+"""Error numbers that no retry cures: the path is no file, or its disk has lost the content."""
 BYTES_MAX = 64 << 20
-"""No file that is read at once is longer; what is, is not read into memory."""
+"""Upper limit of a file that is read into memory at once."""
 
 
 def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
-    """Read a file of ours that is small.
+    """Read a small file of ours into memory.
 
     Args:
         path: the file itself: links are not followed, and pipes not waited for.
-        bytes_max: a longer one is none of ours.
+        bytes_max: a longer file is rejected as damaged.
 
     Raises:
-        FileNotFoundError: there is none.
-        DamagedFileError: it is no file, too long for one of ours, or its disk has lost it.
-        StorageError: it may be whole and cannot be read now: it is another user's, or memory or
-            descriptors are used up. Nobody may set it aside, or write another in its place.
+        FileNotFoundError: there is no such file.
+        DamagedFileError: it is no regular file, too long, or its disk has lost it.
+        StorageError: it may be whole but cannot be read now: it is another user's, or memory or
+            descriptors are used up. Do not set it aside or overwrite it.
     """
     with open_own(path) as file, read_errors(path):
         size = os.fstat(file.fileno()).st_size
@@ -79,7 +79,7 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
 
 
 def open_own(path: Path) -> io.BufferedReader:
-    """Open a file of ours for reading, whatever its length; raises as `read_whole`."""
+    """Open a regular file of any length for reading; raises as `read_small_file`."""
     with read_errors(path):
         # A link may lead anywhere, and a pipe would be waited for.
         if not stat.S_ISREG(path.lstat().st_mode):
@@ -89,7 +89,7 @@ def open_own(path: Path) -> io.BufferedReader:
 
 @contextmanager
 def read_errors(path: Path) -> Iterator[None]:
-    """What opening or reading a file of ours raises, as `read_whole` says it."""
+    """Context manager: turn an OSError into `read_small_file`'s errors."""
     try:
         yield
     except FileNotFoundError:
@@ -101,7 +101,7 @@ def read_errors(path: Path) -> Iterator[None]:
         raise StorageError(
             what,
             where=str(path),
-            remedy="It is left as it is: let this user read it, or try again",
+            remedy="The file is unchanged. Let this user read it, or try again",
             errno=error.errno,
         ) from error
 
@@ -112,12 +112,14 @@ def _without_following(name: str, flags: int) -> int:
 
 @contextmanager
 def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
-    """A file to write that takes its place, whole and on the disk, when the block ends well.
+    """Context manager: a file to write that replaces `path` when the block ends well.
+
+    It is on the disk then.
 
     Raises:
         StorageError: the disk is full or not writable. The old file is still there, unless only the
-            folder could not be synced: then the new file is there, and its name may be lost with
-            the power.
+            folder could not be synced: then the new file is there, and its name may be lost in a
+            power cut.
     """
     temporary = temporary_of(path)
     check_held(path)
@@ -135,14 +137,14 @@ def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
 
 
 def temporary_of(path: Path) -> Path:
-    """A temporary name beside `path` for a file in writing; it names the process that writes."""
+    """Return a temporary path beside `path` that names the writing process."""
     process = os.getpid()
     name = f".{path.name}.{process}.{_started(process) or 0}.{secrets.token_hex(4)}.tmp"
     return path.with_name(name)
 
 
 def remove_stale_temporaries(folder: Path) -> list[Path]:
-    """Delete files that dead processes left half-written in a folder and below; return their paths.
+    """Delete half-written files of dead processes in a folder tree; return their paths.
 
     Files of living processes stay: they may still be written. If a process number was given to
     another process since, the start time shows it.
@@ -163,7 +165,7 @@ def remove_stale_temporaries(folder: Path) -> list[Path]:
 
 
 def is_stale(name: str) -> bool:
-    """Is it a temporary name of a process of this machine that has ended?"""
+    """Return whether `name` is a temporary file of a process of this machine that has ended."""
     if match := _TEMPORARY.fullmatch(name):
         return _started(int(match["process"])) != int(match["started"])
     if match := _OLDER_TEMPORARY.fullmatch(name):
@@ -172,7 +174,7 @@ def is_stale(name: str) -> bool:
 
 
 def _started(process: int) -> int | None:
-    """When a process started, in ticks after the machine's start; None if no such process runs.
+    """Return a process's start time in ticks after boot; None if it does not run.
 
     A zombie has ended, though its parent has not waited for it: None as well.
     """
@@ -185,13 +187,14 @@ def _started(process: int) -> int | None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it; their names are on the disk when this returns.
+    """Create a folder and its parents; their names are on the disk when this returns.
 
-    Another process may have made the last folder and not synced its name: it is synced in any case.
+    Another process may have created the last folder and not synced its name: it is synced in any
+    case.
 
     Raises:
-        OSError: it cannot be made.
-        FolderGoneError: it would be in a folder whose lock we hold, and that one is gone.
+        OSError: it cannot be created.
+        FolderGoneError: its parent is a folder whose lock this process holds, and that one is gone.
     """
     check_held(folder)
     missing = [folder]
@@ -203,18 +206,20 @@ def make_folder(folder: Path) -> None:
 
 
 _CANNOT_SYNC_FOLDERS = {*(errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF)}
-"""Answers of file systems that sync files only, such as CIFS, vboxsf, WSL's and some of FUSE.
+"""Errors of file systems that sync files only, such as CIFS, vboxsf, WSL's and some of FUSE.
+
+PostgreSQL and SQLite ignore them, too: no program can do more there.
 
 PostgreSQL and SQLite go on after them, too: no program can do more there.
 """
 _warned_devices: set[int] = set()
-"""File systems (`st_dev`) that cannot sync folders, and that were warned of."""
+"""File systems (`st_dev`) without folder sync that a warning was logged for."""
 
 
 def sync_folder(folder: Path) -> None:
-    """Put the names in a folder on the disk: a rename is not there until its folder is synced.
+    """Sync a folder, so that new names and renames in it survive a power cut.
 
-    A file system that cannot do so is warned of once; the files themselves are synced there, too.
+    A file system that cannot do so gets one warning; the files themselves are synced there, too.
 
     Raises:
         OSError: the disk failed.
@@ -240,7 +245,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def storage_errors(path: Path, remedy: str = "") -> Iterator[None]:
-    """Turn an OSError of the block into a StorageError that names `path`.
+    """Context manager: turn an OSError into a StorageError that names `path`.
 
     Raises:
         StorageError: in place of any other OSError.
@@ -273,23 +278,23 @@ def locked(
     refusal: str = "a foottile server or node uses this folder",
     remedy: str = "Stop it first: while it runs, it completes sessions by itself",
 ) -> Iterator[None]:
-    """Hold the folder's lock; a running server or node holds it as long as it runs.
+    """Context manager: hold the lock of a folder, as a running server or node does.
 
     Args:
-        folder: must be there.
-        is_shared: others that hold it shared do not matter.
-        refusal: what is said if another process holds it.
+        folder: an existing folder.
+        is_shared: take a shared lock, which other shared locks do not exclude.
+        refusal: error text if another process holds the lock.
         remedy: what to do then.
 
     Raises:
-        StorageError: another process holds it (`errno` is None), it cannot be opened, or the file
-            system has no locks.
+        StorageError: another process holds the lock (`errno` is None), the lock file cannot be
+            opened, or the file system has no locks.
     """
     path = folder / LOCK_NAME
     with storage_errors(folder):
         if path.is_symlink() or (path.exists() and not path.is_file()):
             set_aside(path)
-        # Opening for reading is enough for a lock, and works on a disk that takes no more writes.
+        # Opening for reading is enough for a lock, and works on a read-only disk.
         flags = os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         descriptor = os.open(path, flags, 0o666)
     try:
@@ -300,13 +305,13 @@ def locked(
     except OSError as error:
         os.close(descriptor)
         raise StorageError(
-            f"its file system gives no lock: {error.strerror}",
+            f"its file system has no locks: {error.strerror}",
             where=str(folder),
             expected="a folder that can be locked, so that two processes do not write in it",
             remedy=_NO_LOCKS,
             errno=error.errno,
         ) from error
-    with suppress(OSError):  # to warn at the start; a disk that fails is an error where it matters
+    with suppress(OSError):  # warns at the start; a failing disk raises at the first write
         sync_folder(folder)
     if not is_shared:
         _held[folder] = descriptor
@@ -319,68 +324,69 @@ def locked(
 
 
 _held: dict[Path, int] = {}
-"""Folders whose lock this process holds alone, and the locks' descriptors."""
+"""Folders that this process has locked exclusively, with the locks' descriptors."""
 
 
 def is_held(folder: Path) -> bool:
-    """Is the folder under this name the one whose lock we hold?
+    """Return whether `folder` is still the folder that this process has locked.
 
-    It is not if it was moved, deleted or unmounted meanwhile: files that are open then still take
-    what is written, and nobody will find it there.
+    It is not if it was moved, deleted or unmounted: files that are open then still accept writes,
+    but under another name or none.
     """
     try:
         there, ours = os.stat(folder / LOCK_NAME), os.fstat(_held[folder])
-    except OSError:  # also of a lock that another thread has just changed for the new folder's
+    except OSError:  # or another thread has just replaced the lock by the new folder's
         return False
     return (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
 
 
 def check_held(path: Path) -> None:
-    """Nothing is written where a folder was whose lock we hold: not into an empty mount point.
+    """Refuse to write where a locked folder has gone, such as into an empty mount point.
 
     Raises:
-        FolderGoneError: `path` is in such a folder, and that one is not there any more.
+        FolderGoneError: `path` is in a folder that this process has locked, and the folder is gone.
     """
     for folder in list(_held):
         if path.is_relative_to(folder) and not is_held(folder):
             raise FolderGoneError(
                 "this is not the folder that was opened: it was moved, deleted or unmounted",
                 where=str(folder),
-                remedy="Move it back or mount it: it is then used again by itself",
+                remedy="Move it back or mount it: it is then used again automatically",
                 errno=errno.ENOENT,
             )
 
 
 ASIDE = ".damaged"
+"""Suffix, before a number, of a file that was set aside."""
 
 
 def intended_name(name: str) -> str:
-    """The name that a file had before it was set aside, or has once it is written."""
+    """Return the original name of a set-aside or temporary file."""
     if match := _TEMPORARY.fullmatch(name) or _OLDER_TEMPORARY.fullmatch(name):
         return match["name"]
     return name.partition(ASIDE)[0]
 
 
 def set_aside(path: Path) -> Path:
-    """Rename what is damaged, a file, folder or link, so that nobody reads it as what it was.
+    """Rename a damaged file, folder or link, so that it is not read as the original.
 
     Returns:
-        Where it is now: beside its place, with `.damaged` and a number behind its name.
+        Its new path: in the same folder, with `.damaged` and a number behind its name.
 
     Raises:
-        StorageError: it cannot be renamed; it is where it was then.
+        StorageError: it cannot be renamed, and has its old name.
     """
     with storage_errors(path, "Move it away by hand"):
-        taken = {each.name for each in path.parent.iterdir()}
+        existing = {each.name for each in path.parent.iterdir()}
         free = (f"{path.name}{ASIDE}-{number}" for number in count(1))
-        aside = path.with_name(next(name for name in free if name not in taken))
+        aside = path.with_name(next(name for name in free if name not in existing))
         path.rename(aside)
         sync_folder(path.parent)
     return aside
 
 
 def put_aside(path: Path, why: FootTileError) -> str:
-    """Set aside what turned out to be damaged, if that can be; what happened, in words."""
+    """Set a damaged file aside if possible; return a message of what happened."""
     try:
         return printable(f"{why}; it is kept as {set_aside(path).name}")
     except StorageError as error:

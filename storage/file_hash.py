@@ -1,9 +1,9 @@
-"""The hash with which a Parquet file proves its bytes, without anything beside it.
+"""SHA-256 that a Parquet file carries in its own footer, over all of its bytes.
 
-It is of every byte with its own digits taken as zeros, and stands in the footer: no flipped bit
-escapes it, in the footer's statistics as little as in a page. A sealed session's footer has a hash
-of its own as well, of the footer alone: who reads a slice proves by it what columns, places and
-statistics are said, in a millisecond, and the pages that it reads by their checksums.
+The hash's own digits count as zeros. So it covers every byte, in the footer's statistics as well as
+in a page. A sealed session's footer also has a hash of the footer alone: a reader of a slice checks
+columns, offsets and statistics by it in a millisecond, and the pages that it reads by their
+checksums.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from devices.errors import DamagedFileError, FileFormatError
 FILE_HASH_KEY = b"foottile.file_sha256"
 FOOTER_HASH_KEY = b"foottile.footer_sha256"
 FORMAT_KEY = b"foottile.format"
-"""In the schema's metadata of what we write: frames, events and clocks."""
+"""Key of the format version in the schema's metadata of frames, markers and clocks."""
 FORMAT = b"2"
 FORMAT_WITHOUT_HASH = b"1"
-"""Files of older versions: the same, without any hash of their own. They are read, not written."""
+"""Version of older files: the same format without a hash. They are read, not written."""
 NO_HASH = b"0" * 64
+"""Placeholder for the digits of a hash."""
 _TEXT_OF_64 = b"\x18\x40"
-"""Thrift's mark of a text of 64 bytes: behind its key it stands once in a footer."""
+"""Thrift's prefix of a 64-byte text: behind its key it occurs once in a footer."""
 _REMEDY = "`foottile verify` says more; pull it again, or use a copy"
 _MAGIC = b"PAR1"
 _TAIL = 8
@@ -34,13 +35,13 @@ _BLOCK = 1 << 20
 
 
 def write_file_hash(path: Path) -> None:
-    """Put the hash of a Parquet file's bytes into its footer, where zeros stand for it.
+    """Fill in the hashes of a Parquet file's footer and bytes, where placeholders stand.
 
-    Before it that of the footer, if zeros stand for that, too. It is on the disk when this returns.
+    The footer's is optional. The file is on the disk when this returns.
 
     Raises:
         OSError: it cannot be written.
-        FileFormatError: no place was left for it.
+        FileFormatError: the file has no placeholder for its hash.
     """
     with path.open("r+b") as file:
         put_hash(file, where=str(path))
@@ -49,16 +50,16 @@ def write_file_hash(path: Path) -> None:
 
 
 def put_hash(file: BinaryIO, *, where: str) -> None:
-    """The same for a file that is open, or in memory.
+    """Fill in the hashes of an open or in-memory Parquet file.
 
     Raises:
         OSError: it cannot be written.
-        FileFormatError: no place was left for it.
+        FileFormatError: the file has no placeholder for its hash.
     """
     begin, footer = _footer(file)
     at = _place(footer, FILE_HASH_KEY)
     if at is None:
-        raise FileFormatError("no place for the file's hash", where=where)
+        raise FileFormatError("the footer has no placeholder for the file's hash", where=where)
     own = _place(footer, FOOTER_HASH_KEY)
     if own is not None:
         file.seek(begin + own)
@@ -70,7 +71,7 @@ def put_hash(file: BinaryIO, *, where: str) -> None:
 
 
 def file_hashes(path: Path) -> tuple[str, str] | None:
-    """The file hash that a Parquet file states, and the one that it has; None if it states none.
+    """Return a Parquet file's stated and actual hash; None if it states none.
 
     Raises:
         OSError: it cannot be read.
@@ -80,24 +81,24 @@ def file_hashes(path: Path) -> tuple[str, str] | None:
 
 
 def hashes_of(content: bytes) -> tuple[str, str] | None:
-    """The same for a file's content."""
+    """Return the stated and actual hash of a Parquet file in memory; None if it states none."""
     return _hashes(io.BytesIO(content))
 
 
 def check_hash(hashes: tuple[str, str] | None, said: Mapping[bytes, bytes], *, where: str) -> None:
-    """Refuse a Parquet file that is not what was written.
+    """Refuse a Parquet file whose bytes have changed since it was written.
 
     Checksums of pages alone are not enough: a flip in the footer may give a column the name or the
-    place of another one. What never was a file of ours, and what is of an older version, states no
-    hash and no format that has one, and passes.
+    place of another one. A file of another program, or of an older version, states no hash and no
+    format with a hash, and passes.
 
     Args:
-        hashes: as of `file_hashes`.
+        hashes: stated and actual, as of `read_stated_and_actual_hash`.
         said: the metadata of its schema.
         where: for errors.
 
     Raises:
-        DamagedFileError: its hash is of other bytes, or gone.
+        DamagedFileError: its hash is wrong, or missing.
     """
     if hashes is None and said.get(FORMAT_KEY, FORMAT_WITHOUT_HASH) != FORMAT_WITHOUT_HASH:
         raise DamagedFileError(
@@ -108,7 +109,7 @@ def check_hash(hashes: tuple[str, str] | None, said: Mapping[bytes, bytes], *, w
         )
     if hashes is not None and hashes[0] != hashes[1]:
         raise DamagedFileError(
-            "its bytes are not those that were sealed, by the hash in its footer",
+            "its bytes have changed since it was sealed, by the hash in its footer",
             where=where,
             expected="the bytes as they were written",
             remedy=_REMEDY,
@@ -116,7 +117,7 @@ def check_hash(hashes: tuple[str, str] | None, said: Mapping[bytes, bytes], *, w
 
 
 def read_footer(path: Path) -> bytes:
-    """The footer of a Parquet file, without the eight bytes behind it; empty if it has none.
+    """Return the footer of a Parquet file, without the eight bytes behind it; empty if it has none.
 
     Raises:
         OSError: it cannot be read.
@@ -126,7 +127,7 @@ def read_footer(path: Path) -> bytes:
 
 
 def footer_in(file: BinaryIO) -> bytes:
-    """The same for a file that is open, wherever it is; no more is read of it.
+    """Read the footer of an open Parquet file, and nothing else of it.
 
     Raises:
         OSError: it cannot be read.
@@ -135,9 +136,9 @@ def footer_in(file: BinaryIO) -> bytes:
 
 
 def footer_hashes(footer: bytes) -> tuple[str, str] | None:
-    """The hash that a footer states of itself, and the one that it has; None if it states none.
+    """Return a footer's stated and actual hash of itself; None if it states none.
 
-    It is of the footer with zeros for its own digits and for those of the file.
+    The digits of both hashes, the footer's and the file's, count as zeros.
     """
     own, at = _place(footer, FOOTER_HASH_KEY), _place(footer, FILE_HASH_KEY)
     if own is None or at is None:
@@ -147,18 +148,18 @@ def footer_hashes(footer: bytes) -> tuple[str, str] | None:
 
 
 def check_footer(hashes: tuple[str, str], *, where: str) -> None:
-    """Refuse a footer that is not what was written.
+    """Refuse a footer whose bytes have changed since it was written.
 
     Args:
-        hashes: as of `footer_hashes`.
+        hashes: as of `footer_stated_and_actual_hash`.
         where: for errors.
 
     Raises:
-        DamagedFileError: its hash is of other bytes.
+        DamagedFileError: its hash is wrong.
     """
     if hashes[0] != hashes[1]:
         raise DamagedFileError(
-            "the bytes of its footer are not those that were sealed, by its own hash",
+            "the bytes of its footer have changed since it was sealed, by the footer's hash",
             where=where,
             expected="the bytes as they were written",
             remedy=_REMEDY,
@@ -175,7 +176,7 @@ def _hashes(file: BinaryIO) -> tuple[str, str] | None:
 
 
 def sha256_of(path: Path) -> str:
-    """Hash of a file's bytes as they are, in hexadecimal digits.
+    """Return the SHA-256 of a file's bytes in hexadecimal digits.
 
     Raises:
         OSError: it cannot be read.
@@ -185,7 +186,7 @@ def sha256_of(path: Path) -> str:
 
 
 def _footer(file: BinaryIO) -> tuple[int, bytes]:
-    """Where in the file its footer begins, and the footer; empty if it is no Parquet file."""
+    """Return the offset and bytes of a file's footer; empty if it is no Parquet file."""
     size = file.seek(0, os.SEEK_END)
     if size < _TAIL + len(_MAGIC):
         return size, b""
@@ -200,7 +201,7 @@ def _footer(file: BinaryIO) -> tuple[int, bytes]:
 
 
 def _place(footer: bytes, key: bytes) -> int | None:
-    """Where in a footer the digits of a hash stand."""
+    """Return the offset of a hash's digits in a footer; None if there is no unique one."""
     before = key + _TEXT_OF_64
     at = footer.find(before)
     begin = at + len(before)
@@ -210,7 +211,7 @@ def _place(footer: bytes, key: bytes) -> int | None:
 
 
 def _footer_hash(footer: bytes, *places: int) -> str:
-    """Hash of a footer with zeros for the digits at these places."""
+    """Return the hash of a footer with zeros for the digits at these places."""
     hash_, begin = hashlib.sha256(), 0
     for at in sorted(places):
         hash_.update(memoryview(footer)[begin:at])
@@ -221,7 +222,7 @@ def _footer_hash(footer: bytes, *places: int) -> str:
 
 
 def _hash_without(file: BinaryIO, at: int) -> str:
-    """Hash of the file with zeros for digits at `at`."""
+    """Return the hash of the file with zeros for the digits at `at`."""
     hash_ = hashlib.sha256()
     file.seek(0)
     left = at

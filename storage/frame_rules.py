@@ -1,6 +1,7 @@
-"""What the frames of a stream keep to: a server asks before it takes them, and `verify` after.
+"""Rules that the frames of a stream keep, for a server's intake and for `verify`.
 
-Both ask here, so nothing is acknowledged, sealed and called complete that is called damaged later.
+Both use the same rules. So no frame is acknowledged and sealed as complete that is later reported
+as damaged.
 """
 
 from __future__ import annotations
@@ -22,20 +23,22 @@ from devices.frames import (
 )
 
 COUNTS_MAX = 1023
+"""Largest raw count of a 10-bit chip."""
 _OFFSET_MAX_US = 60_000_000
-"""A tile is read in its own frame, and no frame takes a minute."""
+"""Upper limit of `sample_offset_us`: a tile is read within its frame, in less than a minute."""
 _FORCE_MAX_N = 1e6
 _TILE_BITS = sum(TileStatus)
 _FRAME_BITS = sum(FrameStatus)
 
 Wrong = npt.NDArray[np.bool_]
+"""Mask of the rows that break a rule."""
 
 
 def broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
-    """Why these cannot be frames of this array, in words; empty if they can.
+    """Return a text that names the first broken rule and frame; empty if there is none.
 
     Args:
-        frames: of one message, `seq` rising by one.
+        frames: frames of one message, `seq` rising by one.
         info: the array of their stream.
     """
     for rule, wrong in _rules(frames, info):
@@ -46,17 +49,20 @@ def broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
 
 
 def out_of_range(t_mono_ns: Times, t_ns: Times) -> Wrong:
-    """Which instants, int64[n] each, no clock says; of all others differences fit 64 bits."""
+    """Return a mask of impossible instants, int64[n] each.
+
+    Differences of all others fit 64 bits.
+    """
     mono = (t_mono_ns <= -T_MONO_NS_END) | (t_mono_ns >= T_MONO_NS_END)
     return mono | (t_ns < 0) | (t_ns >= T_NS_END)
 
 
 def runs_back(t_ns_first: Times, t_ns_last: Times) -> npt.NDArray[np.intp]:
-    """Which batches begin before the one before them has ended.
+    """Return the indices of batches that begin before the batch before them has ended.
 
     Args:
         t_ns_first: int64[n], instant of each batch's first frame; batches in order of numbers.
-        t_ns_last: int64[n], instant of its last one.
+        t_ns_last: int64[n], instant of each batch's last frame.
     """
     return np.flatnonzero(t_ns_first[1:] < t_ns_last[:-1]) + 1
 
@@ -84,9 +90,9 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Wrong]]:
         (offset_us > _OFFSET_MAX_US) | (offset_us < -_OFFSET_MAX_US),
     )
     yield "servo_age_us is negative", frames.servo_age_us < NO_SERVO_AGE
-    yield "status has bits that mean nothing", (frames.status & ~np.uint8(_TILE_BITS)) != 0
+    yield "status has undefined bits", (frames.status & ~np.uint8(_TILE_BITS)) != 0
     yield (
-        "frame_status has bits that mean nothing",
+        "frame_status has undefined bits",
         (frames.frame_status & ~np.uint8(_FRAME_BITS)) != 0,
     )
     force_n = frames.reference_force_n

@@ -1,6 +1,6 @@
-"""Sets of sequence numbers as closed intervals: what is held, what is missing, what was lost.
+"""Sets of sequence numbers as closed intervals: stored, missing or lost ones.
 
-`Losses` are intervals by reason: why frames of a stream are not held.
+`Losses` are intervals by reason: why frames of a stream are not stored.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ import numpy as np
 import numpy.typing as npt
 
 NO_END = 2**62
-"""In place of the last number of an interval that goes on with every number to come."""
+"""Stand-in for the last number of an interval without an end."""
 
 OpenPairs = tuple[tuple[int, int | None], ...]
-"""Intervals as they travel and are kept; None: this one goes on with every number to come."""
+"""Intervals in JSON and messages; last None: an interval without an end."""
 
 
 class Intervals:
-    """A set of integers, kept as sorted intervals `(first, last)` that neither touch nor overlap.
+    """Set of integers, kept as sorted intervals `(first, last)` that neither touch nor overlap.
 
     A stream without losses is one interval, however long it runs.
     """
 
     def __init__(self, intervals: Iterable[tuple[int, int]] = ()) -> None:
         self._intervals: list[tuple[int, int]] = []
-        if isinstance(intervals, Intervals):  # at once: another thread may be adding to it
+        if isinstance(intervals, Intervals):  # one copy: another thread may be adding to it
             self._intervals = list(intervals)
             return
         for first, last in intervals:
@@ -51,7 +51,7 @@ class Intervals:
 
     @property
     def count(self) -> int:
-        """How many numbers it holds."""
+        """Number of integers in the set."""
         return sum(last - first + 1 for first, last in self._intervals)
 
     @property
@@ -65,14 +65,14 @@ class Intervals:
         return self._intervals[-1][1] if self._intervals else None
 
     def add(self, first: int, last: int) -> None:
-        """Add `first` to `last`, both included; those already there stay.
+        """Add `first` to `last`, both included.
 
         Raises:
             ValueError: `last` lies before `first`.
         """
         if last < first:
             raise ValueError(f"interval {first} to {last} is empty")
-        if not self._intervals or first > self._intervals[-1][1] + 1:  # behind all, as most are
+        if not self._intervals or first > self._intervals[-1][1] + 1:  # the usual case: at the end
             self._intervals.append((first, last))
             return
         begins, ends = self._intervals[-1]
@@ -88,11 +88,11 @@ class Intervals:
         self._intervals[begin:end] = [(first, last)]
 
     def add_stretches(self, first: npt.NDArray[Any], count: npt.NDArray[Any]) -> None:
-        """Add stretches of numbers, none of them empty, in any order.
+        """Add ranges of numbers, none of them empty, in any order.
 
         Args:
-            first: number with which each begins, [n].
-            count: how many numbers it has, [n].
+            first: first number of each range, [n].
+            count: length of each range, [n].
         """
         first = first.astype(np.int64)
         last = first + count.astype(np.int64) - 1
@@ -102,7 +102,7 @@ class Intervals:
             self.add(a, b)
 
     def within(self, first: int, last: int) -> Intervals:
-        """The numbers of this set from `first` to `last`."""
+        """Return the numbers of this set from `first` to `last`."""
         found = Intervals()
         begin = bisect_left(self._intervals, first, key=itemgetter(1))
         end = bisect_right(self._intervals, last, key=itemgetter(0))
@@ -114,7 +114,7 @@ class Intervals:
         return found
 
     def neighbours(self, first: int, last: int) -> tuple[int | None, int | None]:
-        """The greatest number of this set below `first`, and the least above `last`; or None."""
+        """Return the nearest numbers of this set below `first` and above `last`, or None."""
         at = bisect_left(self._intervals, first, key=itemgetter(0))
         before = min(self._intervals[at - 1][1], first - 1) if at else None
         at = bisect_right(self._intervals, last, key=itemgetter(1))
@@ -122,7 +122,7 @@ class Intervals:
         return before, after
 
     def missing(self, first: int, last: int) -> Intervals:
-        """The numbers from `first` to `last` that are not in this set."""
+        """Return the numbers from `first` to `last` that are not in this set."""
         gaps = Intervals()
         at = first
         for a, b in self.within(first, last):
@@ -134,11 +134,11 @@ class Intervals:
         return gaps
 
     def covers(self, first: npt.NDArray[Any], count: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-        """Which stretches are in this set whole?
+        """Return a mask of the ranges that are in this set completely.
 
         Args:
-            first: number with which each begins, [n].
-            count: how many numbers it has, [n].
+            first: first number of each range, [n].
+            count: length of each range, [n].
         """
         begins, ends = np.array([(0, 0), *self._intervals], np.int64).T  # one before the first
         first = first.astype(np.int64)
@@ -147,11 +147,11 @@ class Intervals:
         return found
 
     def __or__(self, other: Intervals) -> Intervals:
-        """The numbers that are in either."""
+        """Return the union."""
         return union((self, other))
 
     def __and__(self, other: Intervals) -> Intervals:
-        """The numbers that are in both."""
+        """Return the intersection."""
         both = Intervals()
         ours, theirs = list(self._intervals), list(other._intervals)
         i = j = 0
@@ -166,7 +166,7 @@ class Intervals:
         return both
 
     def __sub__(self, other: Intervals) -> Intervals:
-        """The numbers of this set that are not in `other`."""
+        """Return the numbers of this set that are not in `other`."""
         left = Intervals()
         theirs = list(other._intervals)
         j = 0
@@ -187,17 +187,17 @@ class Intervals:
 
 
 def union(sets: Iterable[Intervals]) -> Intervals:
-    """The numbers that are in any of these."""
-    return Intervals(sorted(chain.from_iterable(sets)))  # in order each is added at the end
+    """Return the union of several sets."""
+    return Intervals(sorted(chain.from_iterable(sets)))  # sorted, each is added at the end
 
 
 def closed(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
-    """Intervals of which some have no end, as a set."""
+    """Return pairs as a set, with `NO_END` for a missing last number."""
     return Intervals((first, NO_END if last is None else last) for first, last in pairs)
 
 
 def with_open_ends(pairs: Iterable[tuple[int, int]]) -> OpenPairs:
-    """The same the other way round."""
+    """Return intervals as pairs, with None for a last number of `NO_END` or more."""
     return tuple((first, None if last >= NO_END else last) for first, last in pairs)
 
 
@@ -212,11 +212,11 @@ GIVEN_UP = "given_up"
 REFUSED = "refused"
 
 AsPairs = dict[str, tuple[tuple[int, int], ...]]
-"""How losses travel and are kept: `{"evicted": [[0, 99], [200, 299]]}`."""
+"""Losses in JSON and messages: `{"evicted": [[0, 99], [200, 299]]}`."""
 
 
 class Losses:
-    """Numbers that are lost, by reason; a number keeps the reason that came first."""
+    """Lost numbers by reason; a number keeps its first reason."""
 
     def __init__(self, pairs: Mapping[str, Iterable[tuple[int, int]]] | None = None) -> None:
         self.by_reason: dict[str, Intervals] = {}
@@ -233,25 +233,25 @@ class Losses:
 
     @property
     def all(self) -> Intervals:
-        """Every number that is lost."""
+        """Union of all lost numbers."""
         return union(self.by_reason.values())
 
     def add(self, numbers: Intervals, reason: str) -> None:
-        """Note a loss."""
+        """Add lost numbers; those that have a reason already keep it."""
         if new := numbers - self.all:
             self.by_reason[reason] = new | self.by_reason.get(reason, Intervals())
 
     def found(self, numbers: Intervals) -> None:
-        """These numbers are held after all."""
+        """Remove numbers: they are stored after all."""
         self.by_reason = {
             reason: left for reason, lost in self.by_reason.items() if (left := lost - numbers)
         }
 
     def within(self, numbers: Intervals) -> dict[str, Intervals]:
-        """The lost numbers among these, by reason."""
+        """Return the lost ones among `numbers`, by reason."""
         found = {reason: numbers & lost for reason, lost in self.by_reason.items()}
         return {reason: lost for reason, lost in found.items() if lost}
 
     def as_pairs(self) -> AsPairs:
-        """As it travels and is kept."""
+        """Return the losses as pairs by reason, for JSON and messages."""
         return {reason: tuple(numbers) for reason, numbers in self.by_reason.items() if numbers}

@@ -1,7 +1,7 @@
-"""Where the columns of a message of frames lie in its bytes: its header says it, and nothing else.
+"""Byte layout of messages of frames: where each column lies, by the message's header.
 
-A header of the same bytes says the same of every message, so it is checked once, by Arrow and
-here, and then messages by the thousand are read as numpy columns without asking Arrow for each.
+Messages with equal headers have equal layouts. So a header is checked once, by Arrow and here, and
+thousands of messages are then read as numpy columns without parsing each by Arrow.
 """
 
 from __future__ import annotations
@@ -15,27 +15,30 @@ from storage.arrow_header import HeaderError, read_header
 from storage.schema import from_record_batch
 
 FRAMES_MAX = 4096
-"""Frames in one message; a node sends some ten. More is not what a node sends."""
+"""Upper limit of frames in one message; a node sends some ten."""
 PREFIX_BYTES = 8
-"""Before the header of a message: a mark, and the header's length."""
+"""Length of the marker and the header's length, before the header of a message."""
 _MARK = b"\xff\xff\xff\xff"
-"""With which a message begins. Arrow also reads older ones without it, in which all that is behind
-stands four bytes earlier: where columns are said to lie there would be other numbers."""
+"""First bytes of a message.
+
+Arrow also reads older messages without it, whose header and body begin four bytes earlier: there
+the computed offsets would be wrong.
+"""
 _KNOWN_MAX = 256
-"""Headers that are remembered; a node's batches have two or three different ones."""
+"""Upper limit of cached headers; a node's batches have two or three different ones."""
 _HEAD_BYTES_MAX = 4096
-"""Longer ones are not remembered: ours take some 700 bytes, and a stranger's up to a megabyte."""
+"""Longest cached header: ours take some 700 bytes, a stranger's up to a megabyte."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What the header of a message says.
+    """Byte layout of a message, from its header.
 
     Attributes:
-        rows: frames in it.
-        message_bytes: its length, prefix and header included.
-        columns: first byte of each column's values in the message, in the order of the schema, and
-            how many bytes they are.
+        rows: number of frames.
+        message_bytes: length of the message, prefix and header included.
+        columns: offset and length in bytes of each column's values in the message, in the order of
+            the schema.
     """
 
     rows: int
@@ -44,15 +47,15 @@ class Layout:
 
 
 def layout_of(message: pa.ipc.Message, schema: pa.Schema) -> Layout:
-    """Whether a message is as large as its number of frames makes it, before memory is taken.
+    """Compute a message's layout; check that its size fits its number of frames first.
 
     Args:
-        message: whose form Arrow has checked.
-        schema: of its stream (`storage.schema.wire_schema`).
+        message: a message whose form Arrow has checked.
+        schema: schema of its stream (`storage.schema.wire_schema`).
 
     Raises:
-        FileFormatError: too many frames, or none.
-        HeaderError: columns or buffers are not those of so many frames.
+        FileFormatError: it has no frames, or too many.
+        HeaderError: columns or buffers do not fit that many frames.
     """
     header = read_header(message)
     rows = header.rows
@@ -63,7 +66,7 @@ def layout_of(message: pa.ipc.Message, schema: pa.Schema) -> Layout:
     values_at: list[int] = []
     for type_ in schema.types:
         nodes.append((rows, 0))
-        needed_bytes.append(0)  # which rows are empty: none
+        needed_bytes.append(0)  # validity bitmap: empty, no row is null
         values, value_type = rows, type_
         if isinstance(type_, pa.FixedSizeListType):
             values, value_type = rows * type_.list_size, type_.value_type
@@ -88,10 +91,10 @@ def layout_of(message: pa.ipc.Message, schema: pa.Schema) -> Layout:
 
 
 class Layouts:
-    """Layouts of one stream's messages by their headers. May be used from several threads.
+    """Cache of message layouts by header, for one stream. Thread-safe.
 
     Args:
-        schema: of the stream (`storage.schema.wire_schema`).
+        schema: schema of the stream (`storage.schema.wire_schema`).
     """
 
     def __init__(self, schema: pa.Schema) -> None:
@@ -99,10 +102,10 @@ class Layouts:
         self._known: dict[bytes, Layout] = {}
 
     def of(self, message: bytes | memoryview) -> Layout:
-        """Where the columns of a message are; everything that its header says is checked first.
+        """Return the layout of a message; validate a header that is not cached yet.
 
         Raises:
-            FileFormatError: it is no message of the stream, or is cut off.
+            FileFormatError: it is no message of this stream, or is cut off.
         """
         head = bytes(message[: PREFIX_BYTES + int.from_bytes(message[4:PREFIX_BYTES], "little")])
         layout = self._known.get(head)
@@ -110,7 +113,7 @@ class Layouts:
             if layout is None:
                 layout = self._checked(message, head)
             if layout.message_bytes != len(message):
-                raise HeaderError(f"it is {len(message)} bytes long, and says another length")
+                raise HeaderError(f"it has {len(message)} bytes, not those its header states")
         except (pa.ArrowException, EOFError, OSError, ValueError, IndexError) as error:
             raise FileFormatError(
                 f"no Arrow message of frames: {error}",
@@ -125,7 +128,7 @@ class Layouts:
         layout = layout_of(found, self.schema)
         if layout.message_bytes == len(message):
             record = pa.ipc.read_record_batch(found, self.schema)
-            record.validate(full=True)  # whatever the header did not say
+            record.validate(full=True)  # checks the values, which the header does not describe
             from_record_batch(record)
             if len(head) <= _HEAD_BYTES_MAX:
                 if len(self._known) >= _KNOWN_MAX:

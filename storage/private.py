@@ -1,4 +1,4 @@
-"""Who may read what a process writes: its user, unless the folder's owner lets a group in."""
+"""Permissions of what a process writes: its user's, unless the owner lets a group in."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ _OURS = {
     "demo",  # a data folder of its own, within the user's
     "servers",  # foottile.local_server keeps it beside a node's journal
 }
-"""All that servers and nodes write in their folder."""
+"""All names that servers and nodes write in their folder."""
 _NO_MODES = {
     *(errno.EPERM, errno.EACCES, errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 }
-"""The folder is another user's, or its file system has no permissions, such as vfat and CIFS."""
+"""Errors of `chmod` on another user's folder, or without permissions, such as vfat and CIFS."""
 
 
 def keep_private(folder: Path) -> None:
-    """What this process writes from now on is for its user, whatever the umask was.
+    """Set umask and folder permissions so that only this user can read what it writes.
 
-    A folder that is made here, or is empty, or is ours and every user could read it, is closed to
-    others. One that its owner has opened to its group, and to it only, stays so, and what is
-    written is the group's to read.
+    A folder is closed to others if it is created here, is empty, or holds only files of ours. One
+    that its owner has opened to its group, and to nobody else, stays so, and the group can read new
+    files.
 
     Args:
-        folder: where it will write; made if absent.
+        folder: where the process will write; created if absent.
 
     Raises:
-        StorageError: it cannot be made, or not be closed to others, or its path is not UTF-8.
+        StorageError: it cannot be created or closed to others, or its path is not UTF-8.
     """
     if not is_utf8(str(folder.absolute())):
         raise StorageError(
@@ -63,5 +63,5 @@ def keep_private(folder: Path) -> None:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Is there nothing in it but what we wrote? Somebody's home is not ours to close."""
+    """Return whether the folder holds only files of ours; a home folder must stay as it is."""
     return {intended_name(path.name) for path in folder.iterdir()} <= _OURS

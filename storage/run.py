@@ -1,9 +1,9 @@
-"""Many messages of a stream, read at once: what a loop over batches does, column by column.
+"""Decoding of many messages of a stream at once, column by column.
 
 A batch of 25 ms costs as much to decode as thousands of frames, and a journal has 140,000 of them
-an hour. So the bytes of a run of batches are held against their checksums one by one, which is
-cheap, and everything else is looked at for all of them together. Where anything is not as it
-should be the answer is that it is not: who reads then goes batch by batch, and finds out which.
+an hour. So the bytes of each message are checked against its CRC-32, which is cheap, and everything
+else is checked for all messages together. If any check fails the result is None: the caller then
+decodes batch by batch to find the faulty one.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ Numbers = npt.NDArray[np.integer[Any]]
 
 @dataclass(frozen=True)
 class Run:
-    """Messages that stand one behind the other in memory, and what an index says of them.
+    """Messages that lie one behind the other in memory, with their index entries.
 
     Attributes:
-        content: their bytes.
-        length: of each message.
+        content: the bytes of all messages.
+        length: length of each message in bytes.
         seq_first: number of each message's first frame, rising.
-        count: frames of each message.
-        crc32: of each message's bytes.
+        count: number of frames of each message.
+        crc32: CRC-32 of each message's bytes.
     """
 
     content: bytes
@@ -46,10 +46,10 @@ class Run:
 
 
 class RunReader:
-    """Reads runs of one stream. May be used from several threads.
+    """Decoder of message batches of one stream. Thread-safe.
 
     Args:
-        schema: of the stream (`storage.schema.wire_schema`).
+        schema: schema of the stream (`storage.schema.wire_schema`).
     """
 
     def __init__(self, schema: pa.Schema) -> None:
@@ -57,9 +57,9 @@ class RunReader:
         self._layouts = Layouts(schema)
 
     def read(self, run: Run) -> FrameBatch | None:
-        """The frames of all messages, copied; None if `decode` or the index says otherwise of one.
+        """Decode all messages into copied columns; None if any check against the index fails.
 
-        Whether the frames keep to the rules of their stream is not asked.
+        The rules of frames (`storage.frame_rules`) are not checked.
         """
         ends = np.cumsum(run.length, dtype=np.int64)
         begins = ends - run.length.astype(np.int64)
@@ -72,7 +72,7 @@ class RunReader:
         return frames if _is_in_order(frames, run) else None
 
     def _checked(self, run: Run, begins: Sequence[int], ends: Sequence[int]) -> list[Layout] | None:
-        """The layout of each message; None if one is not what was written, or not ours."""
+        """Return the layout of each message; None if one is damaged or not of this stream."""
         view = memoryview(run.content)
         found = []
         indexed = zip(begins, ends, run.count.tolist(), run.crc32.tolist(), strict=True)
@@ -91,7 +91,7 @@ class RunReader:
 
 
 def _joined(run: Run, begins: Ints, layouts: Sequence[Layout], schema: pa.Schema) -> FrameBatch:
-    """The frames of messages that are known to be whole, copied into columns of their own."""
+    """Copy the frames of verified messages into contiguous columns."""
     count = run.count.astype(np.int64)
     row = np.cumsum(count) - count
     total = int(count.sum())
@@ -110,16 +110,16 @@ def _joined(run: Run, begins: Ints, layouts: Sequence[Layout], schema: pa.Schema
             if not size:
                 continue
             column = columns[name]
-            # Every stretch of so many bytes; those that begin where a message has the column.
+            # A view of every window of `size` bytes, from which the messages' columns are picked.
             shape = len(run.content) - size + 1, size
-            stretches = np.ndarray(shape, np.uint8, run.content, strides=(1, 1))
-            found = stretches[begins[numbers] + offset].view(column.dtype)
+            windows = np.ndarray(shape, np.uint8, run.content, strides=(1, 1))
+            found = windows[begins[numbers] + offset].view(column.dtype)
             column[rows] = found.reshape(len(rows), *column.shape[1:])
     return FrameBatch(**columns)
 
 
 def _is_in_order(frames: FrameBatch, run: Run) -> bool:
-    """Are the frames those of the index, and rise their numbers, and time within each message?"""
+    """Return whether the frames match the index, with rising numbers, and times in each message."""
     first, count = run.seq_first.astype(np.uint64), run.count.astype(np.uint64)
     row = (np.cumsum(count) - count).astype(np.int64)
     number = np.arange(len(frames), dtype=np.uint64)

@@ -1,9 +1,9 @@
-"""One table of columns from which the schemas of wire and disk are made.
+"""Table of columns from which the Arrow schemas of wire and disk are made.
 
 On the wire (and in a journal) a column with one value per tile is a fixed-size list, so that a
-message is read as numpy views without a copy. In a sealed file it is flat, `padc_0`, `padc_1`, ...,
-because that compresses best and any tool can read it. Units and meaning are in the field metadata
-of both, the array's description in the schema metadata.
+message is read as numpy views without a copy. In a sealed file it is flat, `pressure_raw_0`,
+`pressure_raw_1`, ..., because that compresses best and any tool can read it. Units and meaning are
+in the field metadata of both, the array's description in the schema metadata.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from devices.frames import (
 )
 from storage.arrow_alone import leave_pandas_out
 
-leave_pandas_out()  # here, because nothing of ours makes an array before it has a schema
+leave_pandas_out()  # here: every process of ours imports a schema before it makes an array
 
 ARRAY_INFO_KEY = b"foottile.array_info"
 ARRAY_HASH_KEY = b"foottile.array_info_sha256"
-"""In a journal's segments, whose header has no other checksum."""
+"""Key of the description's checksum in a journal's segments, whose header has no other one."""
 ROUNDED_TO = "rounded_to"
-"""In the notes of a file, and in the metadata of each field: the step of a column of estimates."""
+"""Key of a column's rounding step, in the notes of a file and in each field's metadata."""
 
 Array = npt.NDArray[Any]
-"""A numpy column; which type it has is said by the column table, not by the checker."""
+"""Numpy column; its element type is stated by the column table, not by the type checker."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One quantity: its name carries its unit, its type is that of the file."""
+    """Quantity of a frame: its name carries its unit, its type is that of the file."""
 
     name: str
     type: pa.DataType
@@ -50,16 +50,16 @@ class Column:
     description: str
     per_tile: bool = False
     missing: int | None = None
-    """The number that stands for "not known" in memory; null in files. Floats: NaN, null too."""
+    """Stand-in for an unknown value in memory; null in files. Floats: NaN, null too."""
 
     def flat_names(self, tiles: int) -> list[str]:
-        """Names of its columns in a flat file."""
+        """Return the names of its columns in a flat file."""
         return [f"{self.name}_{i}" for i in range(tiles)] if self.per_tile else [self.name]
 
     def field(
         self, name: str, type_: pa.DataType, *, nullable: bool, step: float | None = None
     ) -> pa.Field[Any]:
-        """An Arrow field with unit and description in its metadata, and to what it is rounded."""
+        """Return an Arrow field with unit, description and rounding step in its metadata."""
         metadata = {"unit": self.unit, "description": self.description}
         if step is not None:
             metadata[ROUNDED_TO] = repr(step)
@@ -92,7 +92,7 @@ FRAMES = (
     ),
     _frame("reference_force_n", "N", "force of the calibration rig's sensor"),
 )
-"""What a node measures: `devices.frames.FrameBatch`."""
+"""Columns that a node measures: `devices.frames.FrameBatch`."""
 
 _F32 = pa.float32()
 
@@ -124,7 +124,7 @@ ESTIMATES = (
         "1024 after_saturation, 2048 stuck, 4096 clipped, 8192 baseline_lost",
     ),
 )
-"""What the estimator makes of it: `service.estimation.estimates.Estimates`."""
+"""Columns that the estimator computes: `service.estimation.estimates.Estimates`."""
 
 TRUTH = (
     Column("true_force_n", pa.float64(), "N", "emulation: force on the dome along its axis", True),
@@ -134,16 +134,16 @@ TRUTH = (
     Column("true_cop_y_m", pa.float64(), "m", "emulation: true centre of pressure, foot frame"),
     Column("true_angle_rad", pa.float64(), "rad", "emulation: true angle of the foot segment"),
 )
-"""What an emulated scene knows: `devices.emulation.world.Truth`."""
+"""Ground truth of an emulated scene: `devices.emulation.world.Truth`."""
 
 MILL = (
     Column("pressed_tile", pa.string(), "1", "serial of the tile under the spindle"),
     Column("phase", pa.string(), "1", "rest, load, unload, hold, release, tap or soak"),
 )
-"""What the operator of an indentation rig writes down beside the frames."""
+"""Columns that the operator of an indentation rig records beside the frames."""
 
 PARTS = (Column("part", pa.uint16(), "1", "which part of the session, one for each start"),)
-"""A recorded session goes on when its node is restarted; `seq` then begins at 0 again."""
+"""Part of a recorded session: `seq` begins at 0 again when the node restarts."""
 
 NO_INSTANT = -(2**63)
 
@@ -157,10 +157,10 @@ SERVER_TIME = (
         missing=NO_INSTANT,
     ),
 )
-"""What a clock table makes of `t_ns` when a session is read; never in a sealed file."""
+"""Server's time, computed by a clock table when a session is read; never in a sealed file."""
 
 MARKS = (Column("event", pa.string(), "1", "what people marked at this frame"),)
-"""Placed when a session is read (`storage.formats.marks`); never in a sealed file."""
+"""Markers, placed when a session is read (`storage.formats.marks`); never in a sealed file."""
 
 TIMES = (
     Column(
@@ -168,12 +168,13 @@ TIMES = (
     ),
     Column("time_utc", pa.timestamp("ns", "UTC"), "UTC", "t_ns as a timestamp"),
 )
-"""Made of `t_ns` when a session is read; never in a sealed file."""
+"""Times computed from `t_ns` when a session is read; never in a sealed file."""
 
 KNOWN = {
     column.name: column
     for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME, *MARKS, *TIMES)
 }
+"""Every column by its name."""
 
 
 def numpy_dtype(kind: pa.DataType) -> np.dtype[Any]:
@@ -188,7 +189,7 @@ def numpy_dtype(kind: pa.DataType) -> np.dtype[Any]:
 
 
 def wire_schema(info: ArrayInfo) -> pa.Schema:
-    """Arrow schema of a stream of frames of this array."""
+    """Return the Arrow schema of a stream of frames of this array."""
     tiles, text = len(info.tiles), info.model_dump_json().encode()
     return pa.schema(
         [
@@ -206,7 +207,7 @@ def wire_schema(info: ArrayInfo) -> pa.Schema:
 
 
 def older_wire_schema(info: ArrayInfo) -> pa.Schema:
-    """The same as older versions wrote it, without hash."""
+    """Return the wire schema of older versions, which has no checksum of the description."""
     return wire_schema(info).with_metadata({ARRAY_INFO_KEY: info.model_dump_json().encode()})
 
 
@@ -215,7 +216,7 @@ def _digits(text: bytes) -> bytes:
 
 
 def to_record_batch(batch: FrameBatch, schema: pa.Schema) -> pa.RecordBatch:
-    """Frames as one Arrow record batch; buffers are shared, not copied."""
+    """Return frames as one Arrow record batch; buffers are shared, not copied."""
     arrays = []
     for column, field in zip(FRAMES, schema, strict=True):
         values = getattr(batch, column.name)
@@ -227,10 +228,10 @@ def to_record_batch(batch: FrameBatch, schema: pa.Schema) -> pa.RecordBatch:
 
 
 def from_record_batch(record: pa.RecordBatch) -> FrameBatch:
-    """Numpy views of a record batch; `to_record_batch` backwards.
+    """Return frames as numpy views of a record batch; inverse of `frames_to_record_batch`.
 
     Raises:
-        FileFormatError: the record is not one of frames.
+        FileFormatError: the record batch does not hold frames.
     """
     try:
         return FrameBatch(**{column.name: _view(record, column) for column in FRAMES})
@@ -243,7 +244,7 @@ def from_record_batch(record: pa.RecordBatch) -> FrameBatch:
 
 def _view(record: pa.RecordBatch, column: Column) -> Array:
     array = record.column(column.name)
-    if array.null_count:  # a null row has no values: the rest would shift to other rows
+    if array.null_count:  # a null row has no values, so later rows would shift
         raise ValueError(f"column {column.name} has {array.null_count} empty rows")
     if isinstance(array, pa.FixedSizeListArray):
         values = array.flatten().to_numpy(zero_copy_only=True)
@@ -252,22 +253,22 @@ def _view(record: pa.RecordBatch, column: Column) -> Array:
 
 
 def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
-    """The description of the array that a schema carries.
+    """Return the array description in a schema's metadata.
 
     Raises:
-        FileFormatError: it carries none, one of another version, or one that was changed.
+        FileFormatError: there is none, it is of another version, or it was changed.
     """
-    said = schema.metadata or {}
-    text = said.get(ARRAY_INFO_KEY)
+    metadata = schema.metadata or {}
+    text = metadata.get(ARRAY_INFO_KEY)
     if text is None:
         raise FileFormatError(
             "no description of the tile array in it",
             where=where,
             expected="a file written by foottile",
         )
-    if said.get(ARRAY_HASH_KEY, _digits(text)) != _digits(text):
+    if metadata.get(ARRAY_HASH_KEY, _digits(text)) != _digits(text):
         raise DamagedFileError(
-            "its description of the tile array was changed: it is not what its hash is of",
+            "its description of the tile array was changed: its checksum is wrong",
             where=where,
         )
     try:
@@ -282,7 +283,7 @@ def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
 
 
 def flat_of(tiles: int) -> dict[str, Column]:
-    """Of which quantity every flat column is that an array of so many tiles may have."""
+    """Return the quantity of every possible flat column of an array, by the column's name."""
     return {flat: column for column in KNOWN.values() for flat in column.flat_names(tiles)}
 
 
@@ -291,12 +292,12 @@ def flat_columns(
     values: Mapping[str, Array],
     notes: Mapping[str, object] | None = None,
 ) -> list[tuple[pa.Field[Any], pa.Array[Any]]]:
-    """Fields and arrays of a flat table, in the order of `columns`; missing values become null.
+    """Return fields and arrays of a flat table, in the order of `columns`; missing values are null.
 
     Args:
-        columns: which.
-        values: by their names, (n,) or (n, tiles).
-        notes: of the file, which may say to what columns were rounded.
+        columns: quantities to convert.
+        values: values by column name, (n,) or (n, tiles).
+        notes: notes of the file, which may state rounding steps.
     """
     out = []
     for column in columns:
@@ -310,7 +311,7 @@ def flat_columns(
 def flat_column(
     column: Column, name: str, values: Array, notes: Mapping[str, object] | None = None
 ) -> tuple[pa.Field[Any], pa.Array[Any]]:
-    """Field and array of one flat column, n rows; missing values become null."""
+    """Return field and array of one flat column, n rows; missing values are null."""
     may_miss = column.missing is not None or not np.issubdtype(values.dtype, np.integer)
     steps = (notes or {}).get(ROUNDED_TO)
     step = steps.get(name) if isinstance(steps, dict) else None
@@ -329,10 +330,10 @@ def _to_arrow(values: Array, column: Column) -> pa.Array[Any]:
 
 
 def from_flat(column: Column, table: pa.Table, tiles: int) -> Array:
-    """One column of a flat table as numpy, (n,) or (n, tiles); nulls are what they are in memory.
+    """Read a quantity from a flat table, (n,) or (n, tiles); nulls become missing values.
 
     Raises:
-        KeyError: the table lacks it.
+        KeyError: the table has no such column.
         ValueError: its type is not the column's.
     """
     parts = [flat_values(column, name, table) for name in column.flat_names(tiles)]
@@ -340,10 +341,10 @@ def from_flat(column: Column, table: pa.Table, tiles: int) -> Array:
 
 
 def flat_values(column: Column, name: str, table: pa.Table) -> Array:
-    """One flat column as numpy, (n,); nulls are what they are in memory.
+    """Read one flat column, (n,); nulls become missing values.
 
     Raises:
-        KeyError: the table lacks it.
+        KeyError: the table has no such column.
         ValueError: its type is not the column's.
     """
     array = table.column(name).combine_chunks()

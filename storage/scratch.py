@@ -1,7 +1,7 @@
-"""A file without a name: bytes that are of use to this process only, and gone with it.
+"""Scratch file without a name, for bytes that only this process needs.
 
-For what would take too much memory and can be made again. Its place on the disk is free as soon as
-nobody holds it, however the process ends.
+For data that would take too much memory and can be made again. The disk space is freed when the
+process ends, in whatever way.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from devices.errors import DamagedFileError, StorageError
 
 
 class Kept(NamedTuple):
-    """Where something is in a scratch file."""
+    """Position and sizes of a block in a scratch file."""
 
     at: int
+    """Offset in bytes."""
     stored: int
-    """Bytes that it takes there."""
+    """Length in the file, compressed."""
     size: int
-    """Bytes that it has."""
+    """Length after decompression."""
 
 
 class Scratch:
-    """Keeps pieces of bytes, compressed. One thread puts; any may get.
+    """Scratch file of compressed blocks. One thread appends; any may read.
 
     Args:
-        folder: on whose disk.
+        folder: a folder on the disk to use.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -40,15 +41,15 @@ class Scratch:
         self._end = 0
 
     def put(self, content: bytes) -> Kept:
-        """Keep something.
+        """Compress and append a block.
 
         Raises:
-            StorageError: the disk is full or not writable; what was kept before still is.
+            StorageError: the disk is full or not writable; earlier blocks are still there.
         """
         stored = pa.compress(content, codec="zstd", asbytes=True)
         try:
             if self._file is None:
-                # Open for as long as this object lives.
+                # Stays open as long as this object lives.
                 self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
                 weakref.finalize(self, self._file.close)
             descriptor, written = self._file.fileno(), 0
@@ -58,19 +59,19 @@ class Scratch:
             raise StorageError(
                 f"cannot be written: {error.strerror}", where=str(self._folder), errno=error.errno
             ) from error
-        kept = Kept(self._end, len(stored), len(content))
+        block = Kept(self._end, len(stored), len(content))
         self._end += len(stored)
-        return kept
+        return block
 
     def get(self, kept: Kept) -> bytes:
-        """What was kept.
+        """Read and decompress a block.
 
         Raises:
-            DamagedFileError: it is not there any more.
+            DamagedFileError: it cannot be read any more.
         """
         where = str(self._folder)
         if self._file is None:
-            raise DamagedFileError("nothing was kept", where=where)
+            raise DamagedFileError("the scratch file holds no block", where=where)
         try:
             stored = os.pread(self._file.fileno(), kept.stored, kept.at)
             return pa.decompress(stored, kept.size, "zstd", asbytes=True)

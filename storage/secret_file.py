@@ -1,6 +1,7 @@
-"""`secrets.json`: what two machines share and nobody else may read, by the other one's name.
+"""`secrets.json`: secrets that two machines share, by the other machine's name.
 
-A server keeps one in the folder of each node, a node one in its own folder.
+A server keeps one in the folder of each node, a node one in its own folder. No other user may read
+it.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from storage.durable import make_folder, storage_errors
 SECRETS_NAME = "secrets.json"
 _SECRET = re.compile(r"[0-9a-f]{64}")
 _OWNER_ONLY = 0o600
-"""Also in a folder that its owner has opened to a group."""
+"""File permissions, also in a folder that its owner has opened to a group."""
 
 
 def read_secrets(path: Path) -> dict[str, str]:
-    """Return the secrets by name, 64 hex digits each; none if there is no file.
+    """Return the secrets by name, 64 hex digits each; empty if there is no file.
 
     Raises:
-        DamagedFileError: it is not what was written.
+        DamagedFileError: its content has changed since it was written.
         StorageError: it cannot be read now.
     """
     try:
@@ -42,10 +43,10 @@ def read_secrets(path: Path) -> dict[str, str]:
 
 
 def write_secrets(path: Path, secrets: Mapping[str, str]) -> None:
-    """Write the secrets, whole or not at all; they are on the disk when this returns.
+    """Write the secrets atomically; they are on the disk when this returns.
 
     Raises:
-        StorageError: the disk is full or not writable; the file before stays as it was.
+        StorageError: the disk is full or not writable; the old file is unchanged.
     """
     with storage_errors(path.parent):
         make_folder(path.parent)

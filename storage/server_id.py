@@ -1,4 +1,4 @@
-"""`server_id`: the name that a server gives its data folder, with a CRC-32 that proves it."""
+"""`server_id`: the random name of a server's data folder, with a CRC-32."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _FORM = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
 
 @dataclass(frozen=True)
 class ServerId:
-    """What the file holds."""
+    """Content of the file."""
 
     id: str
     is_proven: bool
-    """False: it states no CRC-32, since an older version wrote it."""
+    """False: an older version wrote it without a CRC-32."""
 
 
 def read_server_id(path: Path) -> ServerId:
-    """Read it.
+    """Read the id and verify its CRC-32.
 
     Raises:
-        FileNotFoundError: there is none.
-        DamagedFileError: it is not what was written.
+        FileNotFoundError: there is no such file.
+        DamagedFileError: its CRC-32 is wrong.
         StorageError: it cannot be read now.
     """
     text = read_whole(path).decode("ascii", "replace").strip()
@@ -39,10 +39,10 @@ def read_server_id(path: Path) -> ServerId:
 
 
 def write_server_id(path: Path, made: str) -> None:
-    """Write it, whole or not at all.
+    """Write an id atomically.
 
     Args:
-        path: the file; one that is there is replaced.
+        path: the file; an existing one is replaced.
         made: 32 hexadecimal digits.
 
     Raises:

@@ -1,8 +1,8 @@
-"""Frames as the bytes that go over the wire and into journals: one Arrow IPC message a batch.
+"""Frames as bytes on the wire and in journals: one Arrow IPC message per batch.
 
-The schema is known to both ends (it follows from the `ArrayInfo` of the stream), so a message is a
-record batch and nothing else; the same bytes, appended to the schema's own message, are an Arrow
-IPC stream that any tool can read.
+Both ends have the schema (it follows from the `ArrayInfo` of the stream), so a message is a record
+batch and nothing else; the same bytes, appended to the schema's own message, are an Arrow IPC
+stream that any tool can read.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from storage.layout import Layouts
 from storage.schema import to_record_batch, wire_schema
 
 _MESSAGE_FRAMES = 64
-"""As many as acquisition puts into a batch at most."""
+"""Largest batch of the acquisition."""
 
 
 @dataclass(frozen=True)
 class EncodedBatch:
-    """Consecutive frames as one message, and what a journal notes of it without decoding it."""
+    """Consecutive frames as one message, with the numbers and times of its first and last frame."""
 
     seq_first: int
     seq_last: int
@@ -36,7 +36,7 @@ class EncodedBatch:
 
     @classmethod
     def of(cls, frames: FrameBatch, payload: bytes) -> EncodedBatch:
-        """The message `payload`, which holds these frames."""
+        """Wrap the message `payload`, which holds these frames."""
         return cls(
             *(int(frames.seq[0]), int(frames.seq[-1])),
             *(int(frames.t_ns[0]), int(frames.t_ns[-1])),
@@ -45,17 +45,17 @@ class EncodedBatch:
 
     @property
     def numbers(self) -> Intervals:
-        """Of its frames."""
+        """Numbers of its frames."""
         return Intervals([(self.seq_first, self.seq_last)])
 
 
 def encode(batch: FrameBatch, schema: pa.Schema) -> bytes:
-    """Frames as one message of a stream with this schema (`storage.schema.wire_schema`)."""
+    """Encode frames as one message of a stream with this schema (`storage.schema.wire_schema`)."""
     return to_record_batch(batch, schema).serialize().to_pybytes()
 
 
 def messages_of(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
-    """Frames as messages of the size that nodes send."""
+    """Encode frames as messages of the size that nodes send."""
     schema = wire_schema(info)
     for begin in range(0, len(frames), _MESSAGE_FRAMES):
         rows = frames.rows(begin, min(begin + _MESSAGE_FRAMES, len(frames)))
@@ -63,10 +63,10 @@ def messages_of(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
 
 
 class Decoder:
-    """Decodes messages of one stream. May be used from several threads.
+    """Decoder of messages of one stream. Thread-safe.
 
     Args:
-        schema: of the stream (`storage.schema.wire_schema`).
+        schema: schema of the stream (`storage.schema.wire_schema`).
     """
 
     def __init__(self, schema: pa.Schema) -> None:
@@ -75,10 +75,11 @@ class Decoder:
         self._tiles = schema.field("padc").type.list_size
 
     def decode(self, payload: bytes | memoryview) -> FrameBatch:
-        """Frames of one message, as views of its bytes; everything about it is checked first.
+        """Decode the frames of one message as views of its bytes, and check them completely.
 
         Raises:
-            FileFormatError: it is no such message, is cut off, or its frames are not in order.
+            FileFormatError: it is no message of this stream, is cut off, or its frames are out of
+                order.
         """
         layout = self._layouts.of(payload)
         by_frame, by_tile = (layout.rows,), (layout.rows, self._tiles)
@@ -92,7 +93,7 @@ class Decoder:
         )
         seq, t_mono_ns = batch.seq, batch.t_mono_ns
         first, last = int(seq[0]), int(seq[-1])
-        # A difference of unsigned numbers wraps, so both ends are looked at as well.
+        # A difference of unsigned numbers wraps, so both ends are checked as well.
         if last - first != len(batch) - 1 or np.count_nonzero(seq[1:] - seq[:-1] != 1):
             raise FileFormatError(
                 f"frames {first} to {last} do not follow one another",
@@ -109,9 +110,5 @@ class Decoder:
 
 
 def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
-    """One message alone, as by a `Decoder`.
-
-    Raises:
-        FileFormatError: as there.
-    """
+    """Decode a single message; raises as `Decoder.decode`."""
     return Decoder(schema).decode(payload)

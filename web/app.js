@@ -3,6 +3,7 @@
 // common/    REST calls, websocket, dialogs, notices, texts and elements
 // live/      panels that draw the latest frame, and the action buttons
 // nodes/     page of all nodes
+// calibrate/ page of the guided calibration
 // sessions/  page of recorded sessions, and the trash
 //
 // A panel is a class that owns one element of index.html. This module creates it and passes server

@@ -1,1 +1,1 @@
-"""Tiles behind multiplexers as one array: found, timed, scanned, and judged reading by reading."""
+"""Array of tiles behind multiplexers: start-up, schedules, scans, plausibility of readings."""

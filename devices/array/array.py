@@ -1,11 +1,9 @@
-"""An array of tiles behind multiplexers: takes frames, whatever happens on the bus.
+"""Array of tiles behind multiplexers: scans frames in spite of faults on the bus.
 
-The order of a frame's transfers is a schedule's (`devices.array.schedules`); here is what a
-transfer does and what becomes of it when it fails. A fault is a bit of `TileStatus` in the frame in
-which the bus shows it, never an exception. The bad tile is left alone so that the others keep their
-rate: second attempts share a budget of time in each frame, and a tile that has fallen silent is
-looked for now and then. Before it is believed again its coefficients are read: it may be another
-part.
+A schedule (`devices.array.schedules`) orders the transfers of a frame; this module runs them and
+handles their faults. A fault is a tile flag in its frame, never an exception. A bad tile must not
+slow down the others: retries share a time budget in each frame, and a silent tile is probed with a
+backoff. When it answers again its coefficients are checked first: it may be another part.
 """
 
 from __future__ import annotations
@@ -33,30 +31,30 @@ AUDIT_NS = 1_000_000_000
 """Interval at which the muxes' control registers are read back."""
 
 _LOOK_FRAMES, _LOOK_PART = 10, 0.008
-"""In one of so many frames, and for no more than this part of the time, a tile is read again."""
+"""Shortest interval in frames, and largest part of the time, for re-reading a tile."""
 
 _BUDGET_PART = 8
 _BUDGET_MIN_NS = 500_000
-"""Second attempts may take an eighth of a frame, but always one reading and a look at who it is."""
+"""Retry budget: an eighth of a frame, but at least one reading and one check of coefficients."""
 _LEARN_NS, _FORGET_NS = 10_000, 2_000
-"""In each frame so much more of the driver's own time is taken for granted, and so much less."""
+"""Largest increase, and fixed decrease, of a tile's learnt turn in each frame."""
 _DISTURBED_BUDGETS = 4
-"""On a line with flipped bits, correct readings are worth some of the rate."""
+"""Factor of the retry budget on a line with flipped bits: correct readings before rate."""
 
 
 class TileArray:
     """Tiles of one bus, addressed by their index in the frame.
 
     Args:
-        bus: what they hang on.
-        tiles: as identified at start-up (`devices.array.startup`).
-        clock: virtual or real.
-        schedule: the order of transfers.
-        timing: of bus and parts, for the length of a frame.
-        temperature_every: temperature is read in every so many frames.
-        broadcast_channels: how many channels may be open at once.
-        recovery: frees a stuck bus; None: there is none.
-        reference_n: gives the reference force in newtons; called once in a frame at the first
+        bus: bus of the tiles.
+        tiles: tiles as identified at start-up (`devices.array.startup`).
+        clock: virtual or real clock.
+        schedule: order of the transfers.
+        timing: timing of bus and parts, for the duration of a frame.
+        temperature_every: interval in frames at which temperature is read.
+        broadcast_channels: largest number of channels open at once.
+        recovery: frees a stuck bus; None: no recovery.
+        reference_n: reads the reference force in newtons; called once in a frame at the first
             tile's sample instant, while the bus waits.
 
     Raises:
@@ -86,7 +84,7 @@ class TileArray:
         self.sample_delay_ns = tuple(
             round(tile.conversion_ms * 1e6) // SAMPLE_PART_OF_CONVERSION for tile in tiles
         )
-        """From the STOP of a tile's CONVERT to the instant its pressure is taken to be sampled."""
+        """Delay from the STOP of a tile's CONVERT to the assumed sample instant of its pressure."""
         self.health = tuple(TileHealth(tile) for tile in tiles)
         self._clock = clock
         self._ports = TilePorts(bus, tiles)
@@ -102,7 +100,7 @@ class TileArray:
         self._temperature_every = temperature_every
         self._reference_n = reference_n
         self._frame_ns = round(frame_s(schedule, timing) * 1e9)
-        # A tile that is started again right after its read has nothing to be read again.
+        # A tile that restarts right after its read has no finished conversion to re-read.
         self._look_frames = 0
         if schedule != "pipelined" and len(tiles) > 1:
             look_ns = (timing.select_s + timing.read_s) * 1e9
@@ -116,7 +114,7 @@ class TileArray:
 
     @property
     def replaced(self) -> tuple[str, ...]:
-        """Serials of the tiles that another part than the identified one now answers for."""
+        """Serials of the tiles in whose place another part answers."""
         return tuple(
             tile.serial
             for tile, health in zip(self.tiles, self.health, strict=True)
@@ -124,22 +122,22 @@ class TileArray:
         )
 
     def begin(self) -> None:
-        """A stream begins: its first frame reads all temperatures, and nothing has gone wrong."""
+        """Begin a stream: clear fault counts and mux state; the first frame reads temperatures."""
         self._frames = 0
         self._ports.router.forget()
         for health in self.health:
             health.counts.clear()
 
     def resume(self) -> None:
-        """The stream goes on after something else used the bus.
+        """Continue the stream after another user of the bus.
 
-        Nothing is taken to be as it was left, and what was converting is too old to be read.
+        Discards the cached mux state and all running conversions.
         """
         self._ports.router.forget()
         self._running = [False] * len(self.tiles)
 
     def troubles(self) -> dict[str, str]:
-        """What is wrong now, in words, by serial; the bus's trouble is under ""."""
+        """Return the present warnings by serial; the bus's warning is under ""."""
         found: dict[str, str] = {}
         if self.bus.trouble:
             found[""] = self.bus.trouble
@@ -156,7 +154,7 @@ class TileArray:
         return found
 
     def scan(self) -> Scan:
-        """Take one frame. A fault of a tile or the bus is a status bit in it, never an exception.
+        """Scan one frame. A fault of a tile or the bus is a flag in it, never an exception.
 
         Raises:
             BusMisuseError: the adapter refuses our transfers: a bug, not a fault of the field.
@@ -172,17 +170,17 @@ class TileArray:
         if scan.budget_ns == budget_ns:
             self._learn_turns()
         if all(padc == NOT_READ for padc in scan.padc):
-            # No tile answers, so nothing was waited for: do not run faster because of it.
+            # Without any answer a frame takes no time: keep the frame rate.
             self._clock.sleep_until_ns(begin_ns + self._frame_ns)
         self._frames += 1
         return scan
 
-    # What schedules are made of
+    # Operations of schedules
 
     def convert(self, scan: Scan, tiles: Sequence[int]) -> None:
-        """Start a conversion in all `tiles` at once, except in those that are lost."""
+        """Start a conversion in all `tiles` at once, except behind lost muxes."""
         if len(tiles) == 1 and self._running[tiles[0]]:
-            return  # a slow part still converts: do not wait for it or disturb it
+            return  # a slow part still converts
         if self._look_frames and self._frames % self._look_frames == self._look_frames - 1:
             self._look_again(scan, tiles)
         called = self._worth_calling(tiles)
@@ -197,21 +195,21 @@ class TileArray:
         now_ns = self._clock.now_ns()
         for i in tiles:
             self._started_ns[i] = now_ns
-            # A tile that is not known to be there may have missed a broadcast.
+            # A lost tile may have missed the broadcast.
             self._running[i] = i in called and self.health[i].present
 
     def _worth_calling(self, tiles: Sequence[int]) -> tuple[int, ...]:
-        """Tiles behind a mux that has a tile present: a broadcast names muxes, not tiles."""
+        """Return the tiles whose mux has a tile present: a broadcast addresses muxes."""
         if all(self.health[i].present for i in tiles):
             return tuple(tiles)
         muxes = {self.tiles[i].mux for i in tiles if self.health[i].present}
         return tuple(i for i in tiles if self.tiles[i].mux in muxes)
 
     def close_ranks(self) -> None:
-        """Wait until all tiles can be read and started again one right after the other.
+        """Wait until all tiles can be read and restarted back to back.
 
-        A tile that was read late once, because another one was asked twice, would stay late: its
-        samples would drift away from those of the others.
+        Otherwise a tile read late once, after a retry of another one, would stay late, and its
+        sample instants would drift away from the others.
         """
         due_ns = 0
         for i in self.indices:
@@ -221,7 +219,7 @@ class TileArray:
         self._clock.sleep_until_ns(due_ns)
 
     def collect(self, scan: Scan, tile: int) -> None:
-        """Read the conversion of a tile as soon as it is finished."""
+        """Read a tile's conversion as soon as it is finished; flag faults in `scan`."""
         health = self.health[tile]
         scan.convert_stop_ns[tile] = self._started_ns[tile]
         if scan.given_up:
@@ -260,10 +258,10 @@ class TileArray:
             scan.flag(tile, TileStatus.NO_ANSWER)
             health.lose(self._clock.now_ns())
 
-    # What becomes of a transfer
+    # Retries
 
     def _attempt(self, scan: Scan, tiles: Sequence[int], transfers: Callable[[], None]) -> bool:
-        """Run `transfers` for `tiles`, a second time if the frame's budget allows."""
+        """Run `transfers` for `tiles`; retry once if the frame's budget allows."""
         for attempt in range(2):
             self._busy_since_ns = self._clock.now_ns()
             try:
@@ -286,30 +284,30 @@ class TileArray:
         return False
 
     def _may_spend(self, scan: Scan, tile: int) -> bool:
-        """Is there time left in this frame for more than one reading of a tile?
+        """Return whether the frame has time left for a retry of a tile.
 
-        Each tile in turn has a frame where the answer is always yes; else the first tiles would
-        use up the time that the last ones need.
+        Each tile in turn has a frame in which it may always retry; otherwise the first tiles would
+        use up the budget.
         """
         return scan.budget_ns > 0 or tile == self._frames % len(self.tiles)
 
     def _wait(self, scan: Scan, ready_ns: int) -> None:
-        """Sleep until a conversion is finished, and do what is to be done at the sample instant."""
+        """Sleep until a conversion is finished; read the reference at the sample instant."""
         if self._reference_n is not None and scan.reference_ns is None:
             scan.reference_ns = self._started_ns[0] + self.sample_delay_ns[0]
             self._clock.sleep_until_ns(scan.reference_ns)
             scan.reference_n = self._reference_n()
         self._clock.sleep_until_ns(ready_ns)
-        self._busy_since_ns = self._clock.now_ns()  # waiting spends nothing
+        self._busy_since_ns = self._clock.now_ns()  # waiting is not charged to the budget
 
-    # Frame by frame
+    # Once per frame
 
     def _learn_turns(self) -> None:
-        """How long after a frame's begin each tile has its turn, if nothing holds the frame up.
+        """Update each tile's turn: the delay from the frame's begin to its start, undisturbed.
 
-        Beside the wires' time that is the driver's own, in which a conversion goes on as well. It
-        is believed little by little, where nothing was asked twice, and forgotten again: else a
-        tile that was late once would be waited for as one that always is.
+        It contains the time on the wires and the driver's own, in which conversions go on. It rises
+        slowly, in frames without retries only, and falls slowly: a single late tile must not become
+        the norm.
         """
         begin_ns = self._started_ns[0] - self._wire_turns_ns[0]
         for i, started_ns in enumerate(self._started_ns):
@@ -328,7 +326,7 @@ class TileArray:
         return False
 
     def _audit(self, scan: Scan) -> None:
-        """Now and then, at the end of a frame, check the muxes, and try a suspect's conversion."""
+        """Audit the muxes at intervals, and test the conversion time of a suspect tile."""
         now_ns = self._clock.now_ns()
         try:
             if now_ns >= self._audit_due_ns:
@@ -339,13 +337,13 @@ class TileArray:
                 self._watch.try_conversion(tile)
                 self._running[tile] = False
                 self.convert(scan, [tile])
-        except NoAcknowledgeError:  # the next frame will see who it is
+        except NoAcknowledgeError:  # the next frame will show the tile
             self._ports.router.forget()
         except BusFaultError:
             scan.note_bus_fault()
 
     def _look_again(self, scan: Scan, tiles: Sequence[int]) -> None:
-        """Check one tile before the next start: were the words read from it its final result?"""
+        """Re-read one tile before its next start, to check that its conversion had finished."""
         tile = self._frames // self._look_frames % len(self.tiles)
         if tile not in tiles:
             return
@@ -359,7 +357,7 @@ class TileArray:
             scan.note_bus_fault()
 
     def _conclude(self, scan: Scan) -> None:
-        """Judge from this frame whether tiles are stale and whether the bus works."""
+        """Flag stale tiles, count faults, and check the bus after a frame without any answer."""
         for i, health in enumerate(self.health):
             if health.is_stale(scan.padc[i], scan.tadc[i]):
                 scan.flag(i, TileStatus.STALE)

@@ -1,8 +1,8 @@
-"""How long a frame takes on the wire, schedule by schedule, and which schedule is best.
+"""Timing budget of the bus: duration of a frame for each schedule, and the best schedule.
 
-The timing model of hardware.md 4: START, repeated START and STOP count one SCL period each, nine
-per byte; every transaction may cost a fixed overhead on top, every sleep an overshoot. What the
-schedules do is in `devices.array.schedules`.
+Timing model of hardware.md 4: START, repeated START and STOP take one SCL period each, a byte nine;
+every transaction may have a fixed overhead, every sleep an overshoot. The schedules are in
+`devices.array.schedules`.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ from devices.scene.hardware import ScheduleName
 SELECT_BITS = 20  # START, address, mask, STOP
 CONVERT_BITS = 29  # START, address, register, data, STOP
 _READ_BITS = 30  # START, address, register, repeated START, address, STOP
-_BYTE_BITS = 9  # eight and the acknowledge
+_BYTE_BITS = 9  # eight bits and the acknowledge
 
 PREFERENCE: tuple[ScheduleName, ...] = ("simultaneous", "per_mux", "pipelined", "sequential")
-"""Order of preference of equally fast schedules: least skew first."""
-_AS_FAST = 0.995  # half a percent is no reason to prefer a schedule
+"""Order of preference among equally fast schedules: least skew first."""
+_AS_FAST = 0.995  # rates within half a percent count as equal
 
 
 def read_bits(n_bytes: float) -> float:
-    """SCL periods of a read of `n_bytes` from a register."""
+    """Return the SCL periods of a read of `n_bytes` from a register."""
     return _READ_BITS + _BYTE_BITS * n_bytes
 
 
 @dataclass(frozen=True)
 class BusTiming:
-    """What a bus, its host and the parts on it need.
+    """Timing of a bus, its host and its parts.
 
     Attributes:
-        scl_hz: the bus clock as it really is.
-        conversions_s: how long to wait for each tile, in the order of the tiles.
-        muxes: which mux each tile is behind.
+        scl_hz: real bus clock.
+        conversions_s: wait for each tile's conversion, in tile order.
+        muxes: mux address of each tile.
         bytes_read: bytes of a sample, 4 with temperature and 2 without; a mean if decimated.
         transaction_s: overhead of one transaction beyond its bits.
-        sleep_s: how much too late a sleep ends.
+        sleep_s: overshoot of a sleep.
     """
 
     scl_hz: float
@@ -51,17 +51,17 @@ class BusTiming:
 
     @property
     def select_s(self) -> float:
-        """One write to a mux."""
+        """Duration of one write to a mux."""
         return SELECT_BITS / self.scl_hz + self.transaction_s
 
     @property
     def convert_s(self) -> float:
-        """One CONVERT."""
+        """Duration of one CONVERT."""
         return CONVERT_BITS / self.scl_hz + self.transaction_s
 
     @property
     def read_s(self) -> float:
-        """One read of a tile's sample."""
+        """Duration of one read of a tile's sample."""
         return read_bits(self.bytes_read) / self.scl_hz + self.transaction_s
 
     @property
@@ -71,11 +71,11 @@ class BusTiming:
 
 
 def frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
-    """Seconds from one frame to the next."""
+    """Compute the frame period of a schedule, in seconds."""
     n, m = len(timing.muxes), len(timing.tiles_by_mux)
     s, c, r = timing.select_s, timing.convert_s, timing.read_s
     waits = [wait + timing.sleep_s for wait in timing.conversions_s]
-    if n == 1:  # the mux stays as it is, and there is nothing to do in the wait
+    if n == 1:  # the mux stays selected, and nothing overlaps the wait
         return c + waits[0] + r
     if schedule == "sequential":
         return n * (s + c + r) + sum(waits) + (m * s if m > 1 else 0.0)
@@ -91,7 +91,7 @@ def frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
 
 
 def turns_s(timing: BusTiming) -> tuple[float, ...]:
-    """From the begin of a pipelined frame to each tile's read, if none of them has to wait."""
+    """Compute the delay from the begin of a pipelined frame to each tile's read, without waits."""
     turns = []
     t_s, alone = 0.0, len(timing.muxes) == 1
     for i, mux in enumerate(timing.muxes):
@@ -103,12 +103,12 @@ def turns_s(timing: BusTiming) -> tuple[float, ...]:
 
 
 def rates_hz(timing: BusTiming) -> dict[ScheduleName, float]:
-    """Frames a second of every schedule."""
+    """Compute the frame rate of every schedule."""
     return {name: 1.0 / frame_s(name, timing) for name in get_args(ScheduleName)}
 
 
 def broadcast_width(schedule: ScheduleName, muxes: Sequence[int]) -> int:
-    """How many channels a schedule opens at once."""
+    """Return the largest number of channels that a schedule opens at once."""
     if schedule == "simultaneous":
         return len(muxes)
     if schedule == "per_mux":
@@ -117,10 +117,10 @@ def broadcast_width(schedule: ScheduleName, muxes: Sequence[int]) -> int:
 
 
 def check_broadcast(schedule: ScheduleName, muxes: Sequence[int], channels_max: int) -> None:
-    """Refuse a broadcast that the wires cannot carry.
+    """Check that a schedule's broadcast does not exceed the drive strength of a part.
 
-    Every open channel adds its pull-ups, and in a read one part alone has to sink them all: 3 mA at
-    0.4 V is what a part is good for (TCA9548A data sheet 9.2.1, hardware.md 2).
+    Every open channel adds its pull-ups, and in a read one part alone sinks their current: at most
+    3 mA at 0.4 V (TCA9548A data sheet 9.2.1, hardware.md 2).
 
     Raises:
         SceneError: more channels at once than `channels_max`.
@@ -138,19 +138,19 @@ def check_broadcast(schedule: ScheduleName, muxes: Sequence[int], channels_max: 
 
 @dataclass(frozen=True)
 class Choice:
-    """A schedule, and in one sentence why this one."""
+    """Chosen schedule, and the reason in one sentence."""
 
     schedule: ScheduleName
     reason: str
 
 
 def choose(timing: BusTiming, *, asked_hz: float, channels_max: int) -> Choice:
-    """The schedule for these tiles: without skew if that is fast enough, else the fastest.
+    """Choose the schedule without skew if it is fast enough, else the fastest.
 
     Args:
-        timing: the bus and the parts, as measured.
-        asked_hz: frames a second that are wanted; 0: as many as there can be.
-        channels_max: how many channels may be open at once.
+        timing: measured timing of bus and parts.
+        asked_hz: requested frame rate; 0: as fast as possible.
+        channels_max: largest number of channels open at once.
     """
     n, m = len(timing.muxes), len(timing.tiles_by_mux)
     rates = {
@@ -170,6 +170,6 @@ def choose(timing: BusTiming, *, asked_hz: float, channels_max: int) -> Choice:
 
 
 def listed(rates: Mapping[ScheduleName, float], first: ScheduleName) -> str:
-    """Rates in words, `first` first."""
+    """Format rates as text, `first` first."""
     others = [f"{other} {rate:.0f}" for other, rate in rates.items() if other != first]
     return f"{first} gives {rates[first]:.0f} frames/s, {', '.join(others)}"

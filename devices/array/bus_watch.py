@@ -1,4 +1,4 @@
-"""Does the bus move at all? Notices that it is stuck, helps it, and notices that it is back."""
+"""Monitor of the bus as a whole: detects a stuck bus, starts recovery, detects its return."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from devices.errors import BusFaultError, BusSetupError
 from devices.recovery.recovery import BusRecovery
 
 _RECOVERY_NS = (10_000_000, 1_000_000_000)
-"""A stuck bus is helped at once, then less and less often."""
+"""First and longest interval between recovery attempts."""
 
 RENEWAL_NS = 1_000_000_000
-"""A bus that does not move for so long is opened anew."""
+"""Time without a working bus after which the adapter is reopened."""
 
 
 @dataclass(frozen=True)
 class Help:
-    """What became of an attempt to free the bus.
+    """Result of an attempt to free the bus.
 
     Attributes:
-        worked: does it move now?
-        problem: why something could not even be tried; empty if all could.
+        worked: True if the bus works again.
+        problem: reason why a step could not be tried; empty if all were.
     """
 
     worked: bool
@@ -32,10 +32,10 @@ class Help:
 
 
 def help_bus(recovery: BusRecovery, moves: Callable[[], bool]) -> Help:
-    """Nine clocks, and if the bus does not move after them, the multiplexers' RESET.
+    """Free a stuck bus by nine clocks, then by the multiplexers' RESET, until `moves()` is True.
 
-    Lines that are high are no proof that it moves: a slave may pull them low again. A line that
-    cannot be had now may be had the next time.
+    High lines do not prove that the bus works: a slave may pull them low again. A GPIO line that is
+    busy now may be free at the next attempt.
     """
     problems = []
     for help_ in (recovery.clock_out, recovery.reset_muxes):
@@ -50,19 +50,19 @@ def help_bus(recovery: BusRecovery, moves: Callable[[], bool]) -> Help:
 
 
 class BusWatch:
-    """The bus as a whole.
+    """Monitor of one bus.
 
     A stuck SDA acknowledges everything and reads as zeros, an open one acknowledges nothing
-    (hardware.md 3.2). What tells them from tiles in trouble is a multiplexer that keeps, or does
-    not keep, what is written to it.
+    (hardware.md 3.2). To tell these from faulty tiles, the monitor writes a multiplexer's register
+    and reads it back.
     """
 
     def __init__(self, router: MuxRouter, clock: Clock, recovery: BusRecovery | None) -> None:
         self.is_down = False
         self.recoveries = 0
-        """How often a stuck bus was helped."""
+        """Number of recovery attempts."""
         self.problem = ""
-        """Why it could not be helped the last time; empty if it could, or there is no recovery."""
+        """Reason why the last recovery failed; empty after success or without recovery."""
         self._router = router
         self._clock = clock
         self._recovery = recovery
@@ -70,12 +70,12 @@ class BusWatch:
         self._renewal_due_ns = 0
 
     def look(self, scan: Scan) -> None:
-        """Nothing but zeros, or no answer at all: if it is the bus, the frame is given up."""
+        """Check the bus after zeros or silence; abandon the frame if it fails."""
         if not self._moves():
             scan.note_bus_fault(for_good=True)
 
     def fall(self) -> None:
-        """The bus has failed: nothing is asked of the tiles until it is back."""
+        """Mark the bus as down: no transfers to tiles until it works again."""
         self.is_down = True
         self.problem = ""
         self._wait_ns, self._due_ns = _RECOVERY_NS[0], 0
@@ -83,23 +83,23 @@ class BusWatch:
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the bus, in words; empty if nothing is."""
+        """Warning about the bus; empty if it works."""
         if not self.is_down:
             return ""
         if not self._router.bus.is_open:
             why = f": {self._router.bus.problem}" if self._router.bus.problem else ""
-            return f"the adapter of the bus is away, and is opened again every second{why}"
-        unhelped = f" and could not be helped: {self.problem}" if self.problem else ""
-        return f"the bus is stuck or cut{unhelped}"
+            return f"the adapter of the bus is missing; retry every second{why}"
+        failure = f"; recovery failed: {self.problem}" if self.problem else ""
+        return f"the bus is stuck or cut{failure}"
 
     def comes_back(self) -> bool:
-        """Check whether a bus that was down moves again; help it if need be."""
+        """Return whether a bus that was down works again; reopen or recover it if due."""
         bus = self._router.bus
         if not bus.reopen(self._clock.now_ns()):
             return False
         back = self._moves()
         if not back and bus.is_open and self._clock.now_ns() >= self._renewal_due_ns:
-            # The open file of a USB adapter that was plugged in again fails with EIO for ever.
+            # After replugging a USB adapter its open file fails with EIO for ever.
             self._renewal_due_ns = self._clock.now_ns() + RENEWAL_NS
             bus.let_go()
             return False

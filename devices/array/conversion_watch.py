@@ -1,4 +1,4 @@
-"""How long each part is waited for, and whether it still keeps the time it was measured to need."""
+"""Monitor of conversion times: detects parts that have become slower than measured."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from devices.clock import Clock
 from devices.frames import NOT_READ
 
 SLOW_AUDIT_NS = 500_000_000
-"""Interval of trials of a slow part, to notice when it is quick again."""
+"""Interval of trials of a slow part, to detect that it is fast again."""
 
 _HESITATION_NS = 100_000
-"""A read that comes later than planned by this much proves nothing."""
+"""Delay of a read beyond plan from which its trial proves nothing."""
 
 _TRIES, _SLOW_TRIES, _SAME_MAX = 8, 2, 3
-"""Every second pair of healthy readings has the same temperature: eight are one in 250. One that is
-known to be slow is asked less often each time: whether it is quick again need not be known at once.
-"""
+"""Conversions in a trial of a suspect and of a slow part, and equal ones that end it. A pair of
+readings of a healthy part has equal temperatures in every second case, eight pairs in one of 250.
+Trials of a slow part are shorter: its return to normal is not urgent."""
 
 
 class ConversionWatch:
-    """Waits of all tiles, and what keeps them true.
+    """Conversion waits of all tiles, and the checks that keep them valid.
 
-    A reading that is taken too early is that of the conversion before. If the part is started again
-    right after it, nothing ever finishes, and its words stand still, which is noticed. If it has
-    time to finish until the next CONVERT, its words change from frame to frame like any other, one
-    frame late, and betray nothing: so in some frames one tile is read again before that CONVERT,
-    and has to be the same. A suspect is tried: is a conversion finished after the measured time?
+    A read that is too early returns the previous conversion. If the part restarts right after it,
+    no conversion ever finishes, and its counts stand still, which is flagged as stale. If the part
+    has time to finish before the next CONVERT, its counts change from frame to frame, one frame
+    late, and look healthy: so in some frames one tile is read again before that CONVERT, and its
+    counts have to be the same. For a suspect tile a trial checks the measured conversion time.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class ConversionWatch:
     ) -> None:
         self._measured_ns = tuple(round(wait_s * 1e9) for wait_s in timing.conversions_s)
         self.wait_ns = list(self._measured_ns)
-        """How long to wait for each tile's conversion."""
+        """Wait for each tile's conversion."""
         self._ports = ports
         self._clock = clock
         self._health = health
@@ -54,10 +54,10 @@ class ConversionWatch:
         self._tries = 0
 
     def look_again(self, tile: int, words: tuple[int, int]) -> None:
-        """Read a tile again that gave `words` and was not started since.
+        """Re-read a tile that gave `words` and was not restarted; suspect it if they changed.
 
         Raises:
-            I2cError: it does not answer.
+            I2cError: the tile does not answer.
         """
         if self._health[tile].slow:
             return
@@ -67,12 +67,12 @@ class ConversionWatch:
             self.suspect(tile)
 
     def suspect(self, tile: int) -> None:
-        """This tile's words may be too old."""
+        """Queue a tile for a trial: it may be read too early."""
         if tile not in self._suspects and not self._health[tile].slow:
             self._suspects.append(tile)
 
     def to_try(self) -> int | None:
-        """A tile whose conversion should be tried now, or None."""
+        """Return the next tile whose trial is due; None: no trial."""
         if self._suspects:
             return self._suspects.pop(0)
         now_ns = self._clock.now_ns()
@@ -84,13 +84,13 @@ class ConversionWatch:
         return None
 
     def try_conversion(self, tile: int) -> None:
-        """Find out whether a part keeps its time, and wait for it accordingly from now on.
+        """Test whether a part converts within its measured time, and set its wait accordingly.
 
-        As in the self-test there is one read for each CONVERT: to read a conversion that is not
-        finished may abort it. Its conversion has to be started again afterwards.
+        As in the self-test there is one read per CONVERT, because a read may abort an unfinished
+        conversion. The caller has to restart the tile afterwards.
 
         Raises:
-            I2cError: it does not answer.
+            I2cError: the tile does not answer.
         """
         health = self._health[tile]
         tries = _SLOW_TRIES if health.slow else _TRIES
@@ -103,17 +103,17 @@ class ConversionWatch:
                 continue
             early.append(words)
             if early[-1][1] != settled[-1][1]:
-                self._believe(tile)  # the temperature is loaded last: this one was finished
+                self._believe(tile)  # the temperature is loaded last: the conversion had finished
                 return
             settled.append(self._settled(tile))
             if len(early) >= _SAME_MAX and early == settled[: len(early)]:
-                break  # not a word of it has changed: it is late
+                break  # no count has changed: the part is late
         if len({tadc for _, tadc in settled}) == 1 and any(
             words != before for words, before in zip(early, settled, strict=False)
         ):
-            self._believe(tile)  # its temperature never changes, so its pressure has to tell
+            self._believe(tile)  # with constant temperature the pressure decides
         elif len(early) >= _SAME_MAX and len(set(settled)) > 1 and not health.slow:
-            # It does finish, but late. (If it never does, nothing is worth waiting for.)
+            # Conversions finish late. (A longer wait would not help a part that never finishes.)
             health.slow = True
             self.wait_ns[tile] = max(self._measured_ns[tile], CONVERSION_MAX_NS)
         self._slow_due_ns = self._clock.now_ns() + SLOW_AUDIT_NS
@@ -123,14 +123,14 @@ class ConversionWatch:
         self.wait_ns[tile] = self._measured_ns[tile]
 
     def _settled(self, tile: int) -> tuple[int, int]:
-        """The words of a conversion that had all its time."""
+        """Convert with the longest wait and return the counts."""
         return self._converted(tile, CONVERSION_MAX_NS)[0]
 
     def _converted(self, tile: int, delay_ns: int) -> tuple[tuple[int, int], bool]:
-        """The words read `delay_ns` after a CONVERT, and whether they were read on time.
+        """Convert and read after `delay_ns`; return the counts and whether the read was on time.
 
-        A busy machine may pause before either transfer, so all time except that on the wires counts
-        as waiting. The conversion always gets its time.
+        A busy machine may pause before either transfer, so all time off the wires counts as
+        waiting. Returns only after the longest conversion time.
         """
         begin_ns = self._clock.now_ns()
         self._ports.convert([tile])

@@ -1,8 +1,8 @@
-"""What a driver can know of one tile from the words it gives: is this sample to be believed?
+"""Health of a tile, inferred from its readings alone.
 
-There is no checksum in this protocol and no status bit in the part (hardware.md 1.1, 8). What there
-is: words that no working part gives, a reading that jumps and does not come again when asked twice,
-readings that never change, and eight coefficients that are burnt into each part.
+The protocol has no checksum and the part no status bit (hardware.md 1.1, 8). Evidence of a fault:
+counts that no working part gives, a jump that a second read does not confirm, readings that never
+change, and other factory coefficients than at start-up.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ from devices.chips.mpl115a2 import COUNTS_MAX, Coefficients, kpa_per_padc
 from devices.frames import NOT_READ, TileInfo, TileStatus
 
 JUMP_KPA = 0.5
-"""A reading this far from the median of the last three is read again. Of a healthy part's, 1.7 in
-a hundred are (noise 0.165 kPa with outliers, hardware.md 1.3)."""
+"""Distance from the median of the last three above which a reading is read again. That affects
+1.7 % of a healthy part's readings (noise 0.165 kPa with outliers, hardware.md 1.3)."""
 FAR_JUMP_KPA = 1.5
-"""Farther than any outlier of a healthy part: if it comes again, is it this tile that answers?"""
+"""Distance beyond any outlier of a healthy part: if confirmed, the tile's identity is verified."""
 JUMP_TADC = 5
 """Temperature does not change by a kelvin from one frame to the next (hardware.md 8)."""
 
 STALE_EVIDENCE = 20
-"""A reading equal to the one before counts two, or one if only the pressure was read. Of healthy
-readings one in nine is equal to its neighbour, so ten in a row come once in 10^9; with noise that
-is correlated over 10 ms once in 10^6."""
+"""Evidence from which a tile is stale. A reading equal to the previous one counts two, or one if
+only the pressure was read. One in nine readings of a healthy part equals its neighbour, so ten in a
+row occur once in 10^9; with noise that is correlated over 10 ms once in 10^6."""
 
 _TRIAL_EVERY = 2048  # every two seconds at 500 frames a second
-_TADC_MAX_NS = 500_000_000  # half of what `devices.temperature` holds one for
+_TADC_MAX_NS = 500_000_000  # half the hold of `devices.temperature`
 _IMPOSSIBLE_TADC = (0, COUNTS_MAX)
 _FIRST_PROBE_NS = 2_000_000  # a loose plug is back within a few milliseconds
-_PROBES_NS = 1_000_000_000  # what has been away for long is asked once a second
-_RECENT = 3  # the median of three is moved by no single outlier
+_PROBES_NS = 1_000_000_000  # longest interval between probes
+_RECENT = 3  # a single outlier does not move the median of three
 
 
 def is_impossible(padc: int, tadc: int) -> int:
-    """The `TileStatus` of words that no working part gives; 0 if these can be."""
+    """Return the tile flag of counts that no working part gives; 0 if they are possible."""
     if padc == tadc == 0:
-        return TileStatus.NOT_CONVERTED  # registers of a part that was just switched on
+        return TileStatus.NOT_CONVERTED  # registers after power-up
     # Both ends of the temperature are 100 K away from anything this foot survives.
     if tadc in _IMPOSSIBLE_TADC:
         return TileStatus.IMPLAUSIBLE
@@ -44,19 +44,19 @@ def is_impossible(padc: int, tadc: int) -> int:
 
 
 class TileHealth:
-    """One tile: its recent readings, and what is known to be wrong with it."""
+    """Recent readings and known faults of one tile."""
 
     def __init__(self, info: TileInfo) -> None:
         self.counts: Counter[str] = Counter()
-        """Counts of faults, by reason."""
+        """Fault counts, by the name of the flag."""
         self.coefficient_words = info.coefficient_words
         self.coefficient_bytes = b"".join(w.to_bytes(2, "big") for w in info.coefficient_words)
         self.present = True
-        """Does it answer? If not, its coefficients are read before it is believed again."""
+        """True if the tile answers and is verified. Else its coefficients are checked first."""
         self.replaced = False
-        """Another part answers in its place."""
+        """True if another part answers in its place."""
         self.slow = False
-        """It takes longer to convert than was measured."""
+        """True if conversions take longer than measured at start-up."""
         chip = Coefficients.from_words(info.coefficient_words)
         count_kpa = abs(float(kpa_per_padc(500, chip.b1, chip.c12)))
         self._jump = JUMP_KPA / count_kpa
@@ -72,7 +72,7 @@ class TileHealth:
     # Presence
 
     def lose(self, now_ns: int) -> None:
-        """The tile does not answer, or its words are impossible; probe it ever less often."""
+        """Mark the tile as lost (silent, or impossible counts); probe it with a backoff."""
         if self.present:
             self.doubt(now_ns)
         else:
@@ -80,7 +80,7 @@ class TileHealth:
             self._probe_wait_ns = min(2 * self._probe_wait_ns, _PROBES_NS)
 
     def doubt(self, now_ns: int) -> None:
-        """Another part may answer now: its coefficients must be read before its readings count."""
+        """Mark the tile as unverified: another part may answer, so check its coefficients."""
         self.present = False
         self._probe_due_ns = now_ns
         self._probe_wait_ns = _FIRST_PROBE_NS
@@ -89,27 +89,27 @@ class TileHealth:
         self._stale_evidence = 0
 
     def is_probe_due(self, now_ns: int) -> bool:
-        """Is it time to check whether the tile is back?"""
+        """Return whether the next probe of a lost tile is due."""
         return now_ns >= self._probe_due_ns
 
     def note(self, status: int) -> None:
-        """Count the faults that a frame shows of it."""
+        """Count the faults in a frame's flags."""
         self.counts.update(bit.name.lower() for bit in TileStatus(status) if bit.name)
 
     def find(self) -> None:
-        """The tile is back, and it is the same part."""
+        """Mark the tile as present again, as the same part."""
         self.present = True
 
     # Readings
 
     def wants_temperature(self, now_ns: int) -> bool:
-        """Is its last temperature missing or too old?"""
+        """Return whether the last temperature is missing or too old."""
         return self._tadc is None or now_ns - self._tadc_ns > _TADC_MAX_NS
 
     def jumps(self, padc: int, tadc: int, *, strictly: bool = False) -> bool:
-        """Is it too far from the readings before, or are there none yet to compare it with?
+        """Return whether a reading is far from the previous ones, or has too few to compare with.
 
-        Strictly: half as far is too far, for a line that is known to be disturbed.
+        Strictly: half the distance is too far, for a line that is known to be disturbed.
         """
         if len(self._recent) < _RECENT:
             return True
@@ -117,20 +117,20 @@ class TileHealth:
         return abs(padc - self._median()) > limit or self._is_hot(tadc)
 
     def may_be_another(self, padc: int, tadc: int) -> bool:
-        """May another tile, or two at once, have sent this reading, although it came twice?"""
+        """Return whether a confirmed reading may come from another tile, or from two at once."""
         if len(self._recent) < _RECENT:
             return False
         return abs(padc - self._median()) > self._far_jump or self._is_hot(tadc)
 
     def believe(self, padc: int, tadc: int, now_ns: int) -> None:
-        """Take in a reading that was accepted."""
+        """Add an accepted reading to the recent ones."""
         self._recent.append(padc)
         if tadc != NOT_READ:
             self._tadc = tadc
             self._tadc_ns = now_ns
 
     def is_stale(self, padc: int, tadc: int) -> bool:
-        """Take note of a frame's reading; has it been the same for too long?"""
+        """Update the evidence with a frame's reading; return whether the tile is stale."""
         if padc == NOT_READ:
             return False
         same = padc == self._last_words[0] and (
@@ -145,12 +145,12 @@ class TileHealth:
 
     @property
     def is_repeating(self) -> bool:
-        """Are its readings stale?"""
+        """True if the readings are stale."""
         return self._stale_evidence >= STALE_EVIDENCE
 
     @property
     def wants_trial(self) -> bool:
-        """Should the cause of stale readings be checked? At the first, then now and then."""
+        """True if the conversion time of a stale tile should be tested: at first, then at times."""
         return 0 <= (self._stale_evidence - STALE_EVIDENCE) % _TRIAL_EVERY < 2
 
     def _median(self) -> int:

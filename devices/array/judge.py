@@ -1,8 +1,8 @@
-"""Is a reading to be believed? What looks doubtful is asked for again, before it is passed on.
+"""Plausibility check of readings; doubtful ones are read again before they are passed on.
 
-The protocol has no checksum, but a finished conversion can be read as often as one likes, and must
-be the same each time. That is dear on the wire, so it is asked for only where a reading is far from
-those before, or where the line is known to be disturbed.
+The protocol has no checksum, but a finished conversion can be read repeatedly and must stay the
+same. A second read costs bus time, so it is used only where a reading jumps or the line is known to
+be disturbed.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from devices.errors import NoAcknowledgeError
 from devices.frames import TileStatus
 
 DISTURBED_NS = 1_000_000_000
-"""After a disturbed reading, a jump that cannot be checked is refused for this long."""
+"""Time after a disturbed reading in which an unconfirmed jump is flagged."""
 
 _IMPLAUSIBLE = int(TileStatus.IMPLAUSIBLE)
 
 
 class Judge:
-    """Judges the readings of an array's tiles."""
+    """Plausibility check of the readings of an array's tiles."""
 
     def __init__(
         self, ports: TilePorts, clock: Clock, health: Sequence[TileHealth], bus: BusWatch
@@ -38,7 +38,7 @@ class Judge:
 
     @property
     def is_disturbed(self) -> bool:
-        """Was a flipped bit seen not long ago?"""
+        """True for a second after a flipped bit was detected."""
         return self._clock.now_ns() < self._disturbed_until_ns
 
     def judge(
@@ -50,14 +50,14 @@ class Judge:
         with_temperature: bool,
         may_ask: bool,
     ) -> None:
-        """Note a reading in `scan`, flagged if it is not to be believed.
+        """Check a reading and store it in `scan`, flagged if it is implausible.
 
         Args:
-            scan: the frame.
-            tile: which tile was read and is connected.
+            scan: frame that receives the reading.
+            tile: index of the tile, which is still connected.
             words: `padc` and `tadc` as read.
-            with_temperature: were both read?
-            may_ask: is there time to ask again?
+            with_temperature: True if both were read.
+            may_ask: True if there is time for another read.
         """
         health = self._health[tile]
         disturbed = self.is_disturbed
@@ -66,7 +66,7 @@ class Judge:
             words = self._confirmed(scan, tile, words, with_temperature)
             jumps = health.jumps(*words)
         elif jumps and disturbed:
-            # On a line with flipped bits a reading that cannot be checked is refused.
+            # On a line with flipped bits an unconfirmed jump is not trusted.
             scan.flag(tile, TileStatus.IMPLAUSIBLE)
         scan.padc[tile], scan.tadc[tile] = words
         if impossible := is_impossible(*words):
@@ -91,7 +91,7 @@ class Judge:
     def _confirmed(
         self, scan: Scan, tile: int, words: tuple[int, int], with_temperature: bool
     ) -> tuple[int, int]:
-        """The reading that came twice: if two differ, one was disturbed, a third tells which."""
+        """Read again and return the majority: if two readings differ, a third one decides."""
         again = self._again(scan, tile, with_temperature)
         if again == words:
             return words
@@ -109,7 +109,7 @@ class Judge:
         return third
 
     def _again(self, scan: Scan, tile: int, with_temperature: bool) -> tuple[int, int] | None:
-        """The same conversion, selected and read once more; None if it does not answer."""
+        """Select the tile and read the same conversion again; None without an answer."""
         words = None
         self._ports.forget([tile])
         with scan.second_attempt(self._clock), suppress(NoAcknowledgeError):
@@ -118,7 +118,7 @@ class Judge:
         return words
 
     def _make_sure(self, scan: Scan, tile: int) -> None:
-        """Check by the coefficients that this tile, and no other, is connected."""
+        """Verify by the coefficients that only this tile is connected; else flag it."""
         health = self._health[tile]
         found = b""
         with scan.second_attempt(self._clock), suppress(NoAcknowledgeError):
@@ -129,7 +129,7 @@ class Judge:
             health.lose(self._clock.now_ns())
 
     def _doubt_all_but(self, tile: int) -> None:
-        """A mux that could not be closed may still connect a tile, which would answer too."""
+        """Mark all other tiles as unverified: a mux that could not be closed may connect one."""
         for i, health in enumerate(self._health):
             if i != tile and health.present:
                 health.doubt(self._clock.now_ns())

@@ -1,6 +1,6 @@
-"""The transfers of an array, tile by tile: connect what is meant, and nothing else, then ask.
+"""Tile input and output: select exactly the addressed tiles, then convert or read.
 
-A `Scan` is one frame while it is taken: what they gave so far, and what may still be spent.
+A `Scan` collects the readings and flags of one frame, and its remaining retry budget.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from devices.frames import NOT_READ, TileInfo, TileStatus
 
 
 class TilePorts:
-    """Tiles of one bus, addressed by their index. Every method raises `I2cError`."""
+    """Transfers to the tiles of one bus, by tile index. Every method may raise `I2cError`."""
 
     def __init__(self, bus: I2cBus, tiles: Sequence[TileInfo]) -> None:
         self.tiles = tuple(tiles)
@@ -38,10 +38,10 @@ class TilePorts:
         self._chip.convert()
 
     def read(self, with_temperature: bool) -> tuple[int, int]:
-        """`padc` and `tadc` (or `NOT_READ`) of the tile that is connected.
+        """Return `padc` and `tadc` (or `NOT_READ`) of the connected tile.
 
-        At either end of its counts the pressure alone does not tell a part that is pressed too hard
-        from a line that is stuck (hardware.md 8), so there the temperature is read as well.
+        At either end of the counts pressure alone cannot tell an overloaded part from a stuck line
+        (hardware.md 8), so the temperature is read as well.
         """
         if not with_temperature:
             padc = self._chip.read_padc()
@@ -50,19 +50,19 @@ class TilePorts:
         return self._chip.read_counts()
 
     def read_coefficients(self) -> bytes:
-        """The eight coefficient bytes of the tile that is connected, read once."""
+        """Read the eight coefficient bytes of the connected tile, once."""
         return self._chip.read_coefficient_bytes()
 
     def read_coefficient_words(self, tile: int) -> tuple[int, int, int, int]:
-        """Its coefficients, three times in agreement and plausible.
+        """Read a tile's coefficients three times and check them.
 
         Raises:
-            TileSetupError: they are not.
+            TileSetupError: the readings differ or are implausible.
         """
         return self._chip.read_coefficient_words(where=f"tile {self.tiles[tile].serial}")
 
     def forget(self, tiles: Sequence[int]) -> None:
-        """Forget what the muxes of these tiles connect."""
+        """Discard the cached state of the muxes of these tiles."""
         for mux in {self.tiles[i].mux for i in tiles}:
             self.router.forget(mux)
 
@@ -76,19 +76,19 @@ class TilePorts:
         return self._masks[tiles]
 
 
-_BUS_FAULTS_MAX = 2  # each may cost the adapter's time-out, 30 ms
+_BUS_FAULTS_MAX = 2  # each may cost the adapter's timeout, 30 ms
 
 
 @dataclass
 class Scan:
-    """What one frame's transfers gave, one entry per tile.
+    """Readings and flags of one frame, one entry per tile.
 
     Attributes:
         padc: 0 to 1023, `NOT_READ` where not read.
         tadc: likewise.
-        convert_stop_ns: CLOCK_MONOTONIC at the STOP of the CONVERT that each sample comes from.
+        convert_stop_ns: CLOCK_MONOTONIC at the STOP of the CONVERT of each sample.
         status: `TileStatus` bits.
-        budget_ns: time left in this frame for second attempts of all tiles together.
+        budget_ns: time left in this frame for retries of all tiles together.
         bus_fault: the bus itself failed, not one tile.
         reference_n: the calibration rig's force in newtons; NaN without.
     """
@@ -102,29 +102,29 @@ class Scan:
     reference_n: float = float("nan")
     reference_ns: int | None = field(default=None, repr=False)
     zeros: int = field(default=0, repr=False)
-    """Tiles that read as nothing but zeros."""
+    """Number of tiles that read as zeros only."""
     _bus_faults: int = field(default=0, repr=False)
 
     @classmethod
     def blank(cls, tiles: int, begin_ns: int, budget_ns: int) -> Scan:
-        """A frame without any reading."""
+        """Create a frame without readings."""
         return cls(
             [NOT_READ] * tiles, [NOT_READ] * tiles, [begin_ns] * tiles, [0] * tiles, budget_ns
         )
 
     @property
     def given_up(self) -> bool:
-        """The bus has failed, so the rest of the frame is not worth its time-outs."""
+        """True if the bus failed so often that the rest of the frame is skipped."""
         return self._bus_faults >= _BUS_FAULTS_MAX
 
     def note_bus_fault(self, *, for_good: bool = False) -> None:
-        """The bus failed once; after the second time, or at once, the frame is given up."""
+        """Count a bus fault; abandon the frame after two, or at once if `for_good`."""
         self.bus_fault = True
         self._bus_faults += _BUS_FAULTS_MAX if for_good else 1
 
     @contextmanager
     def second_attempt(self, clock: Clock) -> Iterator[None]:
-        """Take the block's time from the budget; a fault of the bus in it ends it and is noted."""
+        """Context manager: charge the block's time to the retry budget; count a bus fault."""
         begin_ns = clock.now_ns()
         try:
             yield
@@ -133,5 +133,5 @@ class Scan:
         self.budget_ns -= clock.now_ns() - begin_ns
 
     def flag(self, tile: int, status: TileStatus | int) -> None:
-        """Add to a tile's status."""
+        """Add a flag to a tile."""
         self.status[tile] |= status

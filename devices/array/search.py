@@ -1,7 +1,7 @@
-"""Looking for a tile that was lost: is it back, and is it itself?
+"""Reconnection of lost tiles: probe with a backoff, and verify the identity by coefficients.
 
-The protocol has no identity but the eight coefficients that are burnt into each part. A part
-that comes back with others is another one, however well it answers.
+The eight factory coefficients are the only identity of a part. A part that answers with other
+coefficients is another part.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from devices.frames import TileStatus
 
 
 class Search:
-    """Looks for the lost tiles of an array, each less and less often."""
+    """Prober of the lost tiles of an array, with a backoff for each."""
 
     def __init__(self, ports: TilePorts, clock: Clock, health: Sequence[TileHealth]) -> None:
         self._ports = ports
@@ -29,7 +29,7 @@ class Search:
         scan.flag(tile, TileStatus.IMPLAUSIBLE if replaced else TileStatus.NO_ANSWER)
 
     def look_for(self, scan: Scan, tile: int) -> None:
-        """Check whether a tile is back, if a probe is due; its sample comes with the next frame."""
+        """Probe a lost tile if a probe is due; a tile that is back is sampled in the next frame."""
         self.note_absence(scan, tile)
         health = self._health[tile]
         if not health.is_probe_due(self._clock.now_ns()):
@@ -46,7 +46,7 @@ class Search:
             health.lose(self._clock.now_ns())
 
     def _is_itself(self, tile: int) -> bool:
-        """Do its coefficients say so? If another part's do, it is noted as replaced."""
+        """Return whether the coefficients are the tile's own; mark another part as replaced."""
         health = self._health[tile]
         self._ports.connect(tile)
         if self._ports.read_coefficients() == health.coefficient_bytes:
@@ -61,6 +61,6 @@ class Search:
         if words == {health.coefficient_words}:
             health.replaced = False
             return True
-        # Three equal, plausible readings: a part, but not the one that was here.
+        # Three equal, plausible readings of other coefficients: another part.
         health.replaced = len(words) == 1 and not self._ports.router.silent
         return False

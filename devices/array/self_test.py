@@ -1,10 +1,10 @@
-"""What a bus and its parts really do, measured over that bus before the first frame.
+"""Self-test of bus and parts before the first frame: identity, bus clock, conversion times.
 
-How long a part takes to convert differs from part to part (1.6 ms typical, 3 ms at most, MPL115A2
-data sheet table 10) and no bit says when it is done. What a read during a conversion does is not
-documented: it may return the last result, abort the conversion, or return the new pressure with the
-old temperature (hardware.md 1.4). So there is one read per CONVERT here, never a poll, and no power
-cycle; whether a conversion was finished shows in words that changed.
+Conversion times differ from part to part (1.6 ms typical, 3 ms at most, MPL115A2 data sheet table
+10) and no bit signals the end. The effect of a read during a conversion is not documented: it may
+return the last result, abort the conversion, or return the new pressure with the old temperature
+(hardware.md 1.4). So this module reads once per CONVERT, never polls, and cycles no power; changed
+counts show that a conversion has finished.
 """
 
 from __future__ import annotations
@@ -32,27 +32,28 @@ _SHORTEST_NS = 800_000  # half the typical time: no part is that fast
 _RESOLUTION_NS = 8_000  # half a percent of the typical time
 _NEVER_NS = 1 << 62
 _SAME_MAX = 8
-"""So many readings without any change, and a conversion is taken to be unfinished. Of two healthy
-readings one in nine is equal by chance, in one of 10^7 cases all eight are."""
+"""Unchanged readings from which a conversion counts as unfinished. Two readings of a healthy part
+are equal by chance in one of nine cases, eight in one of 10^7."""
 _TEMPERATURE_SAME_MAX = 20
-"""The same for the temperature alone, which is loaded last; every second one is equal by chance."""
+"""Limit like `_SAME_MAX`, for the temperature alone, which is equal by chance in every second
+reading. It is loaded last."""
 _MARGIN = 1.004
-"""Allowance for the drift of a part's clock; a part that drifts further is noticed in the run."""
+"""Allowance for the drift of a part's clock; a larger drift is detected while running."""
 
 _ADDRESS_BITS = 29
 """SCL periods before a read takes its data: START, address, register, START, address."""
 
 _SCL_READS = 100
 _UNDISTURBED = 0.1
-"""Part of the reads that is taken to be undisturbed by what the machine did meanwhile."""
+"""Part of the reads that is assumed to be undisturbed by other load of the machine."""
 _SCL_BYTES = (2, 12)  # far apart, within the part's registers
 
 
 def identify(bus: I2cBus, tiles: Sequence[TileScene]) -> tuple[TileInfo, ...]:
-    """Find every tile of a scene, one channel at a time, and read its coefficients three times.
+    """Identify every tile of a scene, one channel at a time, by three equal coefficient reads.
 
-    One at a time, because in a broadcast the acknowledge is a wired AND: a missing tile does not
-    show (hardware.md 2).
+    One at a time, because in a broadcast the acknowledge is a wired AND, which hides a missing tile
+    (hardware.md 2).
 
     Raises:
         TileSetupError: a tile or its mux does not answer, or its coefficients are implausible.
@@ -90,13 +91,13 @@ def _identify(router: MuxRouter, chip: Mpl115a2, tile: TileScene) -> TileInfo:
 
 @dataclass(frozen=True)
 class Plug:
-    """One channel of one mux, and what answers there at 0x60.
+    """Device found at address 0x60 behind a channel of a mux.
 
     Attributes:
         mux: address of the mux.
         channel: 0 to 7.
-        coefficient_words: of the part; None if its coefficients are no part's.
-        problem: what is wrong with it; empty if nothing is.
+        coefficient_words: the part's coefficients; None if they are implausible.
+        problem: fault of the part; empty if it is sound.
     """
 
     mux: int
@@ -106,16 +107,16 @@ class Plug:
 
 
 def find_tiles(bus: I2cBus) -> tuple[Plug, ...]:
-    """Look behind every mux address and channel, one at a time, whatever a scene says.
+    """Search all mux addresses and channels for tiles, one at a time, without a scene.
 
     Raises:
-        BusFaultError: the bus itself fails, or acknowledges everything and gives nothing but zeros.
+        BusFaultError: the bus itself fails, or acknowledges everything and returns only zeros.
     """
     muxes = _all_closed(bus)
     router = MuxRouter(bus, muxes)
     if muxes and not router.echoes():
         raise BusFaultError(
-            f"{len(muxes)} multiplexers acknowledge, and none keeps what is written to it",
+            f"{len(muxes)} multiplexers acknowledge, but none stores a mask",
             where=bus.name,
             remedy="SDA is stuck low: pull the tiles' plugs one by one, or cycle their supply",
         )
@@ -135,9 +136,9 @@ def find_tiles(bus: I2cBus) -> tuple[Plug, ...]:
 
 
 def _all_closed(bus: I2cBus) -> list[int]:
-    """Addresses of all muxes that are there, now closed.
+    """Close all muxes and return the addresses of those present.
 
-    A tile behind one that was left open would answer with those that are asked.
+    A tile behind an open mux would answer together with the addressed one.
     """
     return [address for address in ADDRESSES if _answers(bus, address)]
 
@@ -152,17 +153,17 @@ def _answers(bus: I2cBus, address: int) -> bool:
 
 @dataclass(frozen=True)
 class WireTiming:
-    """How fast the wires are, and what a transaction costs beyond its bits."""
+    """Measured bus clock, and overhead of a transaction beyond its bits."""
 
     scl_hz: float
     transaction_s: float
 
 
 def measure_wires(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming:
-    """Measure SCL by the difference of two lengths of reading: nine periods for every byte.
+    """Measure SCL from the time difference of a long and a short read: nine periods per byte.
 
-    The adapter's nominal rate is not to be trusted: on a Raspberry Pi it follows the core's clock
-    (hardware.md 3.2). What reads of both lengths have in common is the overhead.
+    The adapter's nominal rate is unreliable: on a Raspberry Pi it follows the core's clock
+    (hardware.md 3.2). The rest of the short read's time is the overhead.
 
     Raises:
         I2cError: the tile does not answer.
@@ -188,15 +189,14 @@ def measure_wires(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming:
 def measure_conversion_ns(
     bus: I2cBus, clock: Clock, tile: TileInfo, wires: WireTiming
 ) -> int | None:
-    """The longest that a conversion of this part takes; None if its words do not show it.
+    """Measure the longest conversion time of a part; None if its counts do not show it.
 
-    Bisects the delay from CONVERT to the one read. Each trial has two conversions: one read after
-    the longest time that a conversion may take, and one read at the delay in question. If the
-    second one's temperature differs from the first one's, it was finished, because the temperature
-    is loaded last: that is proof. That nothing differs, many times, is taken for unfinished; an
-    error there makes the time too long, never too short. The address of a read takes time on the
-    wires before the data is taken, which counts: who waits for the result does not even begin to
-    read before it is there.
+    Bisects the delay from CONVERT to the read. Each trial has two conversions: one read after the
+    longest possible time, and one read after the delay under test. If their temperatures differ,
+    the second conversion had finished, because the temperature is loaded last: that is proof. Many
+    equal readings count as unfinished; an error there makes the time too long, never too short. The
+    address of a read takes time on the wires before the data are latched. That time is included:
+    callers begin a read only after the result.
 
     Raises:
         I2cError: the part does not answer.
@@ -209,10 +209,9 @@ def measure_conversion_ns(
     wires_ns += round(2e9 * wires.transaction_s)
 
     def convert_and_read(delay_ns: int) -> tuple[tuple[int, int], int]:
-        """The words, and how long after CONVERT they may have been read at the latest.
+        """Return the counts, and the longest possible delay from CONVERT to their read.
 
-        A busy machine may hesitate before either transaction, so all of the time counts that the
-        wires themselves did not take.
+        A busy machine may pause before either transaction, so all time off the wires counts.
         """
         begin_ns = clock.now_ns()
         chip.convert()
@@ -224,10 +223,10 @@ def measure_conversion_ns(
         return words, waited_ns
 
     def finished_within(delay_ns: int, known_ns: int) -> int | None:
-        """The wait after which a conversion was seen to be finished; None if none was.
+        """Return a wait after which a conversion had finished; None if none had.
 
-        A wait of `known_ns` or more, which is known to be enough, proves nothing new. If too few
-        shorter waits were tried, the result is `known_ns`.
+        Waits of `known_ns`, known to be sufficient, or more prove nothing new. With too few shorter
+        waits the result is `known_ns`.
         """
         in_time = 0
         pressure_changed = False
@@ -260,7 +259,7 @@ def _bisected(finished_within: Callable[[int, int], int | None]) -> int | None:
         if waited_ns is None:
             unfinished_ns = middle_ns
         elif waited_ns < finished_ns:
-            finished_ns = waited_ns  # a sleep ends late: the real wait counts
+            finished_ns = waited_ns  # a sleep ends late: use the real wait
         else:
-            break  # this machine's sleeps are not finer than that
+            break  # limit of this machine's sleep resolution
     return finished_ns

@@ -1,4 +1,4 @@
-"""From a scene and a bus to an array that is ready to take frames."""
+"""Start-up of an array: identify and measure the tiles of a scene, choose the schedule."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from devices.scene.hardware import AnySchedule, ArrayScene
 
 @dataclass(frozen=True)
 class Measured:
-    """The tiles of a scene as found on its bus.
+    """Tiles of a scene as identified and measured on its bus.
 
     Attributes:
-        tiles: as identified, with the conversion times measured.
-        timing: of the bus and the parts.
-        unmeasured: serials whose conversion time could not be measured; they are given 3 ms.
+        tiles: identified tiles, with measured conversion times.
+        timing: timing of the bus and the parts.
+        unmeasured: serials whose conversion time could not be measured; 3 ms is assumed.
     """
 
     tiles: tuple[TileInfo, ...]
@@ -37,11 +37,11 @@ class Measured:
 
 @dataclass(frozen=True)
 class Ready(Measured):
-    """An array that was identified and measured.
+    """Array that is identified, measured and ready to scan frames.
 
     Attributes:
-        array: takes frames.
-        choice: the schedule, and why.
+        array: the array.
+        choice: its schedule, and the reason for it.
     """
 
     array: TileArray
@@ -49,7 +49,7 @@ class Ready(Measured):
 
     @property
     def predicted_hz(self) -> float:
-        """Frames a second that it should give."""
+        """Predicted frame rate."""
         return 1.0 / frame_s(self.choice.schedule, self.timing)
 
 
@@ -62,13 +62,13 @@ def make_ready(
     recovery: BusRecovery | None = None,
     reference_n: Callable[[], float] | None = None,
 ) -> Ready:
-    """Identify the tiles of a scene, measure bus and parts, and choose how to ask them.
+    """Free the bus, identify and measure the tiles of a scene, and choose the schedule.
 
     Args:
-        bus: what they hang on.
-        scene: what should be there.
-        clock: virtual or real.
-        schedule: instead of the scene's.
+        bus: bus of the tiles.
+        scene: expected tiles.
+        clock: virtual or real clock.
+        schedule: schedule, instead of the scene's.
         recovery: frees a stuck bus.
         reference_n: as for `TileArray`.
 
@@ -83,7 +83,7 @@ def make_ready(
 
 
 def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
-    """Make sure that the wires move at all: a slave may hang in a byte since the last run.
+    """Check that the bus works, and free it if need be: a slave may hang in a byte.
 
     Raises:
         BusFaultError: SDA or SCL is stuck low, and could not be freed.
@@ -94,11 +94,11 @@ def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
     def moves() -> bool:
         nonlocal fault
         try:
-            # If no mux answers it moves: identification says which tile is missing.
+            # Without any mux the bus works: identification will name the missing tile.
             if router.echoes() or router.refused is not None:
                 return True
             fault = BusFaultError(
-                "the multiplexers acknowledge, and none keeps what is written to it",
+                "the multiplexers acknowledge, but none stores a mask",
                 where=bus.name,
                 remedy="SDA is stuck low: pull the tiles' plugs one by one, cycle their supply, or "
                 "wire [recovery]",
@@ -125,9 +125,9 @@ def renew(
     recovery: BusRecovery | None = None,
     reference_n: Callable[[], float] | None = None,
 ) -> Ready:
-    """The array with the new parts in place of those that were replaced.
+    """Identify and measure replaced parts, and return an array with the new ones.
 
-    Only the new parts are identified and measured, so that the others rest for a moment only.
+    The other parts are not measured again, so that the interruption is short.
 
     Raises:
         TileSetupError, I2cError: a new part is gone again, or is no MPL115A2.
@@ -169,7 +169,7 @@ def _ready(
         recovery=recovery,
         reference_n=reference_n,
     )
-    # A schedule that reads what the frame before started needs one start.
+    # A pipelined schedule reads conversions started in the previous frame.
     array.scan()
     return Ready(found.tiles, found.timing, found.unmeasured, array, choice)
 
@@ -182,14 +182,14 @@ def chosen(
     has_reference: bool,
     asked_hz: float = 0.0,
 ) -> Choice:
-    """The schedule for a scene on a bus with this timing, and why.
+    """Choose the schedule for a scene on a bus with this timing.
 
     Args:
-        scene: what it asks for.
-        timing: as measured.
-        schedule: instead of the scene's.
-        has_reference: is a reference force read with the tiles?
-        asked_hz: instead of the scene's rate.
+        scene: requested schedule and rate.
+        timing: measured timing.
+        schedule: schedule, instead of the scene's.
+        has_reference: True if a reference force is read with the tiles.
+        asked_hz: frame rate, instead of the scene's.
 
     Raises:
         SceneError: the schedule does not suit a reference sensor.
@@ -219,10 +219,10 @@ def _with_reference(asked: AnySchedule) -> Choice:
 
 
 def measured(bus: I2cBus, scene: Scene, clock: Clock) -> Measured:
-    """Identify the tiles of a scene and measure them.
+    """Identify the tiles of a scene and measure their timing.
 
-    With `array.wait_ms` the parts are not measured. A part whose words do not tell is given the
-    data sheet's longest time.
+    With `array.wait_ms` the conversion times are not measured. A part that cannot be measured is
+    assigned the data sheet's longest time.
 
     Raises:
         TileSetupError, I2cError: as for `make_ready`.
@@ -250,13 +250,13 @@ def timing_of(
     muxes: Sequence[int],
     conversions_ns: Sequence[int | None],
 ) -> BusTiming:
-    """The timing by which tiles are asked: waits as the scene says, else as measured.
+    """Compute the bus timing, with the scene's waits, else the measured ones.
 
     Args:
-        array: what the scene says.
-        wires: as measured.
-        muxes: which mux each tile is behind.
-        conversions_ns: of each tile, as measured; None, where it is not known, is the data sheet's
+        array: section of the scene.
+        wires: measured timing of the wires.
+        muxes: mux address of each tile.
+        conversions_ns: measured conversion time of each tile; None: unknown, so the data sheet's
             longest.
     """
     if array.wait_ms is not None:

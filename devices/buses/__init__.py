@@ -1,1 +1,1 @@
-"""Wires to chips, each as one small protocol: I2C, SPI, serial line. No chip here."""
+"""Buses to chips, each as a small protocol: I2C, SPI, serial line. No chip-specific code."""

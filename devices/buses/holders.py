@@ -1,4 +1,4 @@
-"""Which programs have a device open, for an error that says it is busy."""
+"""Search for programs that have a device open, for error messages about busy devices."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PROC = Path("/proc")
 def holders_of(path: str, proc: Path = PROC) -> tuple[str, ...]:
     """Return the programs that have the file at `path` open, as "NAME (process N)".
 
-    Only those that this user may look at: a service's own processes, or all for root.
+    Only processes that this user may inspect: a service's own ones, or all for root.
     """
     device = Path(path).resolve()
     found = []

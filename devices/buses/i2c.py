@@ -1,9 +1,8 @@
-"""The I2C bus as the drivers see it: one call, `transfer`, and errors that say whose fault it was.
+"""I2C bus for the drivers: one method, `transfer`, and errors by cause.
 
-A bus sits on an adapter that takes smbus2 `i2c_msg` objects and raises bare `OSError` with the
-kernel's errno: on a Raspberry Pi that is `smbus2.SMBus`, in an emulation the register-level
-model behind the same method. Classification of the errno (hardware.md 3.2 to 3.4) is this side of
-the seam, so the emulation exercises it too.
+A bus uses an adapter that accepts smbus2 `i2c_msg` objects and raises bare `OSError` with the
+kernel's errno: `smbus2.SMBus` on a Raspberry Pi, a register-level model in an emulation. This
+module classifies the errno (hardware.md 3.2 to 3.4), so the emulation exercises that too.
 """
 
 from __future__ import annotations
@@ -31,15 +30,15 @@ from devices.errors import (
 
 __all__ = ["I2cAdapter", "I2cBus", "i2c_msg", "open_bus"]
 
-# include/uapi/linux/i2c-dev.h: adapter time-out in units of 10 ms, sticky. The core's default of
+# include/uapi/linux/i2c-dev.h: adapter timeout in units of 10 ms, sticky. The core's default of
 # about 1 s would stall the loop for hundreds of frames on one wedged transfer.
 I2C_TIMEOUT = 0x0702
 TIMEOUT_10MS = 3
 
 POISON = 0xFF
-"""What a read buffer holds before the transfer: no working part gives it (see `is_impossible`), and
-no mux was ever told to connect all its channels and none other. So bytes of an earlier read that an
-adapter leaves in place cannot pass as a reading."""
+"""Content of a read buffer before the transfer, so that stale bytes cannot pass as a reading if an
+adapter leaves the buffer as it is. No working part returns it (see `is_impossible`), and no mux has
+all channels open."""
 _READ = 0x0001  # I2C_M_RD, include/uapi/linux/i2c.h
 
 _NACK = {errno.ENXIO, errno.EREMOTEIO}
@@ -48,33 +47,33 @@ _MISUSE = {errno.EINVAL, errno.EOPNOTSUPP}
 
 
 class I2cAdapter(Protocol):
-    """What is beneath a bus: `smbus2.SMBus`, or an emulated adapter."""
+    """Adapter beneath a bus: `smbus2.SMBus`, or an emulated one."""
 
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
-        """One I2C_RDWR transaction: START, repeated STARTs between messages, one STOP."""
+        """Run one I2C_RDWR transaction: START, repeated STARTs between messages, one STOP."""
 
     def set_timeout(self, units_10ms: int) -> None:
-        """How long a wedged transfer lasts before it fails (ioctl I2C_TIMEOUT)."""
+        """Set the timeout of a wedged transfer (ioctl I2C_TIMEOUT)."""
 
     def close(self) -> None:
         """Release the adapter."""
 
 
 class _Smbus(SMBus):
-    """smbus2's adapter, with the call that it lacks and the result that it drops."""
+    """smbus2's adapter, with I2C_TIMEOUT and a check of the ioctl's result."""
 
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
         """Run the messages as one transaction.
 
-        The ioctl returns how many of them were transferred, which smbus2 ignores: an adapter that
+        The ioctl returns the number of transferred messages, which smbus2 ignores: an adapter that
         stops early without an errno leaves the read buffer as it was.
 
         Raises:
-            OSError: the kernel's; EREMOTEIO after fewer messages than asked.
+            OSError: the kernel's; EREMOTEIO if not all messages were transferred.
         """
         if self.fd is None:
             raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-        # Its annotation is of one argument that is a sequence.
+        # smbus2 annotates one sequence instead of arguments.
         data = i2c_rdwr_ioctl_data.create(*i2c_msgs)  # type: ignore[arg-type]
         done = fcntl.ioctl(self.fd, I2C_RDWR, data)
         if done != len(i2c_msgs):
@@ -93,9 +92,9 @@ class I2cBus:
     behind it are two transactions that nothing may come between.
 
     Args:
-        adapter: an open one.
-        name: for errors.
-        reopener: opens the adapter again after it went away; None: it is used as it is.
+        adapter: open adapter.
+        name: device name, for errors.
+        reopener: reopens the adapter after it went away; None: never reopened.
     """
 
     def __init__(
@@ -108,12 +107,12 @@ class I2cBus:
 
     @property
     def is_open(self) -> bool:
-        """Is there an adapter, as far as is known?"""
+        """True unless the adapter is known to have gone away."""
         return self._adapter is not None
 
     @property
     def problem(self) -> str:
-        """Why the adapter could not be opened again the last time; empty if it is open."""
+        """Reason why the last attempt to reopen the adapter failed; empty if it is open."""
         return "" if self._reopener is None or self.is_open else self._reopener.problem
 
     def transfer(self, *messages: i2c_msg) -> None:
@@ -122,7 +121,7 @@ class I2cBus:
         Raises:
             NoAcknowledgeError: an address or a byte was not acknowledged.
             BusLostError: the adapter went away; `reopen` gets it back.
-            BusFaultError: time-out, lost arbitration, or an unspecified I/O error.
+            BusFaultError: timeout, lost arbitration, or an unspecified I/O error.
             BusMisuseError: the adapter cannot do this sequence (a bug in the driver).
         """
         for message in messages:
@@ -137,9 +136,9 @@ class I2cBus:
             raise found from error
 
     def let_go(self) -> None:
-        """Close an adapter that no longer works; while it is open it keeps its number occupied.
+        """Close an adapter that no longer works, so that its device number becomes free.
 
-        Without a `reopener` nothing happens.
+        Without a `reopener` do nothing.
         """
         if self._adapter is None or self._reopener is None:
             return
@@ -149,7 +148,7 @@ class I2cBus:
         self._i2c_rdwr = _refuse
 
     def reopen(self, now_ns: int) -> bool:
-        """Return whether the bus is open; if it is not, attempt it, at most once a second."""
+        """Reopen a closed adapter, at most once a second; return whether the bus is open."""
         if self._adapter is None and self._reopener is not None:
             self._adapter = self._reopener.poll(now_ns)
             if self._adapter is not None:
@@ -169,7 +168,7 @@ def _refuse(*_: i2c_msg) -> None:
 
 
 class PatientBus(I2cBus):
-    """The same bus for a start-up on a disturbed line: refused transfers are tried again."""
+    """Bus that retries transfers without an acknowledge, for start-up on a disturbed line."""
 
     TRIES = 4
 
@@ -177,10 +176,10 @@ class PatientBus(I2cBus):
         self.name = bus.name
         self._bus = bus
         self.repeated = 0
-        """Count of transfers that were acknowledged only on a later try."""
+        """Number of transfers that succeeded only on a retry."""
 
     def transfer(self, *messages: i2c_msg) -> None:
-        """As `I2cBus.transfer`, up to `TRIES` times."""
+        """Run a transfer as `I2cBus.transfer`, up to `TRIES` times."""
         for attempt in range(self.TRIES):
             try:
                 self._bus.transfer(*messages)
@@ -218,9 +217,9 @@ def _classified(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cE
             errno=number,
         )
     return BusLostError(
-        f"the adapter is not there any more ({name})",
+        f"the adapter is missing ({name})",
         where=where,
-        remedy="Check its plug and its supply; it is opened again when it is back",
+        remedy="Check its plug and its supply; it is reopened automatically",
         errno=number,
     )
 
@@ -249,7 +248,7 @@ def _open_adapter(name: str, emulated: I2cAdapter | None) -> I2cAdapter:
 def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
     """Open the bus `name`: a device such as `/dev/i2c-1`, or `"emulated"`.
 
-    An emulated adapter has to be handed in: the caller makes the world behind it.
+    The caller creates and passes the emulated adapter.
 
     Raises:
         BusSetupError: the device is missing or may not be opened.

@@ -1,4 +1,4 @@
-"""Opens a device file again that went away: a USB adapter, a driver that was unbound."""
+"""Reopening of device files that went away: a USB adapter, an unbound driver."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from typing import Generic, Protocol, TypeVar
 from devices.errors import FootTileError
 
 PERIOD_NS = 1_000_000_000
-"""From the begin of one attempt to that of the next."""
+"""Interval between the begins of two attempts."""
 
 
 class Closable(Protocol):
-    """A device that was opened."""
+    """Open device."""
 
     def close(self) -> None:
-        """Release it."""
+        """Release the device."""
 
 
 Device = TypeVar("Device", bound=Closable)
 
 
 class Reopener(Generic[Device]):
-    """Attempts to open a device, one a second, none of which makes the caller wait.
+    """Non-blocking retries, one a second, to open a device.
 
-    An attempt may block: some drivers ask a USB adapter over its cable when it is opened, and wait
-    seconds for an answer. So each attempt runs in a thread of its own.
+    Opening may block: some drivers query a USB adapter over its cable and wait seconds for an
+    answer. So each attempt runs in a separate thread.
 
     Args:
-        open_device: opens it by its path, or raises a `FootTileError`.
+        open_device: opens the device by its path, or raises a `FootTileError`.
         at_once: run attempts in the caller's thread: for emulated devices, which never block, and
             whose time stands still meanwhile.
     """
 
     def __init__(self, open_device: Callable[[], Device], *, at_once: bool = False) -> None:
         self.problem = ""
-        """Why the last attempt failed; empty before the first and after success."""
+        """Reason why the last attempt failed; empty before the first and after success."""
         self._open_device = open_device
         self._at_once = at_once
         self._attempt: Thread | None = None
@@ -44,7 +44,7 @@ class Reopener(Generic[Device]):
         self._due_ns = 0
 
     def poll(self, now_ns: int) -> Device | None:
-        """Return the device if an attempt has opened it; else begin an attempt if one is due."""
+        """Return the device if an attempt has opened it; else start an attempt if due."""
         if self._attempt is None and now_ns >= self._due_ns:
             self._due_ns = now_ns + PERIOD_NS
             if self._at_once:
@@ -60,7 +60,7 @@ class Reopener(Generic[Device]):
         return opened
 
     def close(self) -> None:
-        """Close what an attempt may have opened since."""
+        """Close a device that an attempt opened and `poll` did not return."""
         if self._attempt is None and self._opened is not None:
             self._opened.close()
             self._opened = None

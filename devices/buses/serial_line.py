@@ -1,7 +1,7 @@
-"""A servo's serial line: opened for one user, and asked to hand short answers over at once.
+"""Serial line of a servo: exclusive access, low-latency mode, latency timer.
 
-An FTDI adapter collects bytes for as long as its latency timer says before it hands them over,
-16 ms by default, so that every short answer comes that late (hardware.md 5.2).
+An FTDI adapter buffers received bytes for the time of its latency timer, 16 ms by default, which
+delays every short answer (hardware.md 5.2).
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from devices.errors import ServoLostError, ServoSetupError
 SYSFS = Path("/sys/bus/usb-serial/devices")
 BY_ID = Path("/dev/serial/by-id")
 LATENCY_MS = 1
-"""What the timer should say."""
+"""Recommended latency timer."""
 
 PORT_ERRORS = (OSError, termios.error)
 NOT_SENT = serial.SerialTimeoutException
-"""A request was not sent in time, perhaps because this machine was busy; the port is there."""
+"""Error of a request that was not sent in time, perhaps on a busy machine; the port still works."""
 
 
 class SerialPort(Protocol):
-    """What a servo needs of a serial port: `serial.Serial`, or a test's."""
+    """Serial port of a servo: `serial.Serial`, or a test's."""
 
     def write(self, data: bytes, /) -> int | None:
         """Send `data`."""
 
     def read(self, size: int, /) -> bytes:
-        """Up to `size` bytes; fewer, or none, once the port's time-out is over."""
+        """Read up to `size` bytes; fewer, or none, after the port's timeout."""
 
     def reset_input_buffer(self) -> None:
-        """Discard what has come in so far."""
+        """Discard all received bytes."""
 
     def close(self) -> None:
         """Release the port."""
@@ -60,17 +60,18 @@ def open_line(port: str, baudrate: int, timeout_s: float) -> SerialPort:
             remedy="Check that the device exists, that this user is in the group dialout, that no "
             "other program has it open, and the baud rate",
         ) from error
-    # Saves up to 15 ms per read on FTDI adapters (hardware.md 5.2); others refuse, and need not.
+    # Saves up to 15 ms per read on FTDI adapters (hardware.md 5.2). Others refuse it: harmless.
     with contextlib.suppress(ValueError):
         line.set_low_latency_mode(True)
     return line
 
 
 def stable_path(port: str, folder: Path = BY_ID) -> str:
-    """Return the path by which the adapter at `port` is found again after it was plugged in anew.
+    """Return a path of the adapter at `port` that stays valid after replugging.
 
-    The kernel numbers adapters as they come, so /dev/ttyUSB0 may be /dev/ttyUSB1 afterwards, or
-    another adapter. udev's links in `folder` are named after the adapter; without one it is `port`.
+    The kernel numbers adapters in order of plugging, so /dev/ttyUSB0 may become /dev/ttyUSB1, or
+    another adapter. udev's links in `folder` are named after the adapter; without a link return
+    `port`.
     """
     device = Path(port).resolve()
     try:
@@ -81,10 +82,9 @@ def stable_path(port: str, folder: Path = BY_ID) -> str:
 
 
 def latency_timer_ms(port: str, sysfs: Path = SYSFS) -> int | None:
-    """The latency timer of the adapter at `port`, in milliseconds; None if it has none.
+    """Read the latency timer of the adapter at `port`, in milliseconds; None if it has none.
 
-    Only USB adapters with an FTDI chip have one. `port` may be a link, as those in
-    /dev/serial/by-id are.
+    Only USB adapters with an FTDI chip have one. `port` may be a link, as in /dev/serial/by-id.
     """
     try:
         return int((sysfs / Path(port).resolve().name / "latency_timer").read_text())
@@ -93,7 +93,7 @@ def latency_timer_ms(port: str, sysfs: Path = SYSFS) -> int | None:
 
 
 def latency_remark(port: str, sysfs: Path = SYSFS) -> str | None:
-    """What is wrong with the latency timer of `port`, and the remedy; None if nothing is."""
+    """Return a warning, with remedy, if the latency timer of `port` is too long; else None."""
     timer_ms = latency_timer_ms(port, sysfs)
     if timer_ms is None or timer_ms <= LATENCY_MS:
         return None

@@ -1,7 +1,7 @@
-"""The SPI device as a driver sees it: one call, `xfer2`, which returns a bit for every bit sent.
+"""SPI device for the drivers: one method, `xfer2`, which returns a bit for every bit sent.
 
-On a Raspberry Pi that is `spidev.SpiDev`, in an emulation the bit-level model behind the same
-method. Both raise bare `OSError`; the driver says what it means.
+`spidev.SpiDev` on a Raspberry Pi, a bit-level model in an emulation. Both raise bare `OSError`; the
+driver interprets it.
 """
 
 from __future__ import annotations
@@ -25,13 +25,12 @@ _INSTALL = "Install it: pip install 'foottile[rig]' (it is compiled, and needs g
 
 
 class SpiDevice(Protocol):
-    """What is beneath a driver: `spidev.SpiDev`, or an emulated device."""
+    """Device beneath a driver: `spidev.SpiDev`, or an emulated one."""
 
     def xfer2(self, data: list[int], /) -> list[int]:
         """Exchange bytes while chip select stays low.
 
-        spidev writes what it receives into `data` and returns that: a list to be sent again has to
-        be copied.
+        spidev writes the received bytes into `data` and returns it: copy a list before reuse.
         """
 
     def close(self) -> None:
@@ -39,14 +38,14 @@ class SpiDevice(Protocol):
 
 
 class SpiPort:
-    """An SPI device by its path, opened again after it went away (its driver was unbound)."""
+    """SPI device by its path, reopened after it went away (its driver was unbound)."""
 
     def __init__(self, device: SpiDevice, reopener: Reopener[SpiDevice]) -> None:
         self._device: SpiDevice | None = device
         self._reopener = reopener
 
     def xfer2(self, data: list[int], /) -> list[int]:
-        """As `SpiDevice.xfer2`.
+        """Exchange bytes as `SpiDevice.xfer2`; reopen a device that was away.
 
         Raises:
             OSError: the transfer failed, or the device is away.
@@ -58,7 +57,7 @@ class SpiPort:
         try:
             return self._device.xfer2(data)
         except OSError:
-            # A transfer of three bytes fails for no other reason than that the device is away.
+            # A transfer of three bytes fails only if the device is away.
             device, self._device = self._device, None
             with contextlib.suppress(OSError):
                 device.close()
@@ -74,7 +73,7 @@ class SpiPort:
 def open_spi(name: str, emulated: SpiDevice | None = None) -> SpiDevice:
     """Open the device `name`: a path such as `/dev/spidev0.0`, or `"emulated"`.
 
-    An emulated device has to be handed in: the caller makes the world behind it.
+    The caller creates and passes the emulated device.
 
     Raises:
         SpiSetupError: the device is missing or may not be opened.

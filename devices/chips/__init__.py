@@ -1,1 +1,1 @@
-"""What each chip is: registers and data-sheet formulas over a bus. Nothing here knows an array."""
+"""Chip drivers: registers and data-sheet formulas over a bus, independent of arrays."""

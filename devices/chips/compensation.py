@@ -1,4 +1,4 @@
-"""Counts to absolute pressure for a whole array: the data sheet's compensation per tile."""
+"""Compensation of raw counts to absolute pressure, by the data sheet, for a whole array."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from devices.arrays import Floats
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
 from devices.frames import NOT_READ, FrameBatch, TileInfo, TileStatus
 
-_ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of what rounding to one count takes away
+_ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of the quantization error, in counts
 
 
 class Compensation:
-    """The coefficients of an array's chips, a0, b1, b2 and c12, as arrays over tiles."""
+    """Coefficients a0, b1, b2 and c12 of an array's chips, as arrays over tiles."""
 
     def __init__(self, tiles: Sequence[TileInfo]) -> None:
         chips = [Coefficients.from_words(tile.coefficient_words) for tile in tiles]
@@ -24,11 +24,11 @@ class Compensation:
         )
 
     def kpa(self, padc: npt.ArrayLike, tadc: npt.ArrayLike) -> Floats:
-        """Absolute pressure, (n, tiles), of raw counts of that shape."""
+        """Compute absolute pressure, (n, tiles), from raw counts of that shape."""
         return compensate_kpa(padc, tadc, self.a0, self.b1, self.b2, self.c12)
 
     def readable_kpa(self, frames: FrameBatch) -> Floats:
-        """Absolute pressure of frames, NaN wherever a tile gave none."""
+        """Compute absolute pressure of frames, NaN where a tile has no usable reading."""
         unreadable = (
             ((frames.status & TileStatus.UNUSABLE) != 0)
             | (frames.padc == NOT_READ)
@@ -37,9 +37,9 @@ class Compensation:
         return np.where(unreadable, np.nan, self.kpa(frames.padc, frames.tadc))
 
     def kpa_per_count(self, tadc: npt.ArrayLike) -> Floats:
-        """Pressure step of one count of `padc`; negative."""
+        """Compute the pressure step of one count of `padc`; negative."""
         return kpa_per_padc(tadc, self.b1, self.c12)
 
     def rounding_kpa(self, tadc: npt.ArrayLike) -> Floats:
-        """Standard uncertainty that rounding to a count leaves."""
+        """Compute the standard uncertainty due to quantization to a count."""
         return np.asarray(np.abs(self.kpa_per_count(tadc)) * _ROUNDING)

@@ -1,4 +1,4 @@
-"""Microchip MCP3208: eight inputs, twelve bits, over SPI.
+"""Driver of the Microchip MCP3208: analogue-to-digital converter, eight inputs, 12 bit, SPI.
 
 Sources: data sheet DS21298E section 5, and hardware.md 6.
 """
@@ -21,9 +21,9 @@ _HIGH_BITS = 0x0F  # B11 to B8
 
 
 class Mcp3208:
-    """One converter, read single-ended.
+    """Driver of one converter, read single-ended.
 
-    A transfer is three bytes. The start bit stands where it puts the null bit and B11..B8 into the
+    A transfer is three bytes. The place of the start bit puts the null bit and B11..B8 into the
     second byte and B7..B0 into the third. An MCP3008's framing puts them two bits later, and so
     loses the lowest two.
     """
@@ -31,16 +31,16 @@ class Mcp3208:
     def __init__(self, device: SpiDevice, *, where: str) -> None:
         self._xfer2 = device.xfer2
         self._where = where
-        # Tuples: spidev writes into a list that it is given.
+        # Tuples: spidev overwrites a list.
         self._requests = [
             (_START_SINGLE_ENDED | channel >> 2, (channel & 0b11) << 6, 0) for channel in CHANNELS
         ]
 
     def read_counts(self, channel: int) -> int:
-        """Convert the voltage at input `channel`, 0 to 7: 0 to 4095 counts.
+        """Convert the voltage at input `channel`, 0 to 7, and return 0 to 4095 counts.
 
-        Both ends are returned like any other: what they mean depends on what is connected. A line
-        that is stuck low has a good null bit, and reads 0.
+        The meaning of both end values depends on the connected circuit. A line stuck low has a
+        valid null bit, and reads 0.
 
         Raises:
             AdcSilentError: the null bit is high, as on a line that floats.

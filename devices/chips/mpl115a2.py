@@ -1,7 +1,7 @@
-"""NXP MPL115A2: registers, coefficients, compensation, its inverse, and the three transfers.
+"""Driver of the NXP MPL115A2: registers, coefficients, compensation and its inverse, transfers.
 
-Source throughout: MPL115A2 data sheet Rev. 10, "DS" below. The arithmetic is pure and works on
-arrays; the driver at the end only moves bytes.
+Source: MPL115A2 data sheet Rev. 10, "DS" below. The arithmetic is pure and works on arrays; the
+driver class only transfers bytes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from devices.buses.i2c import I2cBus, i2c_msg
 from devices.errors import TileSetupError
 
 ADDRESS = 0x60
-"""Fixed for every part (DS 2): more than one on a bus needs a multiplexer."""
+"""I2C address, fixed for every part (DS 2): more than one on a bus needs a multiplexer."""
 
 REGISTER_PADC = 0x00
 REGISTER_COEFFICIENTS = 0x04
@@ -28,21 +28,21 @@ REGISTER_CONVERT = 0x12
 
 CONVERSION_TYPICAL_NS = 1_600_000
 CONVERSION_MAX_NS = 3_000_000
-"""DS table 10: what a driver has to allow for while it has not measured the part."""
+"""Longest conversion time (DS table 10), used for a part that is not measured."""
 
 PRESSURE_MIN_KPA = 50.0
 PRESSURE_MAX_KPA = 115.0
-"""The specified range, which is the full scale of Pcomp 0..1023 (DS eq. 2)."""
+"""Upper end of the specified range, 50 to 115 kPa: the full scale of Pcomp (DS eq. 2)."""
 
 COUNTS_MAX = 1023
 
 TADC_PER_KELVIN = -5.35
-"""Counts of `tadc` for a kelvin (Linux' mpl115 driver, Freescale's answer; hardware.md 1.3)."""
+"""Counts of `tadc` per kelvin (Linux' mpl115 driver, Freescale's answer; hardware.md 1.3)."""
 _TADC_AT_25_DEGC = 472
 
 SAMPLE_PART_OF_CONVERSION = 4
-"""The pressure is taken in the first part of a conversion (DS table 7); the exact instant is not
-stated, so a quarter into it is assumed (hardware.md 1.4)."""
+"""Divisor of the conversion time for the sample instant. Pressure is sampled in the first part of a
+conversion (DS table 7); a quarter is assumed, as the instant is not stated (hardware.md 1.4)."""
 
 _KPA_PER_PCOMP = (PRESSURE_MAX_KPA - PRESSURE_MIN_KPA) / COUNTS_MAX
 _SIGNED_WORDS = struct.Struct(">4h")
@@ -51,7 +51,7 @@ _UNSIGNED_WORDS = struct.Struct(">2H")
 
 @dataclass(frozen=True)
 class Coefficients:
-    """The four factory coefficients of a part (DS 8.1, table 5).
+    """Factory coefficients of a part (DS 8.1, table 5).
 
     `a0` in counts, `b1` and `b2` in counts per count, `c12` in counts per count squared.
     """
@@ -63,16 +63,16 @@ class Coefficients:
 
     @classmethod
     def from_words(cls, words: Sequence[int]) -> Coefficients:
-        """Decode the registers a0, b1, b2, c12, given as unsigned 16-bit words.
+        """Decode the registers a0, b1, b2, c12 from unsigned 16-bit words.
 
         a0 has 3 fractional bits, b1 13, b2 14; c12 is 14 bits wide, left-justified, with 13
-        fractional bits behind 9 zeros: forgetting its shift by two makes it four times too large.
+        fractional bits behind 9 zeros: without its shift by two it is four times too large.
         """
         a0, b1, b2, c12 = _SIGNED_WORDS.unpack(struct.pack(">4H", *words))
         return cls(a0=a0 / 8, b1=b1 / 8192, b2=b2 / 16384, c12=(c12 >> 2) / 4194304)
 
     def to_words(self) -> tuple[int, int, int, int]:
-        """Registers that hold the nearest representable coefficients, as unsigned words.
+        """Encode the nearest representable coefficients as unsigned register words.
 
         Raises:
             struct.error: a coefficient does not fit its register.
@@ -87,7 +87,7 @@ class Coefficients:
         return a0, b1, b2, c12
 
     def implausibility(self) -> str:
-        """Why these cannot be a working part's coefficients; empty if they can.
+        """Return the reason why no working part has these coefficients; empty if plausible.
 
         All known parts have a0 > 0, b1 < 0, b2 < 0, c12 > 0 (hardware.md 8). Eight zero bytes (SDA
         stuck low) or eight ones (no part) fail here: they would give a constant 50 kPa.
@@ -107,10 +107,10 @@ def compensate_kpa(
     b2: float | Floats,
     c12: float | Floats,
 ) -> Floats:
-    """Absolute pressure in kPa from raw counts (DS 8.2, eq. 1 and 2).
+    """Compute absolute pressure in kPa from raw counts (DS 8.2, eq. 1 and 2).
 
-    Both counts are unsigned, `tadc` above 511 is the normal case below about 20 degC. Nothing is
-    clipped: a count past the specified range gives a pressure past it. Arguments broadcast.
+    Both counts are unsigned; `tadc` is normally above 511 below about 20 degC. No clipping: counts
+    past the specified range give pressures past it. Arguments broadcast.
     """
     p = np.asarray(padc, dtype=np.float64)
     t = np.asarray(tadc, dtype=np.float64)
@@ -118,14 +118,14 @@ def compensate_kpa(
 
 
 def kpa_of(p: Any, t: Any, a0: Any, b1: Any, b2: Any, c12: Any) -> Any:
-    """The same as bare arithmetic of floats or arrays, which can be compiled."""
+    """Compute `compensate_kpa` as bare arithmetic of floats or arrays, for compiled code."""
     return (a0 + (b1 + c12 * t) * p + b2 * t) * _KPA_PER_PCOMP + PRESSURE_MIN_KPA
 
 
 def padc_of_kpa(
     pressure_kpa: npt.ArrayLike, tadc: npt.ArrayLike, coefficients: Coefficients
 ) -> Floats:
-    """The unrounded `padc` at which `compensate_kpa` gives `pressure_kpa`: its exact inverse."""
+    """Compute the unrounded `padc` of a pressure: the exact inverse of `compensate_kpa`."""
     c = coefficients
     t = np.asarray(tadc, dtype=np.float64)
     pcomp = (np.asarray(pressure_kpa, dtype=np.float64) - PRESSURE_MIN_KPA) / _KPA_PER_PCOMP
@@ -133,20 +133,23 @@ def padc_of_kpa(
 
 
 def kpa_per_padc(tadc: npt.ArrayLike, b1: float | Floats, c12: float | Floats) -> Floats:
-    """Pressure step of one count of `padc` in kPa; negative: `padc` falls as pressure rises."""
+    """Compute the pressure step of one count of `padc` in kPa.
+
+    It is negative: `padc` falls as pressure rises.
+    """
     return np.asarray(kpa_per_count_of(np.asarray(tadc, dtype=np.float64), b1, c12))
 
 
 def kpa_per_count_of(t: Any, b1: Any, c12: Any) -> Any:
-    """The same as bare arithmetic."""
+    """Compute `kpa_per_padc` as bare arithmetic of floats or arrays, for compiled code."""
     return (b1 + c12 * t) * _KPA_PER_PCOMP
 
 
 class Mpl115a2:
-    """The transfers to whatever part the multiplexers have connected to address 0x60.
+    """Transfers to the part that the multiplexers connect.
 
-    Messages are built once; a read overwrites its buffer. Read and write of one transaction are
-    joined by a repeated START as in DS figures 4 and 6.
+    Messages are built once; a read overwrites its buffer. A repeated START joins write and read of
+    one transaction, as in DS figures 4 and 6.
     """
 
     def __init__(self, bus: I2cBus) -> None:
@@ -159,33 +162,33 @@ class Mpl115a2:
         self._coefficients = i2c_msg.read(ADDRESS, 8)
 
     def convert(self) -> None:
-        """Start one conversion of pressure and temperature in every part that is connected."""
+        """Start one conversion of pressure and temperature in every connected part."""
         self._bus.transfer(self._convert)
 
     def read_counts(self) -> tuple[int, int]:
-        """`padc` and `tadc` of the last finished conversion, 0..1023 each."""
+        """Read `padc` and `tadc` of the last finished conversion, 0..1023 each."""
         self._bus.transfer(self._point_at_counts, self._counts)
         padc, tadc = _UNSIGNED_WORDS.unpack(bytes(self._counts))
         return padc >> 6, tadc >> 6
 
     def read_padc(self) -> int:
-        """`padc` alone, which saves 18 bits on the wire."""
+        """Read `padc` alone, which saves 18 bits on the wire."""
         self._bus.transfer(self._point_at_counts, self._padc)
         return int.from_bytes(bytes(self._padc), "big") >> 6
 
     def read_coefficient_bytes(self) -> bytes:
-        """The eight coefficient registers, read once, as they are."""
+        """Read the eight coefficient registers once, without a check."""
         self._bus.transfer(self._point_at_coefficients, self._coefficients)
         return bytes(self._coefficients)
 
     def read_coefficient_words(self, *, where: str, reads: int = 3) -> tuple[int, int, int, int]:
-        """The four coefficient registers as unsigned words, read `reads` times in agreement.
+        """Read the four coefficient registers `reads` times, check them, return unsigned words.
 
         The protocol has no checksum, and a wrong coefficient is a silent, constant error for a
         whole session; hence the repetition and the plausibility check.
 
         Raises:
-            TileSetupError: the readings differ, or no working part has such coefficients.
+            TileSetupError: the readings differ or are implausible.
             I2cError: the transfer failed.
         """
         readings = set()
@@ -210,8 +213,8 @@ class Mpl115a2:
 
 
 def indicative_degc(tadc: float) -> float:
-    """Temperature that `tadc` stands for, within some 5 K: the chip is not calibrated for it.
+    """Estimate the temperature of `tadc`, within some 5 K: the chip is not calibrated for it.
 
-    25 degC at 472 counts and -5.35 counts/K (hardware.md 1.3); no scale is in the data sheet.
+    25 degC at 472 counts and -5.35 counts/K (hardware.md 1.3); the data sheet states no scale.
     """
     return 25.0 + (tadc - _TADC_AT_25_DEGC) / TADC_PER_KELVIN

@@ -1,7 +1,7 @@
-"""TI TCA9548A: one control register, one bit per channel, in force after the next STOP.
+"""Driver of the TI TCA9548A I2C multiplexer: one control register, one bit per channel.
 
-Source: TCA9548A data sheet SCPS207G, 8.5.3 and 8.5.4. Because the selection acts at STOP only, a
-select and the access behind it can never share a transaction; every method here is one transaction.
+Source: TCA9548A data sheet SCPS207G, 8.5.3 and 8.5.4. A selection acts at STOP only, so a select
+and the access behind it are two transactions; every method of `Tca9548a` is one transaction.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _REFUSALS_MAX = 2  # one refusal may be a disturbed bit
 
 
 class Tca9548a:
-    """One multiplexer: writes its control register and reads it back."""
+    """Driver of one multiplexer: writes and reads its control register."""
 
     def __init__(self, bus: I2cBus, address: int) -> None:
         self.address = address
@@ -32,17 +32,17 @@ class Tca9548a:
         self._bus.transfer(self._writes[mask])
 
     def read_mask(self) -> int:
-        """The channels that are connected now."""
+        """Read the mask of the channels connected now."""
         self._bus.transfer(self._read)
         return bytes(self._read)[0]
 
 
 class MuxRouter:
-    """Keeps all multiplexers of a bus so that only the channels asked for are connected.
+    """Router that connects only the requested channels of all multiplexers of a bus.
 
-    All tiles share one address, so a channel left open on another mux would answer too: reads would
-    return the AND of two tiles, plausible and wrong. The state is cached, because a select costs
-    50 us; what is not known is written again before anything else is connected.
+    All tiles share one address, so a tile on an open channel of another mux would answer too: reads
+    would return the AND of two tiles, plausible and wrong. The state is cached, because a select
+    costs 50 us; an unknown state is written again before other channels are connected.
     """
 
     def __init__(self, bus: I2cBus, addresses: Iterable[int]) -> None:
@@ -53,17 +53,17 @@ class MuxRouter:
         self.refused: int | None = None
         """The mux that did not acknowledge in the last `connect`; None if all did."""
         self.silent: set[int] = set()
-        """Muxes that did not let themselves be closed. They are taken to be without supply, which
-        connects nothing; to read a tile of another mux, make sure of that."""
+        """Muxes that did not acknowledge being closed. They are assumed to be without supply, so to
+        connect no channel; callers that read a tile of another mux have to verify it."""
 
     def connect(self, masks: Mapping[int, int]) -> None:
-        """Connect exactly the channels of `masks` (address to mask); all other muxes are closed.
+        """Connect exactly the channels of `masks` (address to mask) and close all other muxes.
 
         Muxes are closed before others are opened, so that no two overlap in between.
 
         Raises:
-            I2cError: a mux did not answer. One that refuses to be closed twice in a row is
-                `silent` from then on, and is skipped.
+            I2cError: a mux did not answer. A mux that fails to close twice in a row is `silent`
+                from then on, and is skipped.
         """
         self.refused = None
         for address, mask in self._masks.items():
@@ -78,7 +78,7 @@ class MuxRouter:
         self.connect({address: 1 << channel})
 
     def forget(self, address: int | None = None) -> None:
-        """Drop the cached state of one mux, or of all: the next `connect` writes it again."""
+        """Discard the cached state of one mux, or of all: the next `connect` writes it again."""
         if address is not None:
             self._masks[address] = None
             return
@@ -87,9 +87,9 @@ class MuxRouter:
         self.silent.clear()
 
     def audit(self) -> bool:
-        """Read back what every mux connects; True if it is what it should be.
+        """Read back the mask of every mux; return whether all match the cached state.
 
-        A mux that was reset behind our back is forgotten, and so is one that does not answer.
+        Discards the cached state of a mux that differs (after a reset) or does not answer.
 
         Raises:
             BusFaultError: the bus itself failed.
@@ -108,10 +108,10 @@ class MuxRouter:
         return sound
 
     def echoes(self) -> bool:
-        """Does a mux keep what is written to it? On a bus with SDA stuck low no mux seems to.
+        """Return whether any mux returns a mask written to it, which proves that the bus works.
 
-        Such a bus acknowledges everything and reads as zeros (hardware.md 3.2), so one bit that
-        comes back is proof that the wires move. Tries the muxes one after another.
+        With SDA stuck low a bus acknowledges everything and reads as zeros (hardware.md 3.2). The
+        muxes are tried one after another.
 
         Raises:
             BusFaultError: the bus itself failed.

@@ -1,1 +1,1 @@
-"""Models of the hardware at registers and bytes, and their world. Drivers never import it."""
+"""Emulation of the hardware at the level of registers and bytes. Drivers never import it."""

@@ -1,10 +1,10 @@
-"""The dome: contact force in, gas pressure on the chip out.
+"""Dome physics: contact force in, gas pressure on the chip out.
 
-Order of the chain (hardware.md 9): contact force -> creep of the rubber -> hysteresis -> volume of
-the bubble -> gas temperature -> absolute pressure; the equations are `dome_steps`.
+Signal chain (hardware.md 9): contact force -> creep of the rubber -> hysteresis -> volume of the
+bubble -> gas temperature -> absolute pressure; the equations are in `dome_steps`.
 
-Everything is computed in pieces of time on a fine grid, for all domes at once, and interpolated
-where a chip samples: the physics does not know who asks, or when, and no piece shows where it ends.
+Pressures of all domes are computed in chunks on a fine time grid, and interpolated at the sample
+instants: the result does not depend on the chunks or on the times of the samples.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from devices.emulation.surroundings import Surroundings
 from devices.scene.emulated import EmulationScene
 
 GRID_S = 0.0005
-"""Between grid points pressure is taken as linear: in a tap of 20 ms that is off by 0.01 kPa."""
-_PIECE = 100  # grid points, 50 ms: so little is computed at once that no transfer waits for long
-_KEPT = 2000  # grid points behind the latest that was asked for
-_LATE = 20_000  # grid points, 10 s: so far behind it is quicker to go on coarsely
-_COARSE = 40  # grid points, 20 ms
+"""Grid interval. Linear interpolation of pressure is off by 0.01 kPa in a tap of 20 ms."""
+_PIECE = 100  # grid points of a chunk, 50 ms: short, so that no transfer waits for long
+_KEPT = 2000  # grid points stored behind the latest requested one
+_LATE = 20_000  # grid points, 10 s: lag beyond which coarse steps are used
+_COARSE = 40  # grid points of a coarse step, 20 ms
 
 _KELVIN = 273.15
 _PLAY_WIDTHS_N = np.array([0.5, 1.0, 2.0, 4.0])
-_FLOW_N_PER_S = 7.5  # where the loop is as wide as the part says: 30 N within 4 s
-_UNLOADED_N = 0.05  # a dome that bears less is not touched: the next touch is a new loading
+_FLOW_N_PER_S = 7.5  # rate of force at which the viscous loop has its stated width: 30 N in 4 s
+_UNLOADED_N = 0.05  # below it a dome is untouched: the next contact is a new loading
 
 
 class Load(Protocol):
-    """What presses on the domes."""
+    """Load on the domes."""
 
     def forces_n(self, t_s: Floats) -> Floats:
-        """Force on each dome along its axis, shape (len(t_s), domes), never negative."""
+        """Compute the force on each dome along its axis, (len(t_s), domes), never negative."""
 
 
 class Domes:
-    """All domes of a foot under one load, integrated forward in pieces.
+    """All domes of a foot under one load, integrated forward in chunks.
 
-    A place may be `bare`: its chip has no dome, and senses what is around it. In real time those
-    who are far behind go on coarsely: a machine that slept would else have all of it to compute.
+    A place may be `bare`: its chip has no dome, and senses the surroundings. In real time a long
+    lag is integrated in coarse steps, for example after the machine slept.
     """
 
     def __init__(
@@ -89,23 +89,23 @@ class Domes:
         self._gas = GasParts.of(parts, self._seal_k)
 
         self._next = 0  # grid index of the first point that is not computed
-        self._asked = 0  # the highest grid index that was asked for
-        # By number. What may still be asked for stays, however far the newest was: how late a
-        # driver is decides when it asks, not what the dome was like then.
+        self._asked = 0  # the highest requested grid index
+        # Chunks by number; older ones stay for late requests, so that a driver's delay does not
+        # change the physics.
         self._pieces: dict[int, Floats] = {}
-        self._extend(0)  # what is compiled is ready before a chip asks
+        self._extend(0)  # compile before the first sample
 
     def again(self, scene: EmulationScene, surroundings: Surroundings) -> Domes:
-        """The same domes under the same load from its first instant on, with other effects."""
+        """Create the same domes under the same load, from its first instant, with other effects."""
         return self._again(scene, surroundings)
 
     def pressure_kpa(self, dome: int, t_s: float) -> float:
-        """Absolute gas pressure of one dome, or around a bare chip.
+        """Compute the absolute gas pressure of one dome, or around a bare chip.
 
-        Times may go back, but not by more than a second from the latest that was asked for.
+        Times may go back by up to a second from the latest requested one.
 
         Raises:
-            ValueError: `t_s` lies before what is still kept.
+            ValueError: `t_s` is too far back.
         """
         position = t_s / GRID_S
         index = int(position)
@@ -124,7 +124,7 @@ class Domes:
         return float(self._pieces[number][row, dome])
 
     def _extend(self, index: int) -> None:
-        """Compute pieces until grid point `index` is there."""
+        """Compute chunks up to grid point `index`; delete old ones."""
         if self._in_real_time and index - self._next > _LATE:
             self._leap((index - _KEPT) // _PIECE)
         while index >= self._next:
@@ -135,7 +135,7 @@ class Domes:
             del self._pieces[number]
 
     def _leap(self, to_piece: int) -> None:
-        """Go on to a piece in coarse steps. What is kept before a sample is computed finely."""
+        """Integrate to a chunk in coarse steps. The chunks stored after that are fine again."""
         points, rest = divmod(to_piece * _PIECE - self._next, _COARSE)
         for points_now, stride in ((points, _COARSE), (rest, 1)):
             if points_now:
@@ -143,7 +143,7 @@ class Domes:
                 self._next += points_now * stride
 
     def _compute(self, points: int, stride: int) -> Floats:
-        """The pressures of so many points from the next grid point on, each `stride` further."""
+        """Compute the pressures of `points` grid points from the next one on, `stride` apart."""
         steps = self._next + stride * np.arange(points, dtype=np.float64)
         t_s: Floats = GRID_S * steps
         force_n = np.ascontiguousarray(self._load.forces_n(t_s))
@@ -156,7 +156,7 @@ class Domes:
         return kpa
 
     def _loading_gains(self, force_n: Floats) -> Floats:
-        """A separate gain for every loading, drawn when the dome is touched."""
+        """Compute gains: a separate one for every loading, drawn at the contact."""
         gains = np.ones_like(force_n)
         if self._scene.repeatability == 0.0:
             return gains
@@ -173,7 +173,7 @@ class Domes:
         return gains
 
     def _gas_kpa(self, t_s: Floats, volume: Floats, step_s: float) -> Floats:
-        """Pressure of the sealed gas at a given relative volume of the unstretched bubble."""
+        """Compute the pressure of the sealed gas at a relative volume of the unstretched bubble."""
         wall_k = np.stack(
             [
                 self._surroundings.gas_wall_degc(t_s, part.chip_lag_s, part.gas_lag_s) + _KELVIN
@@ -195,7 +195,7 @@ class Domes:
 
 
 class _Rubber:
-    """What the rubber makes of a force: creep, loop, and a branch that flows; with their state."""
+    """Rubber model with its state: creep, hysteresis loop, viscous branch."""
 
     def __init__(self, parts: Sequence[DomePart]) -> None:
         terms = max(len(part.creep_s) for part in parts)
@@ -211,7 +211,7 @@ class _Rubber:
         self._flow = FlowParts.of(parts, _FLOW_N_PER_S)
 
     def apparent_n(self, force_n: Floats, step_s: float, scene: EmulationScene) -> Floats:
-        """The force that squeezes the bubble, (times, domes)."""
+        """Compute the force that compresses the bubble, (times, domes)."""
         if scene.rubber:
             decay = np.exp(-step_s / self._creep_s)
             mean = (1 - decay) * self._creep_s / step_s

@@ -1,14 +1,13 @@
-"""The equations of the dome, step by step in time: rubber that creeps, sticks and flows, and gas.
+"""Time steps of the dome's equations: creep, hysteresis and flow of the rubber, and gas.
 
-The gas is heat conduction in a sphere with an isothermal wall, eight modes; the rubber Prony terms,
-as many as the part has, and four play operators, and where the part has it a branch that flows
-(Bergstrom and Boyce 1998: filled rubbers lose energy in chains that creep past one another, at a
-rate that is a high power of their stress, so that the loop grows slowly with speed; there about the
-fourth). None of these equations is the estimator's but that one, whose part, power and width are
-each dome's own; and no number is.
+Gas: heat conduction in a sphere with an isothermal wall, eight modes. Rubber: Prony terms, as many
+as the part has, four play operators, and for some parts a viscous branch (Bergstrom and Boyce 1998:
+filled rubbers lose energy in chains that creep past one another, at a rate that is a high power of
+their stress, so that the loop grows slowly with speed; there about the fourth). The estimator uses
+only that last equation, with other part, power and width for each dome, and no number from here.
 
-Arrays are (times, domes); state is written in place. Every point follows from the one before, so
-that the bits are the same however time is cut into pieces.
+Arrays are (times, domes); state is updated in place. Every point follows from the previous one, so
+that the bits do not depend on the split of time into chunks.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from devices.emulation.parts import DomePart
 _MODES = np.arange(1, 9)
 _MODE_WEIGHTS: Floats = (
     6.0 / (np.pi * _MODES.astype(np.float64)) ** 2
-)  # of the mean temperature of a heated sphere
+)  # weights of the modes in the mean temperature of a heated sphere
 _ROUNDS_MAX = 60  # a bound; each contracts by kappa
 _ROUNDS_END_K = 1e-9  # 3e-10 kPa
 
@@ -35,15 +34,15 @@ _ROUNDS_END_K = 1e-9  # 3e-10 kPa
 def crept_n(
     force_n: Floats, last_n: Floats, parts: Floats, decay: Floats, mean: Floats, slow_n: Floats
 ) -> Floats:
-    """Creep: part of the force appears only after each term's time, statically all of it.
+    """Apply creep: each term's part of the force appears with a delay, finally in full.
 
     Args:
         force_n: (times, domes).
-        last_n: (domes,), at the point before.
-        parts: (domes, terms), of the force; 0: there is no such term.
-        decay: (domes, terms), within a step.
-        mean: (domes, terms), of a term's decay over a step.
-        slow_n: (domes, terms), state: what has appeared.
+        last_n: (domes,), force at the previous point.
+        parts: (domes, terms), parts of the force; 0: no such term.
+        decay: (domes, terms), decay within a step.
+        mean: (domes, terms), mean of a term's decay over a step.
+        slow_n: (domes, terms), state: delayed force.
     """
     apparent_n = np.empty_like(force_n)
     for dome in range(force_n.shape[1]):
@@ -64,12 +63,12 @@ def crept_n(
 
 @compiled
 def played_n(force_n: Floats, widths_n: Floats, weights: Floats, play_n: Floats) -> Floats:
-    """Generalised play: each operator lags between two branches that meet at zero load.
+    """Apply hysteresis by generalised play: operators lag between branches that meet at zero load.
 
     Args:
         force_n: (times, domes).
-        widths_n: (operators,).
-        weights: (domes,), of each operator.
+        widths_n: (operators,), widths of the operators.
+        weights: (domes,), weight of every operator.
         play_n: (domes, operators), state.
     """
     looped_n = np.empty_like(force_n)
@@ -88,11 +87,11 @@ def played_n(force_n: Floats, widths_n: Floats, weights: Floats, play_n: Floats)
 
 @dataclass(frozen=True)
 class FlowParts:
-    """Branches that flow, and their state.
+    """Viscous branches of all domes, and their state.
 
     Attributes:
-        constants: (domes, 3), part of the force, power of the stress, and rate; part 0: none.
-        last_n: (domes,), force at the point before.
+        constants: (domes, 3), part of the force, power of the stress, and rate; part 0: no branch.
+        last_n: (domes,), force at the previous point.
         branch_n: (domes,), stress of the branch.
     """
 
@@ -102,7 +101,7 @@ class FlowParts:
 
     @classmethod
     def of(cls, parts: Sequence[DomePart], n_per_s: float) -> FlowParts:
-        """Of these domes; a loop is as wide as its part says where the force changes so fast."""
+        """Build the branches of domes; loops have their stated width at a rate of `n_per_s`."""
         constants = np.zeros((len(parts), 3))
         for dome, part in enumerate(parts):
             if part.viscous_n > 0.0:
@@ -113,7 +112,7 @@ class FlowParts:
 
     @property
     def is_there(self) -> bool:
-        """Has any dome such a branch?"""
+        """True if any dome has a viscous branch."""
         return bool((self.constants[:, 0] > 0.0).any())
 
 
@@ -121,17 +120,17 @@ class FlowParts:
 def flowed_n(
     force_n: Floats, constants: Floats, step_s: float, last_n: Floats, branch_n: Floats
 ) -> Floats:
-    """A branch beside the spring bears part of a change, and flows: the bubble gets the rest.
+    """Subtract the stress of viscous branches from forces; the bubble gets the rest.
 
-    Branch stress s: ds/dt = part dF/dt - rate |s|^power sign(s). The flow by itself has a closed
-    form, which stands between two halves of the step in force; where F changes as fast as
-    `FlowParts.of` was told it ends at s = `viscous_n`.
+    Branch stress s: ds/dt = part dF/dt - rate |s|^power sign(s). The flow alone has a closed form,
+    applied between two halves of the step in force; at the rate of force given to `FlowParts.of` s
+    tends to `viscous_n`.
 
     Args:
         force_n: (times, domes).
         constants: (domes, 3), as of `FlowParts`.
         step_s: seconds between two times.
-        last_n: (domes,), state: force at the point before.
+        last_n: (domes,), state: force at the previous point.
         branch_n: (domes,), state.
     """
     rest_n = force_n.copy()
@@ -154,15 +153,15 @@ def flowed_n(
 
 @dataclass(frozen=True)
 class GasParts:
-    """The gas of each dome, and its state.
+    """Gas of all domes, and its state.
 
     Attributes:
-        constants: (domes, 4), pressure and temperature at which it was sealed, give of the wall for
-            each kPa over it, and kappa.
-        weights: (modes,), of the mean temperature.
-        rates_per_s: (domes, modes), at which modes decay.
-        modes_k: (domes, modes).
-        last_ln_p: (domes,), at the point before.
+        constants: (domes, 4), pressure and temperature at sealing, compliance of the wall per kPa,
+            and kappa.
+        weights: (modes,), weights in the mean temperature.
+        rates_per_s: (domes, modes), decay rates.
+        modes_k: (domes, modes), temperatures of the modes.
+        last_ln_p: (domes,), logarithm of the pressure at the previous point.
     """
 
     constants: Floats
@@ -173,7 +172,7 @@ class GasParts:
 
     @classmethod
     def of(cls, parts: Sequence[DomePart], seal_k: float) -> GasParts:
-        """Of these domes, at rest."""
+        """Build the gas of domes, at rest."""
         constants = np.array(
             [(part.seal_kpa, seal_k, part.wall_per_kpa, part.kappa) for part in parts]
         )
@@ -199,7 +198,7 @@ def _kpa(
 
 @compiled
 def static_kpa(wall_k: Floats, volume: Floats, head_kpa: Floats, constants: Floats) -> Floats:
-    """Pressure of gas that is as warm as its wall; arguments as of `gas_kpa`."""
+    """Compute the pressure of gas at the temperature of its wall; arguments as of `gas_kpa`."""
     kpa = np.empty_like(volume)
     for dome in range(volume.shape[1]):
         seal_kpa, seal_k, c = constants[dome, 0], constants[dome, 1], constants[dome, 2]
@@ -221,7 +220,7 @@ def gas_kpa(
     modes_k: Floats,
     last_ln_p: Floats,
 ) -> Floats:
-    """Pressure of gas that is warmed by being squeezed.
+    """Compute the pressure of gas with adiabatic heating and heat conduction.
 
     Mean gas temperature T = wall + sum of modes; mode n is driven by kappa T d(ln p) times its
     weight and decays with conduction_s / n^2. The wall yields to the pressure difference over it.
@@ -230,11 +229,11 @@ def gas_kpa(
 
     Args:
         wall_k: (times, domes), temperature of the wall.
-        volume: (times, domes), of the unstretched bubble, relative.
+        volume: (times, domes), relative volume of the unstretched bubble.
         head_kpa: (times, domes), pressure around it above the atmosphere's.
         constants: (domes, 4), as of `GasParts`.
-        gain: (domes, modes), of what drives a mode within a step.
-        decay: (domes, modes), within a step.
+        gain: (domes, modes), gain of a mode's drive within a step.
+        decay: (domes, modes), decay within a step.
         modes_k: (domes, modes), state.
         last_ln_p: (domes,), state.
     """
@@ -242,8 +241,7 @@ def gas_kpa(
     for dome in range(volume.shape[1]):
         seal_kpa, seal_k, c = constants[dome, 0], constants[dome, 1], constants[dome, 2]
         kappa = constants[dome, 3]
-        # Loops and numbers, for sums and rows take numba a quarter of a second longer to compile,
-        # which a first start waits for.
+        # Scalar loops: array sums compile a quarter of a second longer, which delays a first start.
         gain_of_all, excess_k = 0.0, 0.0
         for mode in range(decay.shape[1]):
             gain_of_all += gain[dome, mode]

@@ -1,8 +1,8 @@
-"""Families of parts: the usual one, the paper's six domes, and a broad one of what may come.
+"""Families of emulated parts: the default one, the paper's six domes, and a broad one.
 
-The usual family (`devices.emulation.parts`) is what calibrations and results are kept for, and
-never changes. The broad one is there to try an estimator on domes that nobody has seen: its ranges
-are wider wherever hardware.md says "not known", or gives a number of one part only.
+The default family (`devices.emulation.parts`) is the basis of stored calibrations and results, and
+never changes. The broad one tests an estimator on unknown domes: its ranges are wider wherever
+hardware.md says "not known", or gives a number of one part only.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from devices.errors import SceneError
 from devices.scene.emulated import Family
 
 _LATE_NS = 300_000
-"""A sample is that much earlier or later than a quarter into the conversion, at the most."""
+"""Largest deviation of the sample instant from a quarter of the conversion."""
 _LACKING = 0.05
-"""So many domes show no gas effect, or no creep, or no loop: an estimator must not invent one."""
+"""Probability that a dome lacks the gas effect, creep, or loop: an estimator must not invent one.
+"""
 
 
 def chip_of(family: Family, serial: str, parts_seed: int) -> ChipPart:
-    """The chip of a serial in a family."""
+    """Draw the chip of a serial in a family."""
     chip = draw_chip(serial, parts_seed)
     if family != "broad":
         return chip
@@ -33,7 +34,7 @@ def chip_of(family: Family, serial: str, parts_seed: int) -> ChipPart:
 
 
 def dome_of(family: Family, serial: str, parts_seed: int) -> DomePart:
-    """The dome of a serial in a family."""
+    """Draw the dome of a serial in a family."""
     if family == "default":
         return draw_dome(serial, parts_seed)
     if family == "table-1":
@@ -47,11 +48,11 @@ _BUBBLE_MM = 3.0
 
 
 def _table_dome(serial: str, usual: DomePart) -> DomePart:
-    """One of the paper's domes, Table I, whose serial is its name: v60-11 is 11 mm of Vytaflex 60.
+    """Create a dome of the paper's Table I by its name: v60-11 is 11 mm of Vytaflex 60.
 
-    Of the others the paper states no force. All six are of one casting, a usual dome's, with its
-    forces scaled by modulus and area, which is the same strain at the same part of full scale, and
-    with the give of a thick sphere's wall (hardware.md 9).
+    The paper states forces of v60-11 only. All six are the same default dome, with forces scaled by
+    modulus and area, which gives the same strain at the same part of full scale, and with the
+    compliance of a thick sphere's wall (hardware.md 9).
 
     Raises:
         SceneError: the serial is no name of a dome.
@@ -72,24 +73,24 @@ def _table_dome(serial: str, usual: DomePart) -> DomePart:
         wall_per_kpa=given * usual.wall_per_kpa,
         loop_n=stiffer * usual.loop_n,
     )
-    # A wall that gives way more would shift the end of the range: the rubber's forces are to.
+    # A more compliant wall alone must not shift the end of the range: only the rubber's forces.
     shifted = float(part.felt_n(np.array([PRESSURE_MAX_KPA]))[0])
     lost = part.stiffening * np.log1p(shifted / part.knee_n)
     return replace(part, stiffening=float(lost / np.log1p(stiffer * full_scale_n / part.knee_n)))
 
 
 def _give(modulus_mpa: float, diameter_mm: float) -> float:
-    """Of a thick sphere's wall for a pressure, up to a factor that all domes have in common."""
+    """Compute the relative compliance of a thick sphere's wall, up to a common factor."""
     outer3 = (diameter_mm / 2.0) ** 3
     return outer3 / (modulus_mpa * (outer3 - _BUBBLE_MM**3))
 
 
 def _broad_dome(rng: np.random.Generator) -> DomePart:
-    """A dome that reads the chip's full scale at 20 to 40 N, of whatever rubber and gas.
+    """Draw a dome of varied rubber and gas that reaches the chip's full scale at 20 to 40 N.
 
-    Creep is of one to four terms from 10 ms to 10 s, 2 to 15 % in sum. The loop of a slow stroke is
-    1 to 5 % of full scale from branch to branch, any part of it viscous: flowing with the third to
-    sixth power of the stress, which Bergstrom and Boyce (1998) found to be about the fourth.
+    Creep has one to four terms from 10 ms to 10 s, 2 to 15 % in sum. The loop of a slow stroke is
+    1 to 5 % of full scale from branch to branch, with any viscous part: flow with the third to
+    sixth power of the stress; Bergstrom and Boyce (1998) found about the fourth.
     """
     seal_kpa = rng.uniform(98.0, 102.5)
     full_scale_n = 20.0 * 2.0 ** rng.uniform(0.0, 1.0)
@@ -108,7 +109,7 @@ def _broad_dome(rng: np.random.Generator) -> DomePart:
     loop_n = full_scale_n * rng.uniform(0.01, 0.05) / 2.0
     viscous_part = rng.uniform(0.0, 1.0)
     has_gas, has_creep, has_loop = (rng.random(3) >= _LACKING).tolist()
-    # Drawn last, as they came last: all else is what it was.
+    # Drawn last: a new draw before the others would change all earlier parts.
     flow_part, flow_power = rng.uniform(0.04, 0.12), rng.uniform(3.0, 6.0)
     return DomePart(
         seal_kpa=seal_kpa,

@@ -1,7 +1,7 @@
-"""Faults of parts, multiplexers and wires, by scene key at a time of the scene, or at will.
+"""Timing of faults of parts, multiplexers and wires, from scene files or injected by tests.
 
-What each kind does to the silicon is told where it happens: `mpl115a2` and `front_end` for tiles,
-`tca9548a` for multiplexers, `line` for the two wires. Here is only when.
+Their effects are in the emulated devices: `mpl115a2` and `front_end` for tiles, `tca9548a` for
+multiplexers, `Line` of `buses.i2c` for the two wires.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _BEFORE_NS = 2**62  # later than any instant of the clock
 
 
 class _Window(NamedTuple):
-    """When a fault begins and ends, and how often it happens in between."""
+    """Begin and end of a fault, and its rate in between."""
 
     begin_ns: int
     end_ns: int
@@ -24,12 +24,11 @@ class _Window(NamedTuple):
 
 
 class Fault:
-    """One kind of fault of one target: is it there at a given time?
+    """One kind of fault of one target, active in time windows or by injection.
 
     Args:
         windows_s: begins and ends, in seconds of the scene.
-        rates: of each window, how often, for faults that come and go by chance while they are
-            there; default: `RATE`.
+        rates: probability in each window, for random faults; default: `RATE`.
     """
 
     def __init__(
@@ -37,7 +36,7 @@ class Fault:
     ) -> None:
         self._windows_s = tuple(windows_s)
         self._rates = tuple(rates) if rates is not None else (RATE,) * len(self._windows_s)
-        # A fault at the scene's first instant was there before it.
+        # A fault at the scene's first instant exists before it.
         self._windows_ns = tuple(
             _Window(0, _BEFORE_NS, rate)
             for (begin, _), rate in zip(self._windows_s, self._rates, strict=True)
@@ -49,48 +48,51 @@ class Fault:
 
     @property
     def possible(self) -> bool:
-        """Can this fault occur at any time, past or future?"""
+        """True if this fault can occur at any time, past or future."""
         return bool(self._depth or self._windows_ns or self._was_injected)
 
     def begin(self, epoch_ns: int) -> None:
-        """The scene's time begins at this instant of the clock."""
+        """Begin the scene's time at this instant of the clock."""
         self._windows_ns = tuple(
             _Window(epoch_ns + round(begin * 1e9), epoch_ns + round(end * 1e9), rate)
             for (begin, end), rate in zip(self._windows_s, self._rates, strict=True)
         )
 
     def __call__(self, t_ns: int) -> bool:
-        """Is the fault there at `t_ns`?"""
+        """Return whether the fault is active at `t_ns`."""
         if self._depth:
             return True
-        if not self._windows_ns:  # asked at every START
+        if not self._windows_ns:  # fast path, for every START
             return False
         return any(window.begin_ns <= t_ns < window.end_ns for window in self._windows_ns)
 
     def rate(self, t_ns: int) -> float:
-        """How often it happens at `t_ns`: the greatest rate of active faults, 0 without any."""
+        """Return the largest rate of the windows active at `t_ns`; 0 without any."""
         by_hand = RATE if self._depth else 0.0
-        if not self._windows_ns:  # asked at every byte
+        if not self._windows_ns:  # fast path, for every byte
             return by_hand
         there = [w.rate for w in self._windows_ns if w.begin_ns <= t_ns < w.end_ns]
         return max(there, default=by_hand)
 
     def struck(self, since_ns: int, t_ns: int) -> bool:
-        """Was it there at any time after `since_ns` and not after `t_ns`?"""
+        """Return whether the fault was active at any time after `since_ns` until `t_ns`.
+
+        An ended injection counts once, at the next call.
+        """
         if self._depth or self._was_injected:
             self._was_injected = False
             return True
         return any(w.begin_ns <= t_ns and w.end_ns > since_ns for w in self._windows_ns)
 
     def set_in(self, since_ns: int, t_ns: int) -> bool:
-        """Did it begin after `since_ns` and not after `t_ns`? By hand: once for every block."""
+        """Return whether the fault began after `since_ns` until `t_ns`; injections count once."""
         if self._is_new:
             self._is_new = False
             return True
         return any(since_ns < window.begin_ns <= t_ns for window in self._windows_ns)
 
     def clear(self, t_ns: int) -> None:
-        """End what is there at `t_ns`: it was repaired."""
+        """End the fault at `t_ns`, as by a repair."""
         self._windows_ns = tuple(
             w._replace(end_ns=min(w.end_ns, t_ns)) if w.begin_ns <= t_ns else w
             for w in self._windows_ns
@@ -99,7 +101,7 @@ class Fault:
 
     @contextmanager
     def injected(self) -> Iterator[None]:
-        """The fault is there while the block runs, whatever the time, unless it is cleared."""
+        """Context manager: inject the fault while the block runs, unless it is cleared."""
         self._depth += 1
         self._is_new = True
         try:
@@ -110,17 +112,17 @@ class Fault:
 
 
 class Faults:
-    """All faults that a scene may show, found by kind and target."""
+    """Faults of a scene, by kind and target."""
 
     def __init__(self, scenes: Sequence[FaultScene]) -> None:
         self.possible = bool(scenes)
-        """Can any fault ever occur? Checked first at every transfer."""
+        """True if any fault can ever occur; checked first at every transfer."""
         self._scenes = scenes
         self._faults: dict[tuple[FaultKind, str], Fault] = {}
         self._epoch_ns: int | None = None
 
     def of(self, kind: FaultKind, target: str = BUS) -> Fault:
-        """The fault of one kind and target: a tile's serial, a mux as "0x70", or the bus."""
+        """Return the fault of a kind and target: a tile's serial, a mux as "0x70", or the bus."""
         if (kind, target) not in self._faults:
             mine = [f for f in self._scenes if f.kind == kind and f.target == target]
             windows_s = [(f.t_s, f.t_s + f.duration_s) for f in mine]
@@ -131,12 +133,12 @@ class Faults:
         return self._faults[kind, target]
 
     def injected(self, kind: FaultKind, target: str) -> AbstractContextManager[None]:
-        """A fault by hand, while the block runs."""
+        """Context manager: inject a fault while the block runs."""
         self.possible = True
         return self.of(kind, target).injected()
 
     def begin(self, epoch_ns: int) -> None:
-        """The scene's time begins at this instant of the clock."""
+        """Begin the scene's time at this instant of the clock."""
         self._epoch_ns = epoch_ns
         for fault in self._faults.values():
             fault.begin(epoch_ns)

@@ -1,11 +1,10 @@
-"""Time as a driver has it on silicon, on a machine that also has to play the silicon.
+"""Clocks of a driver and its emulated wires that hide the emulation's computing time.
 
-On hardware a transfer ends when its last bit has passed. Here the same thread first computes what
-the chips do, and is then woken a little late. What that costs is the emulation's, and no silicon's:
-the driver's clock leaves it out, and goes on from the instant at which the transfer was over. Where
-the driver or the wires wait next, that much less is waited, so the clock is CLOCK_MONOTONIC again;
-it is never ahead of it. What the driver itself takes - its own code, its own wake-ups, a machine
-that gives it no core meanwhile - passes on its clock as on any other.
+On hardware a transfer ends with its last bit. In an emulation the same thread first computes the
+chips and is then woken a little late. The driver's clock excludes that time: it continues from the
+instant at which the transfer ended on the wire. The next wait of the driver or the wires is shorter
+by that lag, so that the clock returns to CLOCK_MONOTONIC, and is never ahead. Time of the
+driver itself (code, wake-ups, missing CPU) passes as on any other clock.
 """
 
 from __future__ import annotations
@@ -13,47 +12,47 @@ from __future__ import annotations
 from devices.clock import Clock
 
 BEHIND_MAX_NS = 20_000_000
-"""So far the driver's clock may be behind: less than a batch. A machine that cannot play the wires
-any faster makes its driver late, as it is."""
+"""Largest lag of the driver's clock: less than a batch. On a machine too slow for the emulation the
+driver is really late."""
 
 
 class HostedClock:
-    """The driver's clock.
+    """Clock of the driver.
 
     Args:
-        host: the machine's, of which this is never ahead.
+        host: clock of the machine, which this clock never overtakes.
     """
 
     def __init__(self, host: Clock) -> None:
         self._host = host
-        self._host_now_ns = host.now_ns  # it is asked some fifty times a frame
+        self._host_now_ns = host.now_ns  # called some fifty times a frame
         self._behind_ns = 0
 
     def now_ns(self) -> int:
-        """Nanoseconds of the machine's clock, less what the emulation is behind."""
+        """Return the machine's clock minus the emulation's lag."""
         return self._host_now_ns() - self._behind_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Wait as the driver does: being woken late is its own."""
+        """Sleep until `t_ns`; a late wake-up counts as the driver's time."""
         over_ns = self._host_now_ns() - t_ns
         if over_ns < 0:
             self._host.sleep_until_ns(t_ns)
             self._behind_ns = 0
         else:
-            # It would have waited, at least a part of what the emulation was behind.
+            # The sleep would have absorbed at least a part of the lag.
             self._behind_ns = min(self._behind_ns, over_ns)
 
     def resume_at(self, t_ns: int) -> None:
-        """A transfer was over at `t_ns`, whatever it is now: the driver goes on from there."""
+        """Continue the driver's time from `t_ns`, the end of a transfer."""
         self._behind_ns = min(max(0, self._host_now_ns() - t_ns), BEHIND_MAX_NS)
 
 
 class WireClock:
-    """The clock of what plays the silicon beneath that driver, in the driver's own thread.
+    """Clock of the emulated wires, in the driver's thread.
 
     Args:
-        driver: whose transfers are played.
-        host: how the machine waits while bits pass.
+        driver: clock of the driver.
+        host: clock of the machine, for waiting while bits pass.
     """
 
     def __init__(self, driver: HostedClock, host: Clock) -> None:
@@ -61,14 +60,14 @@ class WireClock:
         self._host = host
 
     def now_ns(self) -> int:
-        """The driver's time: when a transfer begins."""
+        """Return the driver's time, the begin of a transfer."""
         return self._driver.now_ns()
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """End a transfer, never before `t_ns`; the driver's clock says `t_ns` then.
+        """Wait for the end of a transfer and set the driver's clock to it.
 
         Args:
-            t_ns: not before the instant at which the transfer began.
+            t_ns: end of the transfer, not before its begin.
         """
         self._host.sleep_until_ns(t_ns)
         self._driver.resume_at(t_ns)

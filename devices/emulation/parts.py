@@ -1,8 +1,7 @@
-"""What each emulated part is like, always the same for its serial.
+"""Properties of emulated parts, drawn by serial and seed.
 
-Two tiles of one serial are the same tile in every scene and session; `parts_seed` is another shelf
-of parts. Nothing here may be read by a driver or an estimator: they learn what crosses the bus, and
-what a bench recording shows.
+A serial is the same part in every scene and session with the same `parts_seed`. Drivers and
+estimators must not read these properties: they use only the bus, and calibration recordings.
 """
 
 from __future__ import annotations
@@ -18,22 +17,22 @@ from devices.chips.mpl115a2 import CONVERSION_MAX_NS, PRESSURE_MAX_KPA, Coeffici
 
 @dataclass(frozen=True)
 class ChipPart:
-    """One MPL115A2 (hardware.md 1.3, 1.4, 1.6)."""
+    """Properties of an MPL115A2 (hardware.md 1.3, 1.4, 1.6)."""
 
     coefficients: Coefficients
     conversion_ns: int
     tadc_at_25_degc: float
     late_ns: int = 0
-    """How much later than after a quarter of a conversion it samples: not documented (hardware.md
+    """Delay of the sample instant after a quarter of the conversion: not documented (hardware.md
     1.4)."""
 
 
 @dataclass(frozen=True)
 class DomePart:
-    """One polyurethane dome with its bubble (hardware.md 9).
+    """Properties of a polyurethane dome with its bubble (hardware.md 9).
 
-    Static curve: the bubble loses the part `stiffening * ln(1 + F / knee_n)` of its volume under a
-    slow force F; concave, without a limit, and no polynomial.
+    Static curve: under a slow force F the bubble loses the part `stiffening * ln(1 + F / knee_n)`
+    of its volume; concave, unbounded, and no polynomial.
     """
 
     seal_kpa: float
@@ -43,36 +42,38 @@ class DomePart:
     wall_per_kpa: float
     """Volume change per kPa of pressure difference over the wall, relative."""
     conduction_s: float
-    """r^2 / (pi^2 a): slowest mode of heat conduction in the bubble at constant pressure."""
+    """Time constant r^2 / (pi^2 a) of the slowest mode of heat conduction in the bubble at constant
+    pressure."""
     gas_lag_s: float
-    """How long the gas follows its chip's temperature; below zero: the chip follows its gas'."""
+    """Time constant of the gas behind its chip's temperature; negative: of the chip behind the gas.
+    """
     chip_lag_s: float
-    """How long the first of the two follows the surroundings."""
+    """Time constant of the faster of the two behind the surroundings."""
     creep_parts: tuple[float, ...]
-    """Parts of a force that appear late, ..."""
+    """Parts of a force that appear with a delay (Prony terms)."""
     creep_s: tuple[float, ...]
-    """... and how late each of them."""
+    """Time constants of these parts."""
     loop_n: float
-    """Half width of the hysteresis loop at full load that does not depend on speed, in newtons."""
+    """Half width of the rate-independent hysteresis loop at full load, in newtons."""
     viscous_n: float = 0.0
-    """Half width of the loop that the rubber's viscosity makes beside it, in newtons, where a force
-    changes by 7.5 N/s; faster loads make it wider."""
+    """Half width of the additional loop due to viscosity, in newtons, where a force changes by
+    7.5 N/s; faster loads widen it."""
     flow_part: float = 0.08
-    """Of a change of force that the viscous branch bears at first."""
+    """Part of a change of force that the viscous branch bears at first."""
     flow_power: float = 4.0
-    """Of the branch's rate of flow over its stress."""
+    """Exponent of the branch's rate of flow over its stress."""
     kappa: float = 0.4 / 1.4
-    """(gamma - 1) / gamma of the gas: air's, unless vapours of the casting are in it."""
+    """(gamma - 1) / gamma of the gas: air's, unless it contains vapours of the casting."""
 
     def felt_n(self, kpa: Floats) -> Floats:
-        """The slow force that would give a pressure, at the temperature of the sealing."""
+        """Compute the slow force of a pressure: inverse static curve, at sealing temperature."""
         stretched = 1.0 + self.wall_per_kpa * (kpa - self.seal_kpa)
         lost = 1.0 - self.seal_kpa / (kpa * stretched)
         return np.asarray(self.knee_n * np.expm1(lost / self.stiffening))
 
 
 def draw_chip(serial: str, parts_seed: int) -> ChipPart:
-    """The chip of a serial. Ranges bracket the three parts whose coefficients are published."""
+    """Draw the chip of a serial. The ranges bracket the three published sets of coefficients."""
     rng = _rng("chip", serial, parts_seed)
     while True:
         drawn = Coefficients(
@@ -92,9 +93,9 @@ def draw_chip(serial: str, parts_seed: int) -> ChipPart:
 
 
 def draw_dome(serial: str, parts_seed: int) -> DomePart:
-    """The dome of a serial: an 11 mm Vytaflex 60 dome, give or take what casting does.
+    """Draw the dome of a serial: an 11 mm Vytaflex 60 dome with casting tolerances.
 
-    It reads the chip's full scale of 115 kPa at a slow force of 25 to 35 N (paper III-A).
+    It reaches the chip's full scale of 115 kPa at a slow force of 25 to 35 N (paper III-A).
     """
     rng = _rng("dome", serial, parts_seed)
     seal_kpa = rng.uniform(98.0, 102.5)
@@ -122,6 +123,6 @@ def _rng(what: str, serial: str, parts_seed: int) -> np.random.Generator:
 
 
 def random_of(label: str) -> np.random.Generator:
-    """A random generator that depends on `label` alone, on every machine the same."""
+    """Create a random generator seeded by `label` alone, the same on every machine."""
     digest = hashlib.sha256(label.encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:16], "big"))

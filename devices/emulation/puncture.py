@@ -1,9 +1,9 @@
-"""A dome with a hole: its gas leaves under load, and air comes in again when it is let go.
+"""Leak of a punctured dome: gas leaves under load, and air returns after unloading.
 
-A capillary, as a crack or a bad seam is one: the flow is proportional to the pressure difference
-over the wall. A needle's hole takes some hundredths of a second to even it out, a pore minutes.
-What has left is missing afterwards: unloaded, the dome reads less than its surroundings until air
-has come back. One that has been open for long follows the weather, and no temperature.
+The leak is a capillary, like a crack or a bad seam: the flow is proportional to the pressure
+difference over the wall. It equalises in some hundredths of a second through a needle's hole, in
+minutes through a pore. The lost gas is missing afterwards: unloaded, the dome reads less than its
+surroundings until air has returned. A dome open for long follows the weather, and no temperature.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from devices.emulation.faults import Fault
 
 
 class Puncture:
-    """What a hole makes of one dome's pressure; afterwards it is sealed with what it holds.
+    """Leak of one dome; after the fault it is sealed with the remaining gas.
 
     Args:
-        fault: while it is there the gas leaks.
-        leak_s: in this time the pressure difference of an unsqueezed bubble falls to 1/e.
+        fault: fault during which the gas leaks.
+        leak_s: time constant of the pressure difference of an unloaded bubble.
         around_kpa: pressure of the atmosphere.
     """
 
@@ -30,20 +30,20 @@ class Puncture:
         self._last_s = 0.0
 
     def leaked_kpa(self, sealed_kpa: float, t_s: float, t_ns: int) -> float:
-        """Absolute pressure of the dome, of which `sealed_kpa` is that if it were whole.
+        """Compute the absolute pressure with the leak, and update the remaining gas.
 
-        Between two calls the load is taken as constant: a chip samples every few milliseconds.
+        The load is taken as constant between two calls: a chip samples every few milliseconds.
 
         Args:
-            sealed_kpa: absolute.
-            t_s: time of the scene, which never goes back.
+            sealed_kpa: absolute pressure without the leak.
+            t_s: time of the scene, never decreasing.
             t_ns: the same instant of the clock.
         """
         if not self._fault.possible:
             return sealed_kpa
         if self._fault(t_ns):
-            # At a constant volume the amount relaxes to that which gives the outer pressure, the
-            # faster the more the bubble is squeezed.
+            # At constant volume the amount relaxes to its value at outer pressure, faster under
+            # load.
             even = self._around_kpa / sealed_kpa
             kept = math.exp(-max(0.0, t_s - self._last_s) / (self._leak_s * even))
             self._left = even + (self._left - even) * kept

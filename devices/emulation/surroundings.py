@@ -1,7 +1,7 @@
-"""What is around the tiles: temperature, the weather's pressure, and the head of what they sink in.
+"""Surroundings of the tiles: temperature, atmospheric pressure, hydrostatic head.
 
-A dome feels the head through the give of its wall alone, and the weather not at all: it was sealed
-at some pressure, and a session is short. A bare reference tile feels both directly.
+The head affects a dome through the compliance of its wall only, and the weather not at all: it is
+sealed, and a session is short. Both affect a bare reference tile directly.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from devices.emulation.parts import random_of
 from devices.scene.emulated import EmulationScene
 
 _WEATHER_KPA = (99.0, 101.0)
-"""An ordinary day between sea level and 200 m (hardware.md 8: 1.17 kPa per 100 m)."""
+"""Range on ordinary days between sea level and 200 m (hardware.md 8: 1.17 kPa per 100 m)."""
 
 
 class Submersion(Protocol):
-    """How deep the tiles are in something heavy."""
+    """Submersion of the tiles in a heavy medium."""
 
     def head_kpa(self, t_s: Floats) -> Floats:
-        """Hydrostatic pressure on each tile above the atmosphere's, (len(t_s), tiles)."""
+        """Compute the head on each tile above atmospheric pressure, (len(t_s), tiles)."""
 
 
 class Surroundings:
-    """Temperature and pressure around the tiles, and how chip and gas follow.
+    """Temperature and pressure around the tiles, and the delayed temperatures of chip and gas.
 
-    One step of temperature, as the scene says; closed forms of one and two first-order lags.
+    One step of temperature, from the scene; closed forms of one and two first-order lags.
 
     Args:
         scene: temperature, head and weather.
-        submersion: what gives a head besides the scene's own, if anything.
-        label: draws the weather where the scene does not give it.
+        submersion: source of a head in addition to the scene's; None: no such source.
+        label: seed of the weather if the scene does not give it.
     """
 
     def __init__(
@@ -48,11 +48,11 @@ class Surroundings:
 
     @property
     def steady(self) -> bool:
-        """Does the temperature never change?"""
+        """True if the temperature never changes."""
         return self._scene.temperature_step_k == 0.0
 
     def chip_degc(self, t_s: float, chip_lag_s: float, gas_lag_s: float) -> float:
-        """Temperature of a chip: with one lag, or behind its gas with a second (`DomePart`)."""
+        """Compute a chip's temperature: one lag, or a second one behind its gas (`DomePart`)."""
         scene = self._scene
         since = max(t_s - scene.temperature_step_s, 0.0)
         if gas_lag_s < 0.0:
@@ -60,7 +60,7 @@ class Surroundings:
         return scene.ambient_degc - scene.temperature_step_k * math.expm1(-since / chip_lag_s)
 
     def gas_wall_degc(self, t_s: Floats, chip_lag_s: float, gas_lag_s: float) -> Floats:
-        """Temperature of the bubble's wall: behind its chip with a second lag, or before it."""
+        """Compute the bubble wall's temperature: one lag, or a second one behind its chip."""
         scene = self._scene
         since = np.maximum(t_s - scene.temperature_step_s, 0.0)
         if gas_lag_s < 0.0:
@@ -69,21 +69,21 @@ class Surroundings:
         return self._second_degc(since, chip_lag_s, gas_lag_s)
 
     def _second_degc(self, since: Floats, a: float, b: float) -> Floats:
-        """Of what follows with lag `b` what follows the surroundings with lag `a`."""
+        """Compute a temperature behind the surroundings with two lags, `a` and `b`, in series."""
         arrived = 1 - (a * np.exp(-since / a) - b * np.exp(-since / b)) / (a - b)
         return np.asarray(self._scene.ambient_degc + self._scene.temperature_step_k * arrived)
 
     def head_kpa(self, t_s: Floats) -> Floats:
-        """Pressure around each tile above the atmosphere's.
+        """Compute the head around each tile, above atmospheric pressure.
 
         Returns:
-            (len(t_s), tiles), or (len(t_s), 1) where it is the same for all.
+            (len(t_s), tiles), or (len(t_s), 1) if it is the same for all.
         """
         own_kpa = np.where(t_s >= self._scene.head_s, self._scene.head_kpa, 0.0)[:, None]
         return own_kpa if self._submersion is None else own_kpa + self._submersion.head_kpa(t_s)
 
     def bare_kpa(self, t_s: Floats) -> Floats:
-        """What tiles without a dome would sense: the atmosphere and the head on each.
+        """Compute the pressure on tiles without a dome: atmosphere and head.
 
         Returns:
             As `head_kpa`.

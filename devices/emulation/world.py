@@ -1,7 +1,7 @@
-"""A whole emulated foot: chips behind multiplexers under domes on a ground, and its ground truth.
+"""Emulated foot: chips behind multiplexers under domes on a ground, with its ground truth.
 
-A driver gets the world's adapter through `devices.buses.i2c.open_bus` and the pseudo-terminal of
-its servo, and nothing else. Truth is there to judge an estimate by.
+A driver gets only the world's I2C adapter, through `devices.buses.i2c.open_bus`, and the
+pseudo-terminal of the servo. Ground truth is for judging estimates only.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from devices.scene.file import Scene
 from devices.scene.hardware import ServoScene
 
 Effect = Literal["gas", "rubber", "hysteresis", "surroundings"]
-"""What makes a dome's pressure differ from the static curve's; the last: warmth, head of water."""
+"""Effect on a dome's pressure beside the static curve; surroundings: temperature, head of water."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What was really there at n instants, in the foot frame.
+    """Ground truth at n instants, in the foot frame.
 
     Attributes:
         true_force_n: (n, tiles), force on each dome along its axis.
-        true_grf_n: (n,), their vertical sum: what the array could know.
-        true_plate_n: (n,), vertical force on the whole foot: what a plate under it sees.
-        true_cop_x_m: (n,), force-weighted place of the load; NaN without load.
+        true_grf_n: (n,), vertical sum of the dome forces: the ideal measurement of the array.
+        true_plate_n: (n,), vertical force on the whole foot: the load of a plate under it.
+        true_cop_x_m: (n,), force-weighted position of the load; NaN without load.
         true_cop_y_m: (n,), likewise.
         true_angle_rad: (n,), segment angle; NaN for a foot without one.
     """
@@ -64,19 +64,19 @@ class Truth:
 
 
 class World:
-    """One scene, switched on at the clock's present time.
+    """Emulation of one scene, powered up at the clock's present time.
 
     Args:
         scene: the scene file.
-        clock: virtual or real; bus and servo take their time from it.
-        seed: draws noise, outliers, ground and servo noise; not the parts.
-        parts_seed: draws other parts for the same serials.
+        clock: virtual or real clock of bus and servo.
+        seed: seed of noise, outliers, ground and servo noise; not of the parts.
+        parts_seed: seed of the parts; other seeds give other parts for the same serials.
         lead_s: seconds without load before the ground begins.
-        pressed: a recorded load instead of the scene's ground.
-        looped: press it, or hop, over and over again.
-        begun: the scene's time begins now; else at `begin`, and until then all is as at its first
-            instant.
-        in_real_time: the clock goes on by itself, and so does the physics, see `Domes`.
+        pressed: recorded load instead of the scene's ground.
+        looped: repeat the recorded load or the hops endlessly.
+        begun: the scene's time begins now; else at `begin`, and until then the scene stays at its
+            first instant.
+        in_real_time: the clock runs by itself, see `Domes`.
     """
 
     def __init__(
@@ -94,18 +94,18 @@ class World:
     ) -> None:
         self.scene = scene
         self.clock = clock
-        """What the emulated bus takes its time from."""
+        """Clock of the emulated bus."""
         self._begun = False
         self.epoch_ns = 0
         """Instant of the clock at which the scene's time began."""
         self.ground = make_ground(scene, seed=seed, lead_s=lead_s, pressed=pressed, looped=looped)
         self._positions_m = tile_positions_m(scene.tile)
         self.underfoot = Underfoot(self.ground, self._positions_m)
-        """What a plate under the foot sees."""
+        """Load of a plate under the foot."""
         serials = [tile.serial for tile in scene.tile]
         family = scene.emulation.family
         domes = [dome_of(family, serial, parts_seed) for serial in serials]
-        # By scene too: a tile on the bench and in the field must not see the same noise again.
+        # The scene is part of the label: noise must differ between calibration and field.
         draw = f"{scene.name}/{seed}"
         self._around = surroundings = self._surroundings(draw)
         bare = [tile.reference for tile in scene.tile]
@@ -120,12 +120,12 @@ class World:
             in_real_time=in_real_time,
         )
         self.domes = tuple(domes)
-        """What the domes are like, to judge an estimate by."""
+        """Properties of the domes, for judging estimates only."""
         self._faults = Faults(scene.fault)
         self._front_ends: list[FrontEnd] = []
 
         def silicon(index: int, serial: str) -> Silicon:
-            """The chip of a serial under a dome of this foot, or bare if it is for reference."""
+            """Create the chip of a serial under a dome of this foot."""
             chip = chip_of(family, serial, parts_seed)
             fixed_ms = scene.array.conversion_ms
             sense = FrontEnd(
@@ -154,7 +154,7 @@ class World:
             )
             for index, serial in enumerate(serials)
         ]
-        """The chips, to judge a driver by; a driver has its bus only."""
+        """Chips, for judging drivers only; a driver has only the bus."""
         muxes = [
             EmulatedTca9548a(
                 address,
@@ -179,7 +179,7 @@ class World:
             self.begin()
 
     def begin(self) -> None:
-        """Let the scene's time begin now: ground, faults, temperature."""
+        """Begin the scene's time now: ground, faults, temperature."""
         self.epoch_ns = self.clock.now_ns()
         self._begun = True
         for front_end in self._front_ends:
@@ -187,12 +187,12 @@ class World:
         self._faults.begin(self.epoch_ns)
 
     def fault(self, kind: FaultKind, target: str = BUS) -> AbstractContextManager[None]:
-        """Inject a fault into a tile, a mux ("0x70") or the bus while the block runs."""
+        """Inject a fault into a tile, a mux ("0x70") or the bus, within a `with` block."""
         return self._faults.injected(kind, target)
 
     @contextmanager
     def servo(self, servo: ServoScene, clock: Clock) -> Iterator[EmulatedServo]:
-        """The scene's servo on a pseudo-terminal, with a clock of its own line."""
+        """Open the scene's servo on a pseudo-terminal, with the clock of its line."""
         with EmulatedServo(
             lambda t_ns: self._servo_counts(servo, t_ns),
             clock,
@@ -207,7 +207,7 @@ class World:
             yield emulated
 
     def truth(self, t_mono_ns: Times) -> Truth:
-        """Ground truth at instants of the node's monotonic clock."""
+        """Compute the ground truth at instants of the node's monotonic clock."""
         t_s = self.seconds(t_mono_ns)
         forces_n = self.ground.forces_n(t_s)
         angle = self.ground.angle_rad(t_s)
@@ -225,13 +225,13 @@ class World:
         )
 
     def dome_kpa(self, t_mono_ns: Times, without: Collection[Effect] = ()) -> Floats:
-        """True pressure in each dome at rising instants, as it would be without some effects.
+        """Compute the true pressure in each dome at rising instants, without some effects.
 
-        Computed anew from the scene's first instant on. Without "gas" it is what each instant's
-        load would settle at.
+        Computed anew from the scene's first instant on. Without "gas" it is the static pressure of
+        each instant's load.
 
         Returns:
-            (n, tiles); of a bare tile what is around it.
+            (n, tiles); for a bare tile the pressure around it.
         """
         emulation = self.scene.emulation
         off: dict[str, object] = {name: False for name in without if name != "surroundings"}
@@ -248,7 +248,7 @@ class World:
 
     @property
     def mill(self) -> Mill | None:
-        """The reference force sensor beside the spindle, if the ground is the mill."""
+        """Reference force sensor of the indenter; None on any other ground."""
         if isinstance(self.ground, Indentation):
             return Mill(self.ground, self.seconds, self._mill_rng)
         return None
@@ -276,7 +276,7 @@ class World:
         return Surroundings(emulation, ground if isinstance(ground, Hopping) else None, draw)
 
     def seconds(self, t_ns: Times) -> Floats:
-        """Time of the scene at instants of the clock; zero until it begins."""
+        """Convert instants of the clock to seconds of the scene; zero before its begin."""
         if not self._begun:
             return np.zeros(len(t_ns))
         return np.asarray(np.maximum(t_ns - self.epoch_ns, 0) * 1e-9)

@@ -1,1 +1,1 @@
-"""Freeing an I2C bus that a chip holds: clocks on its wires, the multiplexers' RESET."""
+"""Recovery of an I2C bus that a chip holds: clocks on its wires, the multiplexers' RESET."""

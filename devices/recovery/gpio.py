@@ -1,11 +1,11 @@
 """GPIO lines of a Raspberry Pi, through libgpiod's Python binding (version 2).
 
-SDA and SCL belong to the I2C controller. Taking them as GPIO disconnects it, and giving them back
-leaves them inputs: libgpiod knows no alternate functions. So Raspberry Pi OS's `pinctrl` (before
-2023: `raspi-gpio`) restores the pins' function, whatever happened in between.
+SDA and SCL belong to the I2C controller. Requesting them as GPIO disconnects it, and releasing them
+leaves them inputs: libgpiod has no alternate functions. So Raspberry Pi OS's `pinctrl` (before
+2023: `raspi-gpio`) restores the pins' function in every case.
 
-This module has not been run on a Raspberry Pi by this project. What it asks of libgpiod is tested
-with the library's own types, what it asks of `pinctrl` by its command line.
+This module has not been run on a Raspberry Pi by this project. Tests cover the calls of libgpiod
+with the library's own types, and those of `pinctrl` by their command line.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ _TOOL_TIMEOUT_S = 5.0
 
 
 class GpioLine:
-    """One requested line, open-drain: an output that is let go is an input."""
+    """Requested open-drain line: a released output is an input."""
 
     def __init__(self, request: LineRequest, line: int) -> None:
         self._request = request
         self._line = line
 
     def drive(self, *, low: bool) -> None:
-        """Pull it low, or let go."""
+        """Pull the line low, or release it."""
         from gpiod.line import Value
 
         self._request.set_value(self._line, Value.INACTIVE if low else Value.ACTIVE)
 
     def high(self) -> bool:
-        """The level on the pin, whatever drives it."""
+        """Return the level on the pin, whatever drives it."""
         return bool(self._request.get_value(self._line))
 
 
@@ -49,7 +49,7 @@ class GpioLines:
 
     Raises:
         MissingExtraError: gpiod is not installed.
-        BusSetupError: the tool that gives the pins back is not installed.
+        BusSetupError: the tool that restores the pins is not installed.
     """
 
     def __init__(self, scene: RecoveryScene) -> None:
@@ -68,10 +68,10 @@ class GpioLines:
 
     @contextmanager
     def bus(self) -> Iterator[tuple[GpioLine, GpioLine]]:
-        """SCL and SDA, taken from the I2C controller while the block runs.
+        """Request SCL and SDA from the I2C controller while the block runs, then restore them.
 
         Raises:
-            BusSetupError: they cannot be had or moved, or the controller did not get them back.
+            BusSetupError: the lines cannot be requested, driven, or restored.
         """
         scl, sda = self._scene.scl_line, self._scene.sda_line
         try:
@@ -81,7 +81,7 @@ class GpioLines:
             self._restore()
 
     def reset(self) -> AbstractContextManager[GpioLine] | None:
-        """The multiplexers' RESET; None if the scene names no line for it."""
+        """Request the multiplexers' RESET; None if the scene names no line for it."""
         line = self._scene.reset_line
         return None if line is None else self._reset(line)
 
@@ -95,7 +95,7 @@ class GpioLines:
         import gpiod
         from gpiod.line import Direction, Drive, Value
 
-        # Let go from the first moment: no line is pulled low by being taken.
+        # Released from the first moment: the request must not pull a line low.
         open_drain = gpiod.LineSettings(
             direction=Direction.OUTPUT, drive=Drive.OPEN_DRAIN, output_value=Value.ACTIVE
         )
@@ -119,9 +119,10 @@ class GpioLines:
                 self._give_back, check=True, capture_output=True, text=True, timeout=_TOOL_TIMEOUT_S
             )
         except (OSError, subprocess.SubprocessError) as error:
-            said = (getattr(error, "stderr", None) or str(error)).strip()
+            reason = (getattr(error, "stderr", None) or str(error)).strip()
             raise BusSetupError(
-                f"SDA and SCL are still GPIO, the I2C controller is disconnected from them: {said}",
+                "SDA and SCL are still GPIO, the I2C controller is disconnected from them: "
+                + reason,
                 where=self._scene.gpiochip,
                 remedy=f"Run: sudo {' '.join(self._give_back)}; or reboot",
             ) from error

@@ -1,8 +1,8 @@
-"""Freeing an I2C bus whose SDA a chip holds low: nine clocks and a STOP, then the muxes' RESET.
+"""Recovery of an I2C bus whose SDA a chip holds low: nine clocks and a STOP, then the muxes' RESET.
 
 Sources: UM10204 3.1.16, TCA9548A data sheet 6.7, hardware.md 2 and 8. A chip that lost count in
-the middle of a byte waits for clocks with its bit on the line. A Raspberry Pi's adapter sends none
-by itself, and cannot: it takes a line that is low for an acknowledge.
+the middle of a byte waits for clocks with its bit on the line. A Raspberry Pi's adapter cannot send
+them itself: it takes the low line for an acknowledge.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from devices.recovery.gpio import GpioLines
 from devices.scene.hardware import RecoveryScene
 
 CLOCKS = 9
-"""The rest of a byte and its acknowledge, from wherever it was broken off."""
+"""Clocks for the rest of any interrupted byte and its acknowledge."""
 
 HALF_PERIOD_NS = 5_000
-"""100 kHz, which every chip follows."""
+"""Half a clock period at 100 kHz, which every chip supports."""
 
 RESET_NS = 10_000
-"""At least 6 ns (TCA9548A 6.7); long leads and a weak pull-up take longer."""
+"""Length of the RESET pulse: at least 6 ns (TCA9548A 6.7); long leads and a weak pull-up need more.
+"""
 
 
 class BusRecovery(Protocol):
-    """What can be done about a bus that is stuck. Not while a transfer is under way."""
+    """Recovery steps for a stuck bus. Never call them during a transfer."""
 
     def clock_out(self) -> bool:
         """Clock the chip that holds SDA through its byte, and send a STOP.
@@ -34,49 +35,49 @@ class BusRecovery(Protocol):
             True if SDA and SCL are high in the end, so that the bus can be used.
 
         Raises:
-            BusSetupError: the lines cannot be had or given back.
+            BusSetupError: the lines cannot be requested or released.
         """
 
     def reset_muxes(self) -> bool:
-        """Pulse the multiplexers' RESET line: no channel is open behind it, whatever was before.
+        """Pulse the multiplexers' RESET line, which closes all channels.
 
         Returns:
             False if the line is not wired.
 
         Raises:
-            BusSetupError: the line cannot be had.
+            BusSetupError: the line cannot be requested.
         """
 
 
 class Line(Protocol):
-    """An open-drain wire: every device may pull it low, none can pull it high."""
+    """Open-drain wire: every device may pull it low, none can pull it high."""
 
     def drive(self, *, low: bool) -> None:
-        """Pull it low, or let go."""
+        """Pull the line low, or release it."""
 
     def high(self) -> bool:
-        """Is it high, that is, does no device pull it low?"""
+        """Return whether the line is high: no device pulls it low."""
 
 
 class Lines(Protocol):
-    """Where the wires come from. They are ours while the block runs, and let go at first."""
+    """Wires of a bus as GPIO, requested while a block runs; released, so high, at first."""
 
     def bus(self) -> AbstractContextManager[tuple[Line, Line]]:
-        """SCL and SDA."""
+        """Request SCL and SDA."""
 
     def reset(self) -> AbstractContextManager[Line] | None:
-        """RESET of all multiplexers; None if it is not wired."""
+        """Request RESET of all multiplexers; None if it is not wired."""
 
 
 class GpioRecovery:
-    """`BusRecovery` by moving wires one edge at a time."""
+    """Recovery by GPIO, one edge at a time."""
 
     def __init__(self, lines: Lines, clock: Clock) -> None:
         self._lines = lines
         self._clock = clock
 
     def clock_out(self) -> bool:
-        """As `BusRecovery.clock_out`; it gives up on a held SCL, and on SDA after nine clocks."""
+        """Clock out as `BusRecovery.clock_out`; fail on a held SCL, or on SDA after nine clocks."""
         with self._lines.bus() as (scl, sda):
             self._wait(HALF_PERIOD_NS)
             for _ in range(CLOCKS):
@@ -87,11 +88,11 @@ class GpioRecovery:
                     self._drive(scl, low=False)
                 elif self._stop(scl, sda):
                     return True
-                # Else a high bit came before a low one. The failed STOP was a clock, too.
+                # Else a high bit preceded a low one. The failed STOP was a clock, too.
             return scl.high() and sda.high() and self._stop(scl, sda)
 
     def reset_muxes(self) -> bool:
-        """As `BusRecovery.reset_muxes`."""
+        """Pulse RESET as `BusRecovery.reset_muxes`."""
         line = self._lines.reset()
         if line is None:
             return False
@@ -103,7 +104,7 @@ class GpioRecovery:
         return True
 
     def _stop(self, scl: Line, sda: Line) -> bool:
-        """SDA rises while SCL is high; False if one of them is held."""
+        """Send a STOP (SDA rises while SCL is high); return False if a line is held low."""
         self._drive(scl, low=True)
         self._drive(sda, low=True)
         self._drive(scl, low=False)
@@ -119,14 +120,14 @@ class GpioRecovery:
 
 
 def open_recovery(scene: RecoveryScene | None, clock: Clock) -> BusRecovery | None:
-    """Recovery through the GPIO lines of `scene`; None without such a section.
+    """Open the recovery through the GPIO lines of `scene`; None without such a section.
 
-    Every line is taken once and given back, so that what is missing is said at the start and not in
-    the mud. The bus must be idle meanwhile.
+    Requests and releases every line once, so that a fault shows at the start and not in the field.
+    The bus must be idle meanwhile.
 
     Raises:
         MissingExtraError: gpiod is not installed.
-        BusSetupError: the tool that gives pins back is not installed, or a line is in use.
+        BusSetupError: the tool that restores pins is not installed, or a line is in use.
     """
     if scene is None:
         return None

@@ -1,1 +1,1 @@
-"""Scene files: which tiles hang where, what the ground does, which models. Opens no hardware."""
+"""Scene files: wiring of the tiles, ground, models. Opens no hardware."""

@@ -1,10 +1,10 @@
-"""Scene files: which tiles hang where, what the ground does, and what the estimate needs.
+"""Scene files: wiring of the tiles, ground, and settings of the estimate.
 
-A scene is TOML. Every key is listed with its unit and default where its section is described; an
-unknown key, a wrong type or a contradiction is a `SceneError` that names the key and the remedy.
-Built-in scenes are files of the same form in `devices/scene/builtin/`.
+A scene is TOML. The class of each section lists its keys with unit and default. An unknown key, a
+wrong type or a contradiction is a `SceneError` that names the key and the remedy. Built-in scenes
+are files of the same form in `devices/scene/builtin/`.
 
-Sections are described in `hardware`, `grounds`, `emulation` and `faults` beside this module.
+The sections are in `devices.scene.hardware` and `devices.scene.emulated`.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from devices.scene.quantities import Name, NotNegative, Section
 
 
 class Scene(Section):
-    """One scene. See the module's text for what a file looks like."""
+    """Content of a scene file."""
 
     name: Name
     models: tuple[Label, ...] = Field(
         default=("unwrap", "static"), max_length=MODELS_MAX, strict=False
     )
-    """The models that an estimate of this scene needs, in any order."""
+    """Models of the estimate, in any order."""
     rate_hz: NotNegative = 0.0
     """Frame rate; 0: as fast as the schedule allows."""
     calibration: str = "emulated-rig"
     """Calibration file, preset, or "emulated-rig": load the tiles on the emulated rig once."""
     auto_tare: bool = True
-    """May a server that sees the foot in the air let the baseline follow by itself?"""
+    """True if a server may update the baseline automatically while the foot is in the air."""
     array: ArrayScene = ArrayScene()
     tile: Annotated[tuple[TileScene, ...], Field(min_length=1, strict=False)]
     servo: ServoScene | None = None
@@ -95,7 +95,7 @@ def _repeated(values: list[str]) -> str | None:
 
 
 def builtin_scenes() -> tuple[str, ...]:
-    """Names of the scenes that come with FootTile."""
+    """Return the names of the scenes that come with FootTile."""
     folder = resources.files("devices.scene") / "builtin"
     return tuple(sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.is_file()))
 
@@ -121,7 +121,7 @@ def load_scene(name_or_path: str) -> Scene:
 
 
 def parse_scene(text: str, *, where: str) -> Scene:
-    """Build a scene from the text of a scene file; `where` names it in errors.
+    """Parse the text of a scene file; `where` names it in errors.
 
     Raises:
         SceneError: as for `load_scene`.
@@ -134,7 +134,7 @@ def parse_scene(text: str, *, where: str) -> Scene:
 
 
 def build_scene(content: Mapping[str, object], *, where: str) -> Scene:
-    """Build a scene from what a scene file holds.
+    """Validate the parsed content of a scene file; `where` names it in errors.
 
     Raises:
         SceneError: as for `load_scene`.

@@ -1,4 +1,4 @@
-"""Sections of a scene file that say what is wired: bus, tiles, servo, rig, recovery lines."""
+"""Sections of a scene file for the hardware: bus, tiles, servo, reference force, recovery lines."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from devices.chips.tca9548a import ADDRESSES, CHANNELS
 from devices.scene.quantities import GpioLine, Name, Number, Position, Positive, Section
 
 EMULATED = "emulated"
-"""Name of a bus or port that is emulated."""
+"""Name of an emulated bus or port."""
 
 ScheduleName = Literal["simultaneous", "pipelined", "per_mux", "sequential"]
 AnySchedule = Literal["auto", ScheduleName]
 
 
 class ArrayScene(Section):
-    """`[array]`: the bus and how it is asked."""
+    """`[array]`: the bus and its schedule."""
 
     bus: str = EMULATED
-    """A device such as /dev/i2c-1, or "emulated"."""
+    """Device such as /dev/i2c-1, or "emulated"."""
     scl_hz: Annotated[float, Field(ge=10_000, le=1_000_000)] = 400_000.0
     """Bus clock of the emulation; on hardware it is set in config.txt. The bounds catch kHz."""
     schedule: AnySchedule = "auto"
-    """How the bus is asked (`devices.array.schedules`); "auto": the best for these tiles."""
+    """Order of transfers (`devices.array.schedules`); "auto": the best for these tiles."""
     wait_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
-    """How long the driver waits for a conversion. Absent: as long as each part is measured to take
-    at start-up. Too short gives stale results."""
+    """Wait of the driver for a conversion. Absent: each part's conversion time, measured at
+    start-up. Too short a wait gives stale results."""
     temperature_every: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Temperature is read in every so many frames; the others save two bytes a tile."""
+    """Interval in frames at which temperature is read; other frames save two bytes a tile."""
     broadcast_channels: Annotated[int, Field(ge=1, le=64)] = 8
-    """How many channels may be open at once: the pull-ups of all of them have to be sunk by one
-    part (TCA9548A data sheet 9.2.1)."""
+    """Largest number of channels open at once: one part has to sink the current of all pull-ups
+    (TCA9548A data sheet 9.2.1)."""
     conversion_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
     """Emulation only: conversion time of every part. Absent: drawn for each part."""
 
 
 class TileScene(Section):
-    """`[[tile]]`: one tile, where it is plugged in and where it sits in the foot frame."""
+    """`[[tile]]`: a tile, its mux channel and its position in the foot frame."""
 
     serial: Name
     mux: int
@@ -48,7 +48,7 @@ class TileScene(Section):
     y_m: Position
     z_m: Position
     reference: bool = False
-    """A bare tile that measures the surroundings: it bears no load and is in no sum."""
+    """True for a bare tile that measures the surroundings: no load, excluded from all sums."""
 
     @field_validator("mux")
     @classmethod
@@ -66,17 +66,17 @@ class TileScene(Section):
 
 
 class ServoScene(Section):
-    """`[servo]`: the Dynamixel whose position goes with the frames."""
+    """`[servo]`: the Dynamixel servo whose position is stored with the frames."""
 
     port: str = EMULATED
-    """A device such as /dev/ttyUSB0, or "emulated"."""
+    """Device such as /dev/ttyUSB0, or "emulated"."""
     model: Literal["MX-28", "MX-64"] = "MX-64"
     protocol: Literal[1, 2] = 2
-    """What its firmware speaks; the factory's speaks 1."""
+    """Protocol version of its firmware; the factory's is 1."""
     id: Annotated[int, Field(ge=0)] = 1
     baudrate: Annotated[int, Field(gt=0)] = 1_000_000
     rate_hz: Positive = 100.0
-    """How often the position is read."""
+    """Rate at which the position is read."""
     sign: Literal[-1, 1] = 1
     zero_counts: Annotated[int, Field(ge=-(2**28), le=2**28)] = 2048
     ratio: Number = 1.0
@@ -98,7 +98,7 @@ class ServoScene(Section):
         highest = FIRMWARES[protocol].protocol.highest_id
         if servo_id > highest:
             raise ValueError(
-                f"{servo_id} is no id of a servo with protocol {protocol}, which are 0 to {highest}"
+                f"{servo_id} is no servo id of protocol {protocol}; expected 0 to {highest}"
             )
         return servo_id
 
@@ -113,18 +113,18 @@ class ServoScene(Section):
 class ReferenceScene(Section):
     """`[reference]`: the force sensor of a calibration rig, read through an MCP3208 on SPI.
 
-    Force is (volts - zero_v) * n_per_v. Neither has a default: they are known only to those who
-    have measured this sensor with this amplifier.
+    Force is (volts - zero_v) * n_per_v. Neither has a default: both have to be measured with this
+    sensor and amplifier.
     """
 
     port: str = EMULATED
-    """A device such as /dev/spidev0.0, or "emulated"."""
+    """Device such as /dev/spidev0.0, or "emulated"."""
     channel: Annotated[int, Field(ge=0, le=7)] = 0
     """Input of the converter."""
     vref_v: Annotated[float, Field(ge=0.25, le=5.5)] = 3.3
-    """Voltage at the converter's VREF, which is its full scale."""
+    """Voltage at the converter's VREF: its full scale."""
     zero_v: Number
-    """Voltage without a force. At either rail it could not be told from a broken wire."""
+    """Voltage without a force. It must be off the rails, to differ from a broken wire."""
     n_per_v: Number
     """Newtons per volt; negative if a push lowers the voltage."""
 
@@ -154,7 +154,7 @@ class RecoveryScene(Section):
     reset_line: GpioLine | None = None
     """RESET of all multiplexers; absent: not wired."""
     i2c_function: Annotated[str, Field(pattern=r"^a[0-8]$")] = "a0"
-    """What SDA and SCL are to be again, in words of `pinctrl`; on a Pi 5 "a3"."""
+    """Pin function of SDA and SCL to restore, as named by `pinctrl`; "a3" on a Pi 5."""
 
     @model_validator(mode="after")
     def _lines_differ(self) -> Self:

@@ -1,4 +1,4 @@
-"""What the sections of a scene file are made of: strict keys, and quantities within reason."""
+"""Field types of scene files: bounded quantities, and strict sections."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from devices.facts import Label
 
-# No quantity here is meant beyond a million; what is, is a slip of the keyboard or of the unit.
+# A quantity beyond a million is a typing error or a wrong unit.
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -20,7 +20,7 @@ Position = Annotated[float, Field(gt=-1.0, lt=1.0)]  # a tile 50 m away was mean
 
 
 class Section(BaseModel):
-    """One section of a scene file."""
+    """Base class of the sections of a scene file."""
 
-    # Strict: "4" is not 4, and 1 is not true. Only int to float is let through, as in TOML itself.
+    # Strict: "4" is not 4, and 1 is not true. Only int to float is converted, as in TOML itself.
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)

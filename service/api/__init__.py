@@ -1,1 +1,1 @@
-"""The server over HTTP: REST, websockets, page, and who may ask. Rules are in `service.server`."""
+"""HTTP server: REST, websockets, page, access control. Rules are in `service.server`."""

@@ -1,6 +1,6 @@
-"""Where a server is found, and by which token: what a node has to know before the server has begun.
+"""Address and token of a server, which a node needs before the server has started.
 
-Nothing here needs what the server itself is made of, which takes long to import.
+Imports nothing of the server itself, which takes long to import.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from storage.durable import put_aside, read_whole, storage_errors, write_whole
 log = logging.getLogger("foottile.serve")
 
 KEPT_IN = "token"
-"""File of the data folder with the token that was made."""
+"""File of the data folder with the generated token."""
 _BACKLOG = 128
 _UNREAD_MS = 60_000
-"""A connection whose other end takes nothing of what is sent for so long is closed by the kernel:
-no time-out of ours sees how much of a download has arrived."""
+"""Timeout of a peer that acknowledges no data: the kernel closes the connection, since no timeout
+of ours sees how much of a download has arrived."""
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 is any that is free.
+    """Open a listening socket; port 0 is any free one.
 
-    Of a name with several addresses it is the first that can be listened on, IPv4 first.
+    For a name with several addresses it is the first usable one, IPv4 first.
 
     Raises:
         LinkError: the port is in use, or the address is not this machine's.
@@ -72,9 +72,9 @@ def _listening(family: int, kind: int, protocol: int, address: Any) -> socket.so
     listening = socket.socket(family, kind, protocol)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if address[0] == "::":  # IPv4, too, whatever the system's usual is
+        if address[0] == "::":  # IPv4, too, whatever the system's default
             listening.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # those that come to it inherit this
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # accepted sockets inherit this
             listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
         listening.bind(address)
         listening.listen(_BACKLOG)
@@ -90,12 +90,12 @@ def is_everywhere(host: str) -> bool:
 
 
 def urls_of(listening: socket.socket, host: str, advertised: str | None = None) -> list[str]:
-    """Return the addresses under which a server is reached, the most useful to others first.
+    """Return the URLs of a server, the most useful to others first.
 
     Args:
-        listening: its socket.
-        host: what it was told to listen on.
-        advertised: an address or a name to show instead of those found, as of `--advertise`.
+        listening: socket of the server.
+        host: address or name to listen on.
+        advertised: address or name to show instead of those found, as of `--advertise`.
 
     Raises:
         UsageError: `advertised` is no address.
@@ -114,10 +114,10 @@ def urls_of(listening: socket.socket, host: str, advertised: str | None = None) 
 
 
 def advertised_url(advertised: str, port: int) -> str:
-    """Return the address that `--advertise` names: HOST, HOST:PORT, or all of it.
+    """Return the URL for `--advertise`: HOST, HOST:PORT, or a whole URL.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is no address.
     """
     text = advertised.strip().rstrip("/")
     if "://" not in text:
@@ -153,10 +153,10 @@ def _is_ip(name: str) -> bool:
 
 
 def own_names() -> tuple[str, ...]:
-    """Names that this machine goes by in its own network: its host name, and NAME.local by mDNS.
+    """Return the names of this machine in its own network: host name, and NAME.local by mDNS.
 
-    No domain is looked up: who serves the domain names of a network could say any. A host name with
-    a domain counts as it is and without it.
+    No domain is looked up: a network's DNS server could return any. A host name with a domain is
+    used as it is and without it.
     """
     name = socket.gethostname().lower().rstrip(".")
     if not _HOST_NAME.fullmatch(name):
@@ -169,13 +169,13 @@ _HOST_NAME = re.compile(r"(?!\d+$)[a-z0-9](?:[a-z0-9-]{0,62}[a-z0-9])?(?:\.[a-z0
 
 
 def token_for(given: str | None, data: Path) -> str:
-    """Return the token to ask for: the one given, else the one that is kept in the data folder.
+    """Return the server's token: the given one, else the one stored in the data folder.
 
     There is always one: through a reverse proxy, `ssh -L` or a container's port everybody comes
     from loopback.
 
     Raises:
-        StorageError: it cannot be read or kept.
+        StorageError: it cannot be read or stored.
     """
     if given:
         return given
@@ -185,36 +185,36 @@ def token_for(given: str | None, data: Path) -> str:
     except FileNotFoundError:
         pass
     except DamagedFileError as error:
-        log.warning("%s, and a new token is made", put_aside(path, error))
+        log.warning("%s, and a new token is generated", put_aside(path, error))
     with storage_errors(path):
         data.mkdir(parents=True, exist_ok=True)
-        kept = secrets.token_urlsafe(18)
-        write_whole(path, kept.encode() + b"\n", mode=0o600)
-    return kept
+        token = secrets.token_urlsafe(18)
+        write_whole(path, token.encode() + b"\n", mode=0o600)
+    return token
 
 
 def kept_token(data: Path) -> str:
-    """The token that a server has made and keeps in its data folder.
+    """Read the token stored in a data folder.
 
     Raises:
         FileNotFoundError: there is none.
         DamagedFileError: the file holds no token.
-        StorageError: it cannot be read: it is its user's alone.
+        StorageError: it cannot be read: only its user may.
     """
     path = data / KEPT_IN
-    kept = read_whole(path).decode("ascii", "replace").strip()
-    if not _TOKEN.fullmatch(kept):
+    token = read_whole(path).decode("ascii", "replace").strip()
+    if not _TOKEN.fullmatch(token):
         raise DamagedFileError("it holds no token", where=str(path))
-    return kept
+    return token
 
 
 @contextmanager
 def published(listening: socket.socket, token: str) -> Iterator[None]:
-    """Let programs of this user on this machine find the token while the block runs.
+    """Context manager: let programs of this user on this machine find the token.
 
     Args:
         listening: socket of the server.
-        token: of the server.
+        token: token of the server.
     """
     url = urls_of(listening, listening.getsockname()[0])[-1]
     with ExitStack() as stack:
@@ -227,4 +227,4 @@ def published(listening: socket.socket, token: str) -> Iterator[None]:
 
 
 _TOKEN = re.compile(r"[!-~]{8,200}")
-"""What people may have put there themselves, too."""
+"""Valid token, also if a person has written it."""

@@ -1,4 +1,4 @@
-"""The server's application: REST API, websockets and page over one `Server`."""
+"""Application of the server: REST API, websockets and pages over one `Server`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.api.guard import Guard
 from service.api.head import HeadFromGet
 from service.api.logins import Logins
 from service.api.page import PageFiles
-from service.api.routes import access, calibrations, formats, health, index, login, nodes
+from service.api.routes import access, calibrations, formats, health, index, login, nodes, weighings
 from service.api.routes.downloads import data, take_data, zips
 from service.api.routes.recordings import (
     array,
@@ -59,11 +59,11 @@ def make_app(
     """Build the application.
 
     Args:
-        server: the state it serves.
-        logins: token, tickets and cookies: asked for on every change of state and on ingest.
-        hosts: names under which it is reached, in addition to addresses and localhost.
-        find_urls: returns its addresses, which change with the networks that the machine joins; the
-            first one is for phones.
+        server: state to serve.
+        logins: token, tickets and cookies, required for every change of state and for ingest.
+        hosts: names of the server, in addition to addresses and localhost.
+        find_urls: returns the server's URLs, which change with the machine's networks; the first
+            one is for phones.
     """
 
     @asynccontextmanager
@@ -81,7 +81,7 @@ def make_app(
         version=SOFTWARE.rsplit(" ", 1)[1],
         description=_DESCRIPTION,
         openapi_url=f"{API}/openapi.json",
-        docs_url=None,  # its page comes from another host, which a field laptop does not reach
+        docs_url=None,  # FastAPI's page needs another host: no network in the field
         redoc_url=None,
         lifespan=lifespan,
     )
@@ -92,15 +92,15 @@ def make_app(
     api = APIRouter(
         prefix=API,
         responses=access.problems(
-            _400="This is not a request as HTTP/1.1 has them, or its body is not UTF-8.",
-            _401="A change needs the token or a login; on a private server everything does.",
-            _403="The Host header, or the Origin of a change, is not this server's; or the login "
-            "that was shown is a viewer's.",
-            _408="Its headers or its body did not come in time.",
+            _400="Invalid HTTP/1.1, or a body that is not UTF-8.",
+            _401="The token or a login is needed: for a change, and on a private server for "
+            "every request.",
+            _403="Host, or Origin of a change, is not this server; or the login is a viewer's.",
+            _408="Timeout of headers or body.",
             _413="The body is too long.",
-            _422="A parameter or the body is not as described.",
+            _422="Invalid parameter or body.",
             _431="The headers are too long.",
-            _503="There are too many connections, or the data folder is not there.",
+            _503="Too many connections, or the data folder is not in its place.",
         ),
     )
     api.add_api_route(
@@ -111,7 +111,8 @@ def make_app(
         login,
         nodes,
         calibrations,
-        zips,  # before a session of that name
+        weighings,
+        zips,  # before the route with a session's id
         sessions,
         takes,
         trash,
@@ -147,12 +148,16 @@ def make_app(
     async def nodes_page(request: Request) -> Response:
         return await page.get_response("nodes.html", request.scope)
 
+    @app.get("/calibrate", include_in_schema=False)
+    async def calibrate_page(request: Request) -> Response:
+        return await page.get_response("calibrate.html", request.scope)
+
     @app.get("/sessions", include_in_schema=False)
     async def sessions_page(request: Request) -> Response:
         return await page.get_response("sessions.html", request.scope)
 
     @app.get("/sessions/{session_id}", include_in_schema=False)
-    async def session_page(session_id: str, request: Request) -> Response:  # it asks for it itself
+    async def session_page(session_id: str, request: Request) -> Response:
         return await page.get_response("session.html", request.scope)
 
     @app.get("/docs", include_in_schema=False)
@@ -174,13 +179,13 @@ def make_app(
 
 
 def page_folder() -> Path:
-    """Folder with `index.html`.
+    """Return the folder with `index.html`.
 
     Raises:
         FootTileError: the installation lacks it.
     """
     here = Path(__file__).resolve().parent
-    # A wheel carries it as service/web, a checkout has it next to service.
+    # In a wheel it is service/web, in a checkout next to service.
     for folder in (here.parent / "web", here.parents[1] / "web"):
         if (folder / "index.html").is_file():
             return folder

@@ -1,6 +1,6 @@
-"""The API as it describes itself: for people at `/docs`, for programs as OpenAPI and as links.
+"""Self-description of the API: Swagger UI at `/docs`, OpenAPI, list of routes.
 
-What draws it is Swagger UI, of a package that brings it: nothing is asked of another host.
+Swagger UI is served from an installed package: no other host is needed.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ _METHODS = ("get", "post", "put", "patch", "delete")
 _TOKEN = {
     "type": "http",
     "scheme": "bearer",
-    "description": "The server's token. To read from a server that is not private none is needed; "
+    "description": "The server's token. Reading from a server that is not private needs none; "
     "a browser that has logged in needs none either.",
 }
 
 
 def swagger_folder() -> Path:
-    """Folder with `DOCS_FILES`.
+    """Return the folder with `SWAGGER_FILES`.
 
     Raises:
         FootTileError: the installation lacks it.
@@ -42,7 +42,7 @@ def swagger_folder() -> Path:
 
 
 def say_who_may(app: FastAPI) -> None:
-    """Have the description say how a token is shown; nothing needs one everywhere."""
+    """Add the token to the app's OpenAPI document as an optional security scheme."""
     made = app.openapi
 
     def described() -> dict[str, Any]:
@@ -51,11 +51,11 @@ def say_who_may(app: FastAPI) -> None:
         schema["security"] = [{}, {"token": []}]
         return schema
 
-    app.openapi = described  # type: ignore[method-assign]  # as FastAPI has it done
+    app.openapi = described  # type: ignore[method-assign]  # as FastAPI documents
 
 
 def operations(schema: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
-    """Path, method and operation of everything that a description has."""
+    """Return path, method and operation of every operation in an OpenAPI document."""
     return [
         (path, method.upper(), methods[method])
         for path, methods in schema["paths"].items()

@@ -1,8 +1,8 @@
-"""Who may ask: Host and Origin are checked, and a right for every change.
+"""Access control: checks of Host and Origin, and a role for every change.
 
 A web page of another site can make a browser send requests here; it cannot choose the Host header
-nor hide its Origin. The address of a peer is no proof of identity: through a reverse proxy,
-`ssh -L` or a container's port everybody comes from loopback. What a request shows of who asks is in
+nor hide its Origin. The address of a peer is no proof of identity: through a reverse proxy, `ssh
+-L` or a container's port everybody comes from loopback. Credentials of a request are read in
 `service.api.logins`.
 """
 
@@ -24,7 +24,7 @@ from service.link import LIVE_PATH
 from service.server.calibrations import CONTENT_BYTES_MAX
 
 BODY_BYTES_MAX = 64 << 10
-"""Longest body of a request: names and notes."""
+"""Size limit of a request's body: names and notes."""
 CALIBRATIONS_PATH = "/api/v1/calibrations"
 
 LOGIN_PATH = "/api/v1/login"
@@ -37,53 +37,53 @@ _AS_PROGRAM = (
     "was given one, and `foottile invite --data` takes it from there"
 )
 _ASKED = (
-    "To change something here the server's token is needed, or a login: `foottile invite`, on "
+    "A change needs the server's token or a login: `foottile invite`, on "
     f"{_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
 _PRIVATE = (
-    "This server is private: to look, too, the server's token is needed, or a login: `foottile "
+    "This server is private: reading needs the server's token or a login: `foottile "
     f"ticket`, on {_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
 _WRONG = f"This is not the server's token. {_AS_PROGRAM}"
 _ENDED = (
-    "This login has ended: the server was started again, or 12 hours are over. "
-    f"`foottile invite` gives a new one, on {_HERE}"
+    "This login has expired: the server was restarted, or 12 hours have passed. "
+    f"`foottile invite` creates a new one, on {_HERE}"
 )
 _VIEWER = (
-    "This login may look and not press: it came from a viewer's ticket. `foottile invite` gives "
-    f"one that may press, on {_HERE}"
+    "This login is a viewer's and may not change anything. `foottile invite` creates "
+    f"an operator's, on {_HERE}"
 )
-_NO_LOGIN = "For this no login is enough: it needs the server's token"
+_NO_LOGIN = "A login is not enough for this: it needs the server's token"
 _OPEN = re.compile(
-    rf"/|/nodes|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
+    rf"/|/nodes|/calibrate|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
 )
-"""What also a private server shows everybody: pages and files without data, how to get in, and for
-those who watch over its process whether it works."""
+"""Paths that a private server also serves without credentials: pages and files without data, login,
+and the readiness probe."""
 _HOST = re.compile(
     r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)(?P<zone>%[A-Za-z0-9._~%-]{1,40})?\])"
     r"(?::[0-9]{1,5})?"
 )
-"""As browsers write it: a name or an address, and a port; no user, no path.
+"""Host header as browsers write it: a name or an address, and a port; no user, no path.
 
 A link-local address may have a zone, the name of an interface behind `%` or `%25` (RFC 6874): some
-clients send it, and to which interface it leads is decided before it comes here.
+clients send it, and the client has used it before the request arrives here.
 """
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 _DEFAULT_HEADERS = {
     "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
-    "cache-control": "no-cache",  # ask again: after an update the page must not be the old one
+    "cache-control": "no-cache",  # revalidate: after an update the page must be new
 }
 
 
 class Guard:
-    """ASGI middleware that lets through what may pass.
+    """ASGI middleware that rejects forbidden requests.
 
     Args:
-        app: what is guarded.
-        hosts: names under which it is reached, in addition to addresses of this machine.
-        logins: what is asked for on every change of state and on ingest, and of whom.
+        app: application behind it.
+        hosts: names of the server, in addition to addresses of this machine.
+        logins: required for every change of state, and for ingest.
     """
 
     def __init__(self, app: ASGIApp, *, hosts: Iterable[str], logins: Logins) -> None:
@@ -115,7 +115,7 @@ class Guard:
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"
         changes = not websocket and scope["method"] not in SAFE_METHODS
-        # A proxy with TLS that is not trusted to say so makes https of what looks like http here.
+        # Behind an untrusted TLS proxy, https looks like http here.
         is_https = scope["scheme"] in ("https", "wss")
         ours = {f"https://{host}"} if is_https else {f"http://{host}", f"https://{host}"}
         for origin in headers.getlist("origin") if websocket or changes else ():
@@ -127,23 +127,23 @@ class Guard:
                 return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > _most(scope):
-            what = f"A body of {length[:20]} bytes; at most {_most(scope)} are taken"
+            what = f"A body of {length[:20]} bytes; at most {_most(scope)} are accepted"
             return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, what
         if any(ord(character) < ord(" ") for character in scope["path"]):
             return HTTPStatus.BAD_REQUEST, "The path has control characters in it"
         needed = self._needed(scope)
         if needed is None:
             return None
-        shown = self._logins.shown_by(HTTPConnection(scope))
-        if shown.left_s is not None and changes and "origin" not in headers:
-            # Cookies are browsers', and each of these says from where it changes something.
-            shown = Shown(None)
-        return _lacking(needed, shown)
+        credentials = self._logins.shown_by(HTTPConnection(scope))
+        if credentials.left_s is not None and changes and "origin" not in headers:
+            # Cookies come from browsers, which state the Origin of every change.
+            credentials = Shown(None)
+        return _lacking(needed, credentials)
 
     def _needed(self, scope: Scope) -> Right | None:
         path, looking = scope["path"], Right.LOOK if self._logins.is_private else None
         if scope["type"] == "websocket":
-            # Every one but the live one, so that no other way of writing a path is a way in.
+            # Every path but the live one, so that no spelling of a path bypasses the check.
             return looking if path == LIVE_PATH else Right.OWN
         if path == LOGIN_PATH:
             return None
@@ -159,7 +159,7 @@ class Guard:
         if name == "localhost" or name in self._hosts:
             return True
         try:
-            # A foreign DNS can point a name here, but not an address.
+            # DNS rebinding can point a name here, but not an address.
             address = ipaddress.ip_address(name)
         except ValueError:
             return False
@@ -167,13 +167,13 @@ class Guard:
 
 
 def _most(scope: Scope) -> int:
-    """Bytes that its body may have: a whole file comes to one path only."""
+    """Return the limit of the body: a whole file is accepted on one path only."""
     is_file = scope["type"] == "http" and scope["path"] == CALIBRATIONS_PATH
     return CONTENT_BYTES_MAX if is_file else BODY_BYTES_MAX
 
 
 def _lacking(needed: Right, shown: Shown) -> tuple[HTTPStatus, str] | None:
-    """What one who has shown this lacks for what is needed."""
+    """Return the refusal if the credentials lack the required role."""
     if shown.right is None:
         what = _PRIVATE if needed is Right.LOOK else _ASKED
         if shown.has_wrong_token:
@@ -185,7 +185,7 @@ def _lacking(needed: Right, shown: Shown) -> tuple[HTTPStatus, str] | None:
 
 
 class _Limited:
-    """Counts a body that does not state its length."""
+    """ASGI `receive` that limits a body without a stated length."""
 
     def __init__(self, receive: Receive, most: int) -> None:
         self._receive = receive

@@ -1,6 +1,6 @@
-"""HEAD: what GET would answer, without its body.
+"""HEAD on every route: the answer of GET without its body.
 
-A client asks so whether something is there; some proxies and watchdogs ask in no other way.
+Clients use it to check that something exists; some proxies and watchdogs use nothing else.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ class HeadFromGet:
     """ASGI middleware that answers HEAD on every route of GET.
 
     Args:
-        app: what answers GET.
+        app: application that answers GET.
     """
 
     def __init__(self, app: ASGIApp) -> None:

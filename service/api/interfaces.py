@@ -1,4 +1,4 @@
-"""Addresses of this machine in its networks, in the order in which people can use them."""
+"""Addresses of this machine in its networks, the most useful first."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class InterfaceAddress:
     """Address of an interface that is up.
 
     Attributes:
-        interface: its name.
-        address: IPv4 or IPv6; a link-local one of IPv6 has its zone.
-        has_carrier: is a cable plugged in, or a network joined?
-        is_first_host: is it the first address of its network, as that of a hotspot is?
+        interface: name of the interface.
+        address: IPv4 or IPv6; a link-local IPv6 address has its zone.
+        has_carrier: True: a cable is plugged in, or a network joined.
+        is_first_host: True: first address of its network, as for a hotspot.
     """
 
     interface: str
@@ -39,7 +39,7 @@ class InterfaceAddress:
 
     @property
     def rank(self) -> tuple[bool, ...]:
-        """Order: what a phone most probably reaches comes first.
+        """Sort key: the address that a phone most probably reaches comes first.
 
         A hotspot of this machine comes before its cable to a laboratory: its address is private and
         the first of its network, and its interface is wireless.
@@ -57,7 +57,7 @@ class InterfaceAddress:
 
     @property
     def is_virtual(self) -> bool:
-        """Does it lead to containers, virtual machines or a VPN?"""
+        """True if it leads to containers, virtual machines or a VPN."""
         return _VIRTUAL.match(self.interface) is not None
 
 
@@ -65,7 +65,7 @@ def list_addresses(*, has_ipv6: bool) -> list[str]:
     """Return the addresses of all interfaces that are up, the most useful one first.
 
     Args:
-        has_ipv6: with those of IPv6.
+        include_ipv6: include IPv6 addresses.
     """
     families = {socket.AF_INET, socket.AF_INET6} if has_ipv6 else {socket.AF_INET}
     states = psutil.net_if_stats()
@@ -78,15 +78,15 @@ def list_addresses(*, has_ipv6: bool) -> list[str]:
         )
         for name, addresses in psutil.net_if_addrs().items()
         for each in addresses
-        # `isup` of psutil is that there is a carrier, too: a hotspot may have none before a phone
-        # has joined it.
+        # `isup` of psutil needs a carrier, too: a hotspot may have none before a phone
+        # joins.
         if each.family in families and name in states and "up" in states[name].flags.split(",")
     ]
     return [each.address for each in sort_addresses(found)]
 
 
 def sort_addresses(found: list[InterfaceAddress]) -> list[InterfaceAddress]:
-    """Return the addresses that others may reach, the most useful one first."""
+    """Return the addresses that others can reach, the most useful one first."""
     useful = [
         each
         for each in found

@@ -1,7 +1,7 @@
-"""Who has shown what: the token, or a cookie that a ticket or the token was changed for.
+"""Credentials of requests: the token, or a cookie obtained with a ticket or the token.
 
-A ticket is for a person with a phone: short-lived, used once, and never the token itself. All that
-is kept of tickets and cookies are digests, in memory: they end when the server does.
+A ticket is for a person with a phone: short-lived, valid once, and never the token itself. Only
+digests of tickets and cookies are kept, in memory: they end with the server.
 """
 
 from __future__ import annotations
@@ -18,43 +18,43 @@ from starlette.requests import HTTPConnection
 
 TICKET_S = 300.0
 LOGIN_S = 12 * 3600.0
-"""A day in the field."""
+"""Lifetime of a login: a day in the field."""
 TICKETS_MAX = 32
 LOGINS_MAX = 256
 _SECRET_BYTES = 16
 
 
 class Right(IntEnum):
-    """What somebody may do; each includes those before it."""
+    """Role of a client; each includes those before it."""
 
     LOOK = 1
     """Watch, list, download."""
     PRESS = 2
-    """Change something, too."""
+    """Also change something."""
     OWN = 3
-    """Give tickets and be a node, too: who has the token itself."""
+    """Also create tickets and be a node: has the token itself."""
 
 
 @dataclass(frozen=True)
 class Given:
-    """A right that was given, until an instant of the clock that counts."""
+    """Role that was granted until a time of the boot clock."""
 
     right: Right
     ends_s: float
 
 
 def _boot_s() -> float:
-    # Unlike the monotonic clock it goes on while a laptop sleeps.
+    # Unlike the monotonic clock it runs while a laptop sleeps.
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class Secrets:
-    """Random secrets that were given out, known by their digests; each ends by itself.
+    """Random secrets, stored as digests with a role; each expires.
 
     Args:
-        lasts_s: for how long one is good.
-        most: how many there are at once; one more pushes the oldest out.
-        now_s: a clock that never steps.
+        lifetime_s: lifetime of a secret.
+        max_count: limit of valid secrets; a further one replaces the oldest.
+        now_s: clock that never steps.
     """
 
     def __init__(self, *, lasts_s: float, most: int, now_s: Callable[[], float] = _boot_s) -> None:
@@ -64,7 +64,7 @@ class Secrets:
         self._given: dict[bytes, Given] = {}
 
     def new(self, right: Right) -> str:
-        """A secret for a right."""
+        """Create a secret for a role."""
         self._forget_old()
         while len(self._given) >= self._most:
             del self._given[next(iter(self._given))]
@@ -73,30 +73,30 @@ class Secrets:
         return secret
 
     def find(self, secret: str) -> Given | None:
-        """What it was given for; None: it is unknown, has ended, or was taken."""
+        """Return the grant of a secret; None: unknown, expired or used."""
         found = self._find(secret)
         return None if found is None else self._given[found]
 
     def take(self, secret: str) -> Given | None:
-        """The same, and it is good for nothing from now on."""
+        """Return the grant of a secret and invalidate the secret."""
         found = self._find(secret)
         return None if found is None else self._given.pop(found)
 
     def left_s(self, given: Given) -> float:
-        """For how long it is still good."""
+        """Return the remaining lifetime of a grant."""
         return given.ends_s - self._now_s()
 
     def _find(self, secret: str) -> bytes | None:
         self._forget_old()
         digest, found = _digest(secret), None
-        for known in self._given:  # all of them, so that the time says nothing
-            if hmac.compare_digest(known, digest):
-                found = known
+        for stored in self._given:  # compare all: constant time
+            if hmac.compare_digest(stored, digest):
+                found = stored
         return found
 
     def _forget_old(self) -> None:
         now_s = self._now_s()
-        self._given = {d: given for d, given in self._given.items() if given.ends_s > now_s}
+        self._given = {d: grant for d, grant in self._given.items() if grant.ends_s > now_s}
 
 
 def _digest(secret: str) -> bytes:
@@ -105,24 +105,24 @@ def _digest(secret: str) -> bytes:
 
 @dataclass(frozen=True)
 class Shown:
-    """What a request shows of who asks."""
+    """Result of checking a request's token or cookie."""
 
     right: Right | None
-    """None: nothing that counts."""
+    """None: no valid credentials."""
     has_wrong_token: bool = False
     has_ended: bool = False
-    """It has a cookie of this server that is good for nothing any more."""
+    """True: it has a cookie of this server that is no longer valid."""
     left_s: float | None = None
-    """For how long its cookie is still good."""
+    """Remaining lifetime of its cookie; None without one."""
 
 
 class Logins:
-    """The token of a server, its tickets, and the cookies they were changed for.
+    """Token of a server, its tickets and its login cookies.
 
     Args:
-        token: of the server.
-        is_private: is a login asked for to look, too?
-        now_s: a clock that never steps.
+        token: token of the server.
+        is_private: True: reading needs a login, too.
+        now_s: clock that never steps.
     """
 
     def __init__(
@@ -138,12 +138,12 @@ class Logins:
         self.cookies = Secrets(lasts_s=LOGIN_S, most=LOGINS_MAX, now_s=now_s)
 
     def shown_by(self, request: HTTPConnection) -> Shown:
-        """What a request shows; of a token and a cookie only the token counts."""
+        """Check the credentials of a request; the token takes precedence over a cookie."""
         if "authorization" in request.headers:
-            given = bearer_token(request.headers.getlist("authorization"))
-            if given is not None and hmac.compare_digest(given.encode(), self.token.encode()):
+            token = bearer_token(request.headers.getlist("authorization"))
+            if token is not None and hmac.compare_digest(token.encode(), self.token.encode()):
                 return Shown(Right.OWN)
-            return Shown(None, has_wrong_token=given is not None)
+            return Shown(None, has_wrong_token=token is not None)
         cookie = self.cookie_of(request)
         if cookie is None:
             return Shown(None)
@@ -153,17 +153,17 @@ class Logins:
         return Shown(login.right, left_s=self.cookies.left_s(login))
 
     def cookie_of(self, request: HTTPConnection) -> str | None:
-        """The secret in a request's cookie, if it has one of this server's name."""
+        """Return the secret in a request's cookie, if it has one of this server's name."""
         return request.cookies.get(cookie_name(request))
 
 
 def cookie_name(request: HTTPConnection) -> str:
-    """With the server's port: to a browser all ports of a machine have the same cookies."""
+    """Return the cookie's name, with the server's port: browsers share cookies between ports."""
     server = request.scope.get("server")
     return f"foottile_{server[1] if server else 0}"
 
 
 def bearer_token(given: Sequence[str]) -> str | None:
-    """The token in a request's Authorization headers; None unless it is one `Bearer TOKEN`."""
+    """Return the token in Authorization headers; None unless they are one `Bearer TOKEN`."""
     scheme, _, token = (given[0] if len(given) == 1 else "").partition(" ")
     return token.strip() or None if scheme.lower() == "bearer" else None

@@ -1,4 +1,4 @@
-"""The files of the page, compressed once and kept for as long as they stay as they are."""
+"""Static files of the pages, compressed once and cached while unchanged."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starlette.types import Scope
 from service.api.encoding import takes_gzip
 
 _WORTH_IT = 0.9
-"""Of its length: what does not become shorter than that is sent as it is."""
+"""Greatest ratio of lengths for which a file is sent compressed."""
 
 _MEDIA_TYPES = {
     ".html": "text/html",
@@ -24,20 +24,20 @@ _MEDIA_TYPES = {
     ".js": "text/javascript",
     ".svg": "image/svg+xml",
 }
-"""The same on every machine: `mimetypes` would ask the machine's own tables."""
+"""Media types, the same on every machine: `mimetypes` would read the machine's own tables."""
 
 
 @dataclass(frozen=True)
 class _Kept:
     written: tuple[int, int]
-    """Nanoseconds of its last change, and bytes: what tells that it is another one."""
+    """Modification time in ns, and size: a change means another file."""
     plain: bytes
     packed: bytes | None
     tag: str
 
 
 class PageFiles(StaticFiles):
-    """A folder of files that are the same for everyone."""
+    """Folder of static files, the same for every client."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(directory=folder)
@@ -50,10 +50,10 @@ class PageFiles(StaticFiles):
         scope: Scope,
         status_code: int = 200,
     ) -> Response:
-        """Answer with a file, as gzip to who takes it; each form has a tag of its own."""
-        asked = Headers(scope=scope)
+        """Answer with a file, compressed if the client accepts gzip; each form has its own ETag."""
+        request_headers = Headers(scope=scope)
         file = self._file(Path(full_path), stat_result)
-        packed = file.packed is not None and takes_gzip(asked.get("accept-encoding", ""))
+        packed = file.packed is not None and takes_gzip(request_headers.get("accept-encoding", ""))
         answer = Response(
             file.packed if packed else file.plain,
             status_code=status_code,
@@ -62,20 +62,20 @@ class PageFiles(StaticFiles):
         )
         if packed:
             answer.headers["Content-Encoding"] = "gzip"
-        if self.is_not_modified(answer.headers, asked):
+        if self.is_not_modified(answer.headers, request_headers):
             return NotModifiedResponse(answer.headers)
         return answer
 
     def _file(self, path: Path, stat: os.stat_result) -> _Kept:
         written = (stat.st_mtime_ns, stat.st_size)
-        kept = self._kept.get(str(path))
-        if kept is None or kept.written != written:
+        cached = self._kept.get(str(path))
+        if cached is None or cached.written != written:
             plain = path.read_bytes()
             packed = gzip.compress(plain, 9, mtime=0)
-            kept = self._kept[str(path)] = _Kept(
+            cached = self._kept[str(path)] = _Kept(
                 written,
                 plain,
                 packed if len(packed) < _WORTH_IT * len(plain) else None,
                 hashlib.sha256(plain).hexdigest(),
             )
-        return kept
+        return cached

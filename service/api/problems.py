@@ -1,4 +1,4 @@
-"""Every error of the API as RFC 9457 problem+json: what, where, what was expected, what to do."""
+"""Errors of the API as RFC 9457 problem+json."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _STATUS: tuple[tuple[type[FootTileError], HTTPStatus], ...] = (
 
 
 class Problem(BaseModel):
-    """RFC 9457: what went wrong, where, and what to do."""
+    """Problem as of RFC 9457: what happened, where, and what to do."""
 
     type: str = "about:blank"
     title: str
@@ -55,13 +55,13 @@ class Problem(BaseModel):
 def problem(
     path: str, status: int, detail: str, headers: Mapping[str, str] | None = None
 ) -> JSONResponse:
-    """A problem as an answer.
+    """Return a problem as a response.
 
     Args:
-        path: what was asked for.
+        path: path of the request.
         status: HTTP status.
-        detail: for a person: what is wrong and what to do.
-        headers: more headers.
+        detail: error and remedy, for a person.
+        headers: further headers.
     """
     content = {
         "type": "about:blank",
@@ -82,7 +82,7 @@ def install(app: FastAPI) -> None:
 
 
 def status_of(error: FootTileError) -> HTTPStatus:
-    """HTTP status of one of our errors."""
+    """Return the HTTP status of an error."""
     found = (status for kind, status in _STATUS if isinstance(error, kind))
     return next(found, HTTPStatus.INTERNAL_SERVER_ERROR)
 
@@ -107,13 +107,13 @@ async def _on_http(request: Request, error: Exception) -> Response:
         allow = {"Allow": ", ".join(_methods_of(request))}
         if request.method == "OPTIONS":
             return Response(status_code=HTTPStatus.NO_CONTENT, headers=allow)
-        what = f"{request.method} is not for this path; {allow['Allow']} are"
+        what = f"{request.method} is not allowed here; {allow['Allow']} are"
         return problem(request.url.path, error.status_code, what, allow)
     return problem(request.url.path, error.status_code, str(error.detail), error.headers)
 
 
 def _methods_of(request: Request) -> list[str]:
-    """What may be asked of a path: the framework names the methods of its first route only."""
+    """Return the methods of a path: the framework names those of its first route only."""
     routes = [route for route in request.app.routes if not isinstance(route, Mount)]
     found = {
         method
@@ -121,7 +121,7 @@ def _methods_of(request: Request) -> list[str]:
         for route in routes
         if route.matches({**request.scope, "method": method})[0] is Match.FULL
     }
-    found = found or {"GET"}  # what is under a mount is files
+    found = found or {"GET"}  # a mount has files only
     if "GET" in found:
         found.add("HEAD")  # see service.api.head
     return sorted(found | {"OPTIONS"})
@@ -129,5 +129,5 @@ def _methods_of(request: Request) -> list[str]:
 
 async def _on_bug(request: Request, error: Exception) -> JSONResponse:
     log.error("%s %s: this is a bug", request.method, request.url.path, exc_info=error)
-    detail = f"The server made a mistake ({type(error).__name__}); its log says more"
+    detail = f"Internal error ({type(error).__name__}); see the server's log"
     return problem(request.url.path, HTTPStatus.INTERNAL_SERVER_ERROR, detail)

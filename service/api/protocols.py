@@ -1,8 +1,8 @@
-"""uvicorn's protocols with the bounds that it lacks, and how connections are taken in.
+"""Protocols of uvicorn with limits on headers, bodies and connections.
 
-uvicorn bounds neither the size of headers nor the time they take, and counts connections only when
-their headers are there. Its protocol classes are made to be replaced (`http=`, `ws=`), so what is
-missing is added to them here; parsing and answering stay uvicorn's.
+uvicorn limits neither the size of headers nor their time, and counts connections only once their
+headers are complete. Its protocol classes can be replaced (`http=`, `ws=`), so the limits are added
+to them here; parsing and answering stay uvicorn's.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from service.link import INGEST_PATH, SUBPROTOCOL, Close
 log = logging.getLogger("foottile.doors")
 
 OUTLET = "foottile.outlet"
-"""Of a websocket's scope, among the extensions: the connection, as an `Outlet` to write to."""
+"""Extension in a websocket's scope with its connection, a `SubscriberSocket`."""
 SAID_ON_LIVE_BYTES_MAX = 4096
-"""Of a message to a server by others than nodes."""
+"""Size limit of a message by clients other than nodes."""
 _UNREAD_BYTES_MAX = 1 << 20
-"""What may wait for one who goes on asking and does not read."""
+"""Limit of unsent bytes for a client that sends requests and does not read."""
 _STARVED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 _STARVED_PAUSE_S = 0.1
 _PAUSE_S = 0.01
@@ -50,16 +50,16 @@ _TOO_MANY = "There are too many connections; try again in some seconds"
 
 
 class DoorsConfig(uvicorn.Config):
-    """uvicorn's configuration, and the doors that its protocols ask."""
+    """Configuration of uvicorn with the connection limiter."""
 
     doors: Doors
 
     proxies: ProxyHeadersMiddleware
 
     def forwarded_client(self, peer: str, forwarded_for: Sequence[str]) -> str | None:
-        """Return the address that a trusted proxy names as its client's; None: it is the peer's.
+        """Return the client's address as named by a trusted proxy; None: the peer's.
 
-        uvicorn puts it into the scope of a request when that has been admitted already.
+        uvicorn puts it into the scope of a request only after this check.
         """
         trusted = self.proxies.trusted_hosts
         if not forwarded_for or peer not in trusted:
@@ -68,36 +68,36 @@ class DoorsConfig(uvicorn.Config):
 
 
 class Http(HttpToolsProtocol):
-    """HTTP whose headers and bodies come in time and in bounds, or not at all."""
+    """HTTP with limits on the size and time of headers and bodies."""
 
     config: DoorsConfig
     _timer: asyncio.TimerHandle | None = None
     _in_head = False
     _unseen_bytes = 0
-    """Since something came of which a request consists: one endless header, be it behind the body,
-    and an endless name of a chunk reach no callback before they end."""
+    """Bytes since the last parsed element: an endless header, also behind the body, and an endless
+    name of a chunk reach no callback before they end."""
     _head_bytes = 0
-    """With the headers behind the body."""
+    """Size of headers, with those behind the body."""
     _is_too_long = False
     _is_upgraded = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
-        """It waits now."""
+        """Add the connection as idle."""
         super().connection_made(transport)
         self._asked: deque[RequestResponseCycle] = deque()
-        """Requests that are not answered yet, in their order; uvicorn knows but the newest."""
+        """Requests without an answer, in their order; uvicorn has only the newest."""
         self.config.doors.come(transport, _address(self.client))
         self._expect(self.config.doors.bounds.header_timeout_s)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It has gone."""
+        """Remove the connection."""
         self._expect(None)
         self.config.doors.go(self.transport)
         self._forget_asked()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Parse, unless it is more than headers may be."""
+        """Parse bytes, up to the limit of headers."""
         self._unseen_bytes += len(data)
         super().data_received(data)
         if self.transport.is_closing() or self._is_upgraded:
@@ -109,23 +109,23 @@ class Http(HttpToolsProtocol):
             self._expect(self.config.doors.bounds.header_timeout_s)
 
     def on_message_begin(self) -> None:
-        """A request begins."""
+        """Start the limits of a request."""
         super().on_message_begin()
         self._in_head, self._unseen_bytes, self._head_bytes = True, 0, 0
 
     def on_url(self, url: bytes) -> None:
-        """A piece of the request line."""
+        """Add to the size of the request line."""
         self._count(len(url))
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """A header; those behind the body are nobody's."""
+        """Add a header; headers behind the body are ignored."""
         self._count(len(name) + len(value) + 4)
         if self._in_head:
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
-        """It asks for something: is there room?"""
+        """Reject the request if the limit is reached, else run it."""
         self._in_head = False
         self._expect(None)
         is_websocket = self.parser.should_upgrade() and self._should_upgrade()
@@ -145,22 +145,22 @@ class Http(HttpToolsProtocol):
             self._expect_more()
 
     def on_chunk_header(self) -> None:
-        """A piece of the body begins."""
+        """Reset the limit at a piece of the body."""
         self._unseen_bytes = 0
 
     def on_body(self, body: bytes) -> None:
-        """A piece of the body."""
+        """Pass on a piece of the body."""
         self._unseen_bytes = 0
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """The body is there."""
+        """Stop the timeout of the body."""
         self._expect(None)
         self._unseen_bytes = 0
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        """It waits again, unless it has asked for more already."""
+        """Make the connection idle, unless another request follows."""
         is_last = not self.pipeline
         self._asked.popleft()
         self._expect_more()
@@ -169,12 +169,12 @@ class Http(HttpToolsProtocol):
             self.config.doors.rest(self.transport)
 
     def handle_websocket_upgrade(self) -> None:
-        """It is the websocket's from here on."""
+        """Hand the connection over to the websocket."""
         self._is_upgraded = True
         super().handle_websocket_upgrade()
 
     def send_400_response(self, msg: str) -> None:
-        """Say what was wrong with it as a problem, and close."""
+        """Answer a malformed request with a problem, and close."""
         if self._is_too_long:
             what = f"Headers of more than {self.config.doors.bounds.max_header_bytes} bytes"
             self._end(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, what)
@@ -185,7 +185,9 @@ class Http(HttpToolsProtocol):
         self._head_bytes += more
         if self._head_bytes > self.config.doors.bounds.max_header_bytes:
             self._is_too_long = True
-            raise ValueError("headers are too long")  # the parser gives up, and 400 is ours above
+            raise ValueError(
+                "headers are too long"
+            )  # the parser stops; `send_400_response` answers
 
     def _expect(self, within_s: float | None) -> None:
         if self._timer is not None:
@@ -194,7 +196,7 @@ class Http(HttpToolsProtocol):
         self._timer = self.loop.call_later(within_s, late) if within_s is not None else None
 
     def _expect_more(self) -> None:
-        """Time runs for the request whose turn it is: those behind it are perhaps not even read."""
+        """Start the timeout of the first unanswered request; later ones may not even be read."""
         if not self._asked:
             if self._in_head:
                 self._expect(self.config.doors.bounds.header_timeout_s)
@@ -218,33 +220,32 @@ class Http(HttpToolsProtocol):
         self.transport.close()
 
     def _forget_asked(self) -> None:
-        """Nobody waits for the answers any more: to write one would be a mistake."""
+        """Mark unanswered requests as disconnected, so that no answer is written."""
         for cycle in self._asked:
             cycle.disconnected = True
             cycle.message_event.set()
 
 
 class WithoutChunks:
-    """The application for one request of HTTP/1.0, which has no chunks.
+    """Application for one request of HTTP/1.0, which has no chunks.
 
-    uvicorn sends them all the same. Here a body whose length is not known is sent as it is, and
-    ends where the connection ends. One that breaks off resets the connection, else nobody could
-    tell it from a whole one.
+    uvicorn sends chunks nevertheless. Here a body of unknown length is sent as it is, and ends with
+    the connection. An aborted body resets the connection, else it would look complete.
 
     Args:
-        app: what answers.
-        transport: the connection.
+        app: application.
+        transport: transport of the connection.
     """
 
     cycle: RequestResponseCycle
-    """Of this request; set before it is answered."""
+    """Cycle of this request; set before it is answered."""
 
     def __init__(self, app: Any, transport: asyncio.Transport) -> None:
         self._app = app
         self._transport = transport
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer it."""
+        """Answer the request."""
         is_unframed = False
 
         async def send_unframed(message: Message) -> None:
@@ -267,7 +268,7 @@ class WithoutChunks:
 
 
 def reset(transport: asyncio.Transport) -> None:
-    """Close a connection so that its other end sees an error, and not an end."""
+    """Close a connection so that the peer sees an error, not an end."""
     connection = transport.get_extra_info("socket")
     if connection is not None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
@@ -275,25 +276,25 @@ def reset(transport: asyncio.Transport) -> None:
 
 
 class WebSocket(WebSocketsSansIOProtocol):
-    """A websocket with a place: a node's once it has spoken, else that of a screen."""
+    """Websocket with a place: a node's after its first message, else a subscriber's."""
 
     config: DoorsConfig
     _is_node = False
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It has gone."""
+        """Remove the connection."""
         self.config.doors.go(self.transport)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Take in frames; each ping is answered, so one that does not read must not go on."""
+        """Read frames; each ping is answered, so a client that does not read is disconnected."""
         if self.transport.get_write_buffer_size() > _UNREAD_BYTES_MAX:
             self.transport.abort()
         else:
             super().data_received(data)
 
     def handle_connect(self, event: Request) -> None:
-        """Is there room?"""
+        """Reject the connection if the limit is reached, else accept it."""
         doors = self.config.doors
         self._is_node = event.path.partition("?")[0] == INGEST_PATH
         if not self._is_node:
@@ -304,7 +305,7 @@ class WebSocket(WebSocketsSansIOProtocol):
             self.app = refuse
         super().handle_connect(event)
         if not self.close_sent:
-            # An extension's content is a dict by the specification; its reader is our own route.
+            # ASGI requires a dict; the live route reads it.
             self.scope["extensions"] = {
                 **(self.scope["extensions"] or {}),
                 OUTLET: {"outlet": self},
@@ -312,20 +313,19 @@ class WebSocket(WebSocketsSansIOProtocol):
 
     @property
     def is_ready(self) -> bool:
-        """Has what was written before gone, but for what a transport holds (64 KiB)?"""
+        """True if all earlier writes are sent, up to the transport buffer (64 KiB)."""
         return self.writable.is_set()
 
     def write(self, framed: bytes) -> None:
-        """Write whole frames beside uvicorn's own `send`, which frames each message anew."""
+        """Write whole frames beside uvicorn's own `send`, which frames each message again."""
         if not (self.close_sent or self.disconnected or self.transport.is_closing()):
             self.transport.write(framed)
 
     def hang_up(self, code: int, reason: str) -> None:
-        """Say why it ends, to one who does not read as well: behind all that was written before.
+        """Close with a reason without waiting for room, behind all earlier writes.
 
-        As uvicorn's own close, but without waiting for room. Until the other end has answered, or
-        for `close_timeout`, the connection stays open and what comes is left unheard: to close it
-        before that would be a reset, which takes back what was said.
+        Until the peer has answered, or for `close_timeout`, the connection stays open and received
+        data is ignored: closing earlier would be a reset, which discards the reason.
         """
         if not (self.close_sent or self.disconnected or self.transport.is_closing()):
             self.conn.send_close(code, reason)
@@ -337,11 +337,11 @@ class WebSocket(WebSocketsSansIOProtocol):
             self.close_timer = self.loop.call_later(self.close_timeout, self.transport.close)
 
     async def receive(self) -> ASGIReceiveEvent:
-        """A message, or the end; the first word of a node gets it its place, if there is one."""
+        """Return a message, or the end; the first message of a node acquires its place."""
         event = await super().receive()
         is_word = self._is_node and event["type"] == "websocket.receive"
         if is_word and not self.config.doors.admit_node(self.transport):
-            with suppress(ClientDisconnected, RuntimeError):  # it has gone, or was told why
+            with suppress(ClientDisconnected, RuntimeError):  # it has disconnected, or got a reason
                 await self.send(
                     {"type": "websocket.close", "code": Close.TRY_LATER, "reason": _TOO_MANY}
                 )
@@ -349,7 +349,7 @@ class WebSocket(WebSocketsSansIOProtocol):
         return event
 
     async def run_asgi(self) -> None:
-        """Serve it; then it only has to go, which one that does not read does not do by itself."""
+        """Run the app; then make the connection idle, so that it can be closed."""
         await super().run_asgi()
         self.config.doors.rest(self.transport)
 
@@ -362,8 +362,8 @@ async def send(socket: StarletteWebSocket, message: str | bytes) -> None:
     """Send a message on an open websocket, once there is room for it.
 
     Raises:
-        WebSocketDisconnect: it has gone; where this end has closed it meanwhile, starlette and
-            uvicorn say so with a RuntimeError, which must not be taken for another's.
+        WebSocketDisconnect: the connection is closed; if this end has closed it, starlette and
+            uvicorn raise a RuntimeError, which is converted here.
     """
     try:
         if isinstance(message, str):
@@ -375,7 +375,7 @@ async def send(socket: StarletteWebSocket, message: str | bytes) -> None:
 
 
 async def refuse(scope: Scope, receive: Receive, send: Send) -> None:
-    """Say that there is no room, in the way of the one who asks."""
+    """Refuse a connection for lack of room, by HTTP or websocket."""
     if scope["type"] == "websocket":
         chosen = SUBPROTOCOL if SUBPROTOCOL in scope["subprotocols"] else None
         await receive()
@@ -388,15 +388,15 @@ async def refuse(scope: Scope, receive: Receive, send: Send) -> None:
 
 
 async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors) -> None:
-    """Take in connections until cancelled, one after the other.
+    """Accept connections until cancelled, one after the other.
 
-    An event loop's own server takes in all that are there before it tells of one, and, out of
-    descriptors, closes whoever comes: nodes as well.
+    An event loop's own server accepts all pending ones before it reports any, and, out of
+    descriptors, closes whatever comes: nodes as well.
 
     Args:
-        listening: the socket they come to.
-        make: a protocol for each.
-        doors: counts them.
+        listening: listening socket.
+        make_protocol: creates a protocol for each connection.
+        limiter: limiter of connections.
     """
     loop = asyncio.get_running_loop()
     listening.setblocking(False)
@@ -408,9 +408,9 @@ async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors
         try:
             connection, _ = await loop.sock_accept(listening)
         except OSError as error:
-            is_starved = error.errno in _STARVED  # or it has gone already
+            is_starved = error.errno in _STARVED  # or the client has disconnected
             if is_starved:
-                doors.say("starved", f"no connection can be taken in for now: {error}")
+                doors.say("starved", f"no connection can be accepted now: {error}")
                 doors.turn_out()
             await asyncio.sleep(_STARVED_PAUSE_S if is_starved else _PAUSE_S)
             continue
@@ -419,5 +419,5 @@ async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors
             await loop.connect_accepted_socket(make, connection)
         except Exception as error:
             if not isinstance(error, OSError):
-                log.exception("a connection is closed: this is a bug; others are taken in")
+                log.exception("a connection is closed: this is a bug; others are accepted")
             connection.close()

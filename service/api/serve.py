@@ -1,4 +1,4 @@
-"""Runs the application in uvicorn on a socket known to be ours, until it is told to stop."""
+"""Runner of the application: uvicorn on a given socket, until stopped."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _GRACE_S = 3
 async def serving(
     app: FastAPI, listening: socket.socket, bounds: Bounds | None = None
 ) -> AsyncIterator[None]:
-    """Serve while the block runs; on a new machine the models are compiled meanwhile."""
+    """Context manager: serve the app; on a new machine compile the models meanwhile."""
     compiling = None
     if not await asyncio.to_thread(load_kept):
         compiling = asyncio.create_task(_compile_aside(app.state.server))
@@ -36,17 +36,17 @@ async def serving(
         app,
         log_level="warning",
         access_log=False,
-        workers=1,  # else uvicorn reads WEB_CONCURRENCY, and ends if that is no number
+        workers=1,  # else uvicorn reads WEB_CONCURRENCY and fails if it is no number
         server_header=False,
         http=Http,
-        ws=WebSocket,  # on websockets' sans-I/O, the fastest that is kept up (performance.md)
+        ws=WebSocket,  # websockets' sans-I/O, the fastest maintained one (performance.md)
         ws_max_size=MESSAGE_BYTES_MAX,
         ws_per_message_deflate=False,
         ws_ping_interval=20.0,
         ws_ping_timeout=20.0,
         timeout_keep_alive=bounds.idle_timeout_s,  # type: ignore[arg-type]  # it takes fractions
         timeout_graceful_shutdown=_GRACE_S,
-        forwarded_allow_ips=bounds.trusted_peers,  # uvicorn trusts loopback by itself
+        forwarded_allow_ips=bounds.trusted_peers,  # uvicorn trusts loopback by default
     )
     config.doors = Doors(bounds, open_files_max())
     config.proxies = ProxyHeadersMiddleware(app, bounds.trusted_peers)  # type: ignore[arg-type]  # Starlette's scope is wider
@@ -60,7 +60,7 @@ async def serving(
             task.result()
         yield
     finally:
-        if compiling is not None:  # first: what is being sealed waits for it
+        if compiling is not None:  # first: sealing waits for it
             compiling.cancel()
             await asyncio.gather(compiling, return_exceptions=True)
         server.should_exit = True
@@ -70,19 +70,19 @@ async def serving(
 _COMPILES = "from service.estimation.warm import warm_up; warm_up()"
 _NICENESS = 10
 _COMPILES_S = 600.0
-"""Ten times what a slow machine takes: for a process that hangs nothing waits longer."""
+"""Timeout of the process: ten times the time of a slow machine."""
 
 
 async def _compile_aside(of: Server) -> None:
-    """Have the models compiled by a process that leaves time to all others, and load them.
+    """Compile the models in a low-priority process, then load them.
 
-    Where nothing can be kept that was in vain: then they are compiled here, and all wait for it.
+    Without a writable cache the process has no effect: then they are compiled here, and all wait.
     """
     with warming():
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-c", _COMPILES),
             stdin=asyncio.subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for us
+            start_new_session=True,  # Ctrl-C is for the server
         )
         try:
             with suppress(OSError):
@@ -99,9 +99,9 @@ async def _compile_aside(of: Server) -> None:
 
 
 _NO_NEWS = (
-    # We refuse a handshake with an HTTP answer that says why; uvicorn takes that for a mistake.
+    # We refuse a handshake with an HTTP answer and a reason; uvicorn logs that as an error.
     "without completing handshake",
-    # It is told to the one who sent it; a log that others can fill is no log.
+    # The sender gets an answer; clients must not be able to fill the log.
     "Invalid HTTP request received",
     "Unsupported upgrade request",
 )
@@ -112,7 +112,7 @@ def _is_news(record: logging.LogRecord) -> bool:
 
 
 class _Uvicorn(uvicorn.Server):
-    """Leaves signals to its caller, and takes connections in through the doors."""
+    """uvicorn without signal handling, with limited connections."""
 
     config: DoorsConfig
 

@@ -1,7 +1,7 @@
-"""Settings of a server: one table of names, defaults and meanings.
+"""Settings of a server: names, defaults and meanings in one table.
 
 A value comes from the command line, else from an environment variable `FOOTTILE_NAME`, else from
-the TOML file named with --config, else from here.
+the TOML file named with --config, else from the default.
 """
 
 from __future__ import annotations
@@ -21,27 +21,26 @@ from service.user_folders import user_folder
 
 
 class Settings(Bounds):
-    """What a server is told; the bounds of connections are in `service.api.doors`."""
+    """Settings of a server; limits of connections are in `service.api.connection_limits`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0: on every one."""
+    """Address to listen on; 0.0.0.0: all addresses."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
-    """TCP port; 0: any that is free."""
+    """TCP port; 0: any free one."""
     data: Path = Field(default_factory=lambda: user_folder("data", None, "--data"))
-    """Folder for sessions, journals and what is known of nodes."""
+    """Folder for sessions, journals and files of nodes."""
     token: Annotated[str, Field(pattern=r"^[!-~]{8,200}$")] | None = None
-    """Asked for on every change of state; made and kept in the data folder if none is given."""
+    """Token required for changes; generated and stored in the data folder if none is given."""
     private: bool = False
-    """Is a login, or the token, asked for to look, too?"""
+    """True: reading needs a login or the token, too."""
     allow_host: tuple[str, ...] = ()
-    """Names under which the server is reached, in addition to its addresses and this machine's own
-    names."""
+    """Names of the server in addition to its addresses and this machine's own names."""
     advertise: str | None = None
-    """Address or name that is shown to people, as that of a reverse proxy; None: those found."""
+    """Address or name shown to people, as that of a reverse proxy; None: the addresses found."""
     no_quantize: bool = False
-    """Are estimates in recorded sessions as computed, and not rounded?"""
+    """True: estimates in recorded sessions are not rounded."""
 
     @field_validator("data", mode="before")
     @classmethod
@@ -53,7 +52,7 @@ class Settings(Bounds):
     @field_validator("allow_host", "trusted_proxy", mode="before")
     @classmethod
     def _split_names(cls, given: object) -> object:
-        """Split what a variable or a file has in one text: names with commas between, or JSON."""
+        """Split the text of a variable or a file: names with commas between, or JSON."""
         if not isinstance(given, str):
             return given
         if given.startswith("["):
@@ -62,7 +61,7 @@ class Settings(Bounds):
 
 
 def load_settings(config: Path | None, **given: object) -> Settings:
-    """Settings from everywhere; `given` are those of the command line that are not None.
+    """Load the settings from all sources; `given` are those of the command line that are not None.
 
     Raises:
         UsageError: the file is not readable, a name is unknown, or a value is wrong.

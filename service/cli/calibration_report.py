@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
@@ -46,8 +45,6 @@ def _weights(calibration: Calibration, tile: TileCalibration) -> Table:
         *("weight", "force\nN", "pressure\nkPa", "noise\nkPa", "settled\nkPa"),
         *("residual\nN", "95 %\nN"),
     )
-    grid = [point.gauge_kpa for point in facts.band_95]
-    halves_n = [point.new_loading_n for point in facts.band_95]
     for step in sorted(facts.steps, key=lambda step: step.force_n):
         table.add_row(
             escape(step.weight),
@@ -56,7 +53,7 @@ def _weights(calibration: Calibration, tile: TileCalibration) -> Table:
             _number(step.noise_kpa, 2),
             f"{step.settle_kpa:+.2f}",
             f"{step.residual_n:+.2f}",
-            f"±{np.interp(step.gauge_kpa, grid, halves_n):.2f}",
+            f"±{facts.half_width_n(step.gauge_kpa):.2f}",
         )
     return table
 

@@ -1,9 +1,8 @@
-"""What a recording asks for: models that are offered and not named, and their newtons.
+"""Effect of omitted models: models that are offered and not named, and their newtons.
 
-A model that is not named is run all the same, beside the others, over what was seen: how far the
-GRF lies from itself without that model is what the estimate is off by for want of it. All of it
-comes from the calibration's own parameters. `denoise` is left out: it changes no load, and takes
-most of the time.
+Each such model runs beside the others over the recorded frames. The distance of the GRF from the
+GRF without that model is the error of omitting it. All parameters come from the calibration.
+`denoise` is left out: it changes no load, and needs most of the time.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.tare.tare import Tare
 
 ASKED_FROM_N = 0.1
-"""So much of the GRF, mean absolute under load, is worth a word."""
+"""Least effect on the GRF that is reported, mean absolute under load."""
 SEEN: Mapping[str, str] = {
     "temperature": "chips have warmed or cooled since the tare",
     "ambient": "the pressure around the domes has changed",
@@ -29,18 +28,18 @@ SEEN: Mapping[str, str] = {
     "rubber": "loads last",
     "hysteresis": "loads rise and fall",
 }
-"""Models that can be asked for, and what it is that asks."""
+"""Models that are checked, and the reason for naming each."""
 _WHOLE = "whole"
 _NEWTON = 1e9  # whole nanonewtons add up to the same in any order
 
 
 class Asking:
-    """What consecutive frames of one stream ask for.
+    """Effect of omitted models on consecutive frames of one stream.
 
     Args:
         info: the array.
         calibration: of its tiles.
-        models: those that are named.
+        models: names of the models in use.
     """
 
     def __init__(self, info: ArrayInfo, calibration: Calibration, models: Sequence[str]) -> None:
@@ -54,12 +53,12 @@ class Asking:
         self._last_t_mono_ns = 0
 
     def feed(self, tare: Tare, frames: FrameBatch, loaded: Bools) -> None:
-        """Take the next frames.
+        """Estimate the next frames with and without the omitted models.
 
         Args:
             tare: in force.
             frames: n frames, in order, one at least.
-            loaded: (n,), does the foot bear load?
+            loaded: (n,), whether the foot bears load.
         """
         if tare is not self._tare:
             self._begin(tare)
@@ -79,7 +78,7 @@ class Asking:
             self._sums[name] += int(np.rint(_NEWTON * off_n).astype(np.int64).sum())
 
     def finish(self) -> dict[str, float]:
-        """Models that were asked for with the newtons that each is good for, the greatest first."""
+        """Return the omitted models that matter with their effect in newtons, largest first."""
         if not self._frames:
             return {}
         newtons = {name: total / _NEWTON / self._frames for name, total in self._sums.items()}

@@ -1,4 +1,4 @@
-"""What is known of each tile from the bench: curve, range, quality, and where it came from.
+"""Calibration of tiles from the rig: curve, range, quality, and origin.
 
 A calibration states every unit and offset; nothing is assumed (hardware.md 7). Its id is the hash
 of its content, so two calibrations of one id are the same calibration.
@@ -28,26 +28,26 @@ from service.estimation.mounted import Mounted
 
 ANY_SERIAL = "*"
 UNPROVEN = ", unproven"
-"""Behind the name of one that was written or edited by hand, wherever it is reported."""
+"""Suffix of the name of a calibration that was written or edited by hand."""
 EDITED = (
     "It was edited by hand or damaged: calibrate again; or, if the edit is meant, delete its lines "
     '"id" and "check": then it is used, and called unproven'
 )
 LOOP_OPENS_N = 1.0
 CURVE_OPENS_N = 0.2
-"""Forces at which a loop, and what a cubic misses of a curve, have opened by half: at zero load
-there is neither."""
+"""Forces at which the loop, and the misfit of the cubic, reach half of their final width; both
+are 0 at zero load."""
 BASIS = 3
-"""A cubic without constant term has three coefficients to be uncertain about."""
+"""Number of coefficients of a cubic without constant term."""
 _TILES_MAX = 256
-"""A calibration may know more tiles than an array has."""
+"""Largest number of tiles of a calibration, which may exceed that of an array."""
 _ROWS_MAX = 1000
 _Scale = Annotated[float, Field(ge=1e-9, le=1e9)]
 _Pressure = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
 class TileCalibration(CalibrationPart):
-    """The static curve of one tile.
+    """Static curve of one tile.
 
     Force in newtons: `f_offset_n + f_scale_n * poly(u)` with `u = (gauge_kpa - p_offset_kpa) /
     p_scale_kpa` and `poly` from `coefficients`, low to high; with `zero_mode` "subtract_f0" less
@@ -63,14 +63,14 @@ class TileCalibration(CalibrationPart):
     zero_mode: Literal["as_fitted", "subtract_f0"]
     coefficients: tuple[Number, Number, Number, Number]
     range_kpa: tuple[_Pressure, _Pressure]
-    """Gauge pressures that were calibrated; above them force is a lower bound."""
+    """Calibrated gauge pressures; above them force is a lower bound."""
     monotonic: bool
     absolute_scale: Literal["measured", "assumed"]
     covariance: tuple[tuple[Number, ...], ...]
-    """Of coefficients 1 to 3, in units of `f_scale_n` squared."""
+    """Covariance of coefficients 1 to 3, in units of `f_scale_n` squared."""
     relative_misfit: NotNegative
     loop_misfit_n: NotNegative
-    """How a new loading's force scatters about the curve: the variance is the sum of
+    """Scatter of a new loading's force about the curve: its variance is the sum of
     (`relative_misfit` F)^2, a gain that differs between loadings, and (`loop_misfit_n`
     `loop_share(F)`)^2, a hysteresis loop that opens with the first newton."""
     r2: Number | None
@@ -78,21 +78,21 @@ class TileCalibration(CalibrationPart):
     cv_rmse_n: Number | None
     """Leave-one-repeat-out error."""
     hysteresis_n: Number | None
-    """Greatest distance between loading and unloading branch."""
+    """Largest distance between loading and unloading branch."""
     repeats: Count
     baseline_kpa: Number | None
-    """Absolute pressure unloaded, when it was calibrated."""
+    """Absolute pressure unloaded, during the calibration."""
     noise_kpa: Number | None
     """Standard deviation of a single reading, unloaded."""
     coefficient_words: tuple[Word, Word, Word, Word] | None = None
     """Registers of the chip that was calibrated: a serial can be re-labelled, a chip can not.
     None: for any chip, as a preset is."""
     effects: Effects = Effects()
-    """What of the dome beside its static curve is known."""
+    """Parameters of the dome beside its static curve."""
     bench: BenchFacts | None = None
-    """What the recordings were like; None for a preset, and for dead weights."""
+    """Facts about the slow strokes; None for a preset, and for dead weights."""
     weights: WeightFacts | None = None
-    """The dead weights that the curve was fitted to; None: it was not."""
+    """Dead weights that the curve was fitted to; None: slow strokes, or a preset."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -122,29 +122,29 @@ class TileCalibration(CalibrationPart):
 
     @property
     def range_u(self) -> tuple[float, float]:
-        """The calibrated range in the polynomial's variable."""
+        """Calibrated range in the polynomial's variable."""
         low, high = ((p - self.p_offset_kpa) / self.p_scale_kpa for p in self.range_kpa)
         return low, high
 
 
 class Calibration(CalibrationPart):
-    """Calibrations of tiles by serial, with the reference they were made against."""
+    """Calibrations of tiles by serial, with their force reference."""
 
     version: Literal[1] = 1
     name: Label
     reference: Text
-    """The force sensor, or the publication, that the scale comes from."""
+    """Force sensor, or publication, that defines the scale."""
     date: Label
-    """ISO 8601, of the recordings."""
+    """Date of the recordings, ISO 8601."""
     tiles: Annotated[tuple[TileCalibration, ...], Field(max_length=_TILES_MAX)]
     refused: Annotated[dict[Label, Text], Field(max_length=_TILES_MAX)] = Field(default={})
-    """Serials that were pressed as well, and why they have no curve."""
+    """Serials that were loaded too, and the reason for having no curve."""
     mounted: Mounted | None = None
-    """What a plate has shown of the foot that these tiles are mounted on; None: nothing has."""
+    """Mount calibration against a force plate; None: there is none."""
 
     @model_serializer(mode="wrap")
     def _unmounted_as_before(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """What no plate has seen is not written: the ids of older calibrations stay theirs."""
+        """Omit an absent mount calibration, so that ids of older calibrations stay the same."""
         content: dict[str, Any] = written(self)
         if self.mounted is None:
             content.pop("mounted", None)
@@ -152,18 +152,18 @@ class Calibration(CalibrationPart):
 
     @property
     def id(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of the content."""
+        """Identifier: first 16 hexadecimal digits of the SHA-256 of the content."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
     def find(self, serial: str) -> TileCalibration | None:
-        """The entry for a serial; None without one, as for bare tiles, which bear no load."""
+        """Return the entry for a serial; None without one, as for bare tiles."""
         for tile in self.tiles:
             if tile.serial in (serial, ANY_SERIAL):
                 return tile
         return None
 
     def of(self, serial: str) -> TileCalibration:
-        """The entry for a serial.
+        """Return the entry for a serial.
 
         Raises:
             CalibrationError: there is none.
@@ -181,17 +181,17 @@ class Calibration(CalibrationPart):
         )
 
     def gain(self, serial: str) -> Parameter | None:
-        """Of a tile as it is mounted, to its bench; None: no plate has told."""
+        """Return a tile's gain as mounted, over that in the rig; None: not measured."""
         return None if self.mounted is None else self.mounted.gains.get(serial)
 
     def to_json(self) -> str:
-        """Text of a calibration file; the id is in it for people, and checked when read."""
+        """Serialize to the text of a calibration file; its id is checked when read."""
         content = {"id": self.id, **self.model_dump(mode="json")}
         return json.dumps(content, indent=2) + "\n"
 
     @classmethod
     def from_json(cls, text: str, *, where: str) -> Calibration:
-        """Read a calibration file. One without an id was written or edited by hand.
+        """Parse a calibration file; one without an id was written or edited by hand.
 
         Raises:
             CalibrationError: not JSON, a field is missing or unknown, or the id does not match.
@@ -225,12 +225,12 @@ class Calibration(CalibrationPart):
 
 
 def loop_share(force_n: Floats) -> Floats:
-    """How far a hysteresis loop is open at a force: 0 at zero load, half at one newton."""
+    """Return the width of the loop at a force over the final one: 0 at 0 N, a half at 1 N."""
     return np.asarray(1.0 - LOOP_OPENS_N / (np.abs(force_n) + LOOP_OPENS_N))
 
 
 def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:
-    """Whether the cubic rises all over `range_u`: its slope is a parabola, ends and vertex tell."""
+    """Return whether the cubic rises all over `range_u`, by its slope at ends and vertex."""
     _, c1, c2, c3 = coefficients
     places = list(range_u)
     if c3 != 0.0 and range_u[0] < (vertex := -c2 / (3 * c3)) < range_u[1]:
@@ -239,7 +239,7 @@ def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) ->
 
 
 def paper_eq2_shape() -> Calibration:
-    """The paper's eq. 2 as a shape, for any tile, with an assumed scale.
+    """Make the preset of the paper's eq. 2 as a shape, for any tile, with an assumed scale.
 
     F = 0.13 p^3 + 0.02354 p^2 + 0.5702 p + 0.1309 has no stated units, and no reading in SI units
     gives the paper's 25 to 35 N at saturation (hardware.md 7). So: p = gauge / 15 kPa, zero at zero
@@ -283,49 +283,49 @@ PRESETS = {"paper-eq2-shape": paper_eq2_shape}
 
 
 class BandPoint(CalibrationPart):
-    """The curve at one pressure, with half widths of its 95 % bands."""
+    """Curve at one pressure, with half widths of its 95 % bands."""
 
     gauge_kpa: Number
     force_n: Number
     mean_n: NotNegative
-    """Of the mean curve."""
+    """Half width for the mean curve."""
     new_loading_n: NotNegative
-    """Of a reading in a single new loading."""
+    """Half width for a reading in a single new loading."""
 
 
 class BenchFacts(CalibrationPart):
-    """Facts about the slow strokes that a curve was fitted to."""
+    """Facts about the slow strokes of a curve's fit."""
 
     recordings: Annotated[int, Field(ge=1, lt=2**31)]
     """Files with slow strokes of the tile."""
     end_n: Number
     """Reference force where the range ends, mean over repeats."""
     end_absolute_kpa: Number
-    """Pressure where the range ends: baseline and range."""
+    """Absolute pressure where the range ends: baseline plus range."""
     spare_kpa: Number
-    """What of the chip's 115 kPa is left there; negative: beyond its rating."""
+    """Distance from there to the chip's 115 kPa; negative: beyond its rating."""
     ended_by: Literal["load", "chip"]
-    """"load": the spindle turned back, and the tile would have gone on; "chip": its reading went no
-    further, by wrapping or standing still."""
+    """"load": the spindle turned back before the tile saturated; "chip": its reading wrapped or
+    stood still."""
     tadc_counts: Number | None
     """Chip's temperature in counts, unloaded; None: not recorded."""
     degc: Number | None
-    """The same, indicative: good to a few degrees."""
+    """Chip's temperature, to a few degrees."""
     r2_of_mean: Number
-    """Of the cubic to the mean of all repeats and both branches, as the paper states it."""
+    """R2 of the cubic to the mean of all repeats and both branches, as in the paper."""
     repeat_gains: Annotated[tuple[Number, ...], Field(max_length=_ROWS_MAX)]
-    """Force of each repeat over that of the curve."""
+    """Force of each repeat over the curve's."""
     baseline_drift_kpa: NotNegative
-    """Greatest change of the unloaded pressure between repeats of a file, from the second on."""
+    """Largest change of the unloaded pressure between repeats of a file, from the second on."""
     band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
-    """At ten equal steps from zero to the end of the range."""
+    """Bands at ten equal steps from zero to the end of the range."""
 
 
 class WeightStep(CalibrationPart):
-    """A dead weight on a tile, and what the tile read after it had settled."""
+    """Dead weight on a tile, and the tile's settled reading."""
 
     weight: Label
-    """As it was written: `500 g +-0.5 %`."""
+    """Text of the marker: `500 g +-0.5 %`."""
     force_n: Number
     gauge_kpa: Number
     noise_kpa: NotNegative
@@ -337,12 +337,17 @@ class WeightStep(CalibrationPart):
 
 
 class WeightFacts(CalibrationPart):
-    """Facts about the dead weights that a curve was fitted to."""
+    """Facts about the dead weights of a curve's fit."""
 
     steps: Annotated[tuple[WeightStep, ...], Field(max_length=_ROWS_MAX)]
     baseline_drift_kpa: NotNegative
-    """Greatest change of the unloaded pressure since the first rest."""
+    """Largest change of the unloaded pressure since the first rest."""
     scale_sigma: NotNegative
-    """Standard uncertainty of the weights' common scale, a part of the force."""
+    """Standard uncertainty of the weights' common scale, relative."""
     band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
-    """At ten equal steps; `new_loading_n` is what an estimate of a settled load states."""
+    """Bands at ten equal steps; `new_loading_n` is for an estimate of a settled load."""
+
+    def half_width_n(self, gauge_kpa: float) -> float:
+        """Return the half width of the 95 % interval of a new loading at this pressure."""
+        grid = [point.gauge_kpa for point in self.band_95]
+        return float(np.interp(gauge_kpa, grid, [point.new_loading_n for point in self.band_95]))

@@ -1,8 +1,8 @@
-"""Which dome for which load: the paper's Table I, Boyle's law, and what follows from them.
+"""Choice of a dome for a load, by the paper's Table I and Boyle's law.
 
 The paper gives the range of one dome only, 25 to 35 N for 11 mm of Vytaflex 60 (III-A). For the
-others there is a scaling, marked as an estimate, and nothing else: their curves are not
-published. PAPER is Ruppert and Badri-Sproewitz 2020, [D] a derivation in hardware.md 9.
+others there is only a scaling, marked as an estimate: their curves are not published. PAPER is
+Ruppert and Badri-Sproewitz 2020, [D] a derivation in hardware.md 9.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Literal
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 
 SEAL_KPA = 100.0
-"""Pressure at which a bubble is sealed, about (PAPER II-A)."""
+"""Approximate pressure at which a bubble is sealed (PAPER II-A)."""
 ISOTHERMAL = 1.0
 ADIABATIC = 1.4
-"""Of air; a real load lies between the two, with a polytropic exponent that depends on how fast it
-comes, against a relaxation of 5 to 42 ms ([D])."""
+"""Exponents of air; a real load has a polytropic exponent between the two, by its speed against a
+relaxation of 5 to 42 ms ([D])."""
 BUBBLE_RADIUS_MM = 3.0
-"""PAPER Table I, for the 11 mm dome; taken for the others."""
+"""PAPER Table I, for the 11 mm dome; assumed for the others."""
 
 Basis = Literal["paper", "estimate"]
 Verdict = Literal["covers", "perhaps", "saturates"]
@@ -28,10 +28,10 @@ Verdict = Literal["covers", "perhaps", "saturates"]
 
 @dataclass(frozen=True)
 class Material:
-    """A polyurethane of the paper's Table I.
+    """Polyurethane of the paper's Table I.
 
-    Its modulus is as the paper gives it, which is almost surely the maker's modulus at 100 % strain
-    and not the small-strain one ([D]).
+    Its modulus in the paper is almost surely the maker's at 100 % strain, not the small-strain one
+    ([D]).
     """
 
     name: str
@@ -44,19 +44,19 @@ VYTAFLEX_60 = Material("Vytaflex 60", 2.17)
 
 @dataclass(frozen=True)
 class Dome:
-    """One of the paper's domes."""
+    """Dome of the paper's Table I."""
 
     material: Material
     diameter_mm: float
 
     @property
     def name(self) -> str:
-        """As `v60-11`: material and diameter."""
+        """Name such as `v60-11`: material and diameter."""
         return f"v{self.material.name.split()[-1]}-{self.diameter_mm:.0f}"
 
     @property
     def area_mm2(self) -> float:
-        """Of its base."""
+        """Area of the base."""
         return pi * (self.diameter_mm / 2) ** 2
 
 
@@ -65,17 +65,17 @@ DOMES = tuple(
     for material in (VYTAFLEX_40, VYTAFLEX_60)
     for diameter_mm in (10.0, 11.0, 12.0)
 )
-"""PAPER Table I."""
+"""Domes of PAPER Table I."""
 PAPER_DOME = Dome(VYTAFLEX_60, 11.0)
-"""The one that was built (PAPER III-A)."""
+"""Dome that was built (PAPER III-A)."""
 PAPER_RANGE_N = (25.0, 35.0)
-"""Load at which it reaches the chip's end (PAPER III-A)."""
+"""Load at which that dome saturates its chip (PAPER III-A)."""
 
 
 def volume_left(
     p1_kpa: float = SEAL_KPA, p2_kpa: float = PRESSURE_MAX_KPA, exponent: float = ISOTHERMAL
 ) -> float:
-    """V2/V1 of a bubble that goes from p1 to p2: p1 V1^k = p2 V2^k.
+    """Return V2/V1 of a bubble that goes from p1 to p2: p1 V1^k = p2 V2^k.
 
     Slowly, k = 1, this is Boyle's law (PAPER eq. 1): 0.8696 is left at 115 kPa, 13 % are gone. Fast
     loads reach full scale earlier: k = 1.4 leaves 0.9050.
@@ -84,16 +84,16 @@ def volume_left(
 
 
 def fast_share(p1_kpa: float = SEAL_KPA, exponent: float = ADIABATIC) -> float:
-    """Part of the slow full-scale change of volume that a fast load needs for full scale: 0.73.
+    """Return the change of volume of a fast load at full scale over that of a slow one: 0.73.
 
-    As far as volume follows force in proportion, also the part of the load ([D], estimate).
+    With volume proportional to force this is also the ratio of the loads ([D], estimate).
     """
     fast = 1.0 - volume_left(p1_kpa, exponent=exponent)
     return fast / (1.0 - volume_left(p1_kpa))
 
 
 def give_per_kpa(dome: Dome, bubble_radius_mm: float = BUBBLE_RADIUS_MM) -> float:
-    """Part of the bubble's volume that its wall gives way for a kPa of pressure difference.
+    """Return the compliance of the wall: part of the bubble's volume for a kPa of difference.
 
     Thick sphere of an incompressible rubber, 9 b^3 / (4 E (b^3 - a^3)): 0.00124 for Vytaflex 60,
     0.00389 for Vytaflex 40, both of 11 mm ([D], estimate: half a sphere on a board is no sphere).
@@ -103,7 +103,7 @@ def give_per_kpa(dome: Dome, bubble_radius_mm: float = BUBBLE_RADIUS_MM) -> floa
 
 
 def external_share(dome: Dome, p1_kpa: float = SEAL_KPA) -> float:
-    """Part of a change of the surrounding pressure that the bubble sees.
+    """Return the part of a change of the surrounding pressure that reaches the bubble.
 
     11 % in Vytaflex 60 and 28 % in Vytaflex 40, both of 11 mm ([D], estimate): weather, height, and
     the depth of mud. The gas' own stiffness is its pressure.
@@ -114,7 +114,7 @@ def external_share(dome: Dome, p1_kpa: float = SEAL_KPA) -> float:
 
 @dataclass(frozen=True)
 class DomeRange:
-    """Load at which a dome reaches the chip's end, slowly, and how that is known."""
+    """Range of slow loads at which a dome saturates its chip, with its source."""
 
     dome: Dome
     low_n: float
@@ -122,17 +122,17 @@ class DomeRange:
     basis: Basis
 
     def verdict(self, load_n: float) -> Verdict:
-        """Whether it bears a slow load without saturating."""
+        """Return whether the dome covers a slow load without saturating."""
         if load_n <= self.low_n:
             return "covers"
         return "perhaps" if load_n <= self.high_n else "saturates"
 
 
 def range_of(dome: Dome) -> DomeRange:
-    """The paper's range for the paper's dome; for others scaled by modulus and area.
+    """Return the saturation load: the paper's for its dome, else scaled by modulus and area.
 
-    The scaling takes the same shape and strain at full scale. It agrees with the paper in direction
-    only: stiffer and larger domes shift the curve to higher force (PAPER Fig. 5).
+    The scaling assumes the same shape and strain at full scale. It agrees with the paper in
+    direction only: stiffer and larger domes shift the curve to higher force (PAPER Fig. 5).
     """
     if dome == PAPER_DOME:
         return DomeRange(dome, *PAPER_RANGE_N, "paper")
@@ -143,14 +143,14 @@ def range_of(dome: Dome) -> DomeRange:
 
 
 def ranges() -> list[DomeRange]:
-    """All domes of Table I, weakest first."""
+    """Return the saturation loads of all domes of Table I, weakest first."""
     return sorted((range_of(dome) for dome in DOMES), key=lambda found: found.low_n)
 
 
 def dome_for(load_n: float) -> DomeRange | None:
-    """The weakest dome that covers a slow load, which resolves it best.
+    """Return the weakest dome that covers a slow load; it resolves the load best.
 
-    Where none does for certain, the weakest that perhaps does; None if all saturate.
+    If none does for certain, the weakest that perhaps does; None if all saturate.
 
     Raises:
         ValueError: no load.

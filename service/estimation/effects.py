@@ -1,7 +1,7 @@
-"""What a bench recording shows of a tile beside its static curve: gas, rubber, hysteresis, warmth.
+"""Effects of a dome beside its static curve: gas, rubber, hysteresis, temperature.
 
-Every parameter stands with its 95 % interval. What a recording does not determine is not here: the
-model that needs it is not offered for that tile, and `refused` says why.
+Every parameter has its 95 % interval. A recording may not determine an effect: its model is then
+not offered for that tile, and `refused` has the reason.
 """
 
 from __future__ import annotations
@@ -16,52 +16,52 @@ from devices.arrays import Floats
 from devices.facts import Facts, Text
 
 WALL_PER_KPA = 0.00124
-"""Part of the bubble's volume that the wall gives way for a kPa: elastic estimate for Vytaflex 60
-(hardware.md 9), where a soak at two temperatures does not tell."""
+"""Compliance of the wall, part of the bubble's volume for a kPa: elastic estimate for Vytaflex 60
+(hardware.md 9), used without a thermal soak at two temperatures."""
 
 MISFIT_MIN = 0.1
-"""No correction is better than this, however well it fits a bench: a single time stands for a
+"""Least misfit of a correction, however well it fits the rig: a single time constant stands for a
 sphere's many, two terms for a spectrum, three plays for a continuum."""
 
 EffectName = Literal["temperature", "ambient", "gas", "rubber", "hysteresis"]
 
 
 _MOST = 1e12
-"""Far beyond every quantity here, and near enough that no sum, product or cube overflows."""
+"""Bound beyond every quantity here, whose sums, products and cubes do not overflow."""
 Number = Annotated[float, Field(ge=-_MOST, le=_MOST)]
 NotNegative = Annotated[float, Field(ge=0, le=_MOST)]
 PARTS_MAX = 32
 Some = Field(max_length=PARTS_MAX)
-"""Of parts that a model has some of."""
+"""Bound of the number of terms of a model."""
 
 
 class CalibrationPart(Facts):
-    """A part of a calibration file."""
+    """Base of the parts of a calibration file."""
 
 
 class Parameter(CalibrationPart):
-    """A fitted value and its standard uncertainty."""
+    """Fitted value with its standard uncertainty."""
 
     value: Number
     sigma: NotNegative
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Interval that holds it in 95 of 100 cases."""
+        """95 % interval."""
         return self.value - 1.96 * self.sigma, self.value + 1.96 * self.sigma
 
 
 def values(parameters: Iterable[Parameter]) -> Floats:
-    """Values without their uncertainties, (n,)."""
+    """Return the values of parameters without their uncertainties, (n,)."""
     return np.array([parameter.value for parameter in parameters])
 
 
 GAMMA_MOST = 5.0 / 3.0
-"""Of one atom: no gas has a greater ratio of heat capacities."""
+"""Largest ratio of heat capacities of any gas, that of single atoms."""
 
 
 class GasEffect(CalibrationPart):
-    """Of the model `gas`."""
+    """Parameters of the model `gas`."""
 
     gamma: Parameter
     tau_s: Parameter
@@ -76,7 +76,7 @@ class GasEffect(CalibrationPart):
 
 
 class RubberEffect(CalibrationPart):
-    """Of the model `rubber`, with the curve of forces that have lasted, beneath creep and loop.
+    """Parameters of the model `rubber`, with the curve of settled forces, beneath creep and loop.
 
     Curve as in `TileCalibration`, in the same variable and units.
     """
@@ -90,7 +90,7 @@ class RubberEffect(CalibrationPart):
     misfit: NotNegative
     """Part of the correction that the bench shows to be wrong, root mean square."""
     curve_misfit_n: NotNegative
-    """How far a cubic is off where slow strokes agree with one another, root mean square."""
+    """Root mean square misfit of the cubic where slow strokes agree with one another."""
 
     @model_validator(mode="after")
     def _can_be_undone(self) -> Self:
@@ -101,22 +101,22 @@ class RubberEffect(CalibrationPart):
 
 
 PART_MOST = 0.4
-"""Of a change of force: up to here the force is found from what appears of it, come what may."""
+"""Largest part of a change of force for which the inversion always converges."""
 POWERS = (1.5, 10.0)
-"""Of the flow: from nearly an exponential to nearly a play."""
+"""Range of the flow's exponent: from nearly an exponential to nearly a play."""
 STRESS_LEAST_N = 0.01
-"""What bears less is not seen."""
+"""Least stress of a branch that a recording shows."""
 
 
 class FlowEffect(CalibrationPart):
-    """Of the model `hysteresis`: its branch that flows."""
+    """Parameters of the viscous branch of the model `hysteresis`."""
 
     part: Parameter
-    """Of a change of force, that the branch bears at first."""
+    """Part of a change of force that the branch carries at first."""
     stress_n: Parameter
-    """What it bears of a force that changes as in a slow stroke."""
+    """Force on the branch during a slow stroke."""
     power: Parameter
-    """Of its flow over what it bears."""
+    """Exponent of the flow over the force on the branch."""
 
     @model_validator(mode="after")
     def _can_be_undone(self) -> Self:
@@ -132,7 +132,7 @@ class FlowEffect(CalibrationPart):
 
 
 class HysteresisEffect(CalibrationPart):
-    """Of the model `hysteresis`: parts of its plays, and the branch that flows; None: none does."""
+    """Parameters of the model `hysteresis`: weights of its plays, and a viscous branch or None."""
 
     part: Annotated[tuple[Parameter, ...], Some]
     flow: FlowEffect | None = None
@@ -144,7 +144,7 @@ class HysteresisEffect(CalibrationPart):
 
     @model_serializer(mode="wrap")
     def _without_a_branch_as_before(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A branch that is not there is not written: the ids of older calibrations stay theirs."""
+        """Omit an absent branch, so that ids of older calibrations stay the same."""
         content: dict[str, Any] = written(self)
         if self.flow is None:
             content.pop("flow", None)
@@ -152,14 +152,14 @@ class HysteresisEffect(CalibrationPart):
 
 
 class TemperatureEffect(CalibrationPart):
-    """Of the model `temperature`, and of `ambient`, which needs the wall's give."""
+    """Parameters of the model `temperature`; `ambient` needs the wall's compliance."""
 
     kpa_per_k: Parameter
     """Rise of the baseline with the gas' temperature."""
     lag_s: Parameter
-    """How long the gas is behind its chip; negative where the chip is behind its gas."""
+    """Lag of the gas behind its chip; negative where the chip lags."""
     wall_per_kpa: Parameter
-    """Part of the volume that the wall gives way for a kPa, by how much less than p/T it is."""
+    """Compliance of the wall, part of the volume for a kPa, from the rise's deficit below p/T."""
 
     @model_validator(mode="after")
     def _can_be_undone(self) -> Self:
@@ -169,25 +169,25 @@ class TemperatureEffect(CalibrationPart):
 
 
 LATE_MOST_S = 60.0
-"""Nor does any frame take longer; and instants, in nanoseconds, have 64 bits."""
+"""Largest delay of a sample, so that instants fit into 64 bits."""
 
 
 class Effects(CalibrationPart):
-    """All that the recording determined; None otherwise, and `refused` says why."""
+    """Effects that the recordings determined; None otherwise, with the reason in `refused`."""
 
     gas: GasEffect | None = None
     rubber: RubberEffect | None = None
     hysteresis: HysteresisEffect | None = None
     temperature: TemperatureEffect | None = None
     late_s: Parameter | None = None
-    """How much later the tile is sampled than its frames say: where in a conversion the chip does
-    so is not documented. None: no fast loads told."""
+    """Delay of the tile's samples behind the instants in its frames: the data sheet does not say
+    where in a conversion the chip samples. None: not determined, for want of fast loads."""
     late_common_s: NotNegative = 0.0
-    """Standard uncertainty that all tiles' `late_s` share: that of the reference's own delay."""
+    """Standard uncertainty that all tiles' `late_s` share, by the reference's own delay."""
     reference_late_s: Number = 0.0
-    """How late the reference was taken to be: the bench saw the tile later by `late_s` and that."""
+    """Assumed delay of the reference; the rig measured the sum of `late_s` and this."""
     at_bound: Annotated[tuple[Text, ...], Some] = ()
-    """Parameters that were found at the end of what is possible."""
+    """Parameters at a bound."""
     refused: dict[EffectName, Text] = Field(default={})
 
     @model_validator(mode="after")
@@ -198,7 +198,7 @@ class Effects(CalibrationPart):
 
     @property
     def wall_per_kpa(self) -> float:
-        """As measured in the soak, else the estimate for the material."""
+        """Compliance of the wall from the thermal soak, else the estimate for the material."""
         return WALL_PER_KPA if self.temperature is None else self.temperature.wall_per_kpa.value
 
 

@@ -1,15 +1,15 @@
-"""Frames in, estimates out: one code path for ten rows live and ten million offline.
+"""Estimator: frames to estimates, with one code path for ten rows live and ten million offline.
 
-`step` takes the next frames and gives the estimates that are now due, `finish` those that are left.
-Estimates come `lag` later than their frames, in order, exactly one per frame. Any way of cutting a
-recording into batches gives the same bits: everything is done frame by frame, tile by tile, in one
-compiled function, and what is remembered stays in records that it writes to.
+`process_frames` returns the estimates that are due, `finish` the remaining ones. Estimates come a
+look-ahead later than their frames, in order, exactly one per frame. Any batches of a recording give
+the same bits: one compiled function works frame by frame and tile by tile, and its state is in
+records.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -26,12 +26,12 @@ from service.estimation.ladder import whole
 from service.estimation.ladder.laws import Laws, make_laws
 from service.estimation.ladder.lower import feel
 from service.estimation.ladder.plan import EstimationPlan
-from service.estimation.ladder.room import ROWS_LEAST, Room, make_room, moved
-from service.estimation.ladder.state import at_rest
+from service.estimation.ladder.room import ROWS_LEAST, Room, TileSample, make_room, moved
+from service.estimation.ladder.state import FootState, TileState, at_rest
 from service.estimation.ladder.taken import take
-from service.estimation.ladder.upper import BORNE, BOUND_SIGMAS, bear
+from service.estimation.ladder.upper import BORNE, BOUND_SIGMAS, TileForce, bear
 from service.estimation.models import denoise
-from service.estimation.records import Columns, Record, Records, as_bytes
+from service.estimation.records import Columns, RecordArray, as_bytes
 
 _COP_MASKED = int(EstimateStatus.COP_MASKED)
 _AFTER_SATURATION = int(EstimateStatus.AFTER_SATURATION)
@@ -52,7 +52,9 @@ _COLUMNS = (
     "status",
     "frame_status",
 )
-"""Of frames, in the order in which `_step` takes them."""
+"""Columns of frames, in the order of the parameters of `_step`."""
+_ROWS = ("release_row", "sample_row", "end_row")
+"""Rows of the buffer in `FootState`."""
 Answers = tuple[
     npt.NDArray[np.uint64],
     Times,
@@ -64,21 +66,23 @@ Answers = tuple[
 
 
 class Estimator:
-    """Estimates of consecutive frames of one stream, with one tare.
+    """Estimator of consecutive frames of one stream, with one tare.
 
     Args:
-        plan: constants of the estimate.
+        plan: parameters of the estimate.
     """
 
     def __init__(self, plan: EstimationPlan) -> None:
         self.plan = plan
-        self._laws = make_laws(plan)
+        self._params = make_laws(plan)
         tiles = len(plan.info.tiles)
-        self._scene, self._tiles = at_rest(tiles)
-        self._room = make_room(ROWS_LEAST, tiles)
+        self._foot_state, self._tile_states = at_rest(tiles)
+        self._buffer = make_room(ROWS_LEAST, tiles)
+        axes = zip(whole.ALONG, plan.cop_measured, strict=True)
+        self._unmeasured = [row for rows, is_measured in axes if not is_measured for row in rows]
 
     def step(self, frames: FrameBatch) -> Estimates:
-        """Take the next frames, in order; return the estimates that are due.
+        """Process the next frames, in order; return the estimates that are due.
 
         Args:
             frames: n frames with rising `seq` and `t_mono_ns`.
@@ -87,74 +91,78 @@ class Estimator:
             The estimates due; any number, possibly none.
 
         Raises:
-            ValueError: the frames are not of as many tiles as the plan; compiled code would read
-                beside them.
+            ValueError: frames and plan differ in the number of tiles; compiled code would read
+                beyond their memory.
         """
         n = len(frames)
-        if frames.tile_count != len(self._tiles):
-            raise ValueError(f"frames of {frames.tile_count} tiles, a plan of {len(self._tiles)}")
-        if self._scene["end"][0] + n > len(self._room.rows):
+        tiles = len(self._tile_states)
+        if frames.tile_count != tiles:
+            raise ValueError(f"frames of {frames.tile_count} tiles, a plan of {tiles}")
+        if self._foot_state["end_row"][0] + n > len(self._buffer.rows):
             self._make_room(n)
         columns = [_as_compiled(getattr(frames, name)) for name in _COLUMNS]
-        return _estimates(_step(self._laws, self._scene, self._tiles, self._room, *columns))
+        output = _step(self._params, self._foot_state, self._tile_states, self._buffer, *columns)
+        return _estimates(output, self._unmeasured)
 
     def finish(self) -> Estimates | None:
-        """The estimates that still wait for their look-ahead, at the end; None if none wait."""
-        if self._scene["due"][0] == self._scene["end"][0]:
+        """Return the estimates that still wait for their look-ahead; None if there are none."""
+        if self._foot_state["release_row"][0] == self._foot_state["end_row"][0]:
             return None
-        return _estimates(_finish(self._laws, self._scene, self._tiles, self._room))
+        output = _finish(self._params, self._foot_state, self._tile_states, self._buffer)
+        return _estimates(output, self._unmeasured)
 
     def kept(self) -> Columns:
-        """All that it remembers, for another one to go on with; records as their bytes."""
-        self._make_room(0)  # rows that nothing reaches back to any more are not worth keeping
+        """Return a copy of its state for `from_state`; records as their bytes."""
+        self._make_room(0)  # drops rows that nothing reaches back to
         return {name: as_bytes(column).copy() for name, column in self._memory().items()}
 
     @classmethod
     def going_on(cls, plan: EstimationPlan, kept: Columns) -> Self:
-        """One that goes on with what another has kept: both together give the bits of one.
+        """Make an estimator that continues from a state, with the bits of an uninterrupted one.
 
         Args:
-            plan: the other's.
-            kept: by it, in this very version.
+            plan: plan of the estimator that the state comes from.
+            kept: answer of `state_dict`, of the same version.
 
         Raises:
-            ValueError: it is of another plan; compiled code would read beside it.
+            ValueError: the state is of another plan; compiled code would read beyond its memory.
         """
         new = cls(plan)
         rows = len(kept["t_mono_ns"])
-        new._room = make_room(max(ROWS_LEAST, rows), len(new._tiles))
-        new._scene["end"] = rows
+        new._buffer = make_room(max(ROWS_LEAST, rows), len(new._tile_states))
+        new._foot_state["end_row"] = rows
         for name, column in new._memory().items():
             memory, given = as_bytes(column), kept[name]
             if (given.dtype, given.shape) != (memory.dtype, memory.shape):
                 raise ValueError(f"{name} is {given.dtype}{given.shape}, not {memory.shape}")
             memory[...] = given
-        due, read, end = (int(new._scene[mark][0]) for mark in ("due", "read", "end"))
-        if not 0 <= due <= read <= end == rows:
-            raise ValueError(f"its rows are {due}, {read}, {end} of {rows}")
+        due, sample, end = (int(new._foot_state[name][0]) for name in _ROWS)
+        if not 0 <= due <= sample <= end == rows:
+            raise ValueError(f"its rows are {due}, {sample}, {end} of {rows}")
         return new
 
     def _memory(self) -> Columns:
-        end = int(self._scene["end"][0])
-        room = {name: column[:end] for name, column in self._room._asdict().items()}
-        return {"scene": self._scene, "tiles": self._tiles, **room}
+        end = int(self._foot_state["end_row"][0])
+        rows = {name: column[:end] for name, column in self._buffer._asdict().items()}
+        states = {"foot_state": self._foot_state, "tile_states": self._tile_states}
+        return cast("Columns", {**states, **rows})
 
     def _make_room(self, more: int) -> None:
-        scene = self._scene[0]
-        keep = min(scene["due"], max(scene["read"] - 1, 0))
-        if self.plan.ladder.denoise and scene["end"]:
-            t_mono_ns = self._room.t_mono_ns[: scene["end"]]
-            # The next one may not be here yet; it will be no earlier than the last that is.
-            oldest_ns = t_mono_ns[min(scene["due"], scene["end"] - 1)] - denoise.PAST_NS
+        due, sample, end = (int(self._foot_state[name][0]) for name in _ROWS)
+        first = min(due, max(sample - 1, 0))
+        if self.plan.ladder.denoise and end:
+            t_mono_ns = self._buffer.t_mono_ns[:end]
+            # The next frame may not be here yet; it will be no earlier than the last that is.
+            oldest_ns = t_mono_ns[min(due, end - 1)] - denoise.PAST_NS
             within = int(np.searchsorted(t_mono_ns, oldest_ns))
-            keep = min(keep, max(within, scene["due"] - int(denoise.REACHES[-1])))
-        self._room = moved(self._room, keep, scene["end"], more)
-        for mark in ("due", "read", "end"):
-            scene[mark] -= keep
+            first = min(first, max(within, due - int(denoise.REACHES[-1])))
+        self._buffer = moved(self._buffer, first, end, more)
+        for name in _ROWS:
+            self._foot_state[name] -= first
 
 
 def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """In row order, aligned and read-only, as frames of a message are: compiled once, for that."""
+    """Return a column in row order, aligned and read-only: compiled for that only."""
     if column.flags.num & _LAYOUT == _COMPILED_LAYOUT:
         return column
     column = np.array(column, order="C")
@@ -162,8 +170,10 @@ def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return column
 
 
-def _estimates(answers: Answers) -> Estimates:
+def _estimates(answers: Answers, unmeasured: list[int]) -> Estimates:
     seq, t_ns, by_tile, by_frame, contact, status = answers
+    # Afterwards: masking of the centre of pressure needs the row's position.
+    by_frame[unmeasured] = math.nan
     return Estimates(
         seq=seq,
         t_ns=t_ns,
@@ -189,110 +199,128 @@ def _estimates(answers: Answers) -> Estimates:
 
 @compiled
 def _step(
-    laws: Laws,
-    scenes: Records,
-    tiles: Records,
-    room: Room,
+    params: Laws,
+    foot_states: RecordArray[FootState],
+    tile_states: RecordArray[TileState],
+    buffer: Room,
     seq: npt.NDArray[np.uint64],
     t_mono_ns: Times,
     t_ns: Times,
-    padc: npt.NDArray[np.uint16],
-    tadc: npt.NDArray[np.uint16],
+    pressure_raw: npt.NDArray[np.uint16],
+    temperature_raw: npt.NDArray[np.uint16],
     sample_offset_us: npt.NDArray[np.int32],
     servo_counts: npt.NDArray[np.int32],
     servo_age_us: npt.NDArray[np.int32],
-    status: npt.NDArray[np.uint8],
-    frame_status: npt.NDArray[np.uint8],
+    tile_flags: npt.NDArray[np.uint8],
+    frame_flags: npt.NDArray[np.uint8],
 ) -> Answers:
-    scene = scenes[0]
+    foot_params, foot_state = params.foot[0], foot_states[0]
     take(
-        laws, scene, tiles, room, seq, t_mono_ns, t_ns, padc, tadc, sample_offset_us, servo_counts,
-        servo_age_us, status, frame_status,
+        params, foot_state, tile_states, buffer, seq, t_mono_ns, t_ns, pressure_raw,
+        temperature_raw, sample_offset_us, servo_counts, servo_age_us, tile_flags, frame_flags,
     )  # fmt: skip
-    # With look-ahead and averages, a frame waits for the next to show whether it is an outlier.
-    while scene.read < scene.end - laws.scene[0].waits:
-        feel(laws, scene, tiles, room, scene.read)
-        scene.read += 1
-    until = scene.due
-    while until < scene.read and room.t_mono_ns[until] <= scene.newest_ns - laws.scene[0].lag_ns:
+    # With look-ahead and averages, a frame waits for the next one, for outlier replacement.
+    while foot_state.sample_row < foot_state.end_row - foot_params.waits_for_next:
+        feel(params, foot_state, tile_states, buffer, foot_state.sample_row)
+        foot_state.sample_row += 1
+    until, due_ns = foot_state.release_row, foot_state.newest_ns - foot_params.lag_ns
+    while until < foot_state.sample_row and buffer.t_mono_ns[until] <= due_ns:
         until += 1
-    return _released(laws, scene, tiles, room, until)
+    return _released(params, foot_state, tile_states, buffer, until)
 
 
 @compiled
-def _finish(laws: Laws, scenes: Records, tiles: Records, room: Room) -> Answers:
-    scene = scenes[0]
-    while scene.read < scene.end:
-        feel(laws, scene, tiles, room, scene.read)
-        scene.read += 1
-    return _released(laws, scene, tiles, room, scene.end)
+def _finish(
+    params: Laws,
+    foot_states: RecordArray[FootState],
+    tile_states: RecordArray[TileState],
+    buffer: Room,
+) -> Answers:
+    foot_state = foot_states[0]
+    while foot_state.sample_row < foot_state.end_row:
+        feel(params, foot_state, tile_states, buffer, foot_state.sample_row)
+        foot_state.sample_row += 1
+    return _released(params, foot_state, tile_states, buffer, foot_state.end_row)
 
 
 @inlined
-def _released(laws: Laws, scene: Record, tiles: Records, room: Room, until: int) -> Answers:
-    """Estimate the rows up to `until`, now that their look-ahead is there."""
-    n, count, law = until - scene.due, len(tiles), laws.scene[0]
+def _released(
+    params: Laws,
+    foot_state: FootState,
+    tile_states: RecordArray[TileState],
+    buffer: Room,
+    until: int,
+) -> Answers:
+    """Estimate the rows up to `until`, whose look-ahead is complete."""
+    foot_params, count = params.foot[0], len(tile_states)
+    n = until - foot_state.release_row
     seq, t_ns = np.empty(n, np.uint64), np.empty(n, np.int64)
     by_tile = np.full((3, n, count), math.nan)
     by_frame = np.full((whole.COLUMNS, n), math.nan)
-    contact, status = np.empty(n, np.uint8), np.empty(n, np.uint16)
+    contact, flags = np.empty(n, np.uint8), np.empty(n, np.uint16)
     out, windows = np.empty(whole.COLUMNS), denoise.scratch_of_windows()
-    borne = np.zeros(count, BORNE)
+    forces: RecordArray[TileForce] = np.zeros(count, BORNE)
     # Without look-ahead the next frame is not there, and may be of the same instant.
-    look_ns = law.look_ns if law.waits == 1 else -1
-    rows = (scene.due, scene.due)
+    look_ns = foot_params.lookahead_ns if foot_params.waits_for_next == 1 else -1
+    rows = (foot_state.release_row, foot_state.release_row)
     for k in range(n):
-        i = scene.due
-        row = room.rows[i]
+        i, end, lookahead_ns = (
+            foot_state.release_row,
+            foot_state.sample_row,
+            foot_params.lookahead_ns,
+        )
+        row = buffer.rows[i]
         out[:] = math.nan
-        if law.denoise == 1:
-            rows = denoise.in_sight(room.t_mono_ns, i, 0, scene.read, rows, look_ns)
-        unsettled = bear(laws, tiles, room, i, rows, windows, borne)
-        if law.servo == 1:
-            counts = counts_at(room.readings, i, scene.read, law.look_ns)
-            out[whole.ANGLE] = (counts - law.zero_counts) * law.rad_per_count
-        whole.push(laws, borne, out[whole.ANGLE])
-        whole.stand(laws, borne, out)
-        if has_lasted(room.since_ns, room.t_mono_ns, i, scene.read, law.min_ns, law.look_ns):
-            scene.is_contact = row.loaded
-        masked = whole.is_masked(laws, out) or scene.is_contact == 0
-        # A bound tells that there is contact, and never that there is none.
-        known = not math.isnan(out[whole.GRF])
-        decided = known or (scene.is_contact == 1 and out[whole.AT_LEAST] >= law.bound_on_n)
+        if foot_params.has_denoise == 1:
+            rows = denoise.in_sight(buffer.t_mono_ns, i, 0, end, rows, look_ns)
+        unsettled = bear(params, tile_states, buffer, i, rows, windows, forces)
+        if foot_params.has_servo == 1:
+            counts = counts_at(buffer.readings, i, end, lookahead_ns)
+            out[whole.ANGLE] = (counts - foot_params.zero_counts) * foot_params.rad_per_count
+        whole.push(params, forces, out[whole.ANGLE])
+        whole.stand(params, forces, out)
+        min_ns = foot_params.contact_min_ns
+        if has_lasted(buffer.since_ns, buffer.t_mono_ns, i, end, min_ns, lookahead_ns):
+            foot_state.is_contact = row.is_loaded
+        in_contact = foot_state.is_contact == 1
+        masked = whole.is_masked(params, out) or not in_contact
+        # A lower bound can prove contact, and never its absence.
+        is_proven = in_contact and out[whole.AT_LEAST] >= foot_params.contact_bound_n
+        is_known = not math.isnan(out[whole.GRF]) or is_proven
         if masked:
             out[whole.X : whole.ANGLE] = math.nan
         else:
-            _place(laws, room.cells[i], out)
+            _place(params, buffer.samples[i], out)
         for j in range(count):
-            by_tile[_GAUGE, k, j] = room.cells[i, j].gauge_kpa
-            if laws.tiles[j].bears == 1:
-                by_tile[_FORCE, k, j], by_tile[_SIGMA, k, j] = _stated(borne[j])
+            by_tile[_GAUGE, k, j] = buffer.samples[i, j].gauge_kpa
+            if params.tiles[j].is_load_bearing == 1:
+                by_tile[_FORCE, k, j], by_tile[_SIGMA, k, j] = _stated(forces[j])
         by_frame[:, k] = out
         seq[k], t_ns[k] = row.seq, row.t_ns
-        contact[k] = scene.is_contact if decided else UNKNOWN
-        status[k] = (
-            row.status | (_COP_MASKED if masked else 0) | (_AFTER_SATURATION if unsettled else 0)
+        contact[k] = foot_state.is_contact if is_known else UNKNOWN
+        flags[k] = (
+            row.flags | (_COP_MASKED if masked else 0) | (_AFTER_SATURATION if unsettled else 0)
         )
-        scene.due += 1
-    return seq, t_ns, by_tile, by_frame, contact, status
+        foot_state.release_row += 1
+    return seq, t_ns, by_tile, by_frame, contact, flags
 
 
 @inlined
-def _place(laws: Laws, cells: Records, out: Floats) -> None:
-    """Indices of the centre of pressure, and where it is on the ground."""
-    scene = laws.scene[0]
-    if scene.grid == 1:
-        whole.note_index(laws, cells, out)
-    if scene.servo == 1 and not math.isnan(scene.travel_m_per_rad):
+def _place(params: Laws, samples: RecordArray[TileSample], out: Floats) -> None:
+    """Compute the grid indices of the COP, and its position on the ground."""
+    foot_params = params.foot[0]
+    if foot_params.has_grid == 1:
+        whole.note_index(params, samples, out)
+    if foot_params.has_servo == 1 and not math.isnan(foot_params.travel_m_per_rad):
         out[whole.GROUND_X] = to_ground_x_m(
-            out[whole.X], out[whole.Z], out[whole.ANGLE], scene.travel_m_per_rad
+            out[whole.X], out[whole.Z], out[whole.ANGLE], foot_params.travel_m_per_rad
         )
         out[whole.GROUND_Y] = out[whole.Y]
 
 
 @compiled
-def _stated(borne: Record) -> tuple[float, float]:
-    """A tile's force and its uncertainty, or a bound that the truth exceeds in 99 of 100 frames."""
-    if borne.beyond == 1:
-        return borne.force_n - BOUND_SIGMAS * borne.sigma_n, math.nan
-    return borne.force_n, borne.sigma_n
+def _stated(force: TileForce) -> tuple[float, float]:
+    """Return a tile's force and sigma, or a bound that the truth exceeds in 99 of 100 frames."""
+    if force.is_saturated == 1:
+        return force.force_n - BOUND_SIGMAS * force.sigma_n, math.nan
+    return force.force_n, force.sigma_n

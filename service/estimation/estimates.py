@@ -1,4 +1,4 @@
-"""What an estimate of frames consists of, and the flags it carries."""
+"""Estimates of frames, and their flags."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ class EstimateStatus(IntFlag):
     """Bits of `Estimates.estimate_status`, one value per frame."""
 
     SATURATED = 1
-    """A tile is beyond what it can tell: its force is a lower bound, and there is no GRF but
-    one."""
+    """A tile is beyond its range: its force is a lower bound, and so is the GRF."""
     EXTRAPOLATED = 2
     """A tile is below its calibrated range: suction, or a tare that no longer holds."""
     OUTLIER_REPLACED = 4
@@ -28,8 +27,8 @@ class EstimateStatus(IntFlag):
     COP_MASKED = 16
     """No centre of pressure: no contact, or it would be too uncertain."""
     TILE_MISSING = 32
-    """A tile gave no pressure, or no bare one has told what is around, so there is no GRF
-    but a lower bound."""
+    """A tile gave no pressure, or no bare tile gave the surrounding pressure: the GRF is only a
+    lower bound."""
     ASSUMED_SCALE = 64
     """The calibration's scale is assumed: newtons are not to be trusted."""
     TARE_OLD = 128
@@ -37,12 +36,12 @@ class EstimateStatus(IntFlag):
     OVER_RATED = 256
     """A tile is above the chip's 115 kPa, but within its calibration."""
     TARE_LOST = 512
-    """The tare that was in force is damaged on disk: no pressure and no force is known."""
+    """The tare in force is damaged on disk: all pressures and forces are unknown."""
     AFTER_SATURATION = 1024
-    """What a tile bore unseen, saturated or away, has left more in its sigma than a reading's
-    noise."""
+    """The unknown load of a tile during saturation or a gap adds more to sigma than the noise of a
+    reading."""
     STUCK = 2048
-    """A tile repeats itself for longer than its noise allows: nothing is known of its force."""
+    """A tile repeats a count for longer than its noise allows: its force is unknown."""
     CLIPPED = 4096
     """A tile's readings end at an edge within its chip's range: its force is a lower bound."""
     BASELINE_LOST = 8192

@@ -1,8 +1,8 @@
-"""What a plate has shown of a mounted foot: gains of its tiles, and which way it is pushed.
+"""Mount calibration against a force plate: gains of the tiles, direction of the ground's force.
 
-A bench presses a dome along its axis, alone. On the foot a part of the ground's force may go past
-the domes, and what goes through a dome that is not upright has a vertical part which depends on
-friction: no tile can tell it, a plate can.
+A rig loads one dome along its axis. On the foot a part of the ground's force may bypass the domes,
+and the vertical part of the force through an inclined dome depends on friction: a plate measures
+both, tiles do not.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from devices.facts import Label, Text
 from service.estimation.effects import CalibrationPart, Parameter
 
 GAIN_RANGE = (0.05, 20.0)
-"""A gain beyond is none of a mount: unit or tile are wrong."""
+"""Range of gains; beyond, the unit or the tile is wrong."""
 SHEAR_RANGE = (-3.0, 3.0)
-"""Between -1 and 1 is what friction can do; beyond, by as much as a fit may be uncertain."""
+"""Range of shears: friction gives -1 to 1; the rest allows for the uncertainty of a fit."""
 _TILES_MAX = 256
 
 
 class Mounted(CalibrationPart):
-    """A foot as it is mounted, measured against a plate.
+    """Mount calibration of a foot.
 
-    The vertical force on the foot is the sum of `gain F (1 + shear (1 - cos a))`, with F what the
-    bench says of each tile, and `a` the angle between its axis and the vertical.
+    The vertical force on the foot is the sum of `gain F (1 + shear (1 - cos a))`, with F the force
+    on each tile by its rig calibration, and `a` the angle between its axis and the vertical.
     """
 
     against: Text
-    """The session and the reference."""
+    """Session and reference."""
     gains: Annotated[dict[Label, Parameter], Field(min_length=1, max_length=_TILES_MAX)]
-    """By serial: newtons of the ground on the tile's part of the foot for one of the dome's."""
+    """Gains by serial: newtons of the ground on the tile's part of the foot for one of the dome."""
     shear: Parameter | None = None
-    """-1: the ground pushes along the axes of the tiles, as without friction; 1: straight up, and
-    the tiles feel less by the cosine. None: not known."""
+    """Direction of the ground's force. -1: along the axes of the tiles, as without friction; 1:
+    vertical, and the tiles read less by the cosine. None: unknown."""
 
     @model_validator(mode="after")
     def _can_be(self) -> Self:

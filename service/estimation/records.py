@@ -1,32 +1,101 @@
-"""Constants and state of models, tile by tile: numpy records, which compiled code works on.
+"""Parameters and states of compiled code: numpy records, whose fields a class declares once.
 
-Hundreds of fields pass into compiled code as a single argument.
+Hundreds of fields pass into compiled code as a single argument. mypy checks them as attributes of
+the class; numba reads and writes them as fields of the record.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import (
+    Annotated,
+    Any,
+    Protocol,
+    Self,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
 
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats
+
 Records = npt.NDArray[np.void]
-"""One record for every tile, or a single one; (n,)."""
+"""Records of any type, (n,)."""
 Record = Any
-"""One of them within compiled code, which reads and writes its fields as attributes."""
+"""Record whose fields are not checked."""
 Columns = dict[str, npt.NDArray[Any]]
+R_co = TypeVar("R_co", covariant=True)
+
+
+class RecordArray(Protocol[R_co]):
+    """Records of one type, (n,), in Python and in compiled code."""
+
+    def __len__(self) -> int: ...
+    @overload
+    def __getitem__(self, key: int, /) -> R_co: ...
+    @overload
+    def __getitem__(self, key: str, /) -> npt.NDArray[Any]: ...
+    def __setitem__(self, key: str, value: Any, /) -> None: ...
+
+
+class RecordMatrix(Protocol[R_co]):
+    """Records of one type, (n, m), in compiled code."""
+
+    def __len__(self) -> int: ...
+    @overload
+    def __getitem__(self, key: tuple[int, int], /) -> R_co: ...
+    @overload
+    def __getitem__(self, key: int, /) -> RecordArray[R_co]: ...
+
+
+class KernelRecord:
+    """Base of record types: each annotation declares a field, in this order.
+
+    A field is `float`, `int`, a numpy scalar, another record type, or
+    `Annotated[Floats, shape]` or `Annotated[Ints, shape]`. No instance of these classes exists.
+    """
+
+    @classmethod
+    def dtype(cls) -> np.dtype[np.void]:
+        """Return the record's layout, aligned as the processor prefers."""
+        hints = get_type_hints(cls, include_extras=True)
+        return record_type([(name, *_layout(hint)) for name, hint in hints.items()])
+
+    @classmethod
+    def array(cls, n: int, **columns: Any) -> RecordArray[Self]:
+        """Make n records with these columns, zero elsewhere.
+
+        Raises:
+            ValueError: a column is no field, or does not fit.
+        """
+        return records(cls.dtype(), n, **columns)
+
+
+def _layout(hint: Any) -> tuple[Any, ...]:
+    if get_origin(hint) is Annotated:
+        kind, layout = get_args(hint)
+        if isinstance(layout, np.dtype):
+            return (layout,)
+        return (np.float64 if kind == Floats else np.int64, layout)
+    if issubclass(hint, KernelRecord):
+        return (hint.dtype(),)
+    return ({float: np.float64, int: np.int64}.get(hint, hint),)
 
 
 def record_type(fields: list[Any]) -> np.dtype[np.void]:
-    """Type of a record with these fields, each where the processor likes it."""
+    """Make a record layout from names, types and shapes, aligned as the processor prefers."""
     return np.dtype(fields, align=True)
 
 
 def records(dtype: np.dtype[np.void], n: int, **columns: Any) -> Records:
-    """N records with these columns, zero elsewhere.
+    """Make n records with these columns, zero elsewhere.
 
     Raises:
-        ValueError: there is no such column, or it does not fit.
+        ValueError: a column is no field, or does not fit.
     """
     made = np.zeros(n, dtype)
     for name, values in columns.items():
@@ -35,7 +104,7 @@ def records(dtype: np.dtype[np.void], n: int, **columns: Any) -> Records:
 
 
 def as_bytes(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Records as the bytes that they are, (n, ...); what is no record as it is. Not copied."""
+    """View records as their bytes, (n, ...); return any other array unchanged. Copies nothing."""
     if column.dtype.names is None:
         return column
     return column.view(np.uint8).reshape(*column.shape, column.dtype.itemsize)

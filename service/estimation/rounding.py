@@ -1,18 +1,18 @@
-"""Estimates rounded to what they tell: their noise below an eighth of its least sigma is not kept.
+"""Quantization of estimates to an eighth of their least sigma.
 
-A float32 has 24 bits for a force of which five or six are more than noise, and noise does not
-compress. So each column has one step, a power of two, for the whole of a recording, known before
-its first frame from calibration and tares alone. A step of sigma/8 has a standard deviation of
-sigma/28, and makes of sigma 0.07 % more.
+A float32 has 24 bits for a force; only five or six are above the noise, and noise does not
+compress. So each column has one step, a power of two, for the whole recording, computed before its
+first frame from calibration and tares alone. A step of sigma/8 has a standard deviation of
+sigma/28, and raises sigma by 0.07 %.
 
-The least sigma of every column is worked out from the same terms as the estimate's own, each at
-its least; none of them can make it less:
+The least sigma of every column follows from the same terms as the estimate's own, each at its
+least:
 
-- a pressure's is that of its tile's noise;
-- a force's is that of noise averaged over as many readings as can be in a window, the baseline's
-  and the curve's own, where in the tile's range that is least; a GRF's is that of its tiles;
-- a centre of pressure's is that of those forces over the greatest sum of forces there can be;
-- an angle's is that of one count, of which a servo tells no parts.
+- a pressure: the noise of its tile;
+- a force: noise averaged over the largest number of readings in a window, baseline and curve, at
+  the pressure in the tile's range where their sum is least; a GRF: the forces of its tiles;
+- a centre of pressure: those forces over the largest possible sum of forces;
+- an angle: one count of the servo.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from service.estimation.ladder.plan import EstimationPlan
 from service.estimation.models.denoise import AVERAGED_MAX, PAST_NS
 
 PART = 8.0
-"""A step is at most the least sigma over this."""
+"""Least number of steps in the least sigma."""
 _RATE_MORE = 1.25
-"""A window may have so many more readings than the nominal rate says: a bus catches up."""
+"""Largest factor of readings in a window over the nominal rate: a bus catches up."""
 _PLACES = 1025
-"""Of each tile's range, at which the least sigma of its force is looked for."""
+"""Number of pressures in each tile's range at which the sigma of its force is computed."""
 _STEP_LEAST = 2.0**-500
-"""Below it a quotient may be infinite; and no estimate has a digit there."""
+"""Least step; below it a quotient may overflow."""
 _DOWN = frozenset({"grf_at_least_n"})
-"""A bound is rounded down, and remains one."""
+"""Columns that are rounded down: a rounded lower bound remains a lower bound."""
 _BY_TILE = frozenset({"gauge_kpa", "force_n", "force_sigma_n"})
 
 Columns = Mapping[str, npt.NDArray[Any]]
@@ -46,30 +46,29 @@ Columns = Mapping[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Rounding:
-    """The step of every column that is rounded.
+    """Quantization steps of the columns.
 
     Attributes:
-        steps: by name of `Estimates`, one for each tile or one for all, (tiles,) or (1,); 0: is not
-            rounded.
+        steps: by name of `Estimates`, (tiles,) or (1,); 0: not quantized.
     """
 
     steps: Mapping[str, Floats] = field(default_factory=dict)
 
     @classmethod
     def of(cls, plans: Iterable[EstimationPlan]) -> Self:
-        """The steps that go with all estimates of a recording.
+        """Compute the steps for all estimates of a recording.
 
         Args:
-            plans: of all its tares; those of a tare that is lost give no numbers to be rounded.
+            plans: of all its tares; lost tares give no numbers and are skipped.
         """
         least = [_least_sigmas(plan) for plan in plans if not plan.tare.is_lost]
         names = least[0] if least else ()
         return cls({name: _steps([each[name] for each in least]) for name in names})
 
     def rounded(self, columns: Columns) -> dict[str, npt.NDArray[Any]]:
-        """Columns of estimates, (n,) or (n, tiles), each to a multiple of its step.
+        """Round columns of estimates, (n,) or (n, tiles), to multiples of their steps.
 
-        Other columns, NaN and infinity are as they were; zero has no sign.
+        Other columns, NaN and infinity are unchanged; zero has no sign.
         """
         return {
             name: _rounded(values, self.steps[name], down=name in _DOWN)
@@ -79,7 +78,7 @@ class Rounding:
         }
 
     def by_column(self) -> dict[str, float]:
-        """For a file: the step of each flat column that is rounded, in the column's unit."""
+        """Return the step of each quantized flat column, in its unit, for a file's metadata."""
         return {
             f"{name}_{i}" if name in _BY_TILE else name: float(step)
             for name, steps in self.steps.items()
@@ -95,7 +94,7 @@ def _rounded(values: npt.NDArray[Any], step: Floats, *, down: bool) -> npt.NDArr
 
 
 def _steps(least: Sequence[Floats]) -> Floats:
-    """The greatest powers of two that are small enough for each; 0 where there is no sigma."""
+    """Return the largest powers of two within each sigma over `PART`; 0 without a sigma."""
     most = np.min(np.stack(least), axis=0) / PART
     usable = np.isfinite(most) & (most >= _STEP_LEAST)
     exponent = np.frexp(np.where(usable, most, 1.0))[1] - 1
@@ -103,7 +102,7 @@ def _steps(least: Sequence[Floats]) -> Floats:
 
 
 def _least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
-    """Of each column, what its standard uncertainty is at least."""
+    """Compute the least standard uncertainty of each column."""
     tare = plan.tare
     reading_kpa = np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
     of_tile_n = _least_tile_n(plan)
@@ -113,12 +112,11 @@ def _least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
     most_kpa = float(plan.ladder.curves.high_kpa.sum())
     end_n = plan.ladder.curves.force(plan.ladder.curves.high_kpa[None]).force_n
     most_n = float((plan.gain * end_n).sum())
-    x, y = (of_tile_n.min() * _extent(plan.bearing_m[:, axis]) / most_n for axis in (0, 1))
-    cop = {"x": x or y, "y": y or x}  # across a line of tiles there is nothing to be rounded
     least = {"gauge_kpa": reading_kpa, "force_n": force_n, "force_sigma_n": force_n}
     least |= dict.fromkeys(("grf_n", "grf_sigma_n", "grf_at_least_n"), grf_n)
-    for axis, sigma_m in cop.items():
-        names = f"cop_{axis}_m", f"cop_sigma_{axis}_m", f"cop_ground_{axis}_m"
+    for name, is_measured, places_m in zip("xy", plan.cop_measured, plan.bearing_m.T, strict=False):
+        sigma_m = of_tile_n.min() * _extent(places_m) / most_n if is_measured else math.nan
+        names = f"cop_{name}_m", f"cop_sigma_{name}_m", f"cop_ground_{name}_m"
         least |= dict.fromkeys(names, np.array([sigma_m]))
     if plan.grid is not None:
         noise_kpa = float(tare.noise_kpa[plan.bearing].min())
@@ -131,7 +129,7 @@ def _least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
 
 
 def _least_tile_n(plan: EstimationPlan) -> Floats:
-    """Of the force on each bearing tile: over its range, with all the averaging there can be."""
+    """Compute the least sigma of each load-bearing tile's force, over its range, fully averaged."""
     curves, left = plan.ladder.curves, np.ones(len(plan.bearing))
     if plan.ladder.denoise:
         within_s = 1e-9 * (PAST_NS + plan.look_ns)
@@ -145,5 +143,5 @@ def _least_tile_n(plan: EstimationPlan) -> Floats:
 
 
 def _extent(places: Floats) -> float:
-    """What a sigma of 1 of every weight makes of their mean place at least, times their sum."""
+    """Return the sigma of a weighted mean of places, times the weights' sum, for sigmas of 1."""
     return math.sqrt(float(((places - places.mean()) ** 2).sum()))

@@ -1,8 +1,8 @@
-"""Stances one upon another: what was measured in each, over 0 to 100 % of its duration.
+"""Overlay of stances, time-normalized to 0 to 100 % of their durations.
 
-This is what normalising a stance to its duration is, wherever it is done. A stance lasts from its
-first frame to its last (`service.estimation.stances`). What is said at a percentage that is between
-two frames lies on the straight line between them, and is not known if one of them is not.
+The only definition of this normalization. A stance lasts from its first frame to its last
+(`service.estimation.stances`). A value between two frames lies on the straight line between them,
+and is NaN if either frame is.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ import numpy.typing as npt
 from devices.arrays import Floats, Times
 
 OVERLAID = ("grf_n", "cop_x_m", "cop_y_m")
-"""Columns of estimates that are laid one upon another."""
+"""Columns of estimates in the overlay."""
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class Spread:
-    """One quantity over all stances, (points,) each.
+    """Statistics of one quantity over all stances, (points,) each.
 
     Attributes:
-        mean: over the stances in which it is known there; NaN if it is in none.
-        sd: standard deviation over these, with their number less one; NaN of fewer than two.
-        count: of these stances.
+        mean: over the stances with a value; NaN without any.
+        sd: sample standard deviation over these; NaN for fewer than two.
+        count: number of these stances.
     """
 
     mean: Floats
@@ -40,12 +40,12 @@ class Spread:
 
 @dataclass(frozen=True)
 class Overlay:
-    """Stances one upon another.
+    """Overlay of stances.
 
     Attributes:
-        spread: of every column.
-        rows: (k,), which of the stances are there one by one.
-        curves: by column, (k, points) of these.
+        spread: statistics by column.
+        rows: (k,), indices of the stances with single curves.
+        curves: by column, (k, points), these curves.
     """
 
     spread: Mapping[str, Spread]
@@ -54,19 +54,19 @@ class Overlay:
 
 
 def evenly(count: int, most: int) -> npt.NDArray[np.int64]:
-    """`most` of so many rows at the most, the first and the last with others evenly in between."""
+    """Select at most `most` of `count` rows: the first, the last, and evenly in between."""
     if count <= most:
         return np.arange(count)
     return np.round(np.linspace(0, count - 1, most)).astype(np.int64)
 
 
 def normalised(t_ns: Times, values: Floats, points: int) -> Floats:
-    """One stance at `points` percentages from 0 to 100, (points, ...).
+    """Resample one stance at `points` percentages from 0 to 100, (points, ...).
 
     Args:
-        t_ns: (n,), of its frames, rising, two at least.
-        values: (n, ...), in these.
-        points: how many, two at least.
+        t_ns: (n,), instants of its frames, rising, n of 2 or more.
+        values: (n, ...), in these frames.
+        points: number of points, 2 or more.
     """
     share = (t_ns - t_ns[0]) / float(t_ns[-1] - t_ns[0])
     at = np.linspace(0.0, 1.0, points)
@@ -75,15 +75,15 @@ def normalised(t_ns: Times, values: Floats, points: int) -> Floats:
     wide = (slice(None), *(None,) * (values.ndim - 1))
     part = ((at - share[before]) / (share[behind] - share[before]))[wide]
     low, high = values[before], values[behind]
-    # A frame that is exactly there is what it is, whatever is known of the one beside it.
+    # Exactly at a frame its value counts, even beside a NaN.
     between = np.where(part >= 1.0, high, low + (high - low) * part)
     return np.asarray(np.where(part <= 0.0, low, between))
 
 
 class StanceOverlay:
-    """Gathers stances from consecutive frames; any batches give the same, to the bit.
+    """Accumulator of stances from consecutive frames; the result does not depend on the batches.
 
-    Sums are kept, and the curves of some stances: the memory does not depend on how many there are.
+    It stores sums, and the curves of some stances: its memory does not grow with their number.
     """
 
     def __init__(
@@ -95,14 +95,14 @@ class StanceOverlay:
         points: int,
         rows: Collection[int],
     ) -> None:
-        """Begin.
+        """Set the stances and the points.
 
         Args:
-            part: (m,), of each stance, in the order of the frames.
-            begin_t_ns: (m,), of its first frame.
-            end_t_ns: (m,), of its last, later than that.
-            points: percentages from 0 to 100, both included.
-            rows: which stances are kept one by one.
+            part: (m,), part of each stance, in the order of the frames.
+            begin_t_ns: (m,), instant of its first frame.
+            end_t_ns: (m,), instant of its last frame, later than the first.
+            points: number of percentages from 0 to 100, both included.
+            rows: indices of the stances with single curves.
         """
         self._windows = list(
             zip(part.tolist(), begin_t_ns.tolist(), end_t_ns.tolist(), strict=True)
@@ -117,10 +117,10 @@ class StanceOverlay:
         self._mean, self._squares = np.zeros(shape), np.zeros(shape)
 
     def feed(self, t_ns: Times, columns: Columns) -> None:
-        """Take n more frames.
+        """Add the next n frames.
 
         Args:
-            t_ns: (n,), rising within a part.
+            t_ns: (n,), instants, rising within a part.
             columns: `OVERLAID`, (n,) each; `part`, 0 if absent.
         """
         if not len(t_ns) or self._next >= len(self._windows):
@@ -132,7 +132,7 @@ class StanceOverlay:
             self._feed_part(int(part[first]), t_ns[first:end], values[first:end])
 
     def finish(self) -> Overlay:
-        """All of it; no more frames will come."""
+        """Return the overlay of all stances that are complete."""
         known = self._count > 0
         mean = np.where(known, self._mean, np.nan)
         several = self._count > 1
@@ -167,7 +167,7 @@ class StanceOverlay:
         curve = normalised(t_ns, values, self._points)
         if row in self._wanted:
             self._kept.append((row, curve))
-        # Welford (1962): nothing cancels, however many stances there are.
+        # Welford (1962): no cancellation for any number of stances.
         known = np.isfinite(curve)
         self._count += known
         off = np.where(known, curve - self._mean, 0.0)

@@ -1,9 +1,8 @@
-"""Stances: contacts of the foot with the ground, gathered from estimates.
+"""Stances: contacts of the foot with the ground, from estimates.
 
-This is what a stance is, wherever one is counted. It is a run of frames whose `contact` is 1;
-frames in between in which contact is not known belong to it. A foot that was not seen for longer
-than `UNSEEN_NS`, or whose node was started again, may have been lifted meanwhile: the stance before
-is cut there, and what follows is another.
+The only definition of a stance: a run of frames whose `contact` is 1, with the frames of unknown
+contact in between. During a gap longer than `UNSEEN_NS`, or a restart of the node, the foot may
+have been lifted: the stance is cut there, and another one begins.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from service.estimation.estimates import INTERVAL_95, EstimateStatus
 from service.estimation.foot import UNKNOWN, UNSEEN_NS
 
 GATHERED = ("contact", "grf_n", "grf_sigma_n", "cop_x_m", "cop_sigma_x_m", "estimate_status")
-"""Columns of estimates that stances are made of; of a session of several parts `part` as well."""
+"""Columns of estimates that stances need; with several parts also `part`."""
 
 STANCE_COLUMNS = (
     *("number", "part", "begin_t_ns", "end_t_ns", "duration_s", "duration_sigma_s"),
@@ -30,46 +29,46 @@ STANCE_COLUMNS = (
     *("frames", "unknown_frames", "missing_frames", "estimate_status"),
     *("begun", "ended", "is_whole"),
 )
-"""What is said of a stance, wherever one is written."""
+"""Columns of a table of stances."""
 
 EDGE_NS = 10_000_000
-"""The slope of the GRF where a stance begins and ends is that over so long, within the stance."""
+"""Time over which the slope of the GRF at the edges of a stance is measured, within the stance."""
 _SLOPE_SIGMAS = 2.0
-"""A change of the GRF over `EDGE_NS` that is smaller, in sigmas of it, gives no slope."""
+"""Least change of the GRF over `EDGE_NS` for a slope, in its sigmas."""
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class Stance:
-    """One contact of the foot with the ground. What is not known is NaN.
+    """Contact of the foot with the ground. Unknown values are NaN.
 
     Attributes:
-        number: of the stance in its recording, from 1; those that are cut count, too.
-        part: of the session, in which it was.
+        number: number in its recording, from 1; cut stances count, too.
+        part: part of the session.
         begin_t_ns: UTC of its first frame.
-        end_t_ns: UTC of its last.
+        end_t_ns: UTC of its last frame.
         duration_sigma_s: standard uncertainty of the duration (docs/method.md); NaN if the frame
-            before or behind the stance is missing, or if the GRF rises or falls too slowly there.
-        peak_grf_n: greatest GRF of those known; NaN if none is, or if a tile was saturated: the
-            peak was in what is not known then.
-        peak_t_ns: UTC of the first frame of that GRF; None without a peak.
+            before or after the stance is missing, or if the GRF rises or falls too slowly there.
+        peak_grf_n: largest known GRF; NaN without any, or if a tile was saturated, which hides the
+            peak.
+        peak_t_ns: UTC of the first frame with that GRF; None without a peak.
         peak_sigma_n: standard uncertainty of the GRF in that frame.
         impulse_n_s: integral of the GRF by the trapezoidal rule, in newton seconds; NaN if a frame
-            is missing or without a GRF, for no line is drawn across it.
-        impulse_sigma_n_s: standard uncertainty of the impulse, for errors of the GRF that are the
-            same in all frames of the stance.
-        cop_x_first_m: centre of pressure along x where it is first stated, in the foot frame.
-        cop_x_last_m: where it is last stated.
-        cop_x_range_m: greatest less least.
-        cop_x_range_sigma_m: standard uncertainty of that, with errors of least and greatest
-            independent of one another.
-        frames: that are there, from the first to the last.
-        unknown_frames: of these, without a GRF.
-        missing_frames: numbers between the first and the last that are not there.
-        estimate_status: bits that any of its frames has.
-        begun: the frame before it is there, and without contact.
-        ended: the frame behind it likewise.
+            is missing or has no GRF.
+        impulse_sigma_n_s: standard uncertainty of the impulse, for errors of the GRF that are equal
+            in all frames of the stance.
+        cop_x_first_m: first known centre of pressure along x, in the foot frame.
+        cop_x_last_m: last known one.
+        cop_x_range_m: largest less smallest.
+        cop_x_range_sigma_m: standard uncertainty of the range, with independent errors of smallest
+            and largest.
+        frames: number of frames from the first to the last.
+        unknown_frames: number of these without a GRF.
+        missing_frames: number of missing frames between the first and the last.
+        estimate_status: union of the flags of its frames.
+        begun: the frame before exists and is without contact.
+        ended: the frame after it likewise.
     """
 
     number: int
@@ -95,29 +94,29 @@ class Stance:
 
     @property
     def duration_s(self) -> float:
-        """From the first frame to the last."""
+        """Time from the first frame to the last."""
         return (self.end_t_ns - self.begin_t_ns) * 1e-9
 
     @property
     def is_whole(self) -> bool:
-        """Was it seen from its beginning to its end, without a gap, and is its GRF always known?"""
+        """True if both edges exist, no frame is missing, and every GRF is known."""
         return self.begun and self.ended and not self.missing_frames and not self.unknown_frames
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it by name, in the order of tables."""
+        """Return the columns of `STANCE_COLUMNS` by name."""
         return {name: getattr(self, name) for name in STANCE_COLUMNS}
 
 
 def stances_of(seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) -> list[Stance]:
-    """All stances of a recording that is there as a whole; arguments as of `Stances.feed`."""
+    """Compute the stances of a complete recording; arguments as of `StanceDetector.add_frames`."""
     gathered = Stances()
     return [*gathered.feed(seq, t_ns, columns), *gathered.finish()]
 
 
 class Stances:
-    """Gathers stances from consecutive frames; any batches give the same, to the bit.
+    """Detector of stances in consecutive frames; the result does not depend on the batches.
 
-    Sums are kept and no frames: a stance of an hour takes no more memory than one of a step.
+    It stores sums and no frames: its memory does not grow with the length of a stance.
     """
 
     def __init__(self) -> None:
@@ -127,7 +126,7 @@ class Stances:
         self._number = 0
 
     def feed(self, seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) -> list[Stance]:
-        """Take n more frames; return the stances that are over now.
+        """Add the next n frames; return the stances that have ended.
 
         Args:
             seq: (n,), numbers of the frames.
@@ -165,7 +164,7 @@ class Stances:
         return over
 
     def finish(self) -> list[Stance]:
-        """The stance that has not ended, if there is one: no more frames will come."""
+        """Return the stance that has not ended, if there is one, at the end of the frames."""
         return self._close(None)
 
     def _close(self, behind: _Frame | None) -> list[Stance]:
@@ -175,7 +174,7 @@ class Stances:
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame of which contact is known."""
+    """Frame with known contact."""
 
     seq: int
     t_ns: int
@@ -184,17 +183,17 @@ class _Frame:
     grf_n: float
 
     def is_seen_from(self, other: _Frame | None) -> bool:
-        """Can the foot not have been lifted, or put down, between two frames and not be seen?"""
+        """Return whether no gap in which the foot may have moved lies between two frames."""
         if other is None:
             return False
         return self.part == other.part and abs(self.t_ns - other.t_ns) <= UNSEEN_NS
 
     def goes_on_from(self, before: _Frame | None) -> bool:
-        """Is it of the same stance, or flight, as the frame before?"""
+        """Return whether it belongs to the same stance, or flight, as the frame before."""
         return before is not None and self.is_seen_from(before) and self.loaded == before.loaded
 
     def borders(self, other: _Frame | None) -> bool:
-        """Is no number between them, and do they differ in contact?"""
+        """Return whether the two frames are consecutive and differ in contact."""
         if other is None or not self.is_seen_from(other) or self.loaded == other.loaded:
             return False
         return abs(self.seq - other.seq) == 1
@@ -202,7 +201,7 @@ class _Frame:
 
 @dataclass(frozen=True)
 class _Frames:
-    """Those of a batch, (n,) each."""
+    """Frames of a batch with known contact, (n,) each."""
 
     seq: npt.NDArray[np.uint64]
     t_ns: Times
@@ -211,12 +210,12 @@ class _Frames:
     grf_n: Floats
 
     def at(self, i: int) -> _Frame:
-        """One of them."""
+        """Return frame `i`."""
         seq, t_ns, part = int(self.seq[i]), int(self.t_ns[i]), int(self.part[i])
         return _Frame(seq, t_ns, part, bool(self.loaded[i]), float(self.grf_n[i]))
 
     def runs(self) -> Iterator[tuple[int, int]]:
-        """First frame of each stance or flight, and the one behind its last."""
+        """Iterate over stances and flights: first row, and row after the last."""
         differs = (self.loaded[1:] != self.loaded[:-1]) | (self.part[1:] != self.part[:-1])
         cut = np.flatnonzero(differs | (np.diff(self.t_ns) > UNSEEN_NS)) + 1
         edges = [0, *cut.tolist(), len(self.loaded)]
@@ -225,7 +224,7 @@ class _Frames:
 
 @dataclass
 class _Unsure:
-    """Frames since the last of which contact is known: of a stance only if it goes on behind."""
+    """Frames of unknown contact since the last known one; part of a stance if it continues."""
 
     frames: int = 0
     status: int = 0
@@ -245,7 +244,7 @@ class _Force:
 
     @classmethod
     def none(cls) -> _Force:
-        """Return those of no frames."""
+        """Make an empty one."""
         return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
     def followed_by(self, other: _Force) -> _Force:
@@ -257,7 +256,7 @@ class _Force:
         )
 
     def cut(self, begin: int | None, end: int | None) -> _Force:
-        """Return some of these frames."""
+        """Return rows `begin` to `end`."""
         return _Force(self.t_ns[begin:end], self.grf_n[begin:end], self.sigma_n[begin:end])
 
     def crossing_sigma_s(self, edge: int, inside: int, outside: _Frame) -> float:
@@ -277,37 +276,37 @@ class _Force:
 
 @dataclass
 class _Open:
-    """The present stance: what its frames so far come to."""
+    """Stance that has not ended, with the sums over its frames."""
 
     number: int
     first: _Frame
     before: _Frame | None
-    """The frame before it, without contact; None if its beginning was not seen."""
+    """Frame before it, without contact; None if there is none."""
     last: _Frame = field(init=False)
     frames: int = 0
     unknown: int = 0
     status: int = 0
     integrals: tuple[float, float] = (0.0, 0.0)
-    """Of the GRF and of its sigma over time, in newton seconds."""
+    """Integrals of the GRF and of its sigma over time, in newton seconds."""
     peak: tuple[float, int, float] | None = None
     """GRF, instant and sigma."""
     head: _Force = field(default_factory=_Force.none)
-    """The first frames, up to one that is `EDGE_NS` behind the first."""
+    """First frames, up to one `EDGE_NS` after the first."""
     tail: _Force = field(default_factory=_Force.none)
-    """The last frames, from one that is `EDGE_NS` before the last."""
+    """Last frames, from one `EDGE_NS` before the last."""
     cop_x_m: tuple[float, float] | None = None
-    """First and last."""
+    """First and last known COP."""
     extremes_x_m: Floats | None = None
-    """(3, 2): least and greatest of the 95 % intervals' lower ends, of COP, of their upper ends."""
+    """(3, 2): smallest and largest of the 95 % intervals' lower ends, of COP, of the upper ends."""
 
     def add_unsure(self, unsure: _Unsure) -> None:
-        """Take frames in between."""
+        """Add the frames of unknown contact in between."""
         self.frames += unsure.frames
         self.unknown += unsure.frames
         self.status |= unsure.status
 
     def add(self, rows: slice, t_ns: Times, columns: Columns) -> None:
-        """Take the next frames; of the last of them contact is known."""
+        """Add the next frames; contact of the last one is known."""
         t_ns, unsure = t_ns[rows], columns["contact"][rows] == UNKNOWN
         grf_n = columns["grf_n"][rows].astype(np.float64)  # a copy
         grf_n[unsure] = np.nan
@@ -326,7 +325,7 @@ class _Open:
             self._follow(columns["cop_x_m"][rows][stated], columns["cop_sigma_x_m"][rows][stated])
 
     def _follow(self, x_m: Floats, sigma_m: Floats) -> None:
-        """Take centres of pressure that are stated."""
+        """Add known centres of pressure."""
         x_m, sigma_m = x_m.astype(np.float64), sigma_m.astype(np.float64)
         first = float(x_m[0]) if self.cop_x_m is None else self.cop_x_m[0]
         self.cop_x_m = first, float(x_m[-1])
@@ -341,7 +340,7 @@ class _Open:
     def _integrate(self, force: _Force) -> None:
         joined = self.tail.cut(-1, None).followed_by(force)
         steps_s = np.diff(joined.t_ns) * 1e-9
-        # One after the other, so that it does not matter how frames come in batches.
+        # One after the other, so that the sum does not depend on the batches.
         grf_n_s, sigma_n_s = (
             float(np.add.accumulate(np.append(sum_, (of[1:] + of[:-1]) * 0.5 * steps_s))[-1])
             for sum_, of in zip(self.integrals, (joined.grf_n, joined.sigma_n), strict=True)
@@ -355,10 +354,10 @@ class _Open:
         self.tail = tail.cut(max(0, begin), None)
 
     def _duration_sigma_s(self, behind: _Frame | None) -> float:
-        """Return what the frames' distance and the force's uncertainty make of the duration.
+        """Return the sigma of the duration by the frames' distance and the force's uncertainty.
 
         The foot was put down at any instant between the frame before the stance and its first
-        frame, and lifted likewise: half of both gaps is missing in the duration, on average.
+        frame, and lifted likewise: on average the duration lacks half of both gaps.
         """
         head, tail = self.head, self.tail
         if self.before is None or behind is None or head.t_ns[-1] - head.t_ns[0] < EDGE_NS:
@@ -378,16 +377,16 @@ class _Open:
         )
 
     def _impulse_sigma_n_s(self, behind: _Frame | None) -> float:
-        """Return the integral of the force's sigma, with what is cut off at the edges."""
+        """Return the integral of the force's sigma, with the missing parts at the edges."""
         before_s, behind_s = self._gaps_s(behind)
         edges_n_s = 0.5 * (before_s * self.head.grf_n[0] + behind_s * self.tail.grf_n[-1])
         return float(np.hypot(self.integrals[1], edges_n_s))
 
     def _cop_range_m(self) -> tuple[float, float]:
-        """Return how far the centre of pressure went, and the standard uncertainty of that.
+        """Return the range of the centre of pressure, and its standard uncertainty.
 
-        The greatest of all frames lies between the greatest lower and the greatest upper end of
-        their intervals, the least likewise: a doubtful frame may have gone furthest.
+        The largest of all frames lies between the largest lower and the largest upper end of their
+        intervals, the smallest likewise: an uncertain frame may be the extreme one.
         """
         if self.extremes_x_m is None:
             return np.nan, np.nan
@@ -396,7 +395,7 @@ class _Open:
         return float(x_m[1] - x_m[0]), float(np.hypot(*sigmas_m))
 
     def closed(self, behind: _Frame | None) -> Stance:
-        """What it was; `behind` is the next frame of which contact is known."""
+        """Make the stance; `behind` is the next frame with known contact, if there is one."""
         missing = self.last.seq - self.first.seq + 1 - self.frames
         hidden = self.peak is None or self.status & EstimateStatus.SATURATED
         peak_n, peak_t_ns, peak_sigma_n = self.peak or (np.nan, 0, np.nan)

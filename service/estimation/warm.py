@@ -1,8 +1,8 @@
-"""Has the models compiled before the first frames are estimated.
+"""Compilation of the models before the first frames are estimated.
 
-On a new machine that takes some ten seconds, in which a server that compiled would not answer: so
-another process does it, and until then frames go without estimates (`is_warming`). Later it is half
-a second, because the result is kept.
+On a new machine it takes some ten seconds, in which a compiling server would not answer. So another
+process compiles, and until then frames have no estimates (`is_compiling`). Later it takes half a
+second, because the machine code is cached.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ _under_way: set[object] = set()
 
 
 def is_warming() -> bool:
-    """Are the models still being compiled, so that an estimate would wait for that?"""
+    """Return whether the models are being compiled, so that an estimate would wait."""
     return bool(_under_way)
 
 
 @contextmanager
 def warming() -> Iterator[None]:
-    """They are, while the block runs."""
+    """Mark the models as being compiled while the block runs."""
     each = object()
     _under_way.add(each)
     try:
@@ -62,7 +62,7 @@ def warming() -> Iterator[None]:
 
 
 def load_kept() -> bool:
-    """Warm up with what another process has compiled before; is all of it there?"""
+    """Load machine code of another process; return whether it is complete."""
     try:
         with only_kept():
             warm_up()
@@ -72,7 +72,7 @@ def load_kept() -> bool:
 
 
 def warm_up() -> None:
-    """Estimate a few frames of a made-up foot, with all models and with hardly any."""
+    """Compile the models: estimate a few synthetic frames, with all models and with one."""
     info = ArrayInfo(
         node="warm-up",
         boot_id="0" * 32,
@@ -88,7 +88,7 @@ def warm_up() -> None:
     )
     kpa, nothing = np.full(3, 97.0), np.zeros(3)
     tare = Tare(kpa, nothing + 0.01, nothing + 0.1, nothing + 507.0, 0, 0.0, 1.0, 100, "lead")
-    # What the temperature does is followed by its model or, without it, by the watch.
+    # Fault detection tracks thermal drift only without the model `temperature`.
     for models in (MODELS, ("static",)):
         plan = make_plan(info, _calibration(), tare, models=models, lag_ms=4.0)
         estimator = Estimator(plan)

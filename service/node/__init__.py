@@ -1,7 +1,7 @@
-"""The node: acquisition in a process of its own, a journal on disk, and the link to a server.
+"""Node: acquisition in a separate process, a journal on disk, and the link to a server.
 
-`run.py` joins the parts. The link is, from the outside in, `publisher` (dials, again and again),
-`connection` (what goes each way), `sending` (which frames are next) and `flow` (how many at once).
-Touches hardware through `service.rig`, and the disk through `storage.journal` and, for a recording
-of its own, `storage.sessions`; serves no web page.
+`run` combines the parts. The link consists, from the outside in, of `publisher` (connects with
+retries), `connection` (messages in both directions), `sending` (order of frames) and `flow` (flow
+control). It uses hardware through `service.rig`, and the disk through `storage.journal` and, for
+local recording, `storage.sessions`; it serves no web page.
 """

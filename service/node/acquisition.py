@@ -1,10 +1,10 @@
-"""Acquisition in a process of its own, so that nothing else on the node disturbs its pace.
+"""Acquisition in a separate process, so that no other work of the node disturbs its timing.
 
-The child opens the array, takes frames and encodes them; a thread of it sends them through a pipe.
-On hardware it may have to wait for the array: the parent gets `Waiting` each time it was not there.
-The parent gets `Started`, then `Batch` after `Batch`, and `Started` again when the array
-has become another one, with which a new stream begins; a `Failed` ends it. The child ends when it
-is told to, or when the pipe breaks because its parent died.
+The child opens the array, acquires frames and encodes them; a thread of the child sends them
+through a pipe. The parent receives `Waiting` for each failed attempt to open an absent array, then
+`Started` and `Batch` messages, and `Started` again when a replaced part begins a new stream;
+`Failed` is the last message. The child ends on request, or when its parent died and the pipe
+breaks.
 """
 
 from __future__ import annotations
@@ -38,40 +38,40 @@ from storage.schema import wire_schema
 from storage.wire import EncodedBatch, encode
 
 _WAITING_MAX = 4096
-"""Batches that may wait for a parent that does not read, 100 s; then frames are lost and counted
-as a gap in `seq`."""
+"""Queue limit in batches, 100 s; while the parent reads none, later frames are lost and counted as
+a gap in `seq`."""
 _END_S = 5.0
-"""How long a process that is told to end has before it is killed."""
+"""Timeout of a requested end, before the process is killed."""
 OPEN_AGAIN_S = 1.0
-"""Between two attempts to open an array that is not there."""
+"""Interval of attempts to open an absent array."""
 _ABSENT = {errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EBUSY}
 _LOOK_EVERY_NS = 500_000_000
-"""Interval at which the array is asked for its health, in the stream's own time."""
+"""Interval of health checks of the array, in the stream's time."""
 
 
 @dataclass(frozen=True)
 class Started:
-    """The array was found; frames follow."""
+    """Message that the array is open; frames follow."""
 
     info: ArrayInfo
     remarks: tuple[str, ...] = ()
-    """What a user should hear about it."""
+    """Start-up messages for the user."""
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """The array could not be opened; it is asked for again."""
+    """Message that the array could not be opened; retries follow."""
 
     problem: str
 
 
 @dataclass(frozen=True)
 class Health:
-    """How the array is.
+    """Health of the array.
 
     Attributes:
-        troubles: what is wrong now, in words.
-        counts: of what went wrong since the stream began, by serial and reason.
+        troubles: texts of the present warnings.
+        counts: fault counts of the stream, by serial and reason.
     """
 
     troubles: tuple[str, ...] = ()
@@ -80,18 +80,18 @@ class Health:
 
 @dataclass(frozen=True)
 class Batch:
-    """Frames, and what was counted beside them so far."""
+    """Message with frames, and the present counters and health."""
 
     batch: EncodedBatch
     missed_slots: int
     notices: tuple[str, ...] = ()
-    """What has become wrong with the array, or right again."""
+    """Messages about warnings that began or ended."""
     health: Health = Health()  # frozen, so one for all is safe
 
 
 @dataclass(frozen=True)
 class Failed:
-    """It ended for this reason, and no more will come; None: it was told to stop."""
+    """Last message: the error that ended acquisition; None: ended on request."""
 
     error: BaseException | None
 
@@ -101,11 +101,11 @@ _Item = tuple[FrameBatch, int, tuple[str, ...], Health]
 
 
 class AcquisitionProcess:
-    """The child process, and a thread here that hands on what it says.
+    """Child process of acquisition, with a thread of the parent that receives its messages.
 
     Args:
-        options: what to open.
-        on_message: called for every message, from that thread.
+        options: options of the rig.
+        on_message: called with every message, from that thread.
     """
 
     def __init__(self, options: RigOptions, on_message: Callable[[Message], None]) -> None:
@@ -121,12 +121,12 @@ class AcquisitionProcess:
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask it to end; the last frames still come, then `Failed(None)`."""
+        """Request the end; the last frames still arrive, then `Failed(None)`."""
         with suppress(OSError):
             self._connection.send(None)
 
     def close(self) -> None:
-        """End the process: ask first, then kill it."""
+        """End the process: request it, then kill it after a timeout."""
         self.stop()
         self._process.join(_END_S)
         if self._process.is_alive():
@@ -157,7 +157,7 @@ class AcquisitionProcess:
 
 def _how_ended(code: int | None) -> str:
     if code is None:
-        return "says nothing more"
+        return "does not respond any more"
     if code >= 0:
         return f"ended with code {code}"
     with suppress(ValueError):  # a signal without a name
@@ -166,14 +166,13 @@ def _how_ended(code: int | None) -> str:
 
 
 def _run(options: RigOptions, connection: Connection) -> None:
-    """Body of the child process."""
-    # Ctrl-C and a service manager's stop go to the whole group; the parent decides when this ends.
+    """Run the child process."""
+    # Ctrl-C and a service manager's stop signal the whole group; only the parent may end the child.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     stop = threading.Event()
     threading.Thread(target=_await_stop, args=(connection, stop), daemon=True).start()
-    # Said before anything is closed: hardware that hangs may keep that waiting. A parent that died
-    # wants no more messages.
+    # Sent before devices are closed: hung hardware may block that. The parent may have died.
     with suppress(OSError), ExitStack() as stack:
         connection.send(Failed(_streamed(options, connection, stop, stack)))
 
@@ -181,7 +180,7 @@ def _run(options: RigOptions, connection: Connection) -> None:
 def _streamed(
     options: RigOptions, connection: Connection, stop: threading.Event, stack: ExitStack
 ) -> FootTileError | None:
-    """Take frames until told to stop; why it ended before that, if it did."""
+    """Acquire frames until the stop; return the error of an earlier end, else None."""
     try:
         rig = _open_rig(options, connection, stop, stack)
         if rig is None:
@@ -205,13 +204,13 @@ def _streamed(
 def _open_rig(
     options: RigOptions, connection: Connection, stop: threading.Event, stack: ExitStack
 ) -> Rig | None:
-    """Open the array, again and again while it may yet come; None if told to stop before.
+    """Open the array, with retries while it may still appear; None if stopped before.
 
-    A node that starts with its robot starts before the sensors have their supply. Emulated tiles do
-    not come by being waited for: the time of their faults begins with the first frame.
+    A node that starts with its robot may start before the sensors have power. No retries for
+    emulated tiles: the time of their faults begins with the first frame.
 
     Raises:
-        FootTileError: it cannot be opened, and waiting does not help.
+        FootTileError: the array cannot be opened, and a retry does not help.
     """
     while True:
         attempt, waits = ExitStack(), False
@@ -224,14 +223,14 @@ def _open_rig(
             attempt.close()
             connection.send(Waiting(str(error)))
         finally:
-            if not waits:  # what failed for good is closed after it was reported
+            if not waits:  # after a final failure close only after the report
                 stack.enter_context(attempt)
         if stop.wait(OPEN_AGAIN_S):
             return None
 
 
 def _may_pass(error: FootTileError) -> bool:
-    """Return whether hardware that is not there now may come without a change of the set-up."""
+    """Return whether absent hardware may appear without a change of the configuration."""
     if isinstance(error, (BusSetupError, SpiSetupError)):
         return getattr(error.__cause__, "errno", None) in _ABSENT
     return not isinstance(error, BusMisuseError)
@@ -246,13 +245,13 @@ def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:
     sender.start()
     try:
         for batch in rig.batches(stop.is_set):
-            told: tuple[str, ...] = ()
+            changes: tuple[str, ...] = ()
             if batch.t_mono_ns[-1] >= look_ns:
-                told = notices.since(rig.troubles())
+                changes = notices.since(rig.troubles())
                 health = Health(notices.lasting, rig.counts())
                 look_ns = int(batch.t_mono_ns[-1]) + _LOOK_EVERY_NS
             with suppress(queue.Full):
-                waiting.put_nowait((batch, rig.acquisition.missed_slots, told, health))
+                waiting.put_nowait((batch, rig.acquisition.missed_slots, changes, health))
     finally:
         waiting.put(None)
         sender.join()

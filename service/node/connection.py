@@ -1,6 +1,6 @@
-"""A connection on which a server has welcomed a node: what goes each way while it lasts.
+"""Connection of a node to a server after the handshake: messages in both directions.
 
-Before frames go, the offset between the node's clock and the server's is measured.
+The offset between the clocks of node and server is measured from the beginning.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from storage.journal.node.journal import NodeJournal
 from storage.journal.node.stream import NodeStream
 
 STATUS_EVERY_S = 1.0
-"""Interval of status messages, which are for people to read."""
+"""Interval of status messages."""
 
 
 class Connection:
-    """What goes each way on one connection.
+    """Connection to a server: receives its messages, sends frames, status and clock probes.
 
     Args:
-        link: both sides have greeted each other on it.
+        link: connection after its handshake.
         delivered: called whenever the server has acknowledged frames.
     """
 
@@ -60,10 +60,10 @@ class Connection:
         self._take_wanted(link.welcome.wanted)
 
     async def run(self, renewed: asyncio.Event) -> None:
-        """Until it breaks, or the node has another stream to say hello with.
+        """Exchange messages until the connection breaks or `renewed` is set.
 
         Raises:
-            LinkError, OSError, WebSocketException: it is broken.
+            LinkError, OSError, WebSocketException: the connection is broken.
         """
         await _until_one_ends(
             self._receive(),
@@ -81,7 +81,7 @@ class Connection:
                 case Ack(boot_id=boot_id, seq_first=first, seq_last=last):
                     stream = self._link.source.streams().get(boot_id)
                     self._delivered()
-                    # What was never taken, nobody can have: it is not forgotten when it comes.
+                    # Acknowledged future frames cannot exist: do not delete them later.
                     if stream is not None and first < stream.next_seq:
                         last = min(last, stream.next_seq - 1)
                         stream.acknowledge(self._link.server_id, first, last)
@@ -90,7 +90,7 @@ class Connection:
                 case Probe():
                     self._probes.answered(message)
                 case Challenge() | Welcome():
-                    raise LinkError(f"{message.type} was said before")
+                    raise LinkError(f"the server sent {message.type} a second time")
 
     def _take_wanted(self, wanted: Wanted) -> None:
         earlier = (stream.array_info.boot_id for stream in self._link.hello.earlier)
@@ -111,26 +111,26 @@ class Connection:
 
 
 def parse(message: str | bytes) -> SaidByServer:
-    """What a server has said.
+    """Verify and parse a message of a server.
 
     Raises:
-        LinkError: it is no message of the link.
+        LinkError: it is no valid message of the protocol.
     """
     try:
         return understood(FromServer, heard(message))
     except LinkError as error:
         raise LinkError(
-            f"the server said something that is no message: {error}",
+            f"the server sent an invalid message: {error}",
             expected=f"{SUBPROTOCOL} messages",
-            remedy="Is it a foottile server of this version?",
+            remedy="Check that it is a foottile server of the same version",
         ) from error
 
 
 async def _until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
-    """Run all of these at once until one ends; fail as that one failed.
+    """Run coroutines concurrently until one ends, cancel the others, and raise its exception.
 
-    Not by a TaskGroup: before Python 3.13 one that ends while its owner is about to go on may leave
-    the owner cancelled (CPython 117407), and a node without its link.
+    Without a TaskGroup: before Python 3.13 a group that ends while its owner is about to resume may
+    leave the owner cancelled (CPython 117407), and a node without its link.
     """
     tasks = [asyncio.create_task(each) for each in work]
     try:
@@ -144,14 +144,14 @@ async def _until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
 
 
 _EARLIER_MAX = 64
-"""As many as fit into a message."""
+"""Most earlier streams that fit into a message."""
 
 
 def hello_of(options: NodeOptions, journal: NodeJournal, present: NodeStream) -> Hello:
-    """What a node says of itself; it looks into the journals of earlier streams.
+    """Compose a node's hello; reads the journals of earlier streams.
 
     Raises:
-        StorageError: one of them cannot be read.
+        StorageError: a journal cannot be read.
     """
     next_seq = present.next_seq  # before `held`, which may grow meanwhile
     # Another stream may have begun meanwhile; it has not ended.
@@ -196,15 +196,15 @@ def _earlier(stream: NodeStream) -> EarlierStream:
 
 
 PROBE_EVERY_S = 10.0
-"""Two crystals of 50 ppm part by 1 ms at most in this time."""
+"""Interval of clock measurements, in which two crystals of 50 ppm drift by 1 ms at most."""
 
 
 class ClockProbes:
-    """Probes of one connection.
+    """Measurement of the clock offset on one connection.
 
     Args:
         socket: the connection.
-        utc_offset_ns: `t_ns` minus `t_mono_ns` of the stream that is being taken.
+        utc_offset_ns: `t_ns` minus `t_mono_ns` of the present stream.
     """
 
     def __init__(self, socket: ClientConnection, utc_offset_ns: int) -> None:
@@ -213,12 +213,12 @@ class ClockProbes:
         self._answers: asyncio.Queue[Probe] = asyncio.Queue(PROBES)
 
     def answered(self, probe: Probe) -> None:
-        """The server has answered a probe."""
+        """Queue the server's answer to a probe."""
         with suppress(asyncio.QueueFull):
             self._answers.put_nowait(probe)
 
     async def run(self) -> None:
-        """Measure again and again, and tell the server; a failed measurement is not sent."""
+        """Measure the offset at intervals and send it to the server, except failed measurements."""
         number = 0
         while True:
             best: ClockRow | None = None

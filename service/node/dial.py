@@ -1,9 +1,9 @@
-"""A TCP connection as soon as there can be one.
+"""TCP connection to a server with overlapping attempts, and backoff between connections.
 
-While a link is down an attempt waits for its time-out, and the kernel repeats its first packet
-after one second, three, seven: a link that returns would not be noticed for seconds. So a new
-attempt begins each half second beside those that wait, and the first that succeeds is taken. A slow
-link is given the time it needs.
+While a link is down an attempt waits for its timeout, and the kernel repeats its first packet after
+one second, three, seven: it would detect a returned link only seconds later. So a new attempt
+begins each half second beside the waiting ones, and the first success wins. Earlier attempts go on,
+for slow links.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from foottile.websocket import UpgradeRefused
 from service.link import INGEST_PATH, Close
 
 EVERY_S = 0.5
-"""Interval of attempts: a link that has returned carries one at the latest after this."""
+"""Interval of attempts, and so the longest delay after the link's return."""
 GIVE_UP_S = 5.0
-"""After that the address is looked up again."""
+"""Timeout of all attempts; then the address is looked up again."""
 _UNSENT_BYTES = 16 << 10
-"""Some messages of frames."""
+"""Limit of unsent bytes in the kernel: some messages of frames."""
 
 
 def ingest_url(server: str) -> str:
-    """The websocket address of a server's ingest.
+    """Build the websocket address of a server's ingest.
 
     Raises:
         UsageError: `server` is no address.
@@ -50,13 +50,13 @@ def ingest_url(server: str) -> str:
 
 
 async def dial(url: str) -> socket.socket:
-    """Connect to a server.
+    """Connect a TCP socket to a server, with an attempt each half second.
 
     Args:
-        url: its websocket address.
+        url: the server's websocket address.
 
     Raises:
-        OSError: it refuses, or does not answer.
+        OSError: the server refuses, or does not answer in time.
     """
     parts = urlsplit(url)
     host, port = parts.hostname or "", parts.port or (443 if parts.scheme == "wss" else 80)
@@ -81,7 +81,7 @@ async def dial(url: str) -> socket.socket:
         for attempt in attempts:
             attempt.cancel()
         for left in await asyncio.gather(*attempts, return_exceptions=True):
-            if isinstance(left, socket.socket):  # two came through at once
+            if isinstance(left, socket.socket):  # two attempts succeeded at once
                 left.close()
     raise refused or TimeoutError(f"no answer for {GIVE_UP_S:g} s")
 
@@ -97,7 +97,7 @@ async def _attempt(host: str, port: int) -> socket.socket:
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if hasattr(socket, "TCP_NOTSENT_LOWAT"):
-                # What waits in the kernel cannot be overtaken by newer frames.
+                # Newer frames cannot overtake bytes in the kernel's buffer.
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
             await loop.sock_connect(connection, address)
         except OSError as refused:
@@ -112,33 +112,33 @@ async def _attempt(host: str, port: int) -> socket.socket:
 
 
 BACK_OFF_S = (0.1, 0.5)
-"""Between attempts at a server that cannot be reached: the picture is back within a second."""
+"""Shortest and longest delay while the server is unreachable: live data return within a second."""
 REFUSED_BACK_OFF_S = (0.2, 5.0)
-"""Between attempts at a server that answered and refused."""
+"""Shortest and longest delay while the server refuses the node."""
 
 
 class BackOff:
-    """How long to wait before the next attempt."""
+    """Exponential backoff with jitter between connections."""
 
     def __init__(self) -> None:
         self._bounds = BACK_OFF_S
         self._wait_s = 0.0
 
     def succeeded(self) -> None:
-        """A server has acknowledged frames.
+        """Reset after acknowledged frames.
 
-        A welcome alone is none: whoever is let go for what it sends would come back at once.
+        A welcome is not enough: a node whose frames are refused would reconnect at once.
         """
         self._bounds, self._wait_s = BACK_OFF_S, 0.0
 
     def failed(self, error: Exception) -> None:
-        """An attempt, or a connection, has ended for this reason."""
+        """Choose the delays by the error that ended an attempt or a connection."""
         bounds = REFUSED_BACK_OFF_S if _is_refusal(error) else BACK_OFF_S
         if bounds != self._bounds:
             self._bounds, self._wait_s = bounds, bounds[0]
 
     def next_s(self) -> float:
-        """How long to wait now: longer each time, with jitter so that nodes do not coincide."""
+        """Return the next delay: twice the previous one, with jitter so that nodes spread."""
         least, most = self._bounds
         self._wait_s = min(max(2.0 * self._wait_s, least), most)
         return self._wait_s * random.uniform(0.5, 1.0)  # noqa: S311  # no secret
@@ -146,14 +146,14 @@ class BackOff:
 
 def _is_refusal(error: BaseException) -> bool:
     if isinstance(error, ConnectionClosed):
-        # A server that is going down will be back; what was damaged on its way is sent again.
+        # A restarting server will be back, and damaged messages are sent again.
         soon = (Close.RESTART, Close.MALFORMED)
         return error.rcvd is not None and error.rcvd.code not in soon
     return isinstance(error, UpgradeRefused)
 
 
 def reason_of(error: Exception, url: str = "") -> str:
-    """Why there is no connection to an address, in words."""
+    """Explain in words why the connection to an address failed."""
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         return error.rcvd.reason or f"closed with code {error.rcvd.code}"
     if isinstance(error, UpgradeRefused):

@@ -1,9 +1,8 @@
-"""How much may be under way on a link, so that what is newest never waits long behind the rest.
+"""Flow control of a link: a limit of the bytes in flight, so that the newest frames wait briefly.
 
-Every message counts as under way until an answer shows that the other side has read past it. From
-the pace at which that happens follows how much the link carries in `QUEUE_S`, and no more than that
-is sent ahead: a slow link has half a second of frames in its buffers, not a minute. Pure
-arithmetic; the sender tells it what happened, and when.
+A message is in flight until the answer to a later ping shows that it was read. The throughput gives
+the bytes that the link transfers in `QUEUE_S`, and no more are sent ahead: a slow link has half a
+second of frames in its buffers, not a minute. Pure arithmetic; the sender reports events and times.
 """
 
 from __future__ import annotations
@@ -11,19 +10,20 @@ from __future__ import annotations
 from collections import deque
 
 QUEUE_S = 0.4
-"""How long the bytes under way may take: the newest frame waits no longer than this."""
+"""Transfer time of a full window: the longest wait of the newest frame."""
 LEAST_BYTES = 32 << 10
-"""Half a second or so of four tiles: with less, a link with a long delay would stand idle."""
+"""Smallest window, about half a second of four tiles; with less, a link with a long delay would
+idle."""
 MOST_BYTES = 8 << 20
-"""More than any link needs in `QUEUE_S`; bounds memory."""
+"""Largest window, more than any link needs in `QUEUE_S`; bounds memory."""
 _PACE_OVER_S = 1.0
-"""The pace is that of the last second: links change."""
+"""Time over which throughput is measured."""
 _PIECES = 8
-"""Number of questions that are under way in a full window."""
+"""Number of pings in flight in a full window."""
 
 
 class Flow:
-    """What is under way on one connection."""
+    """Send window of one connection."""
 
     def __init__(self) -> None:
         self._sent = 0
@@ -31,38 +31,38 @@ class Flow:
         self._passed = 0
         self._history: deque[tuple[float, int]] = deque()
         self.window_bytes = LEAST_BYTES
-        """How much may be under way."""
+        """Limit of the bytes in flight."""
 
     @property
     def under_way_bytes(self) -> int:
-        """Sent, and not yet known to be read."""
+        """Bytes sent and not yet known to be read."""
         return self._sent - self._passed
 
     @property
     def is_open(self) -> bool:
-        """May more be sent?"""
+        """True if more may be sent."""
         return self.under_way_bytes < self.window_bytes
 
     @property
     def wants_mark(self) -> bool:
-        """Is it time to ask? Often enough that room comes back piece by piece, not all at once."""
+        """True if a ping is due; several per window, so that it opens gradually."""
         marked = self._marks[-1][1] if self._marks else self._passed
         return self._sent - marked >= self.window_bytes / _PIECES
 
     def sent(self, length: int) -> None:
-        """A message of so many bytes went out."""
+        """Add a sent message of `length` bytes."""
         self._sent += length
 
     def mark(self, number: int) -> None:
-        """A question went out behind what was sent so far; its answer is `answered`."""
+        """Record a ping behind all bytes sent before; `answered` takes its answer."""
         self._marks.append((number, self._sent))
 
     def answered(self, number: int, now_s: float) -> None:
-        """The other side has answered a question: it has read all that went out before.
+        """Update the window with a ping's answer: the other side has read all bytes before it.
 
         Args:
-            number: of the question; an unknown one tells nothing.
-            now_s: an instant of a clock that never steps.
+            number: number of the ping; unknown numbers have no effect.
+            now_s: instant of a monotonic clock.
         """
         while self._marks and self._marks[0][0] <= number:
             self._passed = self._marks.popleft()[1]
@@ -71,7 +71,7 @@ class Flow:
             self._history.popleft()
         (begin_s, before), (end_s, after) = self._history[0], self._history[-1]
         if end_s - begin_s > 0:
-            # Twice what it needs would be a window that grows until the link is full, and then
-            # holds `QUEUE_S` of what the link carries.
+            # The window grows until the link is saturated, and then stays at `QUEUE_S` of it.
+
             pace = (after - before) / (end_s - begin_s)
             self.window_bytes = round(min(max(pace * QUEUE_S, LEAST_BYTES), MOST_BYTES))

@@ -1,4 +1,4 @@
-"""What has become wrong with an array, or right again, for people to read on a terminal."""
+"""Debounce of an array's warnings, for a terminal and the node's status."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from collections.abc import Mapping
 
 
 class Notices:
-    """Reports what lasts; what comes and goes between two looks is only in the frames' flags."""
+    """Debouncer of warnings: a warning has to be present in two updates in a row.
+
+    Shorter faults show only in the frames' flags.
+    """
 
     def __init__(self) -> None:
         self._last: Mapping[str, str] = {}
@@ -14,14 +17,14 @@ class Notices:
 
     @property
     def lasting(self) -> tuple[str, ...]:
-        """What is wrong, and lasts."""
+        """Texts of the present debounced warnings."""
         return tuple(self._told.values())
 
     def since(self, troubles: Mapping[str, str]) -> tuple[str, ...]:
-        """What is new since the last look.
+        """Update with the present warnings; return messages about begun and ended ones.
 
         Args:
-            troubles: what is wrong now, in words, by what it is wrong with.
+            troubles: texts of the present warnings, by faulty part.
         """
         lasting = {what: text for what, text in troubles.items() if self._last.get(what) == text}
         new = [text for what, text in lasting.items() if self._told.get(what) != text]

@@ -1,4 +1,4 @@
-"""What a node is told to do."""
+"""Options of a node."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from service.rig.options import RigOptions
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """What a node does.
+    """Options of a node.
 
     Attributes:
-        rig: the array to open.
+        rig: options of the rig.
         journal: the node's folder.
-        server: address of the server; None: none, it records for itself.
+        server: address of the server; None: no server, local recording only.
         record: name of a session to record on the node itself; None: no recording.
-        calibration: of its tiles, for the server to estimate with.
-        calibration_problem: why there is no calibration.
-        token: of the server; None: that of a server which this user runs on this machine.
-        ca: file or folder of CA certificates, beside those that the machine trusts.
+        calibration: calibration of the tiles, for the server's estimates.
+        calibration_problem: reason why there is no calibration.
+        token: the server's token; None: the token of this user's server on this machine.
+        ca: file or folder of CA certificates, in addition to the system's.
     """
 
     rig: RigOptions

@@ -1,7 +1,6 @@
-"""The node's end of the link: dials the server, gives it what it lacks, and never stops trying.
+"""Publisher of a node's frames: connects to the server, with endless retries.
 
-Whatever breaks, the journal keeps the frames, and the next connection takes up where the server
-says it left off.
+The journal stores all frames, and the next connection continues with the server's missing ones.
 """
 
 from __future__ import annotations
@@ -40,14 +39,14 @@ from service.node.sending import Greeted, Source
 
 
 class Publisher:
-    """Gives a node's streams to a server, over as many connections as it takes.
+    """Publisher of a node's streams to a server, over successive connections.
 
     Args:
         server: http(s) or ws(s) address of the server.
-        source: the node.
-        token: of the server; None: that of a server which this user runs on this machine.
-        ca: file or folder of CA certificates, beside those that the machine trusts.
-        report: told what happened, once for every change.
+        source: callbacks of the node.
+        token: the server's token; None: the token of this user's server on this machine.
+        ca: file or folder of CA certificates, in addition to the system's.
+        report: called with a message for every change.
     """
 
     def __init__(
@@ -68,19 +67,19 @@ class Publisher:
         self._last_report = ""
         self._connected = False
         self._fingerprint = ""
-        """Of the secret that it showed last."""
+        """Fingerprint of the last used secret."""
         self._is_refused = False
-        """Did the server refuse it as another machine? Then it shows its secret, so that a person
+        """True after a refusal as another machine: then the node sends its secret, so that a person
         can accept it."""
         self._wake = asyncio.Event()
         self._renewed = asyncio.Event()
 
     def notify(self) -> None:
-        """There are new frames."""
+        """Wake the sender: there are new frames."""
         self._wake.set()
 
     def renew(self) -> None:
-        """Another stream has begun: say hello again."""
+        """Reconnect with a new hello: another stream has begun."""
         self._renewed.set()
 
     async def run(self) -> None:
@@ -97,7 +96,7 @@ class Publisher:
                 try:
                     await self._speak(tcp, token, back_off)
                 finally:
-                    tcp.close()  # if it was not handed over, or not yet let go
+                    tcp.close()  # if the websocket does not own it
             except (OSError, ValueError, WebSocketException) as error:
                 reason = reason_of(error, self._url)
                 if _is_wrong_identity(error):
@@ -110,7 +109,7 @@ class Publisher:
 
     @property
     def is_connected(self) -> bool:
-        """Has a server welcomed it?"""
+        """True while a server has accepted the node."""
         return self._connected
 
     async def _speak(self, tcp: sockets.socket, token: str | None, back_off: BackOff) -> None:
@@ -122,7 +121,7 @@ class Publisher:
             subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
             compression=None,  # costs three times the CPU, saves little (performance.md)
             max_size=MESSAGE_BYTES_MAX,
-            ping_interval=None,  # we ask ourselves, and measure by the answers
+            ping_interval=None,  # `Sending` sends its own pings
             open_timeout=SILENCE_S,
             close_timeout=1.0,
             additional_headers={"Authorization": f"Bearer {token}"} if token else {},
@@ -144,7 +143,7 @@ class Publisher:
         node = self._source.present().info.node
         await socket.send(say(Identify(protocol=PROTOCOL, node=node)))
         challenge = await _answer(socket, Challenge)
-        # In threads: one keeps a secret, the other looks into the journals of earlier streams.
+        # In threads: both read or write the disk.
         secret = await asyncio.to_thread(self._source.secret, challenge.server_id)
         self._fingerprint = "" if secret is None else fingerprint_of(secret)
         if secret is not None and challenge.is_known and not self._is_refused:
@@ -172,7 +171,7 @@ async def _answer(socket: ClientConnection, kind: type[_Kind]) -> _Kind:
         answer: SaidByServer = parse(await socket.recv())
     if not isinstance(answer, kind):
         expected = kind.model_fields["type"].default
-        raise LinkError(f"the server said {answer.type!r}", expected=expected)
+        raise LinkError(f"the server sent {answer.type!r}", expected=expected)
     return answer
 
 

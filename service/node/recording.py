@@ -1,8 +1,8 @@
-"""A session that is recorded on the node itself, with or without a server.
+"""Local recording of a session on the node, with or without a server.
 
-It is a list of intervals of the node's streams like any other session, and sealed by the same code.
-One that a crash left behind goes on if a node with the same name for it is started again; otherwise
-it is sealed as it is.
+The session is a list of intervals of the node's streams like any other, and sealed by the same
+code. After a crash an unsealed session continues if the node restarts with the same session name;
+otherwise it is sealed as it is.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from storage.sessions.ledger import ledger_of, numbers_of, states_of
 
 
 class NodeRecording:
-    """The node's own sessions.
+    """Local sessions of a node.
 
     Args:
         root: the node's folder; sessions are in `sessions` below it.
-        node: its name.
-        journal: where the frames are.
-        name: of the session to record; None: none, but what was left behind is sealed.
-        calibration: to estimate with.
-        scene_content: of its scene file.
-        emulated: is its array?
-        report: told what happens.
+        node: name of the node.
+        journal: journal of the frames.
+        name: name of the session to record; None: only seal sessions of earlier runs.
+        calibration: calibration for the estimates.
+        scene_content: content of the scene file.
+        emulated: True if the array is emulated.
+        report: called with messages for the user.
     """
 
     def __init__(
@@ -59,9 +59,9 @@ class NodeRecording:
         self._report = report
         self._session: Session | None = None
         self._sealing = threading.Lock()
-        """Held while what was left is sealed: a node may be stopped meanwhile."""
+        """Lock while sessions of earlier runs are sealed: a node may be stopped meanwhile."""
         found, self._unreadable = self._folder.load_all()
-        """Unreadable sessions: it is not known which frames they need, so all frames are kept."""
+        """Unreadable sessions. They may need any frame, so all frames are retained."""
         for session_id, error in self._unreadable.items():
             report(f"session {session_id} is left out: {error}")
         for stray in self._folder.strays():
@@ -72,7 +72,11 @@ class NodeRecording:
         self._need()
 
     def goes_on_in(self, stream: NodeStream) -> None:
-        """A stream has begun: it belongs to the session from its first frame on."""
+        """Add a new stream to the session, from its first frame on.
+
+        Creates the session, or continues an interrupted one. With other tiles the session ends and
+        another one begins.
+        """
         if self._name is None:
             return
         session, part = self._session, Part(boot_id=stream.boot_id, seq_first=0)
@@ -102,10 +106,10 @@ class NodeRecording:
         self._note(session)
 
     def stop(self) -> tuple[str | None, bool]:
-        """Seal the session; return its id (None if there is none), and whether it is lossy.
+        """Seal the session; return its id (None without a session), and whether it is lossy.
 
         Raises:
-            FootTileError: it cannot be sealed; everything stays, for `foottile recover`.
+            FootTileError: it cannot be sealed; all files stay, for `foottile recover`.
         """
         session, self._session = self._session, None
         if session is None:
@@ -116,7 +120,7 @@ class NodeRecording:
         return sealed.id, sealed.ledger is None or not sealed.ledger.complete
 
     def seal_what_was_left(self) -> None:
-        """Seal sessions of earlier runs; one that cannot be is reported and stays."""
+        """Seal sessions of earlier runs; report failures and leave these sessions."""
         with self._sealing:
             for session in list(self._left_over):
                 try:
@@ -132,7 +136,7 @@ class NodeRecording:
                 self._need()
 
     def _broken_off(self) -> Session | None:
-        """The newest session that this recording left behind and that no other one continues."""
+        """Find the newest interrupted session of this name that no other one continues."""
         for session in self._left_over:
             is_its_own = self._name in (session.name, numbered(session.name)[0])
             if is_its_own and session.state != "pending":
@@ -142,11 +146,11 @@ class NodeRecording:
     def _note(self, session: Session) -> None:
         try:
             self._folder.save(session)
-        except StorageError as error:  # its frames are kept all the same, if any can be
-            self._report(f"session {session.id} cannot be noted: {error}")
+        except StorageError as error:  # its frames are retained nevertheless
+            self._report(f"session {session.id} cannot be saved: {error}")
 
     def _seal(self, session: Session) -> Session:
-        # Here, because a real node need not wait for scipy before its first frame.
+        # Imported here, because scipy would delay a node's first frame.
         from service.sessions.sealing import seal
         from service.sessions.sources import sources_of
 
@@ -162,12 +166,12 @@ class NodeRecording:
         return sealed
 
     def _described(self, session: Session) -> dict[str, SessionStream]:
-        """What is known of a session's streams, by boot_id."""
+        """Collect the stored state of a session's streams, by boot_id."""
         known = {stream.boot_id: _described(stream) for stream in self._journal.streams}
         return {p.boot_id: known.get(p.boot_id, SessionStream()) for p in session.parts}
 
     def _need(self) -> None:
-        """Tell the journal to keep the frames that are not sealed yet."""
+        """Make the journal retain all frames that are not sealed yet."""
         sessions = (*self._left_over, *((self._session,) if self._session else ()))
         needed = numbers_of(part for session in sessions for part in session.parts)
         if self._unreadable:
@@ -176,9 +180,9 @@ class NodeRecording:
 
 
 def _described(stream: NodeStream) -> SessionStream:
-    """What a session on the node knows of one of its streams: it has ended, and all of it is here.
+    """Describe a stream of a local session: it has ended, and no frames are missing elsewhere.
 
-    A session here ends with its stream, not by an instant: the date may have been set meanwhile.
+    A local session ends with its stream, not at an instant: the date may have been set meanwhile.
     """
     return SessionStream(
         held=stream.stored,

@@ -1,4 +1,4 @@
-"""A node: acquisition in its own process, a journal on disk, and the publisher that empties it."""
+"""Running node: acquisition process, journal on disk, local recording, and publisher."""
 
 from __future__ import annotations
 
@@ -32,29 +32,28 @@ from storage.journal.node.stream import NodeStream
 from storage.journal.node.wanted import ServerWants
 
 _LOOK_S = 0.02
-"""Between two looks whether the server has everything."""
+"""Poll interval while waiting for delivery."""
 _DRAIN_S = 3.0
-"""A node that is stopped waits no longer for the server."""
+"""Timeout of delivery to the server when the node stops."""
 _AWAY_LOOKS = 50
-"""After this many looks without a link, a second in all, it waits no longer."""
+"""Polls without a link, a second in all, that end the wait for delivery."""
 _PROBLEMS_MAX, _PROBLEM_LENGTH = 20, 400
-"""What a server is told of what was found damaged; all of it was said here."""
+"""Limits of the journal's problems in a status message; the node reports all problems locally."""
 _TROUBLES_S = 0.5
-"""Between two looks at what is wrong."""
+"""Interval of checks for changed warnings."""
 _SILENT_S = 2.0
-"""Acquisition that gives nothing for this long is held up: it gives a batch every 25 ms."""
+"""Time without a batch after which acquisition counts as stalled; a batch takes 25 ms."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of the frames of sessions when a node ended.
+    """Outcome of a node's run, for the frames of sessions.
 
     Attributes:
-        undelivered_frames: on the node's disk, for a server that has not got them yet.
-        lost_frames: on no disk of the node or of a server, by reason; frames that were dropped
-            because no session wanted them do not count.
-        recorded: id of the session that was recorded here; None: none was, or it is not sealed.
-        is_lossy: is that session not complete?
+        undelivered_frames: frames on the node's disk that the server has not acknowledged.
+        lost_frames: frames of sessions that are on no disk of node or server.
+        recorded: id of the local session; None: no recording, or not sealed.
+        is_lossy: True if that session is not complete.
     """
 
     undelivered_frames: int = 0
@@ -66,22 +65,22 @@ class Outcome:
 async def run_node(
     options: NodeOptions, *, stop: asyncio.Event, report: Callable[[str], None]
 ) -> Outcome:
-    """Take frames, keep them and publish them until `stop`.
+    """Acquire frames, journal them and publish them until `stop`.
 
     Args:
-        options: what to do.
-        stop: ends the node, gently.
-        report: told what happens to link, disk and array.
+        options: options of the node.
+        stop: ends the node in order.
+        report: called with messages about link, disk and array.
 
     Raises:
-        FootTileError: the array cannot be opened or failed for good, or another node has the
+        FootTileError: the array cannot be opened or failed for good, or another node uses the
             folder.
     """
     rig = options.rig
     journal = await asyncio.to_thread(NodeJournal, options.journal, rig.node)
     try:
         node = RunningNode(options, journal, report)
-        journal.start()  # it knows now what the node's own sessions need
+        journal.start()  # only now, when the retention for local sessions is set
         try:
             return await node.run(stop)
         finally:
@@ -91,7 +90,7 @@ async def run_node(
 
 
 class RunningNode:
-    """The parts of a running node, and how they are joined."""
+    """Running node: connects acquisition, journal, recording and publisher."""
 
     def __init__(
         self, options: NodeOptions, journal: NodeJournal, report: Callable[[str], None]
@@ -115,7 +114,7 @@ class RunningNode:
         self._present: NodeStream | None = None
         self._messages: asyncio.Queue[Message] = asyncio.Queue()
         self._heard_s = math.inf
-        """When acquisition gave something last; never so far."""
+        """Time of the last message from acquisition; infinite before the first."""
         self._publisher: Publisher | None = None
         self._publishing: asyncio.Task[None] | None = None
         self._told: tuple[str, ...] = ()
@@ -127,7 +126,7 @@ class RunningNode:
         )
 
     async def run(self, stop: asyncio.Event) -> Outcome:
-        """Until it is stopped, or the array fails for good."""
+        """Run until stopped, or until the array fails for good."""
         stopping = asyncio.create_task(stop.wait())
         tasks: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._watch())]
         try:
@@ -150,7 +149,7 @@ class RunningNode:
             if self._present is not None:
                 self._present.end()
             await self._drain()
-            # Sealed before it is settled, a session would end without what was in flight.
+            # A session sealed before all frames are on disk would lack those in flight.
             outcome = Outcome(is_lossy=self._options.record is not None)
             if await asyncio.to_thread(self._journal.settle):
                 outcome = await asyncio.to_thread(self._outcome)
@@ -166,7 +165,7 @@ class RunningNode:
 
     async def _await_array(self, stopping: asyncio.Task[bool]) -> Started | None:
         """Wait until the array is open; return None if the node is stopped before."""
-        told = ""
+        reported = ""
         while True:
             message = asyncio.create_task(self._messages.get())
             await asyncio.wait({message, stopping}, return_when=asyncio.FIRST_COMPLETED)
@@ -177,16 +176,16 @@ class RunningNode:
                 case Started() as started:
                     return started
                 case Waiting(problem):
-                    if problem != told:
+                    if problem != reported:
                         self._report(f"waits for the array, and asks again each second: {problem}")
-                    told = problem
+                    reported = problem
                 case Failed(error) if error is not None:
                     raise error
                 case _:
                     return None
 
     def _tell_failure(self, task: asyncio.Task[None]) -> None:
-        """A publisher that ended by itself ends the node, which would else go on in silence."""
+        """End the node if the publisher ended unexpectedly."""
         if not self._is_closing:
             error = None if task.cancelled() else task.exception()
             self._messages.put_nowait(Failed(error or FootTileError("the publisher has ended")))
@@ -260,14 +259,14 @@ class RunningNode:
         self._journal.want(server_id, wants)
 
     def _silence(self) -> tuple[str, ...]:
-        """Whether acquisition is held up: this process and its link go on without it."""
+        """Return a warning if acquisition is stalled; this process and its link go on."""
         silent_s = time.monotonic() - self._heard_s
         if silent_s < _SILENT_S:
             return ()
         return (f"acquisition is held up; no frames for {silent_s:.0f} s",)
 
     async def _watch(self) -> None:
-        """Say when acquisition is held up or the disk takes nothing, and when that is over."""
+        """Report stalls of acquisition and problems of the disk, and their end."""
         while True:
             await asyncio.sleep(_TROUBLES_S)
             troubles = (*self._silence(), *self._journal.troubles)
@@ -281,7 +280,7 @@ class RunningNode:
             self._told = kinds
 
     async def _drain(self) -> None:
-        """Give the server, if it is there, a moment to take what its sessions need."""
+        """Wait for the server, if connected, to acknowledge all frames, within a timeout."""
         publisher = self._publisher
         if publisher is None:
             return
@@ -325,5 +324,5 @@ def _hand_over(
 ) -> None:
     try:
         loop.call_soon_threadsafe(messages.put_nowait, message)
-    except RuntimeError:  # the loop has ended, so nothing listens
+    except RuntimeError:  # the event loop has ended
         return

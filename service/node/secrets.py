@@ -1,7 +1,7 @@
-"""The secrets that a node shares with servers, by the id of their data folders.
+"""Secrets that a node shares with servers, by the id of their data folders.
 
-They lie in the node's own folder, so a node that is renamed is another node, and each server has
-a secret of its own.
+They are in the node's folder, so a renamed node counts as another node. Each server has a separate
+secret.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from storage.durable import put_aside
 from storage.secret_file import SECRETS_NAME, read_secrets, write_secrets
 
 _SERVERS_MAX = 256
-"""The oldest is dropped: the address of a server may answer with ever new ids."""
+"""Most secrets; the oldest is dropped, as a server's address may answer with ever new ids."""
 
 
 class ServerSecrets:
-    """The secrets of one node.
+    """Secrets of one node.
 
     Args:
-        folder: the node's own.
-        report: told what is damaged or cannot be kept, from another thread.
+        folder: the node's folder.
+        report: called with errors of reading or writing, from another thread.
     """
 
     def __init__(self, folder: Path, report: Callable[[str], None]) -> None:
@@ -32,10 +32,9 @@ class ServerSecrets:
         self._reported = ""
 
     def share(self, server_id: str) -> str | None:
-        """Return the secret for a server, made at first contact; it is on the disk then.
+        """Return the secret for a server; create it at first contact and store it on disk.
 
-        None: the disk does not keep it. A secret that is lost with the process would lock the node
-        out.
+        None: it cannot be stored. A secret lost with the process would lock the node out.
         """
         try:
             secrets = self._read()

@@ -1,7 +1,7 @@
-"""Frames on their way to a server: the newest first, and what it lacks of the past behind them.
+"""Sender of frames to a server: the newest first, then the backlog of missing older ones.
 
-Never more is under way than passes in part of a second (`service.node.flow`); how much has passed
-is known by the answers to pings that are sent in between.
+Flow control (`service.node.flow`) bounds the bytes in flight to a part of a second. Answers to
+interleaved pings show how much the server has read.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ from storage.journal.node.stream import NodeStream
 from storage.wire import EncodedBatch
 
 _ASK_EVERY_S = 0.5
-"""Asked even if nothing is sent, so that silence means something."""
+"""Interval of pings on an idle link, to detect its loss."""
 _NO_ANSWER_S = 4.0
-"""A link on which nothing comes back for this long is half open."""
+"""Timeout of a ping, after which the link counts as half open."""
 _LIVE_BEHIND_S = 0.5
-"""Frames that wait longer to be sent are overtaken by newer ones."""
+"""Age from which unsent new frames are moved to the backlog."""
 _CHUNK_FRAMES = 512
-"""A second or so of the past is read at once; then newer frames have their turn."""
+"""Frames of the backlog read at once, about a second; then newer frames have priority."""
 _READ_AGAIN_S = 0.2
-"""After what was to be read was deleted meanwhile."""
+"""Delay before frames that were not found are read again."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """The node, as far as its link uses it.
+    """Callbacks of the node for its link.
 
     Attributes:
-        present: the stream that is being taken.
-        streams: all streams that the node has, by boot_id.
-        hello: describes them; asked for at every connection.
-        secret: the one that it shares with a server, by the server's id; made and kept on the disk
-            at first contact. None if the disk does not keep it.
-        status: what the node counts; is given how many frames are behind.
-        wanted: called with what the server's sessions need, and the streams that it knows.
-        damaged: called with frames that turned out to be damaged on disk.
+        present: returns the present stream.
+        streams: returns all streams of the node, by boot_id.
+        hello: describes them for a new connection.
+        secret: returns the secret shared with a server, by the server's id; created and stored at
+            first contact. None if it cannot be stored.
+        status: returns the node's status, given the number of frames in the backlog.
+        wanted: receives a server's retention request, and the streams announced to the server.
+        damaged: receives frames found damaged on disk.
     """
 
     present: Callable[[], NodeStream]
@@ -61,15 +61,15 @@ class Source:
 
 @dataclass(frozen=True)
 class Greeted:
-    """A connection on which both sides have greeted each other.
+    """Connection after its handshake.
 
     Attributes:
         socket: the connection.
-        source: the node.
-        server_id: name of the server's data folder.
-        hello: what it has said.
-        welcome: what the server has answered.
-        wake: set whenever there may be something to send.
+        source: callbacks of the node.
+        server_id: id of the server's data folder.
+        hello: the node's hello.
+        welcome: the server's answer.
+        wake: set whenever there may be frames to send.
     """
 
     socket: ClientConnection
@@ -81,26 +81,26 @@ class Greeted:
 
 
 class Sending:
-    """Sends the frames of a node over one connection."""
+    """Sender of a node's frames over one connection."""
 
     def __init__(self, link: Greeted) -> None:
         self._link = link
         self._flow = Flow()
         self._asked: dict[int, float] = {}
-        """Questions that were not answered yet, and when they were asked."""
+        """Unanswered pings, with the times at which they were sent."""
         self._numbers = count()
         self.backlog = Backlog(
-            # In the server's order: what sessions need comes first.
+            # In the server's order: frames of sessions first.
             (lacks.boot_id, _before(pair, link.hello, lacks.boot_id))
             for lacks in link.welcome.lacks
             for pair in lacks.numbers
         )
-        """What is still to be sent of the past."""
+        """Older frames still to be sent."""
         self._not_found: tuple[str, int, int] | None = None
-        """What was looked for last in vain."""
+        """Range of the last read that found no frames."""
 
     async def run(self) -> None:
-        """The newest frames as they come, and behind them what the server lacks."""
+        """Send new frames as they come, and in between the backlog, until cancelled."""
         present, hello = self._link.source.present(), self._link.hello
         at = hello.next_seq
         behind_frames = max(1, round(_LIVE_BEHIND_S * hello.array_info.nominal_rate_hz))
@@ -108,13 +108,13 @@ class Sending:
         named = hello.array_info.boot_id
         reading: asyncio.Task[list[tuple[str, EncodedBatch]]] | None = None
         while True:
-            self._link.wake.clear()  # what comes while sending is seen in the next round
+            self._link.wake.clear()  # frames that come while sending are sent in the next round
             if not self._flow.is_open:
                 await self._link.wake.wait()
                 continue
             newest = present.recent(at)
             if newest:
-                # Overtake frames that waited too long; a long batch alone is no reason.
+                # Skip frames that waited too long, but not because of one long batch.
                 late = newest[-1].seq_last - behind_frames
                 batch = next((b for b in newest if b.seq_first > late), newest[-1])
                 if batch.seq_first > at:
@@ -123,7 +123,7 @@ class Sending:
             elif chunk:
                 boot_id, batch = chunk.popleft()
             else:
-                # Reading may take long, beside a card that is being written.
+                # A read may take long while the card is being written.
                 if reading is None and self.backlog.count:
                     chunk_of = asyncio.to_thread(self._next_chunk)
                     reading = asyncio.create_task(chunk_of)
@@ -143,7 +143,7 @@ class Sending:
                 await self.ask()
 
     async def watch(self) -> None:
-        """Ask now and then whether the server is there: a link that is half open is noticed."""
+        """Send pings at intervals; raise `LinkError` if the server does not answer in time."""
         while True:
             oldest_s = next(iter(self._asked.values()), None)
             if oldest_s is not None and time.monotonic() - oldest_s > _NO_ANSWER_S:
@@ -152,7 +152,7 @@ class Sending:
             await asyncio.sleep(_ASK_EVERY_S)
 
     async def ask(self) -> None:
-        """Mark what was sent so far; the answer says that it was read."""
+        """Send a ping; its answer shows that all frames sent before were read."""
         number, flow = next(self._numbers), self._flow
         asked = self._asked
         asked[number] = time.monotonic()
@@ -167,7 +167,7 @@ class Sending:
         asyncio.ensure_future(await self._link.socket.ping()).add_done_callback(answered)
 
     def _next_chunk(self) -> list[tuple[str, EncodedBatch]]:
-        """Batches of the backlog, read from where they are."""
+        """Read the next batches of the backlog, from memory or disk."""
         backlog = self.backlog
         wanted = backlog.next(_CHUNK_FRAMES)
         if wanted is None:
@@ -185,9 +185,9 @@ class Sending:
                 self._link.source.damaged(stream, damaged)
             except StorageError:
                 has_failed = True
-            # What is not held was evicted meanwhile, and counted; what still is may be on its way
-            # between disk and memory, and is looked for again. Batches are sent whole, and may
-            # reach further than what was asked for.
+            # Frames not held were evicted meanwhile, and counted; held ones may be on the way from
+            # memory to disk, and are read again. Whole batches are sent, which may exceed the
+            # requested range.
             done = union(batch.numbers for batch in found) | damaged | (asked - stream.held)
             if not asked & done:
                 time.sleep(_READ_AGAIN_S)
@@ -200,18 +200,18 @@ class Sending:
 
 
 def _before(pair: tuple[int, int | None], hello: Hello, boot_id: str) -> Intervals:
-    """Missing frames taken before hello; newer frames of the present stream follow anyway."""
+    """Return the missing frames from before hello; newer ones are sent anyway."""
     newest = hello.next_seq - 1 if boot_id == hello.array_info.boot_id else NO_END
     return closed([pair]).within(0, newest)
 
 
 class Backlog:
-    """Numbers still to be sent behind the newest ones.
+    """Backlog of frames to be sent after the newest ones. Thread-safe.
 
-    The loop adds to it while a thread reads what is next and takes off what is done.
+    The event loop adds frames while a thread reads the next ones and removes them.
 
     Args:
-        lacks: streams and their numbers, most urgent first; a stream may come more than once.
+        lacks: streams and their missing frames, most urgent first; streams may repeat.
     """
 
     def __init__(self, lacks: Iterable[tuple[str, Intervals]] = ()) -> None:
@@ -220,7 +220,7 @@ class Backlog:
 
     @property
     def count(self) -> int:
-        """How many frames."""
+        """Number of frames in the backlog."""
         streams: dict[str, Intervals] = {}
         with self._lock:
             for boot_id, numbers in self._lacks:
@@ -228,7 +228,7 @@ class Backlog:
         return sum(numbers.count for numbers in streams.values())
 
     def add(self, boot_id: str, first: int, last: int) -> None:
-        """These frames could not be sent when they were new."""
+        """Add frames that could not be sent when they were new."""
         with self._lock:
             for stream, numbers in self._lacks:
                 if stream == boot_id:
@@ -237,7 +237,7 @@ class Backlog:
             self._lacks.append((boot_id, Intervals([(first, last)])))
 
     def next(self, frames_max: int) -> tuple[str, int, int] | None:
-        """Stream, first and last number of what is to be sent next; None: there is nothing."""
+        """Return stream, first and last number of the next frames to send; None if empty."""
         with self._lock:
             for boot_id, numbers in self._lacks:
                 for first, last in numbers:
@@ -245,7 +245,7 @@ class Backlog:
         return None
 
     def done(self, boot_id: str, first: int, last: int) -> None:
-        """These are sent, or cannot be."""
+        """Remove frames that are sent or cannot be read."""
         gone = Intervals([(first, last)])
         with self._lock:
             left = [(s, n - gone if s == boot_id else n) for s, n in self._lacks]

@@ -1,1 +1,1 @@
-"""What people run at a desk: simulate, estimate, calibrate, doctor, and a client of the server."""
+"""Offline commands: simulation, estimation, calibration, comparison, export and diagnosis."""

@@ -1,4 +1,4 @@
-"""How far an estimate is from the truth of an emulated scene, counted as the design says.
+"""Errors of an estimate against the truth of an emulated scene.
 
 Error is estimate minus truth at the same `t_ns`. The figures come from an emulated foot; the
 paper's (GRF within 1 N, COP within 4 mm) come from a real one.
@@ -30,22 +30,22 @@ COMPARED = (
     "true_cop_x_m",
     "true_cop_y_m",
 )
-"""Columns that `accuracy_of` needs."""
+"""Columns that `compute_accuracy` needs."""
 
 GRF_FROM_N = 0.5
 COP_FROM_N = 3.0
 STANCE_MIN_NS = 50_000_000
 STEEP = 2.0
-"""Of a foot that bears load, loading and unloading are where the true force changes by more than so
-many peaks of that load per its duration: of half a sine the outer 28 % each."""
+"""Slope of the true force, in stance peaks per stance duration, above which a frame is loading or
+unloading; for a half sine these are the outer 28 % on each side."""
 PHASES = ("flight", "loading", "mid_stance", "unloading")
 
 
 @dataclass(frozen=True)
 class Covered:
-    """Frames of one phase, and in how many of them the truth lies within 1.96 sigma.
+    """Counts of one phase: frames, and frames with the truth within 1.96 sigma.
 
-    Counts, so that recordings can be pooled by adding them.
+    As counts, so that recordings can be pooled by addition.
     """
 
     frames: int
@@ -53,24 +53,24 @@ class Covered:
 
     @property
     def share(self) -> float:
-        """The part within; NaN if there are no frames."""
+        """Fraction within 1.96 sigma; NaN without frames."""
         return self.within / self.frames if self.frames else math.nan
 
     def __add__(self, other: Covered) -> Covered:
         return Covered(self.frames + other.frames, self.within + other.within)
 
     def as_dict(self) -> dict[str, float]:
-        """For JSON."""
+        """Return the JSON representation."""
         return {"frames": self.frames, "within": self.within, "coverage_95": self.share}
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors of one recording. NaN where there is nothing to judge.
+    """Errors of one recording; NaN where no frame qualifies.
 
-    GRF: frames with more than 0.5 N of truth and no saturated or missing tile. COP: frames with
-    more than 3 N of truth in which it is stated. Flight: frames without any load. `grf_phases`: all
-    frames without a saturated or missing tile, by what the true force does.
+    GRF: frames with a true GRF above 0.5 N and no saturated or missing tile. COP: frames with a
+    true GRF above 3 N and a COP, on the axes that the tiles measure. Flight: frames without any
+    load. `grf_phases`: all frames without a saturated or missing tile, by phase of the true force.
     """
 
     frames: int
@@ -79,15 +79,15 @@ class Accuracy:
     grf_rms_n: float
     grf_bias_n: float
     grf_coverage_95: float
-    """Part of the GRF frames whose truth lies within 1.96 sigma."""
+    """Fraction of the GRF frames with the truth within 1.96 sigma."""
     grf_sigma_median_n: float
     grf_sigma_mid_stance_n: float
     """Median of sigma in mid-stance."""
     grf_published_mae_n: float
-    """Mean absolute error against the truth of the instant at which an estimate is published, `lag`
-    after the one it is about; over the GRF frames whose instant of publication is recorded."""
+    """Mean absolute error against the truth at the time of publication, one look-ahead after the
+    frame; over the GRF frames whose time of publication is recorded."""
     grf_phases: Mapping[str, Covered]
-    """Coverage separately in each of `PHASES`."""
+    """Coverage in each of `PHASES`."""
     flight_mean_n: float
     flight_mae_n: float
     peak_error_n: float
@@ -99,29 +99,29 @@ class Accuracy:
     cop_mean_m: float
     cop_p95_m: float
     cop_coverage_95: float
-    """Part of the COP frames whose true x lies within 1.96 sigma."""
+    """Fraction of the COP frames with the true x within 1.96 sigma."""
     cop_covered: Covered
-    """The same as counts."""
+    """Counts behind `cop_coverage_95`."""
     cop_masked_frames: int
-    """Frames with more than 3 N of truth but without a COP."""
+    """Frames with a true GRF above 3 N but without a COP."""
     cop_masked_share: float
-    """The same as a part of all frames with more than 3 N of truth."""
+    """Fraction of these among all frames with a true GRF above 3 N."""
     saturated_frames: int
     bounds: Covered
-    """Frames without a GRF but with a lower bound of it, and in how many the truth is above."""
+    """Frames with a lower bound instead of a GRF, and how many have the truth above it."""
     after_saturation_mae_n: float
-    """Mean absolute error of the GRF in usable frames that carry what was unseen, which are also
-    among the others."""
+    """Mean absolute GRF error in usable frames after saturation, which count in the figures above
+    too."""
     after_saturation: Covered
-    """Those frames, and in how many the truth lies within 1.96 sigma."""
+    """Frames after saturation, and how many have the truth within 1.96 sigma."""
 
 
 def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0) -> Accuracy:
-    """Compare estimates with truth.
+    """Compute the errors of estimates against the truth.
 
     Args:
-        columns: `COMPARED`, one value per frame, at least one.
-        lag_ms: look-ahead of the estimates: how long after its frame one is published.
+        columns: `ACCURACY_COLUMNS`, one value per frame, at least one.
+        lag_ms: look-ahead of the estimates, the delay from frame to publication.
     """
     true_n, error_n = columns["true_grf_n"], columns["grf_n"] - columns["true_grf_n"]
     saturated = (columns["estimate_status"] & EstimateStatus.SATURATED) != 0
@@ -131,15 +131,16 @@ def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0)
     after = usable & ((columns["estimate_status"] & EstimateStatus.AFTER_SATURATION) != 0)
     judged = (true_n > GRF_FROM_N) & usable
     heavy = true_n > COP_FROM_N
-    stated = heavy & np.isfinite(columns["cop_x_m"])
-    off_m = np.hypot(
-        columns["cop_x_m"][stated] - columns["true_cop_x_m"][stated],
-        columns["cop_y_m"][stated] - columns["true_cop_y_m"][stated],
+    cop_m, true_m = (
+        np.stack([columns[f"{source}cop_{axis}_m"] for axis in "xy"]) for source in ("", "true_")
     )
+    measured = np.isfinite(cop_m).any(axis=1)  # across a row of tiles nothing is
+    stated = heavy & np.isfinite(cop_m[measured]).all(axis=0) & measured.any()
+    off_m = np.hypot(*np.where(measured[:, None], cop_m - true_m, 0.0)[:, stated])
     within = np.abs(error_n[judged]) <= INTERVAL_95 * columns["grf_sigma_n"][judged]
+    stated_x = stated & measured[0]
     within_x = (
-        np.abs(columns["cop_x_m"][stated] - columns["true_cop_x_m"][stated])
-        <= INTERVAL_95 * columns["cop_sigma_x_m"][stated]
+        np.abs(cop_m[0] - true_m[0])[stated_x] <= INTERVAL_95 * columns["cop_sigma_x_m"][stated_x]
     )
     peaks_n, impulses_ns = _stances(columns["t_ns"], true_n, columns["grf_n"])
     flight = error_n[(true_n == 0.0) & np.isfinite(error_n)]
@@ -182,15 +183,15 @@ def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0)
 
 
 def phases_of(t_ns: npt.NDArray[np.int64], true_n: Floats) -> npt.NDArray[np.intp]:
-    """Index into `PHASES` of every frame, by the truth alone.
+    """Return every frame's index into `PHASES`, by the true force alone.
 
-    Flight is where the true force is exactly zero. Each stretch between two flights is judged by
-    itself, whatever its load and length; see `STEEP`.
+    Flight: the true force is exactly zero. Each interval between two flights is classified by its
+    own peak and duration; see `STEEP_PEAKS_PER_DURATION`.
     """
     phases = np.full(len(true_n), PHASES.index("flight"))
     t_s = (t_ns - t_ns[0]) * 1e-9
     for begin, end in _stretches(true_n != 0.0):
-        # With a frame of flight on each side, so that a touch has a slope, too.
+        # With a frame of flight on each side, so that short contacts have a slope.
         first, last = max(begin - 1, 0), min(end + 1, len(true_n))
         inner = slice(begin - first, end - first)
         duration_s = t_s[last - 1] - t_s[first]
@@ -210,7 +211,7 @@ def phases_of(t_ns: npt.NDArray[np.int64], true_n: Floats) -> npt.NDArray[np.int
 def _published_error_n(
     columns: Mapping[str, npt.NDArray[Any]], lag_ns: int, rows: npt.NDArray[np.bool_]
 ) -> Floats:
-    # Counted from the first frame: float64 does not hold nanoseconds since 1970.
+    # From the first frame: float64 cannot represent nanoseconds since 1970.
     since_ns = (columns["t_ns"] - columns["t_ns"][0]).astype(np.float64)
     published_ns = since_ns[rows] + lag_ns
     seen = published_ns <= since_ns[-1]
@@ -219,7 +220,7 @@ def _published_error_n(
 
 
 def _stances(t_ns: Floats, true_n: Floats, grf_n: Floats) -> tuple[Floats, Floats]:
-    """Errors of peak and impulse of every stance: a stretch of truth above `GRF_FROM_N`."""
+    """Compute peak and impulse errors of every stance, where the truth is above `GRF_FROM_N`."""
     peaks, impulses = [], []
     for begin, end in _stretches(true_n > GRF_FROM_N):
         rows = slice(begin, end)
@@ -232,7 +233,7 @@ def _stances(t_ns: Floats, true_n: Floats, grf_n: Floats) -> tuple[Floats, Float
 
 
 def _stretches(rows: Bools) -> list[tuple[int, int]]:
-    """First row of every run of rows that are true, and the first row behind it."""
+    """Return first row and end row (exclusive) of every run of True."""
     edges = np.flatnonzero(np.diff(rows, prepend=False, append=False)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 

@@ -1,4 +1,4 @@
-"""From a session over a plate to a better calibration of the foot as it is mounted."""
+"""Calibration of a mounted foot from a session on a force plate."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from storage.sessions.reader import SessionReader
 
 @dataclass(frozen=True)
 class AgainstOptions:
-    """How to calibrate against a plate; see `foottile calibrate --help`."""
+    """Options of a calibration against a plate; see `foottile calibrate --help`."""
 
     stated: Stated
     lag_range_s: tuple[float, float] | None = None
@@ -36,7 +36,7 @@ class AgainstOptions:
 
 @dataclass(frozen=True)
 class Against:
-    """What came of it."""
+    """Result of a calibration against a plate."""
 
     calibration: Calibration
     mount: Mount
@@ -46,19 +46,19 @@ class Against:
 def calibrate_against(
     path: Path, reference_path: Path, options: AgainstOptions, *, name: str
 ) -> Against:
-    """The calibration of a session's foot, with what a plate shows of how it is mounted.
+    """Extend a session's calibration by the mount's gains and shear, from a plate.
 
     Args:
         path: a sealed session with estimates and calibration.
-        reference_path: what the plate has recorded.
-        options: as asked.
-        name: of the calibration.
+        reference_path: the plate's recording.
+        options: options of the fit.
+        name: name of the new calibration.
 
     Raises:
-        FileFormatError: one of the files cannot be read, or the session brings no calibration.
+        FileFormatError: a file cannot be read, or the session has no calibration.
         UsageError: a unit or sign of the reference is not stated.
         ComparisonError: the two cannot be compared.
-        CalibrationError: the load does not determine what was asked for.
+        CalibrationError: the load does not determine the requested parameters.
     """
     asked = CompareOptions(
         stated=options.stated, lag_range_s=options.lag_range_s, remove_offset=True
@@ -70,12 +70,12 @@ def calibrate_against(
         raise CalibrationError(
             far[0],
             where=str(reference_path),
-            remedy="Mend its units, or name the plate's recording of this very session",
+            remedy="Check its units, and that it is the plate's recording of this session",
         )
     pairs = comparison.pairs
     if not pairs.removed:
         raise CalibrationError(
-            "the foot is never in flight for long enough to tell the plate's zero",
+            "no flight is long enough to estimate the plate's zero",
             where=str(path),
             remedy="Lift the foot off the plate for a second before or after",
         )
@@ -121,7 +121,7 @@ def _calibration(session: SessionReader) -> Calibration:
 
 
 def _tilted(info: ArrayInfo, pairs: Pairs) -> Floats:
-    """1 - cos of the angle between each tile's axis and the vertical, (n, tiles)."""
+    """Compute 1 - cos of the angle between each tile's axis and the vertical, (n, tiles)."""
     positions_m = np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in info.tiles])
     bearing = np.array([not tile.reference for tile in info.tiles])
     axes = np.zeros(len(positions_m))
@@ -134,5 +134,5 @@ def _tilted(info: ArrayInfo, pairs: Pairs) -> Floats:
 
 
 def _times(gain: Parameter, before: float) -> Parameter:
-    """With the gain that the session was estimated with; its doubt is replaced by the new one."""
+    """Multiply a fitted gain by the session's gain; the new uncertainty replaces the old one."""
     return Parameter(value=gain.value * before, sigma=gain.sigma * before)

@@ -1,8 +1,8 @@
-"""A bench recording whose programme is in its marks, as whoever moves the spindle made them.
+"""Calibration programme of a rig recording, from its markers.
 
-A mark says what is done from its instant on: `T01 load` that tile T01 is under the spindle, which
-goes down; `T01 500 g` that a weight stands on it; `soak` and `end` that nothing does. Others are
-remarks. A misspelt one is refused: a stroke would go on where it had ended.
+A marker begins a step: `T01 load`: the spindle moves down on tile T01; `T01 500 g`: a weight is on
+it; `soak` and `end`: no load. Other markers are remarks. A misspelt step is an error, because the
+step before would be extended beyond its end.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.errors import CalibrationError
-from service.estimation.fitting.bench.weights import parse_weight
+from service.estimation.weights import parse_weight
 from storage.schema import NO_INSTANT
 from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.folder import Event
 from storage.sessions.reader import SessionReader
 
 PRESSED = ("rest", "load", "unload", "hold", "release", "tap")
-"""What is done with a tile, named before it."""
+"""Steps of a marker that begins with a tile's serial."""
 IDLE = {"soak": "soak", "end": "rest"}
-"""What is said of no tile, and the phase that it is."""
+"""Phase of each marker without a serial."""
 _FORM = (
     "SERIAL and one of "
     + ", ".join(PRESSED)
@@ -32,23 +32,23 @@ _FORM = (
 )
 
 Programme = tuple[npt.NDArray[np.object_], npt.NDArray[np.str_]]
-"""Of every frame: serial of the tile under the spindle or None, and phase."""
+"""Programme by frame: serial of the loaded tile, or None, and phase."""
 
 
 def programme_of(session: SessionReader) -> Programme | None:
-    """What the marks beside a sealed session say; None: none of them says any of that.
+    """Read the calibration programme from a sealed session's markers; None: they have no step.
 
     Raises:
-        CalibrationError: one is misspelt, or it is not known at which frame it was.
-        FileFormatError: what lies beside the frames is damaged.
+        CalibrationError: a marker is misspelt or has no frame.
+        FileFormatError: the markers file is damaged.
     """
     try:
         events = read_events(session.path.with_name(EVENTS_NAME)).events
     except FileNotFoundError:
         return None
     serials, where = session.info.serials, str(session.path.parent)
-    said = [(event, _said_by(event, serials, where)) for event in events]
-    steps = sorted(((event.t_ns, step) for event, step in said if step is not None))
+    parsed = [(event, _said_by(event, serials, where)) for event in events]
+    steps = sorted(((event.t_ns, step) for event, step in parsed if step is not None))
     if not steps:
         return None
     clock = clock_beside(session)
@@ -59,7 +59,7 @@ def programme_of(session: SessionReader) -> Programme | None:
     t_server_ns = np.concatenate(pieces)
     if (t_server_ns == NO_INSTANT).any():
         raise CalibrationError(
-            "the node's clock was not compared with the server's, by which its marks are",
+            "the markers are on the server's clock, and the node's clock was not compared with it",
             where=where,
             remedy="Record once the node's clock is measured, some seconds after it connects",
         )
@@ -70,10 +70,10 @@ def programme_of(session: SessionReader) -> Programme | None:
 
 
 def _said_by(event: Event, serials: Sequence[str], where: str) -> tuple[str, str] | None:
-    """Serial, empty for none, and phase that begins; None: it is a remark.
+    """Parse a marker into serial (empty for none) and phase; None for a remark.
 
     Raises:
-        CalibrationError: it seems to mean one and does not say which.
+        CalibrationError: it resembles a step but is not one.
     """
     label = event.label.strip()
     if label in IDLE:
@@ -88,7 +88,7 @@ def _said_by(event: Event, serials: Sequence[str], where: str) -> tuple[str, str
     begins = any(re.match(rf"{re.escape(known)}\b", label) for known in serials)
     if begins or phase in PRESSED or label.lower() in IDLE:
         raise CalibrationError(
-            f"mark {label[:80]!r} says no step of a bench",
+            f"mark {label[:80]!r} is no calibration step",
             where=where,
             expected=f"{_FORM}, of a tile of {', '.join(serials)}",
             remedy="Rename or remove it on the session's page",

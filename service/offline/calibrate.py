@@ -1,4 +1,4 @@
-"""From indentation recordings to a calibration: reads sealed sessions, fits each tile."""
+"""Fit of a calibration to the indentation recordings in sealed sessions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from storage.sessions.reader import SessionReader
 
 @dataclass(frozen=True)
 class Pressed:
-    """A tile's part of one file, and the chip and stream it came from."""
+    """Recording of one tile in one file, with its chip and stream."""
 
     indentation: Indentation
     chip: tuple[int, int, int, int]
@@ -45,18 +45,18 @@ def calibrate_recordings(
     delay: Parameter = UNKNOWN_DELAY,
     progress: Callable[[str], None] = lambda message: None,
 ) -> Calibration:
-    """Fit every tile that was pressed.
+    """Fit a calibration of every loaded tile.
 
-    Repeats of a tile may be spread over several files: each has its own baseline and reference
-    zero. A file that is only a soak counts for every tile that is pressed in another. A tile
-    without a believable curve is left out, with the reason in `refused`.
+    Repeats of a tile may be in several files, each with its own baseline and reference zero. A file
+    with only a soak counts for every tile that is loaded in another file. A tile without a valid
+    curve is left out, with the reason in `refused`.
 
     Args:
-        recordings: of each serial.
-        name: for people.
-        reference: the force sensor.
-        delay: of its readings behind the force, in seconds.
-        progress: told of every tile what was found.
+        recordings: recordings by serial.
+        name: display name.
+        reference_name: name of the force sensor.
+        reference_delay: delay of its readings behind the force, in seconds.
+        on_progress: called with the result of every tile.
 
     Raises:
         CalibrationError: no tile has a curve.
@@ -96,12 +96,12 @@ def calibrate_recordings(
 
 
 def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
-    """Every tile's recordings, by serial.
+    """Read every tile's recordings, by serial.
 
     Raises:
         FileFormatError: a file is no session.
-        CalibrationError: a file is no indentation, a serial stands for two chips, or the same
-            frames are given twice.
+        CalibrationError: a file is no indentation recording, a serial has two chips, or frames
+            occur twice.
     """
     found: dict[str, list[Pressed]] = {}
     for path in paths:
@@ -122,7 +122,7 @@ def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
     }
     if not bench:
         raise CalibrationError(
-            "no tile is pressed in any of the recordings",
+            "no tile is loaded in any of the recordings",
             where=", ".join(str(path) for path in paths),
             expected="phases load and unload, with pressed_tile naming a tile",
         )
@@ -141,14 +141,14 @@ def _refuse_contradiction(first: Pressed, second: Pressed) -> None:
             where=files,
             remedy="Give the replaced part a serial of its own, and calibrate each by itself",
         )
-    # A repeat that counts twice would look like agreement.
+    # A repeat counted twice would look like good repeatability.
     if (
         first.boot_id == second.boot_id
         and first.seq[0] <= second.seq[1]
         and second.seq[0] <= first.seq[1]
     ):
         raise CalibrationError(
-            f"tile {serial}: the same frames are given twice",
+            f"tile {serial}: the same frames occur twice",
             where=files,
             remedy="Name each recording once",
         )
@@ -160,9 +160,9 @@ def _fitted(pressed: Sequence[Pressed], delay: Parameter) -> TileCalibration:
     if any(weighted):
         if not all(weighted):
             raise CalibrationError(
-                "one recording has dead weights, another one strokes of a mill",
+                "one recording uses dead weights, another one an indenter",
                 where=", ".join(recording.where for recording in recordings),
-                remedy="Calibrate from one kind of them",
+                remedy="Calibrate from one kind of recording",
             )
         tile = fit_weights(pressed_in(recordings))
         return tile.model_copy(update={"coefficient_words": pressed[0].chip})
@@ -176,7 +176,7 @@ def _fitted(pressed: Sequence[Pressed], delay: Parameter) -> TileCalibration:
 
 
 def _in_words(tile: TileCalibration) -> str:
-    """What was found, in a line."""
+    """Describe a tile's fit in one line."""
     effects = tile.effects
     found = [f"curve to {tile.range_kpa[1]:.1f} kPa"]
     if (facts := tile.weights) is not None:
@@ -200,10 +200,10 @@ def _in_words(tile: TileCalibration) -> str:
 
 
 def _marked(session: SessionReader) -> Programme:
-    """The programme of a recording of a server, which has it in its marks.
+    """Read the programme from the markers of a server's recording.
 
     Raises:
-        CalibrationError: it has none, or was broken off in between.
+        CalibrationError: there is none, or the recording has a gap.
     """
     notes = session.notes.get("session")
     if isinstance(notes, dict) and len(notes.get("parts") or ()) > 1:
@@ -211,7 +211,7 @@ def _marked(session: SessionReader) -> Programme:
             "the node was restarted while it was recorded",
             where=str(session.path),
             expected="a recording in one part",
-            remedy="Record the bench once more",
+            remedy="Record again",
         )
     marked = programme_of(session)
     if marked is None:
@@ -220,13 +220,13 @@ def _marked(session: SessionReader) -> Programme:
             where=str(session.path),
             expected="columns pressed_tile and phase beside reference_force_n, or marks such as "
             "`T01 load`",
-            remedy="Record one with the mill, or `foottile simulate --scene indentation`",
+            remedy="Record one with a rig, or `foottile simulate --scene indentation`",
         )
     return marked
 
 
 def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
-    """Every tile's part of a bench recording, and its first and last frame."""
+    """Split a rig recording by tile; also return its first and last seq."""
     has_columns = session.has("pressed_tile", "phase")
     marked = None if has_columns else _marked(session)
     pieces = list(session.batches(*(("pressed_tile", "phase") if has_columns else ())))
@@ -236,12 +236,12 @@ def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
         phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
     else:
         pressed, phase = marked
-    # A soak by itself is one of all tiles.
+    # A recording with only a soak counts for all tiles.
     only_soak = bool((phase == "soak").any()) and not np.isin(pressed, session.info.serials).any()
     held, _ = hold_temperature(frames)
     readable_kpa = Compensation(session.info.tiles).readable_kpa(held)
-    # A count that ran past its end reads as next to no pressure (model `unwrap`): here it says
-    # only that the tile was pressed beyond what its chip can tell.
+    # A count that wrapped around reads as almost no pressure (model `unwrap`): the tile was
+    # loaded beyond its chip's range.
     kpa = np.where(readable_kpa < PRESSURE_MIN_KPA, np.inf, readable_kpa)
     tiles = [
         Indentation(
@@ -259,7 +259,7 @@ def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
     ]
     if not tiles:
         raise CalibrationError(
-            "no tile of the array is pressed in the recording",
+            "no tile of the array is loaded in the recording",
             where=str(session.path),
             expected="pressed_tile naming one of " + ", ".join(session.info.serials),
         )

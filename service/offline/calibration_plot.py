@@ -1,4 +1,4 @@
-"""The picture of a calibration: curve, residuals, and what fast loads do, for each tile."""
+"""Plot of a calibration: curve, residuals and response to fast loads of each tile."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from service.offline.plots import new_figure, png_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito: told apart with any colour vision, and by shape besides.
+# Okabe and Ito: distinct for any colour vision, and by shape.
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 BRANCHES = ((True, "loading", BLUE, "o"), (False, "unloading", VERMILION, "^"))
 COLUMNS = 4
-"""Tiles side by side; more go on below."""
+"""Tiles per line of the figure."""
 FAST = {"release": "release of a held load", "tap": "tap"}
 _HEIGHTS = (3.0, 1.5, 1.5, 1.5)
 _LETTERS_PER_IN = 11.0
@@ -30,11 +30,11 @@ _LETTERS_PER_IN = 11.0
 def plot_calibration(
     calibration: Calibration, recordings: Mapping[str, Sequence[Indentation]]
 ) -> bytes:
-    """Curve with its bands, residuals and fast behaviour of every tile, as a PNG.
+    """Draw curve, bands, residuals and fast loads of every tile as a PNG.
 
     Args:
-        calibration: fitted.
-        recordings: what each tile was fitted to, by serial.
+        calibration: the fitted calibration.
+        recordings: recordings behind the fit, by serial.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -166,7 +166,7 @@ def _fast(axis: Axes, kind: str, replay: Replay | None) -> None:
 
 
 def _same_scale(axes: Sequence[Axes]) -> None:
-    """One scale of force or pressure for tiles side by side, labelled once."""
+    """Give adjacent tiles the same y scale, labelled once."""
     low = min(axis.get_ylim()[0] for axis in axes)
     high = max(axis.get_ylim()[1] for axis in axes)
     for i, axis in enumerate(axes):

@@ -1,9 +1,9 @@
-"""Where a calibration comes from by its name: a preset, a file, or the emulated bench.
+"""Lookup of a calibration by name: a preset, a file, or the emulated rig.
 
-The bench presses each tile alone, as a user would on the mill, and fits what was recorded. A serial
-always means the same tile, so its result is kept in the user's cache; it is found again by serial,
-parts seed and version, and would be the same if it were made again. Those of the tiles of built-in
-scenes come with the program, in `SHIPPED`, so that a first start does not wait for the mill.
+The emulated rig indents each tile alone, as a user would, and fits the recording. The result is
+deterministic by serial, parts seed and version, and is stored under these in the user's cache. The
+program contains those for the tiles of built-in scenes, in `SHIPPED_FOLDER`, so that a first start
+need not wait for the rig.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from storage.durable import make_folder, read_whole, set_aside
 
 EMULATED_RIG = "emulated-rig"
 SHIPPED = Path(__file__).parent / "shipped"
-"""Written by `FOOTTILE_WRITE_RIG=1 sh scripts/test tests/service/offline/test_shipped.py`."""
+"""Made by `FOOTTILE_WRITE_RIG=1 sh scripts/test tests/service/offline/test_shipped.py`."""
 RIG_REFERENCE = "emulated mill, 12 bit over 100 N"
 RIG_DELAY = Parameter(value=0.0, sigma=0.0001)
-"""Its amplifier has no filter, and its converter is asked within the frame."""
+"""Delay of the rig's force sensor: no filter, and its converter is read within the frame."""
 
 Progress = Callable[[str], None]
 
@@ -52,19 +52,19 @@ def find_calibration(
     cache: Path | None = None,
     progress: Progress = lambda message: None,
 ) -> Calibration:
-    """The calibration called `name`, checked to cover `serials`.
+    """Find a calibration by name, and check that it covers `serials`.
 
     Args:
         name: "emulated-rig", a preset's name, or the path of a file.
         serials: tiles that it must cover.
-        parts_seed: which parts the emulated bench presses.
-        family: of which family of parts.
-        repeatability: how much their loadings differ on it, instead of what the bench's scene says.
-        cache: where the bench's results are kept; default: the user's cache.
-        progress: told what takes time.
+        parts_seed: seed of the parts on the emulated rig.
+        family: family of these parts.
+        repeatability: standard deviation between their loadings; None: that of the rig's scene.
+        cache_folder: folder of the rig's results; None: the user's cache.
+        on_progress: called before slow steps.
 
     Raises:
-        CalibrationError: no such calibration, or it lacks a tile.
+        CalibrationError: no such calibration, or a tile is missing in it.
     """
     if name == EMULATED_RIG:
         folder = cache if cache is not None else _cache_folder()
@@ -83,17 +83,17 @@ def find_calibration(
 
 
 def _cache_folder() -> Path | None:
-    """Return the folder of the bench's results in the user's cache; None: there can be none."""
+    """Return the rig's folder in the user's cache; None without a home folder."""
     with suppress(UsageError):
         return user_folder("cache", None, "") / "rig"
     return None
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read a calibration file, which may have been written by hand: then its name says so.
+    """Read a calibration file; one without hashes, as written by hand, is named as unproven.
 
     Raises:
-        CalibrationError: there is none, it is not one, or not what its hashes are of.
+        CalibrationError: the file is missing or invalid, or a hash differs.
         StorageError: it cannot be read now.
     """
     try:
@@ -103,7 +103,7 @@ def read_calibration(path: Path) -> Calibration:
             f"no calibration {str(path)!r}",
             expected=f"a file, {EMULATED_RIG!r}, or a preset: {', '.join(PRESETS)}",
         ) from error
-    except (DamagedFileError, RuntimeError) as error:  # the second: links in a circle
+    except (DamagedFileError, RuntimeError) as error:  # RuntimeError: a loop of links
         what = error.what if isinstance(error, DamagedFileError) else str(error)
         raise not_one(what, str(path)) from error
     return calibration_of(content, where=str(path))
@@ -113,7 +113,7 @@ def _bench_tile(
     scene: Scene, parts_seed: int, folder: Path | None, progress: Progress
 ) -> Calibration:
     serial = scene.tile[0].serial
-    # Another version or another bench is another result.
+    # The name contains version and rig scene, because the result depends on both.
     made_by = hashlib.sha256(f"{SOFTWARE}/{parts_seed}/{scene.model_dump_json()}".encode())
     name = f"{serial}-{made_by.hexdigest()[:16]}.json"
     kept = folder / name if folder is not None else None
@@ -121,12 +121,12 @@ def _bench_tile(
         return found
     if (SHIPPED / name).is_file():
         return read_calibration(SHIPPED / name)
-    # Here, because only the emulated bench needs the physics.
-    with needs_extra("server", "the emulated bench"):
+    # Imported here: only the emulated rig needs the physics.
+    with needs_extra("server", "the emulated rig"):
         from service.offline.calibrate import calibrate_recordings, read_recordings
         from service.offline.simulate import SimulateOptions, simulate
 
-    progress(f"pressing tile {serial} on the emulated bench")
+    progress(f"calibrating tile {serial} on the emulated rig")
     foot = EmulatedFoot(parts_seed=parts_seed)
     with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:
         recording = Path(work) / f"bench-{serial}.parquet"
@@ -139,20 +139,20 @@ def _bench_tile(
         )
     if kept is None:
         progress(
-            f"the calibration of {serial} is not kept: no home folder can be written. Name a "
+            f"the calibration of {serial} is not cached: the home folder is not writable. Name a "
             "folder in XDG_CACHE_HOME"
         )
         return calibration
     try:
         make_folder(kept.parent)
         write_calibration(kept, calibration)
-    except OSError as error:  # it is what it is without a cache
-        progress(f"the calibration of {serial} is not kept: {error}")
+    except OSError as error:  # the calibration is usable without a cache
+        progress(f"the calibration of {serial} is not cached: {error}")
     return calibration
 
 
 def _kept_in(kept: Path, serial: str, progress: Progress) -> Calibration | None:
-    """What is in the cache; None if nothing is, or nothing that proves itself: that is said."""
+    """Return a cached calibration; None if missing or damaged, with a progress message."""
     if not os.path.lexists(kept):
         return None
     try:
@@ -176,7 +176,7 @@ def _kept_in(kept: Path, serial: str, progress: Progress) -> Calibration | None:
 def bench_scene(
     serial: str, family: Family = "default", repeatability: float | None = None
 ) -> Scene:
-    """The mill with one tile under it."""
+    """Build the indenter scene with one tile."""
     scene = with_tiles(load_scene("indentation"), [serial])
     asked: dict[str, object] = {"family": family}
     if repeatability is not None:
@@ -185,7 +185,7 @@ def bench_scene(
 
 
 def with_tiles(scene: Scene, serials: Sequence[str]) -> Scene:
-    """The same scene with these tiles, plugged in and placed one after another."""
+    """Return the scene with other tiles, at consecutive channels and positions."""
     tiles = [
         {
             "serial": serial,

@@ -1,4 +1,4 @@
-"""A sealed session against a reference: read, aligned, judged."""
+"""Comparison of a sealed session with a reference: reading, alignment, errors."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.reader import SessionReader
 
 ROW = "row"
-"""Beside the columns of a session: in which row of the file a frame is."""
+"""Column added to a session's columns: the frame's row in the file."""
 ANGLE = "angle_rad"
-"""Beside what is compared, of a foot with a servo."""
+"""Column of a foot with a servo, read beside the compared ones."""
 
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """How to compare; see `foottile compare --help`."""
+    """Options of a comparison; see `foottile compare --help`."""
 
     stated: Stated
     lag_range_s: tuple[float, float] | None = None
@@ -55,21 +55,21 @@ class CompareOptions:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What came of it.
+    """Result of a comparison.
 
     Attributes:
-        session: which one, as its file says.
-        reference: the file.
-        alignment: of the two.
-        clock_lag: what the lag has to be by the clocks, where both are sessions of one server.
+        session: path and identity of the session.
+        reference: path of the reference.
+        alignment: alignment of both.
+        clock_lag: lag by the clock tables, if both are sessions of one server.
         pairs: our frames with the reference.
-        force_n: (n, tiles), forces of the tiles in these frames; of a bare one NaN.
-        serials: of the tiles.
-        errors: by trial and over trials.
-        trials_are: what a trial is.
-        notes: what a user should know of both recordings.
-        advice: what a user may do to learn more of the foot.
-        options: as given.
+        tile_force_n: (n, tiles), tile forces of these frames; NaN for a tile without dome.
+        serials: serials of the tiles.
+        errors: errors by trial and over trials.
+        trial_definition: definition of a trial, in words.
+        notes: remarks on both recordings.
+        advice: suggestions for a more informative comparison.
+        options: options of the comparison.
     """
 
     session: Mapping[str, object]
@@ -86,7 +86,7 @@ class Comparison:
     options: CompareOptions
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return the JSON representation."""
         alignment, pairs = self.alignment, self.pairs
         return {
             "session": self.session,
@@ -117,7 +117,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     """Compare a sealed session with a reference.
 
     Raises:
-        FileFormatError: one of the files cannot be read, or the session has no estimates.
+        FileFormatError: a file cannot be read, or the session has no estimates.
         UsageError: a unit or sign of the reference is not stated.
         ComparisonError: the two cannot be compared.
     """
@@ -181,7 +181,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
 
 
 def _columns(session: SessionReader) -> tuple[Columns, Floats]:
-    """What is compared, `t_ns` on the session's time axis, and the forces of the tiles."""
+    """Read the compared columns, with `t_ns` on the session's time axis, and the tile forces."""
     wanted = [*COMPARED, "force_n"]
     if absent := [name for name in wanted if not session.has(name)]:
         raise FileFormatError(
@@ -200,10 +200,10 @@ def _columns(session: SessionReader) -> tuple[Columns, Floats]:
     columns["t_ns"] = session.axis.at(columns["t_ns"], columns.get("part"))
     if (np.diff(columns["t_ns"]) <= 0).any():
         raise ComparisonError(
-            "time runs back within a part of the session",
+            "time decreases within a part of the session",
             where=str(session.path),
             expected="frames whose t_ns rises",
-            remedy="See what is wrong with it: foottile verify",
+            remedy="Check it with foottile verify",
         )
     force_n = columns.pop("force_n").astype(np.float64)
     columns["grf_n"] = columns["grf_n"].astype(np.float64)
@@ -215,7 +215,7 @@ def _columns(session: SessionReader) -> tuple[Columns, Floats]:
 
 
 def _marks(session: SessionReader, path: Path, columns: Columns) -> tuple[list[Mark], list[str]]:
-    """Marks that lie beside a session, at their frames, and which could not be placed."""
+    """Read a session's markers at their frames; also return notes on those without a frame."""
     beside = path.with_name(EVENTS_NAME)
     if not beside.is_file():
         return [], []
@@ -230,7 +230,7 @@ def _marks(session: SessionReader, path: Path, columns: Columns) -> tuple[list[M
 
 
 def _clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:
-    """By the clock tables beside two sessions; None: one has none, or it says nothing of then."""
+    """Compute the lag from two sessions' clock tables; None if either has no row at `at_ns`."""
     found = [_server_offset(one, at_ns) for one in (path, reference_path)]
     if found[0] is None or found[1] is None:
         return None
@@ -239,7 +239,7 @@ def _clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:
 
 
 def _server_offset(path: Path, at_ns: int) -> tuple[int, int] | None:
-    """The server's time less that of the session's axis, and its bound, at the frame nearest."""
+    """Return server time minus session time at the nearest frame, and its bound, in ns."""
     with SessionReader(path) as session:
         try:
             clock = clock_beside(session)
@@ -255,11 +255,11 @@ def _server_offset(path: Path, at_ns: int) -> tuple[int, int] | None:
             if nearest is None or apart_ns < abs(int(nearest["axis_ns"][0]) - at_ns):
                 nearest = one
     assert nearest is not None  # noqa: S101  # both have been compared
-    said = clock.columns(nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part"))
-    server_ns = int(said["t_server_ns"][0])
+    server_times = clock.columns(nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part"))
+    server_ns = int(server_times["t_server_ns"][0])
     if server_ns == NO_INSTANT:
         return None
-    return server_ns - int(nearest["axis_ns"][0]), int(said["t_server_uncertainty_ns"][0])
+    return server_ns - int(nearest["axis_ns"][0]), int(server_times["t_server_uncertainty_ns"][0])
 
 
 def _reference(data: ReferenceData, begin_ns: int, cop_offset_m: tuple[float, float]) -> Reference:
@@ -278,7 +278,9 @@ def _remarks(alignment: Alignment, pairs: Pairs, options: CompareOptions) -> Seq
             "does not explain the difference"
         )
     if options.remove_offset and not pairs.removed:
-        notes.append("no flight is long enough to tell the reference's offset: nothing is removed")
+        notes.append(
+            "no flight is long enough to estimate the reference's offset; it is not removed"
+        )
     elif not pairs.removed and pairs.zero_n is not None:
         low_n, high_n = pairs.zero_n.interval_95
         if low_n > 0.0 or high_n < 0.0:
@@ -296,8 +298,8 @@ def _remarks(alignment: Alignment, pairs: Pairs, options: CompareOptions) -> Seq
 def _advice(alignment: Alignment, options: CompareOptions) -> list[str]:
     if options.reference_sigma_n is not None:
         return gain_notes(alignment)
-    said = "nothing is said of coverage: --reference-sigma-n was not given"
-    return [*gain_notes(alignment), said]
+    hint = "coverage is not computed: --reference-sigma-n is not given"
+    return [*gain_notes(alignment), hint]
 
 
 def _any(pairs: Pairs, bit: EstimateStatus) -> bool:

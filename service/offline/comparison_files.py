@@ -1,4 +1,4 @@
-"""A comparison as files: numbers in JSON, a report, a picture, and what was compared by frame."""
+"""Files of a comparison: figures in JSON, report, plot, and compared values by frame."""
 
 from __future__ import annotations
 
@@ -28,27 +28,29 @@ from storage.sessions.comparisons import (
 )
 
 _WANTING = {
-    **dict.fromkeys(("grf_coverage_95",), ": --reference-sigma-n says how true the reference is"),
+    **dict.fromkeys(
+        ("grf_coverage_95",), ": give the reference's uncertainty with --reference-sigma-n"
+    ),
     **dict.fromkeys(
         ("cop_coverage_x_95", "cop_coverage_y_95"),
-        ": --reference-cop-sigma-m says how true the reference's COP is",
+        ": give the reference's COP uncertainty with --reference-cop-sigma-m",
     ),
     **dict.fromkeys(
         ("cop_mean_m", "cop_p95_m", "cop_bias_x_m", "cop_bias_y_m", "cop_p95_about_mean_m"),
-        ": the reference states no centre of pressure under load",
+        ": the reference has no centre of pressure under load",
     ),
 }
-"""Of figures that are not always there, what they want."""
+"""Requirement of each figure that may be missing, appended to error messages."""
 
 
 @dataclass(frozen=True)
 class Compared:
-    """What was written.
+    """Files of a comparison that were written.
 
     Attributes:
-        content: of `compare.json`.
-        text: of `compare.md`.
-        missed: limits that were, in words.
+        content: content of `compare.json`.
+        report_text: content of `compare.md`.
+        missed_limits: descriptions of missed limits.
     """
 
     content: Mapping[str, Any]
@@ -64,17 +66,17 @@ def write_comparison(
     folder: Path,
     title: str,
 ) -> Compared:
-    """Compare a sealed session with a reference, into `compare.json` and what goes with it.
+    """Compare a sealed session with a reference; write figures, report, plot and series.
 
-    These are a report, a picture, and `series.parquet`, unless that would be too long to be read.
+    `series.parquet` is not written if it would exceed `ROWS_MAX`.
 
     Args:
-        source: its frames.
-        reference: the file.
-        options: how.
-        limits: of figures, for their means.
-        folder: to write in.
-        title: of report and picture.
+        session_path: the session's frames file.
+        reference_path: the reference file.
+        options: options of the comparison.
+        limits: limits of figures' means, by name.
+        folder: folder to write to.
+        title: title of report and plot.
 
     Raises:
         FootTileError: as for `compare_session`; or a file cannot be written.
@@ -102,13 +104,13 @@ def write_comparison(
     write_whole(folder / "compare.png", png)
     if len(found.pairs.t_s) <= ROWS_MAX:
         write_series(folder / SERIES_NAME, _series(found.pairs))
-    else:  # that of a comparison before
+    else:  # of an earlier comparison
         (folder / SERIES_NAME).unlink(missing_ok=True)
     return Compared(content, text, missed)
 
 
 def _series(pairs: Pairs) -> pa.Table:
-    """Every frame of ours at which the reference is known."""
+    """Build the table of our frames at which the reference is known."""
     cop_m = np.where(pairs.contact[:, None], pairs.reference_cop_m, np.nan)
     columns = {
         "t_ns": pairs.columns["t_ns"],
@@ -128,7 +130,7 @@ def _series(pairs: Pairs) -> pa.Table:
 
 
 def _missed(name: str, mean: float, limit: float) -> str | None:
-    """Why a limit is missed; None: it is kept."""
+    """Describe a missed limit; None if it is met."""
     if math.isnan(mean):
         return f"{name} is not known here, and was limited to {limit:g}{_WANTING.get(name, '')}"
     if name in AT_LEAST:

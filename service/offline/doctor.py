@@ -1,6 +1,6 @@
-"""What hangs on a bus, how fast it can be asked, and what to change, in words.
+"""Diagnosis of a bus: its parts, the frame rate it allows, and advice in words.
 
-Everything is measured over the bus; a scene only says what should be there.
+All values are measured over the bus; a scene only gives the expected parts.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _WORTH_SAYING = 1.05
 
 @dataclass(frozen=True)
 class TileFinding:
-    """One tile, or what stands in its place.
+    """Finding for one tile position.
 
     Attributes:
-        serial: as the scene calls it; empty if the scene does not know of it.
-        mux, channel: where it is plugged in.
-        coefficient_words: a0, b1, b2, c12; None if none could be read.
-        conversion_ms: as measured; None if it could not be.
-        problem: what is wrong; empty if nothing is.
+        serial: serial in the scene; empty if the scene has no such tile.
+        mux, channel: its address.
+        coefficient_words: a0, b1, b2, c12; None if unreadable.
+        conversion_ms: measured conversion time; None if unmeasurable.
+        problem: description of the fault; empty without one.
     """
 
     serial: str
@@ -48,17 +48,17 @@ class TileFinding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and what it means.
+    """Result of a bus diagnosis.
 
     Attributes:
-        tiles: every tile of the scene, and every other one.
-        scl_hz: bus clock as measured; None without a tile to measure it with.
-        asked_scl_hz: what it should be.
-        transaction_s: what a transaction costs beyond its bits.
-        rates_hz: frames a second by schedule; None where it would open too many channels.
-        schedule: the best one; None without tiles.
-        holds: will the rate asked for be held, by tiles that are all well?
-        verdict: all of it in a sentence or two, with what to change.
+        tiles: findings for all tiles of the scene and all others found.
+        scl_hz: measured bus clock; None without a working tile.
+        configured_scl_hz: configured bus clock.
+        transaction_overhead_s: overhead of a transaction beyond its bits.
+        rates_hz: frames per second by schedule; None if it would open too many channels.
+        fastest_schedule: fastest schedule; None without tiles.
+        is_rate_reached: True if all tiles work and the requested rate is reached.
+        verdict: summary in a few sentences, with advice.
     """
 
     tiles: tuple[TileFinding, ...]
@@ -72,17 +72,17 @@ class Diagnosis:
 
 
 def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float = 0.0) -> Diagnosis:
-    """Examine a bus.
+    """Diagnose a bus.
 
     Args:
-        bus: which one.
-        clock: virtual or real.
-        scene: what should be there; None: whatever is.
-        asked_hz: frames a second that are wanted; 0: as many as there can be.
+        bus: the bus.
+        clock: virtual or real clock.
+        scene: expected parts; None: accept any.
+        requested_hz: requested frames per second; 0: the highest possible.
 
     Raises:
         BusFaultError: the bus itself does not work.
-        BusSetupError: it cannot be used.
+        BusSetupError: the bus cannot be used.
     """
     array = scene.array if scene is not None else ArrayScene()
     bus = PatientBus(bus)
@@ -98,10 +98,10 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
     for finding, info in well:
         try:
             conversion_ns = measure_conversion_ns(bus, clock, info, wires)
-            never = "its words never change: is it converting?"
+            never = "its readings never change: it may not be converting"
             problem = "" if conversion_ns is not None else never
         except I2cError as error:
-            conversion_ns, problem = None, f"it went silent while it was measured: {error}"
+            conversion_ns, problem = None, f"it stopped responding during the measurement: {error}"
         conversions_ns.append(conversion_ns)
         conversion_ms = None if conversion_ns is None else conversion_ns / 1e6
         measured[finding.mux, finding.channel] = replace(
@@ -249,7 +249,7 @@ def _pace_setter(
     schedule: ScheduleName,
     rate_hz: float | None,
 ) -> str:
-    """Which part holds all others up, if one does; `asked` are those that `timing` is of."""
+    """Describe the tile that limits the rate, if one does; `asked` are the tiles of `timing`."""
     slowest_s = max(timing.conversions_s)
     slow = asked[timing.conversions_s.index(slowest_s)]
     if rate_hz is None or slow.conversion_ms is None:
@@ -269,7 +269,7 @@ def _pace_setter(
 
 
 def _disturbance(repeated: int) -> str:
-    """What transfers that were acknowledged only when they were repeated say of the wires."""
+    """Describe disturbed wiring from the number of transfers acknowledged only on retry."""
     if not repeated:
         return ""
     transfers = "1 transfer was" if repeated == 1 else f"{repeated} transfers were"

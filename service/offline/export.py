@@ -1,4 +1,4 @@
-"""A sealed session in, a file of another format out, with its marks."""
+"""Export of sealed sessions to other file formats, with their markers."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ _ALL = Slice()
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What to export; see `foottile export --help`."""
+    """Options of an export; see `foottile export --help`."""
 
     to: str
     """Name of the format."""
     part: Slice = _ALL
     clock: ClockName = "node"
     marks: bool | None = None
-    """None: if there are events beside the frames."""
+    """Export of markers; None: if there is a markers file beside the frames."""
     options: FormatOptions = NO_OPTIONS
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What came of it."""
+    """Result of an export."""
 
     size_bytes: int
     left_out: tuple[Mark, ...]
-    """Marks that are at no frame."""
+    """Markers without a frame."""
     lacks_marks: bool
-    """Nothing lies beside the frames that would say what was marked."""
+    """True if a markers file was expected beside the frames but is missing."""
     remarks: tuple[str, ...]
-    """What a person should know of the time axes."""
+    """Remarks on the time axes for the user."""
 
 
 def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
     """Write a sealed session, or a slice of it, in another format.
 
     Args:
-        source: its frames.
-        out: the file.
-        options: what of it.
+        source: the session's frames file.
+        out: the file to write.
+        options: options of the export.
 
     Raises:
-        UsageError: marks or a clock are asked for that are not there, or a slice is empty.
+        UsageError: requested markers or clock do not exist, or a slice is empty.
         FileFormatError: a file is damaged.
         StorageError: `out` cannot be written.
     """
@@ -67,15 +67,15 @@ def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
 
 
 def export_together(sources: Sequence[Path], out: Path, options: ExportOptions) -> Exported:
-    """Write several sealed sessions into one file, on the server's axis of time.
+    """Write several sealed sessions to one file, on the server's time axis.
 
     Args:
-        sources: their frames.
-        out: the file.
-        options: what of each; of a slice, seconds count from each session's own first frame.
+        sources: the sessions' frames files.
+        out: the file to write.
+        options: options of the export; a slice counts from each session's own first frame.
 
     Raises:
-        UsageError: as for `export_session`; the format holds one session only.
+        UsageError: as for `export_session`; or the format supports one session only.
         FileFormatError: a file is damaged.
         StorageError: `out` cannot be written.
     """
@@ -92,12 +92,12 @@ def export_together(sources: Sequence[Path], out: Path, options: ExportOptions) 
 
 
 def _export_of(reader: SessionReader, options: ExportOptions) -> tuple[Export, bool]:
-    """What is to be written, and whether nothing says what was marked."""
+    """Prepare an export; also return True if an expected markers file is missing."""
     beside = reader.path.with_name(EVENTS_NAME)
     stored = read_events(beside) if options.marks is not False and beside.is_file() else None
     if options.marks and stored is None:
         raise UsageError(
-            f"there is no {EVENTS_NAME} beside {reader.path.name}, so nothing is known of marks",
+            f"there is no {EVENTS_NAME} beside {reader.path.name}, so its markers are unknown",
             where=str(reader.path.parent),
             expected="a session's folder as a server sealed it or `foottile pull` fetched it",
         )

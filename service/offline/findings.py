@@ -1,4 +1,4 @@
-"""What the estimates of a session come to: stances and, where the truth is known, their error."""
+"""Summary of a session's estimates: stances, ground pull, and errors if the truth is known."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ if TYPE_CHECKING:
     from service.estimation.ladder.plan import EstimationPlan
 
 PLATE = "true_plate_n"
-"""What a plate sees, which is what gains of a mounted foot are to; the domes' own sum else."""
+"""Truth column of a mounted foot's calibration: the plate's force instead of the domes' sum."""
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
 
 PULL_SIGMAS = 4.0
 PULL_MIN_N = 1.0
-"""A GRF below zero by both, or whose tile has lost its baseline, is a pull; mud pulls, too, for a
-moment."""
+"""A GRF below zero by `PULL_MIN_N`, and by `PULL_SIGMAS` or with a lost baseline, is a pull. Mud
+pulls too, briefly."""
 
 
 @dataclass(frozen=True)
 class Pull:
-    """Time in which the estimates have the ground pull at the foot, as after a loaded tare.
+    """Negative estimated GRF, as after a tare under load.
 
     Attributes:
-        duration_s: in all.
-        most_n: strongest of it.
+        duration_s: total duration.
+        greatest_n: greatest magnitude.
     """
 
     duration_s: float = 0.0
@@ -44,21 +44,21 @@ class Pull:
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of a session; empty without estimates."""
+    """Summary of a session's estimates; empty without estimates."""
 
     stances: tuple[Stance, ...] = ()
     accuracy: Accuracy | None = None
     """None without the truth."""
     assumed_scale: bool | None = None
-    """Whether newtons rest on an assumed scale."""
+    """True if forces are based on an assumed scale."""
     pull: Pull = Pull()
 
 
 class FindingsOf:
-    """Gathers them from consecutive frames with estimates.
+    """Accumulator of a summary over consecutive frames with estimates.
 
     Args:
-        judging: the columns bring the truth, and may bring `PLATE`.
+        has_truth: True if the columns contain the truth, and perhaps `PLATE_COLUMN`.
     """
 
     def __init__(self, *, judging: bool) -> None:
@@ -69,7 +69,7 @@ class FindingsOf:
         self._pull = Pull()
 
     def feed(self, batch: FrameBatch, columns: Columns) -> None:
-        """Take the next frames."""
+        """Add the next frames."""
         self._stances += self._gathered.feed(batch.seq, batch.t_ns, columns)
         self._feel_pull(batch, columns)
         if self._judging:
@@ -78,7 +78,7 @@ class FindingsOf:
             self._judged.append({name: known[name] for name in names})
 
     def finish(self, plan: EstimationPlan) -> Findings:
-        """All of it; `plan` is what the estimates were made with."""
+        """Return the summary; `plan` contains the constants of the estimates."""
         accuracy = None
         if self._judged:
             judged = joined(self._judged)
@@ -93,7 +93,7 @@ class FindingsOf:
         is_lost = (columns["estimate_status"] & EstimateStatus.BASELINE_LOST) != 0
         is_sure = is_lost | (grf_n < -PULL_SIGMAS * columns["grf_sigma_n"])
         pulls = (grf_n < -PULL_MIN_N) & is_sure
-        if not pulls.any() or len(batch) < 2:  # of one frame no period is known
+        if not pulls.any() or len(batch) < 2:  # one frame has no period
             return
         period_s = float(np.median(np.diff(batch.t_ns))) * 1e-9
         self._pull = Pull(
@@ -103,5 +103,5 @@ class FindingsOf:
 
 
 def joined(pieces: Sequence[Columns]) -> dict[str, npt.NDArray[Any]]:
-    """Columns of all pieces, one after another."""
+    """Concatenate the columns of consecutive batches."""
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}

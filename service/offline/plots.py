@@ -1,4 +1,4 @@
-"""Plots for people."""
+"""Figures and their PNG encoding, with matplotlib."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DPI = 120
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure of that size in inches.
+    """Create an empty figure of a size in inches.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -28,7 +28,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def png_of(figure: Figure) -> bytes:
-    """A figure as a PNG."""
+    """Render a figure as a PNG."""
     png = BytesIO()
     figure.savefig(png, dpi=DPI, format="png")
     return png.getvalue()

@@ -1,7 +1,7 @@
-"""Work in processes of its own: each result as it is there, and an end when we are told to end.
+"""Process pool that yields results in order of completion and survives killed processes.
 
-A process may be killed, as by a machine that runs out of memory: its task goes to another one, and
-is given up when it has cost several.
+If a process is killed, as by a machine that runs out of memory, its task goes to another process;
+after `LOSSES_MAX` losses the task fails.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ Result = TypeVar("Result")
 
 
 class GoesOn:
-    """Result of a task that is done in part: it is given again, to whoever is free."""
+    """Result of a partly done task, which is then submitted again, to any free process."""
 
 
 LOSSES_MAX = 3
-"""A task that so many processes have died over is given up."""
+"""Number of killed processes after which a task fails."""
 _PATIENCE_S = 5.0
-"""For a process that was told to end."""
+"""Time to wait for a terminated process."""
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """Count the cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
@@ -45,15 +45,15 @@ def spread(
     *,
     begin: Callable[[], None] | None = None,
 ) -> Iterator[tuple[Task, Result | Exception]]:
-    """Every task with its result as it is finished, or with the error that its process raised.
+    """Run tasks in processes; yield each with its result, or its process's exception, when done.
 
-    Tasks are taken as there is a process for them.
+    `tasks` is consumed only as processes become free.
 
     Args:
-        work: a function of a module, that raises nothing it expects.
-        tasks: what to call it with; with one that goes on again and again.
-        jobs: so many processes at the same time; 1: in this one.
-        begin: a function of a module, called in every process first.
+        work: a module-level function, which returns expected failures as results.
+        tasks: arguments of `work`; a task that returns `Unfinished` is submitted again.
+        process_count: number of processes; 1: run in this process.
+        initializer: a module-level function, called first in every process.
     """
     if jobs == 1:
         for task in tasks:
@@ -101,14 +101,14 @@ def _lost(times: int, code: int | None) -> WorkerLostError:
     with suppress(ValueError):
         name = signal.Signals(-(code or 0)).name
         return WorkerLostError(
-            f"{times} processes were killed over it, the last by {name}",
+            f"{times} processes were killed while running it, the last by {name}",
             remedy="If memory ran out, use fewer --jobs",
         )
-    return WorkerLostError(f"{times} processes ended over it, the last with {code}")
+    return WorkerLostError(f"{times} processes exited while running it, the last with {code}")
 
 
 class _Worker:
-    """A process that does one task after the other."""
+    """Process that runs one task after the other."""
 
     def __init__(self, work: Callable[[Any], Any], begin: Callable[[], None] | None) -> None:
         context = multiprocessing.get_context("spawn")
@@ -119,7 +119,7 @@ class _Worker:
         theirs.close()
 
     def end(self, *, at_once: bool = False) -> int | None:
-        """Have it end; its exit code."""
+        """Stop the process, and return its exit code."""
         self.connection.close()
         if at_once:
             self._process.terminate()
@@ -140,20 +140,20 @@ class _Pool(Generic[Task, Result]):
         self._work, self._begin = work, begin
 
     def give(self, task: Task) -> _Worker:
-        """Hand a task to a process that has none, or to a new one."""
+        """Send a task to an idle process, or to a new one."""
         while self.idle:
             worker = self.idle.pop()
-            with suppress(OSError):  # it was killed while it had nothing to do
+            with suppress(OSError):  # killed while idle
                 worker.connection.send(task)
                 return worker
             worker.end()
         worker = _Worker(self._work, self._begin)
-        with suppress(OSError):  # killed already: that is seen when its answer is read
+        with suppress(OSError):  # killed already: reading its result will fail
             worker.connection.send(task)
         return worker
 
     def end(self, busy: Iterable[_Worker]) -> None:
-        """Nobody waits for what is left: those who are busy are told to end."""
+        """Terminate busy processes and stop idle ones."""
         for worker in busy:
             worker.end(at_once=True)
         for worker in self.idle:
@@ -163,8 +163,8 @@ class _Pool(Generic[Task, Result]):
 def _serve(
     connection: Connection, work: Callable[[Any], Any], begin: Callable[[], None] | None
 ) -> None:
-    """Body of a process; it ends when its client has, or tells it to."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # what is open is cleaned up
+    """Run a process's loop until the client closes the connection or terminates it."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # runs cleanup code of open files
     if begin is not None:
         begin()
     while True:
@@ -176,15 +176,15 @@ def _serve(
             result = work(task)
         except Exception as error:
             result = error
-        with suppress(OSError):  # the client was killed; seen at the next task
+        with suppress(OSError):  # the client was killed: the next recv() ends the loop
             connection.send(result)
 
 
 @contextmanager
 def _interrupts_wait() -> Iterator[None]:
-    """Processes that are started meanwhile know no Ctrl-C: we tell them when to end.
+    """Start processes with Ctrl-C blocked: the client stops them.
 
-    One that comes meanwhile is not lost, and finds no process half-started.
+    A Ctrl-C within the block is raised at its end, so that no process is half-started.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""Which servos are on a serial line, and whether the one that a scene means is among them."""
+"""Diagnosis of a serial line: its servos, and whether the scene's servo is among them."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from devices.errors import ServoSetupError
 from devices.scene.hardware import ServoScene
 
 TIMEOUTS_S = (0.05, 0.25)
-"""For how long an answer is waited for; again, and longer, where nobody answered at all: a machine
-that is busy may be late itself, and a servo that is there must not be looked for in its cable."""
+"""Response timeouts; the second one is used if no servo answered, because a busy machine may read
+late, and a working servo must not be reported as missing."""
 
 
 @dataclass(frozen=True)
 class ServoDiagnosis:
-    """Which servos are on a serial line.
+    """Result of a serial line's diagnosis.
 
     Attributes:
         found: every servo that answered.
-        latency_timer_ms: of the adapter; None if it has none.
-        is_well: is the one that is wanted there, as the scene says, and the adapter quick?
-        verdict: all of it in a sentence or two, with what to change.
+        latency_timer_ms: latency timer of the adapter; None if it has none.
+        is_well: True if the expected servo is present with the scene's settings, and the adapter
+            is fast.
+        verdict: summary in a few sentences, with advice.
     """
 
     found: tuple[FoundServo, ...]
@@ -34,12 +35,12 @@ class ServoDiagnosis:
 
 
 def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoDiagnosis:
-    """Ask for a servo in both protocols at the usual baud rates.
+    """Search for a servo in both protocols at the usual baud rates.
 
     Args:
-        port: its serial port.
-        clock: a real one.
-        wanted: what the scene says of it; None: the one with id 1.
+        port: serial port.
+        clock: a real clock.
+        expected: the scene's servo; None: any with id 1.
     """
     servo_id = wanted.id if wanted is not None else 1
     rates = dict.fromkeys((*((wanted.baudrate,) if wanted is not None else ()), *BAUDRATES))
@@ -53,7 +54,7 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
         holders = ", ".join(holders_of(port))
         held = f" It is open in {holders}." if holders else ""
         return ServoDiagnosis((), None, is_well=False, verdict=f"{error}.{held}")
-    said = [
+    found_texts = [
         f"{servo.model or f'model {servo.model_number}'}, protocol {servo.protocol}, "
         f"{servo.baudrate} baud, id {servo.servo_id}."
         for servo in found
@@ -72,8 +73,12 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
     if remark := latency_remark(port):
         wrong.append(remark)
     if (lasting := stable_path(port)) != port:
-        said.append(f"Name it {lasting} in the scene: {port} may be another adapter's next time.")
-    return ServoDiagnosis(found, latency_timer_ms(port), not wrong, " ".join((*said, *wrong)))
+        found_texts.append(
+            f"Name it {lasting} in the scene: {port} may be another adapter's next time."
+        )
+    return ServoDiagnosis(
+        found, latency_timer_ms(port), not wrong, " ".join((*found_texts, *wrong))
+    )
 
 
 def _is_wanted(servo: FoundServo, wanted: ServoScene) -> bool:

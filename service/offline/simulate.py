@@ -1,6 +1,7 @@
-"""A session on emulated silicon in virtual time: the real driver, frames, estimates, one file.
+"""Session on emulated chips in virtual time, with the real driver and estimator, into one file.
 
-The same command and version give the same bytes: time is virtual, every draw comes from the seeds.
+The output is bit-identical for the same command and version: time is virtual, and all randomness
+is seeded.
 """
 
 from __future__ import annotations
@@ -38,21 +39,21 @@ from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, no
 from storage.sessions.file import SessionWriter
 
 START_NS = 1_577_836_800_000_000_000
-"""2020-01-01T00:00:00Z, at which every emulated session begins."""
+"""Begin of every emulated session, 2020-01-01T00:00:00Z."""
 
 NODE = "emulated"
 
 _GATHER = 64
 
-# Real time. Generous: a reading lost because the machine is busy would change the file.
+# Real time; long, because a reading lost on a busy machine would change the file.
 _ANSWER_S = 10.0
 _SILENCE_S = 0.25
-"""The same of a servo that is to be silent: each request that it does not answer costs so much."""
+"""Response timeout for an intentionally silent servo, paid for each unanswered request."""
 
 
 @dataclass(frozen=True)
 class SimulateOptions:
-    """What to emulate; see `foottile simulate --help`."""
+    """Options of a simulation; see `foottile simulate --help`."""
 
     scene: Scene
     seconds: float | None = None
@@ -65,7 +66,7 @@ class SimulateOptions:
 
 @dataclass(frozen=True)
 class Simulated:
-    """What came of it."""
+    """Result of a simulation."""
 
     frames: int
     seconds: float
@@ -73,19 +74,19 @@ class Simulated:
     missed_slots: int
     choice: Choice
     replaced: tuple[str, ...]
-    """Serials of tiles that another part answered for."""
+    """Serials of tiles whose chip was replaced."""
     unmeasured: tuple[str, ...]
-    """Serials whose conversion time could not be measured: they were given 3 ms."""
+    """Serials whose conversion time could not be measured; 3 ms are assumed."""
     flags: Mapping[str, Mapping[str, int]]
     """Frames in which a tile was flagged, by serial and reason."""
     pressed: PressedTrace | None
     findings: Findings
     wall_s: float
-    """What taking, estimating and writing the frames took, set-up and bench left out."""
+    """Real time to acquire, estimate and write the frames, without set-up and calibration."""
 
 
 class Simulation:
-    """One emulated foot, identified over its bus and ready to run."""
+    """Emulated foot, identified over its bus and ready to run."""
 
     def __init__(self, options: SimulateOptions, stack: ExitStack) -> None:
         scene = options.scene
@@ -106,7 +107,7 @@ class Simulation:
         self.choice = ready.choice
         self.unmeasured = ready.unmeasured
         self.array = ready.array
-        # The machine was switched on earlier, the session and its scene begin now.
+        # The machine was switched on earlier; session and scene begin now.
         self.world.begin()
         begin_ns = self._clock.now_ns()
         self.end_ns = begin_ns + duration_ns
@@ -136,10 +137,10 @@ class Simulation:
         )
 
     def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
-        """Frames with what the emulation adds: truth if asked for, the mill's notes."""
+        """Yield frames with the emulation's columns: requested truth, and the indenter's notes."""
         mill = self.world.mill
         batches = self.acquisition.run(lambda: self._clock.now_ns() >= self.end_ns)
-        # Nothing is shown live, so frames may gather: batching does not change a bit of the result.
+        # No live view, so frames are batched; the result is bit-identical for any batch size.
         while gathered := list(islice(batches, _GATHER)):
             batch = FrameBatch.concatenate(gathered)
             extra: dict[str, npt.NDArray[Any]] = {}
@@ -147,7 +148,7 @@ class Simulation:
                 extra |= asdict(self.world.truth(batch.t_mono_ns))
             if mill is not None:
                 extra |= mill.notes(batch.t_mono_ns)
-                # While nothing is pressed, the sensor's reading is no reference for any tile.
+                # Without a loaded tile, the sensor's reading is no reference.
                 idle = np.array([tile is None for tile in extra["pressed_tile"]])
                 force_n = np.where(idle, np.float32(np.nan), batch.reference_force_n)
                 batch = replace(batch, reference_force_n=force_n)
@@ -157,12 +158,12 @@ class Simulation:
 def simulate(
     options: SimulateOptions, out: Path, estimate: Callable[[], EstimateOptions] | None
 ) -> Simulated:
-    """Run a session and seal it at `out`; without `estimate`, raw frames only.
+    """Run a session and seal it at `out_path`; without `make_estimate_options`, raw frames only.
 
-    `estimate` is asked for once the scene is known to run, since a calibration may take a while.
+    `make_estimate_options` is called after the scene has started: a calibration may be slow.
 
     Raises:
-        FootTileError: anything wrong with scene, load or calibration; `out` is not touched then.
+        FootTileError: scene, load or calibration is invalid; `out_path` is unchanged.
     """
     notes: dict[str, object] = {
         "scene": options.scene.model_dump(mode="json"),
@@ -215,7 +216,7 @@ def simulate(
 
 
 def _flags(batch: FrameBatch) -> dict[tuple[int, str], int]:
-    """Frames of a batch in which a tile has a flag, by its index and the flag's name."""
+    """Count the frames of a batch with a tile flag, by tile index and flag name."""
     if not batch.status.any():
         return {}
     counts = {}

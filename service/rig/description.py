@@ -1,4 +1,4 @@
-"""The `ArrayInfo` of a stream: what was found on the bus, and what the scene says of it."""
+"""Composition of the `ArrayInfo` of a stream from identified tiles and scene."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def describe(
     schedule: ScheduleName,
     rate_hz: float,
 ) -> ArrayInfo:
-    """Put together what a reader of the frames needs to know.
+    """Compose the array description of a stream.
 
     Args:
         scene: the scene file.
-        tiles: as identified on the bus.
-        anchor: the stream's UTC.
+        tiles: tiles as identified on the bus.
+        anchor: UTC anchor of the stream.
         node: name of the node.
-        boot_id: name of the stream.
-        schedule: how the bus is asked.
-        rate_hz: frames a second that are to be expected.
+        boot_id: id of the stream.
+        schedule: schedule of the bus.
+        rate_hz: expected frame rate.
     """
     servo = None
     if scene.servo is not None:

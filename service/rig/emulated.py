@@ -1,4 +1,4 @@
-"""An emulated foot: what presses it, and which parts and noise are drawn for it."""
+"""Options of an emulated foot: load, seeds of parts and noise, plates under it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EmulatedFoot:
-    """What a scene does not say; `foottile simulate --help` says what each is for."""
+    """Options of an emulation beside the scene; see `foottile simulate --help`."""
 
     load: LoadTrace | None = None
     load_scale: float = 1.0
@@ -29,10 +29,10 @@ class EmulatedFoot:
     plates: PlateFiles = PlateFiles()  # noqa: RUF009  # frozen, so one for all is safe
 
     def pressed_on(self, scene: Scene) -> PressedTrace | None:
-        """The recorded load on the tiles of a scene; None if there is none.
+        """Compute the recorded load's forces on the tiles of a scene; None without a load.
 
         Raises:
-            LoadTraceError: it does not fit the tiles.
+            LoadTraceError: the load does not fit the tiles.
         """
         if self.load is None:
             return None
@@ -49,12 +49,12 @@ class EmulatedFoot:
         looped: bool = False,
         in_real_time: bool = False,
     ) -> World:
-        """Chips, domes and ground of a scene, before they begin.
+        """Create the emulated world of a scene, before its time begins.
 
         Raises:
             MissingExtraError: the physics needs packages that are not installed.
         """
-        # Here, because a real node need not wait for numba, nor have room for it.
+        # Imported here, because a real node has no numba.
         with needs_extra("emulation", "an emulated array"):
             from devices.emulation.world import World
 
@@ -71,7 +71,7 @@ class EmulatedFoot:
         )
 
     def write_plates(self, world: World, end_ns: int) -> None:
-        """Write what the plates under it have seen until an instant of the node's clock.
+        """Write the recordings of the plates under the foot, until an instant of the node's clock.
 
         Raises:
             StorageError: a file cannot be written.

@@ -1,4 +1,4 @@
-"""What rig to open. Commands say it, who need not import what opens it."""
+"""Options of a rig, importable by commands without the rig's dependencies."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from service.rig.emulated import EmulatedFoot
 
 @dataclass(frozen=True)
 class RigOptions:
-    """What to open; `foot` is for emulation only."""
+    """Options of a rig; `foot` is for emulation only."""
 
     scene: Scene
     node: str
     foot: EmulatedFoot = EmulatedFoot()  # noqa: RUF009  # frozen, so one for all is safe
     streams: Path | None = None
-    """Folder of the node's journals: frames in flight are kept there, each stream's in its own."""
+    """Folder of the node's journals, for the files of frames in flight in a subfolder per stream.
+    """
 
     @property
     def emulated(self) -> bool:
-        """Are the tiles emulated?"""
+        """True if the tiles are emulated."""
         return self.scene.array.bus == EMULATED

@@ -1,7 +1,7 @@
-"""How fast frames come where nothing disturbs them: a busy machine is no slower bus.
+"""Frame rate of an array without disturbance by other load of the machine.
 
-The pace of a trial is that of its best stretches; a stream that is faster than its nominal rate
-proves that wrong.
+The rate of a trial is estimated from its fastest runs of frames; a stream that is faster than its
+nominal rate disproves that rate.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import numpy as np
 from devices.frames import FrameBatch
 
 _STRETCH = 10
-"""Frames in a row: after a pause one comes early, which the pause before it makes up for."""
-_BEST_PART = 10  # per cent of all stretches: most may be disturbed, and still it is found
+"""Frames in a run, which averages out an early frame after a pause."""
+_BEST_PART = 10  # percentile of the runs' durations: most runs may be disturbed
 _WRONG = 1.02
-"""So much faster than nominal, over `_OVER_NS`, is no jitter."""
+"""Ratio to the nominal rate, over `_OVER_NS`, that exceeds jitter."""
 _OVER_NS = 2_000_000_000
 
 
 def undisturbed_hz(t_ns: Sequence[int]) -> float:
-    """Frames a second of the best stretches.
+    """Estimate the frame rate from the fastest runs of frames.
 
     Args:
-        t_ns: when each frame of a trial was over, rising, more than ten of them.
+        t_ns: end of each frame of a trial, rising, more than ten frames.
     """
     instants_ns = np.asarray(t_ns, dtype=np.int64)
     took_ns = instants_ns[_STRETCH:] - instants_ns[:-_STRETCH]
@@ -33,20 +33,20 @@ def undisturbed_hz(t_ns: Sequence[int]) -> float:
 
 
 class Pace:
-    """Watches whether a stream is faster than it should be able to be.
+    """Monitor of a stream that detects frames faster than the nominal rate.
 
     Args:
-        nominal_hz: what it was taken to be capable of.
+        nominal_hz: nominal rate, the assumed maximum.
     """
 
     def __init__(self, nominal_hz: float) -> None:
         self._nominal_hz = nominal_hz
         self._passed: deque[tuple[int, int]] = deque()
         self.found_hz: float | None = None
-        """The rate that proves the nominal one wrong; None so far."""
+        """Measured rate that exceeds the nominal one; None until then."""
 
     def see(self, batch: FrameBatch) -> None:
-        """Frames that were taken, in order."""
+        """Update with the next batch."""
         passed = self._passed
         passed.append((int(batch.t_mono_ns[-1]), int(batch.seq[-1])))
         (begin_ns, first), (end_ns, last) = passed[0], passed[-1]

@@ -1,7 +1,8 @@
-"""Emulated plates under an emulated foot, which write down what they see as instruments do.
+"""Emulated plates under an emulated foot, recorded to files as by real instruments.
 
-A plate knows the ground and nothing of the foot's tiles; whoever compares knows its file. Beside
-that lies what was injected, `NAME.injected.json`, to judge a comparison by, which none may read.
+A plate depends on the ground only, not on the foot's tiles; a comparison reads only its file. The
+injected errors are in a sidecar, `NAME.injected.json`, to judge a comparison; no comparison may
+read it.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ if TYPE_CHECKING:
     from devices.emulation.world import World
 
 RECORDED_MAX_S = 120.0
-"""An instrument's trial: it stops by itself then."""
+"""Longest trial of an instrument, which stops by itself."""
 INJECTED = ".injected.json"
 
 
 @dataclass(frozen=True)
 class PlateFiles:
-    """Which plates lie under an emulated foot, each with its file; None: it is not there."""
+    """Files of the plates under an emulated foot; None: no such plate."""
 
     force_plate: Path | None = None
     pressure_plate: Path | None = None
 
     @property
     def by_name(self) -> Mapping[str, Path]:
-        """Those that are there."""
+        """Files of the present plates, by instrument."""
         both = {"force plate": self.force_plate, "pressure plate": self.pressure_plate}
         return {name: path for name, path in both.items() if path is not None}
 
@@ -44,14 +45,14 @@ class PlateFiles:
 def write_plates(
     files: PlateFiles, world: World, end_ns: int, *, seed: int, parts_seed: int
 ) -> None:
-    """Write what plates have seen since a world's scene began.
+    """Write the recordings of the plates since the begin of a world's scene, with sidecars.
 
     Args:
-        files: where.
-        world: what happened.
-        end_ns: until this instant of the node's clock.
-        seed: draws how the trial was set up, and noise.
-        parts_seed: draws which plates these are.
+        files: paths to write.
+        world: world with the foot.
+        end_ns: end of the recording on the node's clock.
+        seed: seed for the set-up of the trial, and noise.
+        parts_seed: seed for the properties of the plates.
 
     Raises:
         StorageError: a file cannot be written.
@@ -66,14 +67,14 @@ def write_plates(
 
 
 def injected_beside(path: Path) -> Path:
-    """Where it is written what was injected into a plate's file."""
+    """Return the path of the sidecar with the injected errors of a plate's file."""
     return path.with_name(path.stem + INJECTED)
 
 
 def _force_plate(
     world: World, end_s: float, trial: str, plate: int
 ) -> tuple[bytes, dict[str, object]]:
-    # Here, because a foot without plates is there sooner without it.
+    # Imported here for a faster start without plates.
     import pyarrow as pa
     import pyarrow.csv
 
@@ -87,7 +88,7 @@ def _force_plate(
         world.underfoot.wrench, end_s, random_of(f"force plate noise/{trial}")
     )
     columns = {"time_s": time_s, **dict(zip(CHANNELS, channels.T, strict=True))}
-    # As many digits as its converter has, and a clock to the microsecond.
+    # The converter's resolution, and microseconds of the clock.
     table = pa.table({name: np.round(values, 6) for name, values in columns.items()})
     text = BytesIO()
     options = pyarrow.csv.WriteOptions(quoting_style="none")

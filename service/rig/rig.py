@@ -1,6 +1,6 @@
-"""An array and its servo, opened on a real clock and ready to stream: real, emulated, or mixed.
+"""Rig on a real clock: array, servo, reference force sensor and recovery lines, ready to stream.
 
-With it what is wired beside: a reference force sensor, and lines that free the bus.
+Each may be real or emulated.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ def open_reference_sensor(
 
 
 def open_recovery_lines(scene: Scene, clock: Clock, world: World | None) -> BusRecovery | None:
-    """Lines that can free the scene's bus; None if they are not wired.
+    """Open the recovery of the scene's bus; None if no lines are wired.
 
     Raises:
-        BusSetupError: the lines cannot be had.
+        BusSetupError: the lines cannot be requested.
     """
     if scene.recovery is None or world is None or scene.array.bus != EMULATED:
         return open_recovery(scene.recovery, clock)
@@ -76,24 +76,24 @@ def open_recovery_lines(scene: Scene, clock: Clock, world: World | None) -> BusR
 
 
 _TRIAL_FRAMES = 100
-"""A fifth of a second with four tiles."""
+"""Frames of the rate measurement: a fifth of a second with four tiles."""
 _RENEW_AGAIN_NS = 2_000_000_000
-"""Between attempts to identify a part that is being plugged."""
+"""Interval of attempts to identify a replaced part."""
 
-# The thread that plays an emulated servo must not make the bus wait for Python's lock for longer
-# than a bit or so.
+# Python's switch interval: an emulated servo's thread may hold the lock for about a bit at most.
 _SWITCH_S = 0.0002
 
 
 class Rig:
-    """One array, identified over its bus, with its servo beside it.
+    """Open array, identified and measured, with its servo and reference sensor.
 
     Args:
-        options: what to open.
-        stack: what is opened is closed with it.
+        options: options of the rig.
+        stack: closes all opened devices.
 
     Raises:
-        I2cError, TileSetupError, ServoSetupError, LoadTraceError, UsageError: it cannot be opened.
+        I2cError, TileSetupError, ServoSetupError, LoadTraceError, UsageError: a device cannot be
+            opened.
     """
 
     def __init__(self, options: RigOptions, stack: ExitStack) -> None:
@@ -101,7 +101,7 @@ class Rig:
         sharpen_timers()
         self._options = options
         self._clock: Clock = SpinningClock()
-        # What runs beside the loop, or plays the wires, must not keep it from its core.
+        # Other threads, and the emulated wires, must not spin on the loop's core.
         self._line_clock = SystemClock()
         self._lead: Lead | None = None
         world = self._world(options, stack)
@@ -118,9 +118,9 @@ class Rig:
             reference_n=self._reference_n,
         )
         self.remarks = [f"schedule {self._ready.choice.schedule}: {self._ready.choice.reason}"]
-        """What a user should hear about it."""
+        """Start-up messages for the user."""
         self.remarks += [
-            f"the conversion time of tile {serial} could not be measured: it is given 3 ms"
+            f"the conversion time of tile {serial} could not be measured; 3 ms is assumed"
             for serial in self._ready.unmeasured
         ]
         self._servo_source = (
@@ -129,7 +129,7 @@ class Rig:
         self._renew_at_ns = 0
         self._in_flight: InFlight | None = None
         bus_hz = self._bus_hz(self._ready)
-        # Only now: on a busy machine all that was before would use up the lead.
+        # Last: on a busy machine the start-up before would use up the lead.
         if world is not None and options.emulated:
             self._lead = Lead(world, options.foot.lead_s)
             stack.callback(self._write_plates, world)
@@ -174,11 +174,11 @@ class Rig:
         self._pace = Pace(self.info.nominal_rate_hz)
 
     def batches(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
-        """Frames until `stop()`; those before an emulated load begins are marked as lead.
+        """Acquire batches of one stream until `stop()` returns True.
 
-        Ends before that when another part was plugged in, or the stream turned out to be faster
-        than its nominal rate: then `info` describes a new stream, and the next call goes on with
-        it.
+        Frames before the begin of an emulated load are flagged as lead. The stream also ends when a
+        part was replaced, or when it is faster than its nominal rate: then `info` describes a new
+        stream, which the next call acquires.
         """
         while not stop():
             for batch in self.acquisition.run(lambda: stop() or self._is_renewal_due()):
@@ -195,7 +195,7 @@ class Rig:
                 return
 
     def troubles(self) -> dict[str, str]:
-        """What is wrong now, in words, by what it is wrong with."""
+        """Return the present warnings, by tile's serial or device."""
         found = self._ready.array.troubles()
         if self._reference is not None and self._reference.trouble:
             found["reference"] = self._reference.trouble
@@ -204,7 +204,7 @@ class Rig:
         return found
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """How often what went wrong since the stream began, by serial and reason."""
+        """Return the fault counts of the stream, by serial and reason."""
         array = self._ready.array
         return {
             tile.serial: dict(health.counts)
@@ -225,7 +225,7 @@ class Rig:
                 recovery=self._recovery,
                 reference_n=self._reference_n,
             )
-        except (I2cError, TileSetupError):  # it is being plugged: go on with the others
+        except (I2cError, TileSetupError):  # perhaps half plugged in: go on with the others
             self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS
             self._ready.array.resume()
             return False
@@ -247,7 +247,7 @@ class Rig:
         return options.foot.world(scene, clock, pressed, looped=True, in_real_time=True)
 
     def _write_plates(self, world: World) -> None:
-        """What plates have seen, when all is closed: nobody is there any more to be told."""
+        """Write the plates' files on closing; print errors, as no caller can handle them."""
         try:
             self._options.foot.write_plates(world, self._clock.now_ns())
         except FootTileError as error:
@@ -272,10 +272,10 @@ class Rig:
         return stack.enter_context(ServoReader(servo, self._line_clock, rate_hz=scene.rate_hz))
 
     def _bus_hz(self, ready: Ready) -> float:
-        """Frames a second that the bus can give, by what transfers and conversions take.
+        """Estimate the highest frame rate of the bus: the predicted or a measured one.
 
-        Both were measured beside whatever else this machine does; if some frames of no stream come
-        faster than they allow, these are right.
+        The prediction uses timings measured under the machine's other load. Trial frames that are
+        faster disprove it.
         """
         t_ns = [self._clock.now_ns()]
         for _ in range(_TRIAL_FRAMES):

@@ -1,5 +1,5 @@
-"""The server: streams of nodes, live estimates, recording. It opens no hardware and serves no HTTP.
+"""Server state: streams of nodes, live estimates, recording. No hardware access, no HTTP.
 
-A *server's node* holds a node's streams, estimates, tares and clock; a *server's stream* holds the
-journal of one stream and what the node has said of it.
+A `ServerNode` holds a node's streams, estimates, tares and clock; a `ServerStream` holds one
+stream's journal and the node's report.
 """

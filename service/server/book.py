@@ -1,7 +1,4 @@
-"""The sessions of a server: what is known of each, kept on disk, and what people say of them.
-
-Those that were deleted are in the `Trash`, and can be had back until it is emptied.
-"""
+"""Store of a server's sessions: on disk, in memory, with its trash."""
 
 from __future__ import annotations
 
@@ -35,38 +32,38 @@ log = logging.getLogger("foottile.book")
 
 
 def load_or_restore(folder: SessionFolder) -> tuple[list[Session], dict[str, str]]:
-    """All sessions that can be read, or made again; and of the others what is wrong, by id."""
+    """Load all sessions, rebuilding damaged ones; return them, and errors by id."""
     found, unreadable = folder.load_all()
-    left: dict[str, str] = {}
+    errors: dict[str, str] = {}
     for session_id, error in unreadable.items():
         if not any(folder.path(session_id).glob("[!.]*")):
-            continue  # never written down
+            continue  # never saved
         try:
             session = restore(folder, session_id)
         except StorageError as refused:
-            log.warning("session %s cannot be made again: %s", session_id, refused)
+            log.warning("session %s cannot be rebuilt: %s", session_id, refused)
             session = None
         if session is None:
             log.warning("session %s is left out, and no frames are dropped: %s", session_id, error)
-            left[session_id] = str(error)
+            errors[session_id] = str(error)
         else:
             log.warning("session %s: %s", session_id, session.problem)
             found.append(session)
-    return found, left
+    return found, errors
 
 
 def told_strays(strays: Iterable[StraySession]) -> dict[str, str]:
-    """Warn of sessions whose folders were renamed or copied; return what is wrong, by folder."""
+    """Log sessions whose folders were renamed or copied; return the errors by folder."""
     for stray in strays:
         log.warning("session folder %s is left out: %s", printable(stray.name), stray.error)
     return {printable(stray.name): str(stray.error) for stray in strays}
 
 
 class Trash:
-    """The sessions in the trash.
+    """Deleted sessions that can be restored until the trash is emptied.
 
     Args:
-        folder: where they are.
+        folder: folder of the trash.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -75,21 +72,21 @@ class Trash:
             shutil.rmtree(doomed, ignore_errors=True)
         found, unreadable = load_or_restore(self.folder)
         self.has_unreadable = bool(unreadable)
-        """Is it not known which frames one of them needs?"""
+        """True if a session cannot be read: the frames that it needs are unknown."""
         unreadable |= told_strays(self.folder.strays())
         self.problems = [f"in the trash, {text}" for text in _in_words(unreadable)]
-        """Sessions that cannot be read, and why."""
+        """Sessions that cannot be read, and the reasons, as text."""
         self._sessions = SessionIndex(found)
 
     def __contains__(self, session_id: str) -> bool:
         return session_id in self._sessions
 
     def all(self) -> list[Session]:
-        """What is in it, newest first."""
+        """Return all sessions in the trash, newest first."""
         return list(self._sessions.newest_first())
 
     def unsealed(self) -> list[Session]:
-        """Those in it that are not sealed."""
+        """Return the unsealed sessions in the trash."""
         return self._sessions.unsealed()
 
     def take(self, session: Session, out_of: SessionFolder) -> None:
@@ -102,10 +99,10 @@ class Trash:
         self._sessions.put(session)
 
     def give_back(self, session_id: str, to: SessionFolder) -> Session:
-        """Move a session back to where it was.
+        """Move a session back to its former folder.
 
         Raises:
-            UnknownError: it is not here.
+            UnknownError: it is not in the trash.
             StorageError: it cannot be moved.
         """
         self.folder.path(session_id)
@@ -115,10 +112,11 @@ class Trash:
         return self._sessions.take(session_id)
 
     def doom(self) -> list[Path]:
-        """Give up all its sessions for good; return the folders to delete.
+        """Remove all sessions for good; return their folders, to be deleted by `delete_files`.
 
         Raises:
-            StorageError: one of them cannot be moved; it and those after it are still here.
+            StorageError: a folder cannot be moved; its session and those after it are still in the
+                trash.
         """
         doomed = []
         for session in self.all():
@@ -128,10 +126,10 @@ class Trash:
 
 
 def destroy(folders: list[Path]) -> int:
-    """Delete folders with all their files; return how many bytes they took.
+    """Delete folders with all their files; return the number of bytes freed.
 
     Raises:
-        StorageError: one of them cannot be deleted; the next start tries it again.
+        StorageError: a file cannot be deleted; the next start tries again.
     """
     size_bytes = 0
     for folder in folders:
@@ -146,9 +144,9 @@ class SessionBook:
     """All sessions of a server.
 
     Args:
-        folder: where they are kept.
-        trash: where those are that were deleted.
-        changed: told of every session that changed.
+        folder: folder of the sessions.
+        trash: deleted sessions.
+        on_change: called with every session that changed.
     """
 
     def __init__(
@@ -158,43 +156,43 @@ class SessionBook:
         self.trash = trash
         self.changed = changed
         found, self.unreadable = load_or_restore(folder)
-        """By id why these cannot be read; their files are as they were."""
+        """Errors of the sessions that cannot be read, by id; their files are unchanged."""
         strays = folder.strays()
         self.has_unreadable = bool(self.unreadable) or any(each.may_need_frames for each in strays)
-        """Is a session unreadable? Then it is not known which frames it needs."""
+        """True if a session cannot be read: the frames that it needs are unknown."""
         self.has_unreadable |= trash.has_unreadable
         self.unreadable |= told_strays(strays)
         self.problems = _in_words(self.unreadable) + trash.problems
-        """The same in words, with those in the trash."""
+        """Unreadable sessions and their errors as text, with those in the trash."""
         self._sessions = SessionIndex(found)
         self._files = CheckedFiles()
 
     def frames(self, session_id: str, *, only_slices: bool = False) -> SessionReader:
-        """The sealed file of a session, opened; from any thread.
+        """Open the sealed file of a session. Runs in any thread.
 
         Args:
-            session_id: which.
+            session_id: id of the session.
             only_slices: as for `SessionReader`.
 
         Raises:
-            FileFormatError: there is none, or it is damaged.
+            FileFormatError: it is missing or damaged.
         """
         path = self.folder.path(session_id) / FRAMES_NAME
         return self._files.open(path, only_slices=only_slices)
 
     def unsealed(self, node: str | None = None) -> list[Session]:
-        """Sessions, of all nodes or of one, that are not sealed yet and not in the trash."""
+        """Return unsealed sessions, of all nodes or of one, without those in the trash."""
         return self._sessions.unsealed(node)
 
     def newest_first(self, before: Age | None = None) -> Iterator[Session]:
-        """All sessions, or those before one, newest first; change none meanwhile."""
+        """Yield all sessions, or those before one, newest first; change none meanwhile."""
         return self._sessions.newest_first(before)
 
     def get(self, session_id: str) -> Session:
-        """One session, with the counts of the moment.
+        """Return a session as last saved or cached.
 
         Raises:
-            UnknownError: there is none of this id.
+            UnknownError: no session has this id.
             StateError: it cannot be read.
         """
         self.folder.path(session_id)
@@ -209,11 +207,11 @@ class SessionBook:
         return self._sessions[session_id]
 
     def begun_by(self, asked: Asked | None) -> list[Session]:
-        """Sessions that this very request has begun before, oldest first.
+        """Return the sessions that an earlier sending of this request created, oldest first.
 
         Raises:
-            UsageError: its key came with another request.
-            StateError: what it began is in the trash.
+            UsageError: the key came with another request before.
+            StateError: a session that it created is in the trash.
         """
         if asked is None:
             return []
@@ -225,23 +223,23 @@ class SessionBook:
         for session in found:
             if session.asked != asked:
                 raise UsageError(
-                    "this Idempotency-Key came with another request before, which began session "
+                    "this Idempotency-Key was used by another request, which started session "
                     f"{session.id}",
                     remedy="Make a new key for each recording, and send it again with the same "
                     "request only",
                 )
             if session.id in self.trash:
                 raise StateError(
-                    f"this request began session {session.id} before, which is in the trash",
+                    f"this request has started session {session.id}, which is in the trash",
                     remedy="Restore it, or record with another Idempotency-Key",
                 )
         return found[::-1]
 
     def keep(self, session: Session) -> Session:
-        """Write a new or changed session to the disk, and report it.
+        """Save a new or changed session to the disk, and notify `on_change`.
 
         Raises:
-            StorageError: it cannot be written down; what is known here is as it was.
+            StorageError: it cannot be saved; the session in memory is unchanged.
         """
         self.folder.save(session)
         self.note(session)
@@ -249,21 +247,21 @@ class SessionBook:
         return session
 
     def note(self, session: Session) -> None:
-        """Replace what is known of a session in memory; its next change is written to disk."""
+        """Replace a session in memory only; its next `save` writes it to the disk."""
         self._sessions.put(session)
 
     def change(self, session_id: str, *, only_if: str | None = None, **changes: object) -> Session:
-        """Change what people say of a session: name, subject, notes, tags.
+        """Edit the user-written fields of a session: name, subject, notes, tags.
 
         Args:
-            session_id: of the session.
-            only_if: only if `said_of` it is still this; None: whatever it is.
-            changes: by name.
+            session_id: id of the session.
+            if_revision: expected `session_revision`; None: any.
+            changes: new values by name.
 
         Raises:
-            UnknownError: no such session.
-            ChangedError: what people say of it is not this any more.
-            StorageError: it cannot be written down.
+            UnknownError: no session has this id.
+            ChangedError: its revision is another one.
+            StorageError: it cannot be saved.
         """
         session = self.get(session_id)
         expect(only_if, said_of(session), f"session {session_id}")
@@ -272,14 +270,14 @@ class SessionBook:
     def mark(
         self, session_id: str, label: str, t_ns: int | None, event_id: str | None = None
     ) -> Event:
-        """Note an event, now or at `t_ns` of the server's UTC; once, if it comes with an id.
+        """Add a marker at `t_ns` of the server's UTC, or now; once only if it comes with an id.
 
         Raises:
-            UnknownError: no such session.
-            StorageError: it cannot be written down.
+            UnknownError: no session has this id.
+            StorageError: it cannot be saved.
         """
         session = self.get(session_id)
-        event = next((known for known in session.events if known.id == event_id), None)
+        event = next((marker for marker in session.events if marker.id == event_id), None)
         if event is None:
             event = Event(
                 id=event_id or uuid.uuid4().hex[:12],
@@ -294,12 +292,12 @@ class SessionBook:
     def change_mark(
         self, session_id: str, event_id: str, *, only_if: str | None = None, **changes: object
     ) -> Event:
-        """Rename or move an event; arguments as for `change`.
+        """Rename or move a marker; arguments as for `edit_description`.
 
         Raises:
-            UnknownError: no such session or event.
-            ChangedError: it is not this any more.
-            StorageError: it cannot be written down.
+            UnknownError: no such session or marker.
+            ChangedError: its revision is another one.
+            StorageError: it cannot be saved.
         """
         event = self._marked(session_id, event_id, only_if)
         changed = event.model_copy(update=changes)
@@ -308,7 +306,7 @@ class SessionBook:
         return changed
 
     def remove_mark(self, session_id: str, event_id: str, *, only_if: str | None = None) -> None:
-        """Take an event away; arguments and errors as for `change_mark`."""
+        """Remove a marker; arguments and errors as for `edit_marker`."""
         self._marked(session_id, event_id, only_if)
         events = self.get(session_id).events
         self._keep_marks(session_id, tuple(event for event in events if event.id != event_id))
@@ -338,12 +336,12 @@ class SessionBook:
 
 
 def said_of(session: Session) -> str:
-    """What people say of a session, as a short hash: it tells whether someone has changed it."""
+    """Return the revision of a session's user-written fields, a short hash."""
     return _hash(session.model_dump_json(include={"name", "subject", "notes", "tags"}))
 
 
 def mark_of(event: Event) -> str:
-    """An event, as a short hash."""
+    """Return the revision of a marker, a short hash."""
     return _hash(event.model_dump_json())
 
 
@@ -352,20 +350,20 @@ def _hash(text: str) -> str:
 
 
 def expect(wanted: str | None, found: str, what: str) -> None:
-    """Refuse to change what is not any more what somebody has seen.
+    """Refuse a change if the client has seen another revision.
 
     Args:
-        wanted: hash of what was seen; None: whatever it is.
-        found: hash of what it is.
-        what: it is, in words.
+        expected: revision that the client has seen; None: any.
+        actual: present revision.
+        what: description of the object, for the error.
 
     Raises:
         ChangedError: they differ.
     """
     if wanted is not None and wanted != found:
         raise ChangedError(
-            f"{what} was changed by somebody else meanwhile",
-            remedy="Look at it as it is now, and change it again",
+            f"{what} was changed by another client meanwhile",
+            remedy="Reload it and retry",
         )
 
 

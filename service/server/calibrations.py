@@ -1,7 +1,7 @@
-"""The calibrations that a server keeps, by id: what was uploaded, and what was fitted here.
+"""Store of a server's calibrations, uploaded or fitted here, by id.
 
-An id is the hash of the content, so none is ever changed: another content is another calibration.
-What uses one has a copy of its own, so that one may be deleted at any time.
+An id is the hash of the content, so a calibration never changes: other content is another
+calibration. Nodes and sessions copy the one they use, so a calibration may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from storage.durable import (
 
 CALIBRATIONS_MAX = 1000
 CONTENT_BYTES_MAX = 1 << 20
-"""As long as a message of the link: a longer one could not come from a node either."""
+"""Size limit, that of a message of the link: a node cannot send a longer one either."""
 CALIBRATION_ID = re.compile(r"[0-9a-f]{16}")
 
 
 @dataclass(frozen=True)
 class Kept:
-    """What is known of one without reading it again."""
+    """Facts of a calibration that are kept in memory."""
 
     id: str
     name: str
@@ -45,13 +45,13 @@ class Kept:
     serials: tuple[str, ...]
     refused: tuple[str, ...]
     is_assumed: bool
-    """Is the scale of any tile an assumption?"""
+    """True if the scale of any tile is an assumption."""
     is_mounted: bool
-    """Has a plate shown how its tiles are mounted?"""
+    """True if a force plate has shown how its tiles are mounted."""
 
     @classmethod
     def of(cls, calibration: Calibration) -> Kept:
-        """In short."""
+        """Return the summary of a calibration."""
         return cls(
             id=calibration.id,
             name=calibration.name,
@@ -65,10 +65,10 @@ class Kept:
 
 
 class CalibrationBook:
-    """The calibrations of a data folder; one that is damaged is set aside, and not listed.
+    """Calibrations of a data folder; a damaged file is set aside and not listed.
 
     Args:
-        folder: where they are; made when the first one is kept.
+        folder: folder of the files; created with the first one.
 
     Raises:
         StorageError: the folder cannot be read.
@@ -93,15 +93,15 @@ class CalibrationBook:
                 self._kept[path.stem] = Kept.of(calibration)
 
     def all(self) -> list[Kept]:
-        """All of them, the newest recordings first."""
+        """Return the summaries of all calibrations, the newest recordings first."""
         return sorted(self._kept.values(), key=lambda kept: (kept.date, kept.id), reverse=True)
 
     def get(self, calibration_id: str) -> Calibration:
-        """One of them, from the disk.
+        """Load a calibration from the disk.
 
         Raises:
-            UnknownError: there is none of this id.
-            StateError: its file is damaged, or has been taken away.
+            UnknownError: no calibration has this id.
+            StateError: its file is damaged or was deleted.
             StorageError: it cannot be read now.
         """
         if calibration_id not in self._kept:
@@ -117,29 +117,29 @@ class CalibrationBook:
             ) from error
 
     def keep(self, calibration: Calibration) -> Kept:
-        """Keep one, whole or not at all; the same content twice is one calibration.
+        """Save a calibration atomically; the same content twice is one calibration.
 
         Raises:
-            StateError: there are too many.
+            StateError: the store is full.
             StorageError: it cannot be written.
         """
-        kept = Kept.of(calibration)
-        if kept.id not in self._kept and len(self._kept) >= CALIBRATIONS_MAX:
+        summary = Kept.of(calibration)
+        if summary.id not in self._kept and len(self._kept) >= CALIBRATIONS_MAX:
             raise StateError(
                 f"this server keeps {len(self._kept)} calibrations already",
-                remedy="Delete some that nobody needs",
+                remedy="Delete unused ones",
             )
         with storage_errors(self._folder):
             make_folder(self._folder)
-        write_whole(self._path(kept.id), content_of(calibration))
-        self._kept[kept.id] = kept
-        return kept
+        write_whole(self._path(summary.id), content_of(calibration))
+        self._kept[summary.id] = summary
+        return summary
 
     def delete(self, calibration_id: str) -> None:
-        """Delete one; nodes and sessions that use it have it still.
+        """Delete a calibration; nodes and sessions that use it have a copy.
 
         Raises:
-            UnknownError: there is none of this id.
+            UnknownError: no calibration has this id.
             StorageError: it cannot be deleted.
         """
         if calibration_id not in self._kept:

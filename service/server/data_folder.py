@@ -1,4 +1,4 @@
-"""The server's data folder: its lock, its id, and whether it is still the one under its name."""
+"""Data folder of a server: its lock, its id, and the check that it is still in its place."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _COMES_BACK = (
 
 
 class DataFolder:
-    """Held by one server until it is closed.
+    """Data folder, locked by one server until `close`.
 
-    A folder that was moved or unmounted is waited for; meanwhile nothing is written under its name.
-    It may come back mounted anew, or as a copy, which its id proves: `take_again`.
+    The server waits for a folder that was moved or unmounted; meanwhile nothing is written at its
+    path. The folder may come back mounted again, or as a copy, which its id proves: `reopen`.
 
     Args:
-        path: made if absent.
+        path: created if absent.
 
     Raises:
-        StorageError: it or its id cannot be read or written, or another server has it.
+        StorageError: folder or id cannot be read or written, or another server has locked it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,7 +49,7 @@ class DataFolder:
             make_folder(path)
         self._lock = self._locked()
         self.problems: list[str] = []
-        """What was found damaged of what is kept here, and what became of it, in words."""
+        """Damage found in the folder's own files, and the consequence, as text."""
         try:
             if (path / _PROBE_NAME).is_dir():
                 set_aside(path / _PROBE_NAME)
@@ -59,32 +59,31 @@ class DataFolder:
             raise
 
     def check(self) -> None:
-        """Whether the folder that is in use is there; from any thread.
+        """Check that the folder in use is at its path. Runs in any thread.
 
         Raises:
-            FolderGoneError: it is not, and what is in its place.
-            StorageError: that cannot be seen, or its id not be read.
+            FolderGoneError: it is not; the error names the folder that is there now.
+            StorageError: that cannot be checked, or the id not be read.
         """
         if is_held(self.path):
             return
         with storage_errors(self.path, _COMES_BACK):
             place = self._place()
         raise FolderGoneError(
-            f"the data folder was moved, deleted or unmounted, and nothing is kept: {place}",
+            f"the data folder was moved, deleted or unmounted, and nothing is stored: {place}",
             where=str(self.path),
             remedy=_COMES_BACK,
             errno=errno.ENOENT,
         )
 
     def take_again(self) -> None:
-        """Use what is in its place and has its id: the folder, mounted anew, or a copy.
+        """Lock the folder at the path if it has the same id: mounted again, or a copy.
 
-        What is open in the one before takes what is written and keeps it for nobody: the caller has
-        closed all of that.
+        Files that are open in the former folder are lost: the caller has closed them all.
 
         Raises:
-            FolderGoneError: nothing there has its id.
-            StorageError: another server has it.
+            FolderGoneError: no folder with its id is there.
+            StorageError: another server has locked it.
         """
         if is_held(self.path) or self._id_there() != self.id:
             self.check()
@@ -95,25 +94,25 @@ class DataFolder:
         log.warning("%s: the data folder was mounted anew or copied; it is used again", self.path)
 
     def check_writable(self) -> None:
-        """Whether it is there, and something can be written.
+        """Check that the folder is in place and writable.
 
         Raises:
-            FolderGoneError: it is not there.
-            StorageError: it cannot be written.
+            FolderGoneError: it is not in place.
+            StorageError: it is not writable.
         """
         self.check()
-        # As much as some seconds of frames: on a full disk an empty file can still be written.
+        # The size of some seconds of frames: a full disk still accepts an empty file.
         write_whole(self.path / _PROBE_NAME, bytes(_PROBE_BYTES))
 
     def close(self) -> None:
-        """Let another server have it."""
+        """Release the lock."""
         self._lock.close()
 
     def _place(self) -> str:
-        """What is in its place, in words.
+        """Describe the content of the path, for an error.
 
         Raises:
-            OSError: that cannot be seen.
+            OSError: it cannot be read.
         """
         found = self._id_there()
         if found is not None:
@@ -128,7 +127,7 @@ class DataFolder:
         return f"there is {what} in its place"
 
     def _id_there(self) -> str | None:
-        """The id of what is in its place; None if it has none."""
+        """Read the id of the folder at the path; None if it has none."""
         with suppress(DamagedFileError, FileNotFoundError):
             return read_server_id(self.path / SERVER_ID_NAME).id
         return None
@@ -145,21 +144,21 @@ class DataFolder:
         return stack
 
     def _known_id(self) -> str | None:
-        """The id, written anew if it states no checksum; None if there is none, or not any more.
+        """Read the id, rewriting it if it has no checksum; None if missing or damaged.
 
         Raises:
-            StorageError: it cannot be read or written now; nobody is given a new name for that.
+            StorageError: it cannot be read or written now; no new id is made for that.
         """
         path = self.path / SERVER_ID_NAME
         try:
-            kept = read_server_id(path)
+            stored = read_server_id(path)
         except FileNotFoundError:
             return None
         except DamagedFileError as error:
-            self.problems.append(f"{put_aside(path, error)}; nodes get to know this server anew")
+            self.problems.append(f"{put_aside(path, error)}; nodes treat this server as a new one")
             log.warning("%s", self.problems[-1])
             return None
-        return kept.id if kept.is_proven else self._new_id(kept.id)
+        return stored.id if stored.is_proven else self._new_id(stored.id)
 
     def _new_id(self, made: str) -> str:
         write_server_id(self.path / SERVER_ID_NAME, made)

@@ -1,8 +1,7 @@
-"""Calibrations fitted on the server, from sessions that it has: `foottile calibrate` beside it.
+"""Jobs that fit a calibration on the server from its sessions, as `foottile calibrate` does.
 
-A process of its own does it, one at a time and after everything else that wants the processor, so
-that recording goes on. What it has found is kept when it is whole, or not at all; a server that
-ends has it end.
+A job runs in a separate process at low priority, one at a time, so that recording goes on. Its
+calibration is stored whole or not at all; the process ends with the server.
 """
 
 from __future__ import annotations
@@ -35,23 +34,23 @@ SESSIONS_MAX = 32
 FRAMES_MAX = 1_000_000
 """Half an hour of the fastest array; all frames are in memory at once."""
 _KEPT = 16
-"""Of those that have ended, the newest."""
+"""Number of ended jobs that are listed, the newest."""
 _SAID_KEPT = 300
-"""Lines: more than an array has tiles."""
+"""Number of log lines: more than an array has tiles."""
 _LINE_BYTES = 4000
 _LASTS_MAX_S = 1800.0
-"""A process that hangs is not waited for without end."""
+"""Time limit, against a process that hangs."""
 _NICENESS = 15
 _COMMAND = (sys.executable, "-c", "from service.cli.main import main; main()", "calibrate")
 _REFUSED_SOME = 3
-"""Exit code of `foottile calibrate`: written, but a tile was refused."""
+"""Exit code of `foottile calibrate`: file written, but a tile was refused."""
 
 FitState = Literal["running", "done", "failed", "cancelled"]
 
 
 @dataclass
 class Fit:
-    """One of them, under way or ended."""
+    """State of a calibration job."""
 
     id: str
     name: str
@@ -60,18 +59,18 @@ class Fit:
     state: FitState = "running"
     ended_t_ns: int | None = None
     said: deque[str] = field(default_factory=lambda: deque(maxlen=_SAID_KEPT))
-    """What was found so far, a line a tile."""
+    """Log of the job up to now, a line per tile."""
     calibration_id: str | None = None
     problem: str | None = None
-    """Why it failed."""
+    """Reason of a failure."""
 
 
 class Fits:
-    """The fits of a server, of which one may be under way.
+    """Calibration jobs of a server; at most one is running.
 
     Args:
-        sessions: to fit.
-        calibrations: where what was found is kept.
+        sessions: store of the sessions to fit.
+        calibrations: store of the results.
     """
 
     def __init__(self, sessions: SessionBook, calibrations: CalibrationBook) -> None:
@@ -81,15 +80,20 @@ class Fits:
         self._task: asyncio.Task[None] | None = None
         self._running: Fit | None = None
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether one is under way."""
+        return self._running is not None
+
     def all(self) -> list[Fit]:
-        """Those that are known, the newest first."""
+        """Return the known jobs, newest first."""
         return [*reversed(self._fits.values())]
 
     def get(self, fit_id: str) -> Fit:
-        """One of them.
+        """Return a job.
 
         Raises:
-            UnknownError: there is none of this id, or it was long ago.
+            UnknownError: no known job has this id.
         """
         if fit_id not in self._fits:
             raise UnknownError(
@@ -99,17 +103,17 @@ class Fits:
         return self._fits[fit_id]
 
     def start(self, name: str, sessions: Sequence[str], options: Mapping[str, str]) -> Fit:
-        """Begin to fit what was recorded on a bench; from the server's loop.
+        """Start to fit bench recordings; called on the event loop.
 
         Args:
-            name: of the calibration.
-            sessions: ids; repeats of a tile may be spread over several.
-            options: more of `foottile calibrate`, by name.
+            name: name of the calibration.
+            sessions: ids of sessions; repeats of a tile may be spread over several.
+            options: further options of `foottile calibrate`, by name.
 
         Raises:
-            UnknownError: no such session.
-            StateError: a session is not sealed, or another fit is under way.
-            UsageError: a session is named twice, or they are too long.
+            UnknownError: no session has this id.
+            StateError: a session is not sealed, or another job is running.
+            UsageError: a session is named twice, or the sessions are too long.
         """
         if self._running is not None:
             raise StateError(
@@ -144,10 +148,10 @@ class Fits:
         return fit
 
     async def cancel(self, fit_id: str) -> Fit:
-        """End one that is under way, with nothing kept; one that has ended stays as it is.
+        """Cancel a running job and drop its result; an ended job is unchanged.
 
         Raises:
-            UnknownError: there is none of this id.
+            UnknownError: no known job has this id.
         """
         fit = self.get(fit_id)
         if fit is self._running:
@@ -155,13 +159,13 @@ class Fits:
         return fit
 
     async def close(self) -> None:
-        """End what is under way."""
+        """Cancel the running job."""
         if self._task is None or self._running is None:
             return
         fit, task = self._running, self._task
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        if fit.state == "running":  # it had not begun yet
+        if fit.state == "running":  # the task had not started
             self._end(fit, "cancelled")
 
     async def _run(self, fit: Fit, paths: list[Path], options: Mapping[str, str]) -> None:
@@ -179,7 +183,7 @@ class Fits:
             self._end(fit, "failed")
         except Exception as error:
             log.exception("fit %s: this is a bug", fit.id)
-            fit.problem = f"the server made a mistake: {error!r}"
+            fit.problem = f"internal error: {error!r}"
             self._end(fit, "failed")
 
     def _end(self, fit: Fit, state: FitState) -> None:
@@ -189,20 +193,20 @@ class Fits:
     async def _have_fitted(
         self, fit: Fit, paths: list[Path], out: Path, options: Mapping[str, str]
     ) -> None:
-        """Have the process write the calibration at `out`.
+        """Run the process that writes the calibration to `out`.
 
         Raises:
-            StateError: it did not.
+            StateError: the process failed.
         """
-        said = {"name": fit.name, **options}
+        all_options = {"name": fit.name, **options}
         process = await asyncio.create_subprocess_exec(
             *(*_COMMAND, f"--out={out}"),
-            *(f"--{name.replace('_', '-')}={value}" for name, value in said.items()),
+            *(f"--{name.replace('_', '-')}={value}" for name, value in all_options.items()),
             *("--", *map(str, paths)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is for us
+            start_new_session=True,  # Ctrl-C is for the server
         )
         try:
             with suppress(OSError):
@@ -211,7 +215,7 @@ class Fits:
                 await self._listen(fit, process)
                 code = await process.wait()
         except TimeoutError as error:
-            raise StateError(f"it was not done after {_LASTS_MAX_S:.0f} s") from error
+            raise StateError(f"not finished after {_LASTS_MAX_S:.0f} s") from error
         finally:
             if process.returncode is None:
                 process.kill()

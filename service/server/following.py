@@ -1,10 +1,10 @@
-"""Sessions of a node that comes and goes: where in its streams they begin, go on and end.
+"""Parts of sessions on a server: where they begin, go on in another stream, and end.
 
-A session is a list of intervals of streams. A node that is switched on again adds a part, and so
-does every stream that it took meanwhile and brings home. Where a part ends is decided in
-`service.sessions.ends`.
+A session is a list of intervals of streams. A node that restarts adds a part, and so does every
+stream that it recorded offline and sends later. Where a part ends is decided in
+`service.sessions.part_end`.
 
-What is known of a session as of now follows from them: its ledger, and what it is made from.
+The present ledger and inputs of a session follow from its parts.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from storage.sessions.folder import Ledger, Part, Session
 from storage.sessions.ledger import ledger_of, numbers_of, states_of
 
 _UNHEARD_NS = 1_000_000_000
-"""How long after a hello frames may come of which it did not know."""
+"""Time after a hello within which frames may come that the hello did not count."""
 
 
 def streams_of(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
-    """What is known of a session's streams, by boot_id."""
+    """Return the facts of a session's streams, by stream id."""
     found = {}
     for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
         stream = node.streams.get(boot_id) if node is not None else None
         if stream is not None:
             found[boot_id] = stream.for_session(_offset_ns(session, node, boot_id))
-        else:  # until the node has spoken, it may have all of it
+        else:  # before its first hello the node may have all frames
             is_gone = node is not None and node.has_spoken
             found[boot_id] = SessionStream(may_come=Intervals(() if is_gone else [(0, NO_END)]))
     return found
 
 
 def first_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: float) -> Part:
-    """The part of a session that starts now, or earlier if a journal reaches back so far.
+    """Return the first part of a session that starts now, or a pre-roll earlier if stored.
 
-    What the node still has and is to send counts as if it were here.
+    Frames that the node still has and will send count as stored.
     """
     seq_first, journal = last_seq + 1, node.journal
     if pre_roll_s > 0 and journal is not None:
@@ -60,66 +60,75 @@ def first_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: floa
 
 
 def stopped(session: Session, node: ServerNode | None) -> Session:
-    """The session, stopped at this instant; its end is open until the stream has passed it."""
+    """Return the session, stopped now; its end is open until the stream has passed this time."""
     update: dict[str, object] = {"stopped_t_ns": utc_ns(), "state": "pending", "problem": None}
     if node is not None and node.connected:
         update["missed_slots_at_stop"] = {node.boot_id: node.present.missed_slots}
     session = session.model_copy(update=update)
     if node is None or node.clock is not None or not node.connected or node.last_seq is None:
         return session
-    # Its instants cannot be compared with ours: end with the newest frame there is.
+    # Its clock cannot be compared with ours: end with the newest frame.
     return ended(session, session.parts[-1], node.last_seq)
 
 
 def followed(session: Session, node: ServerNode) -> list[Session]:
-    """The session as far as its node's streams are known to go by now.
+    """Extend the session's parts to the present end of its node's streams.
 
     Returns:
-        The session, and those that take it up where the node came back with other tiles.
+        The session, and further ones that continue it where the node came back with other tiles.
     """
     found = [reattach(session, node)]
     while found[-1].parts[-1].seq_last is None:
-        further = _step(found[-1], node)
-        if not further:
+        extended = _step(found[-1], node)
+        if not extended:
             break
-        found[-1:] = further
+        found[-1:] = extended
     return found
 
 
 def reattach(session: Session, node: ServerNode) -> Session:
-    """Return the session with its open end in the stream that came back, if it left it too early.
+    """Return the session with its open end in an earlier stream that was resumed.
 
-    A part is closed when its node announces another stream. If that one is gone, and the earlier
-    one goes on after all, as where a copy of a node's card was in its place for a while, then the
-    recording goes on in the earlier one, with all frames that it has had meanwhile.
+    A part is closed when its node announces another stream. If that stream is gone and the earlier
+    one goes on, as when a copy of a node's card was in use for a while, the recording goes on in
+    the earlier one, with all frames that it has had meanwhile.
     """
-    left = session.parts[-1]
-    stream = node.streams.get(left.boot_id)
-    may_go_on = stream is not None and (left.boot_id in node.order or bool(stream.may_come))
-    if left.seq_last is not None or not node.has_spoken or may_go_on or left.boot_id in node.unread:
+    last_part = session.parts[-1]
+    stream = node.streams.get(last_part.boot_id)
+    may_go_on = stream is not None and (last_part.boot_id in node.order or bool(stream.may_come))
+    if (
+        last_part.seq_last is not None
+        or not node.has_spoken
+        or may_go_on
+        or last_part.boot_id in node.unread
+    ):
         return session
     for boot_id in node.order:
-        own = [part for part in session.parts if part.boot_id == boot_id]
+        own_parts = [part for part in session.parts if part.boot_id == boot_id]
         stream = node.streams[boot_id]
-        ends = [part.seq_last for part in own if part.seq_last is not None]
+        ends = [part.seq_last for part in own_parts if part.seq_last is not None]
         seq_first = max(ends, default=-1) + 1
-        if own and (stream.held | stream.may_come).within(seq_first, NO_END):
+        if own_parts and (stream.held | stream.may_come).within(seq_first, NO_END):
             session = _go_on_in(session, node, Part(boot_id=boot_id, seq_first=seq_first))
     return session
 
 
 def _go_on_in(session: Session, node: ServerNode, part: Part) -> Session:
-    """Return the session with its open part ended and another one open."""
-    *before, left = at_end(session, streams_of(session, node), utc_ns()).parts
+    """Return the session with its open part closed and another one open."""
+    *before, last_part = at_end(session, streams_of(session, node), utc_ns()).parts
     tails = {name: n for name, n in session.unsynced_tail_max.items() if name != part.boot_id}
-    parts = before if left.seq_last is None or left.seq_last < left.seq_first else [*before, left]
+    parts = (
+        before
+        if last_part.seq_last is None or last_part.seq_last < last_part.seq_first
+        else [*before, last_part]
+    )
     if parts and parts[-1].boot_id == part.boot_id:
         part = parts.pop().model_copy(update={"seq_last": None})
     return session.model_copy(update={"parts": (*parts, part), "unsynced_tail_max": tails})
 
 
 def given_up(session: Session, node: ServerNode | None) -> Session:
-    """The session without what has not come: an open end is closed at what is here."""
+    """Return the session without its missing frames: its open end is closed."""
     if node is not None:
         session = reattach(session, node)
     closed = broken_off(session, streams_of(session, node), utc_ns())
@@ -127,16 +136,16 @@ def given_up(session: Session, node: ServerNode | None) -> Session:
 
 
 def parts_needed(session: Session, node: ServerNode | None) -> Iterator[Part]:
-    """Parts of streams that a session, not sealed yet, needs in the journals."""
+    """Yield the parts that an unsealed session needs in the journals."""
     yield from session.parts
     if session.parts[-1].seq_last is None and node is not None:
-        # It is not known yet which stream it was stopped in.
+        # The stream in which the session was stopped is not known yet.
         for boot_id in _following(session, node):
             yield Part(boot_id=boot_id, seq_first=0)
 
 
 def clock_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
-    """Measurements of a node's clock from the beginning of a part on, and the last before it."""
+    """Return the clock measurements from the beginning of a part on, and the last before it."""
     begin_t_ns = (
         journal.t_ns_near(part.seq_first, newest=False) if (journal := node.journal) else None
     )
@@ -149,7 +158,7 @@ def clock_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
 
 
 def _step(session: Session, node: ServerNode) -> list[Session]:
-    """The session with its open part ended, and what follows; nothing if that is not known yet."""
+    """Close the open part and return the session with the next one; empty if undecided."""
     boot_id = session.parts[-1].boot_id
     if boot_id in node.unread and not session.given_up:
         return []
@@ -162,11 +171,11 @@ def _step(session: Session, node: ServerNode) -> list[Session]:
     following = next(iter(_following(session, node)), None)
     if following is None:
         return []
-    begun = session.stopped_t_ns is None or _has_begun(session, node, following)
-    if begun is None:
+    began = session.stopped_t_ns is None or _has_begun(session, node, following)
+    if began is None:
         return []
     closed, stream = at_end(session, streams, utc_ns()), streams[boot_id]
-    if not begun:
+    if not began:
         wanted = numbers_of(closed.parts).get(boot_id, Intervals())
         return [] if (stream.may_come - stream.held) & wanted else [closed]
     info = node.streams[following].info
@@ -188,60 +197,60 @@ def _step(session: Session, node: ServerNode) -> list[Session]:
 
 
 def _following(session: Session, node: ServerNode) -> Iterable[str]:
-    """Streams that began after that of the session's open part, oldest first."""
+    """Return streams that began after the one of the session's open part, oldest first."""
     boot_id, order = session.parts[-1].boot_id, node.order
     if boot_id in order:
         return order[order.index(boot_id) + 1 :]
-    # The node does not remember it: what began after its last frame came after it.
+    # Hello no longer lists it: streams that began after its last frame are later.
     newest = streams_of(session, node)[boot_id].t_ns_near(NO_END, newest=True)
 
     def is_later(name: str) -> bool:
         begin = node.streams[name].t_ns_first
         return newest is not None and begin is not None and begin > newest
 
-    known = {part.boot_id for part in session.parts}
-    return [n for n in order if n not in known and (n == node.boot_id or is_later(n))]
+    known_ids = {part.boot_id for part in session.parts}
+    return [n for n in order if n not in known_ids and (n == node.boot_id or is_later(n))]
 
 
 def _offset_ns(session: Session, node: ServerNode | None, boot_id: str) -> int | None:
-    """What to add to a stream's instants for the server's UTC; None if it was never measured."""
+    """Return the offset from a stream's time to the server's UTC; None without a measurement."""
     stream = node.streams.get(boot_id) if node is not None else None
     if stream is not None and stream.clock is not None:
         return stream.clock.server_minus_node_ns
     rows = [row for row in session.clock if row.boot_id == boot_id]
     if rows:
         return rows[-1].server_minus_node_ns
-    # The node had no link during that stream: its clock was most likely as wrong as it is now.
+    # No link during that stream: most likely the node's clock was as wrong as now.
     return node.clock.server_minus_node_ns if node is not None and node.clock is not None else None
 
 
 def _begin_t_ns(session: Session, node: ServerNode, boot_id: str) -> int:
-    """When a stream began, server's UTC; now, if that is not known."""
+    """Return the begin of a stream, server's UTC; the present time if unknown."""
     begin_t_ns, offset_ns = node.streams[boot_id].t_ns_first, _offset_ns(session, node, boot_id)
     return utc_ns() if begin_t_ns is None or offset_ns is None else begin_t_ns + offset_ns
 
 
 def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
-    """Had a stream begun when the session was stopped? None: not known yet.
+    """Return whether a stream began before the session was stopped; None: not known yet.
 
-    The node says when the oldest frame that it has was taken. That is when the stream began, unless
-    older ones are gone: then only the frames themselves say so.
+    The node states the time of its oldest frame. That is the begin of the stream, unless older
+    frames are gone: then only the frames themselves show it.
     """
     stream, rate_hz = node.streams[boot_id], node.streams[boot_id].info.nominal_rate_hz
     stop_t_ns = session.stopped_t_ns or utc_ns()
     offset_ns = _offset_ns(session, node, boot_id)
     if boot_id != node.boot_id:
-        known = offset_ns is not None and stream.t_ns_first is not None
-        return _begin_t_ns(session, node, boot_id) <= stop_t_ns if known else None
-    said = node.hello
-    if node.greeted_t_ns is not None and not said.next_seq and not stream.held:
-        # Of frames that it has just taken it may not know yet; then they come at once.
+        is_known = offset_ns is not None and stream.t_ns_first is not None
+        return _begin_t_ns(session, node, boot_id) <= stop_t_ns if is_known else None
+    hello = node.hello
+    if node.greeted_t_ns is not None and not hello.next_seq and not stream.held:
+        # Hello may not count the newest frames; these come at once.
         is_settled = stop_t_ns < node.greeted_t_ns < utc_ns() - _UNHEARD_NS
         return False if is_settled else None
-    if said.t_ns_first and said.held and offset_ns is not None:
-        if said.t_ns_first + offset_ns <= stop_t_ns:
+    if hello.t_ns_first and hello.held and offset_ns is not None:
+        if hello.t_ns_first + offset_ns <= stop_t_ns:
             return True
-        if said.held[0][0] == 0:
+        if hello.held[0][0] == 0:
             return False
     journal = stream.journal
     oldest = next(iter(stream.held), None)
@@ -258,16 +267,16 @@ def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
 
 
 def ledger_now(session: Session, node: ServerNode | None) -> Ledger:
-    """What became of every frame of a session."""
+    """Return the session's present ledger: the fate of every frame."""
     if session.state == "sealed" and session.ledger is not None:
         return session.ledger
     finished = session.stopped_t_ns is not None and session.parts[-1].seq_last is not None
-    about, streams = _provisional(session, node)
-    return ledger_of(about.parts, states_of(about, streams), finished=finished)
+    likely, streams = _provisional(session, node)
+    return ledger_of(likely.parts, states_of(likely, streams), finished=finished)
 
 
 def sources_now(session: Session, node: ServerNode, *, exact: bool = False) -> Sources:
-    """Sources that a session can be sealed or exported from; `exact`: estimates not rounded."""
+    """Return the inputs from which a session can be sealed or exported now."""
     session, streams = _provisional(session, node)
     return sources_of(
         session,
@@ -280,14 +289,14 @@ def sources_now(session: Session, node: ServerNode, *, exact: bool = False) -> S
 
 
 def is_unread(session: Session, node: ServerNode | None) -> bool:
-    """Is any of its journals here, and cannot be read now? Then what is lost is not known."""
+    """Return whether a journal of the session cannot be read now: its losses are then unknown."""
     if node is None or session.given_up:
         return False
     return any(part.boot_id in node.unread for part in session.parts)
 
 
 def is_all_here(session: Session, node: ServerNode | None) -> bool:
-    """Have all frames come, and are they on the disk?"""
+    """Return whether all obtainable frames are stored and synced."""
     if session.parts[-1].seq_last is None or is_unread(session, node):
         return False
     for boot_id, numbers in numbers_of(session.parts).items():
@@ -300,8 +309,8 @@ def is_all_here(session: Session, node: ServerNode | None) -> bool:
 def _provisional(
     session: Session, node: ServerNode | None
 ) -> tuple[Session, dict[str, SessionStream]]:
-    """A session with its likely end, and its streams."""
+    """Return a session with its likely end, and its streams."""
     streams = streams_of(session, node)
-    with suppress(FootTileError):  # the frames that tell are damaged
+    with suppress(FootTileError):  # the frames at the stop are damaged
         session = at_stop(session, streams)
     return session, streams

@@ -1,7 +1,7 @@
-"""The secrets by which a server tells its nodes from other machines, and machines that it refused.
+"""Secrets by which a server verifies its nodes, and machines that it refused.
 
-A refused machine is remembered until the server ends or a person accepts it; it asks again by
-itself every few seconds.
+A refused machine is listed until the server ends or a person accepts it; it retries every few
+seconds.
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ log = logging.getLogger("foottile.nodes")
 
 @dataclass(frozen=True)
 class Claim:
-    """A machine's claim to be a node.
+    """Claim of a machine to be a node.
 
     Attributes:
         node: name of the node.
-        challenge: what the machine was asked.
-        answer: what it answered.
-        address: where it connected from.
+        challenge: challenge sent to the machine.
+        proof: answer of the machine.
+        address: peer address of the machine.
     """
 
     node: str
     challenge: Challenge
     answer: Proof
+    """answer of the machine."""
     address: str
 
 
 @dataclass(frozen=True)
 class Replacement:
-    """A machine that asked to connect under the name of another one, and was refused.
+    """Machine that was refused because another one has the name.
 
     Attributes:
-        secret: it comes into force if a person accepts the machine.
-        address: where it connected from.
-        asked_t_ns: when, server's UTC.
+        secret: becomes the node's secret if a person accepts the machine.
+        address: peer address of the machine.
+        asked_t_ns: time of its last attempt, server's UTC.
     """
 
     secret: str
@@ -52,12 +53,12 @@ class Replacement:
 
     @property
     def fingerprint(self) -> str:
-        """What the machine shows of its secret."""
+        """Fingerprint of the machine's secret."""
         return fingerprint_of(self.secret)
 
 
 class NodeIdentities:
-    """The secrets of all nodes of one server, in `nodes/NAME/secrets.json`.
+    """Secrets of all nodes of one server, in `nodes/NAME/secrets.json`.
 
     Args:
         data: the server's data folder.
@@ -66,24 +67,24 @@ class NodeIdentities:
     def __init__(self, data: Path) -> None:
         self._nodes = data / "nodes"
         self.replacements: dict[str, Replacement] = {}
-        """The machine that asked last, by the name of the node."""
+        """Machine that was refused last, by the name of the node."""
         self.problems: list[str] = []
-        """What was found damaged, and what became of it, in words."""
+        """Damage found, and the consequence, as text."""
 
     def secret_of(self, node: str) -> str | None:
-        """Return the secret of a node; None if it is not known, or was damaged.
+        """Read the secret of a node; None if unknown or damaged.
 
         Args:
-            node: its name, fit for a folder.
+            node: its name, valid as a folder name.
 
         Raises:
-            StorageError: it cannot be read now. Nobody may be taken for the node meanwhile.
+            StorageError: it cannot be read now: no machine may be accepted as the node meanwhile.
         """
         path = self._path(node)
         try:
             return read_secrets(path).get(node)
         except DamagedFileError as error:
-            # The true node sends it again. Without this it would be locked out for a flipped bit.
+            # The true node sends it again. Otherwise a flipped bit would lock it out.
             self.problems.append(
                 f"node {node}: {put_aside(path, error)}; "
                 "the next machine that connects under this name is taken for it"
@@ -92,10 +93,10 @@ class NodeIdentities:
             return None
 
     def challenge(self, node: str, server_id: str) -> Challenge:
-        """Return what a machine that connects as this node is asked.
+        """Make the challenge for a machine that connects as this node.
 
         Raises:
-            StorageError: as `secret_of`.
+            StorageError: as `read_secret`.
         """
         is_known = self.secret_of(node) is not None
         return Challenge(
@@ -103,21 +104,21 @@ class NodeIdentities:
         )
 
     def is_proven(self, claim: Claim, now_t_ns: int) -> bool:
-        """Return whether a claim is proven; False: no secret of the node is known.
+        """Return whether a claim is proven; False if the node has no secret here.
 
         Raises:
             HangUp: the name belongs to another machine.
-            StorageError: as `secret_of`.
+            StorageError: as `read_secret`.
         """
         node, answer = claim.node, claim.answer
-        known = self.secret_of(node)
-        if known is None:
+        secret = self.secret_of(node)
+        if secret is None:
             return False
-        if is_proven(known, claim.challenge, node, answer):
+        if is_proven(secret, claim.challenge, node, answer):
             return True
         if answer.secret is not None:
             self.replacements[node] = Replacement(answer.secret, claim.address, now_t_ns)
-        # The way out first: a reason has 123 bytes.
+        # The remedy comes first: a close reason has 123 bytes.
         raise HangUp(
             Close.WRONG_IDENTITY,
             f"accept this machine with `foottile accept-node {node}`: the name is another "
@@ -125,33 +126,35 @@ class NodeIdentities:
         )
 
     def keep_first(self, claim: Claim) -> None:
-        """Keep the secret of a first contact. Without room for it the frames are worth having."""
+        """Store the secret of a first contact. A failure is logged: frames matter more."""
         try:
             if claim.answer.secret is not None:
                 self._keep(claim.node, claim.answer.secret)
                 return
-            why = "its disk keeps none"
+            why = "its disk stores none"
         except StorageError as error:
             why = str(error)
-        log.warning("no secret of node %s is kept; any machine may take it: %s", claim.node, why)
+        log.warning(
+            "no secret of node %s is stored; any machine may use its name: %s", claim.node, why
+        )
 
     def accept(self, node: str, fingerprint: str) -> None:
-        """Take the machine that asked last for the node from now on.
+        """Accept the machine that was refused last as the node from now on.
 
         Raises:
-            StateError: no machine asks.
-            ChangedError: another one than this asked last.
-            StorageError: the disk is full or not writable; the machine before stays in force.
+            StateError: no machine was refused.
+            ChangedError: another machine than this one was refused last.
+            StorageError: the disk is full or not writable; the former machine stays accepted.
         """
         asking = self.replacements.get(node)
         if asking is None:
             raise StateError(
-                f"no other machine asks to connect as {node!r}",
-                remedy="Start it; it asks again by itself every few seconds",
+                f"no other machine was refused as {node!r}",
+                remedy="Start it; it retries every few seconds",
             )
         if asking.fingerprint != fingerprint:
             raise ChangedError(
-                f"another machine asked to connect as {node!r} meanwhile: {asking.fingerprint}",
+                f"another machine was refused as {node!r} meanwhile: {asking.fingerprint}",
                 expected=f"the machine {fingerprint}",
                 remedy="Compare it with the fingerprint that the machine itself prints",
             )

@@ -1,7 +1,7 @@
-"""Sessions by id, by age, and those that are not sealed yet: updated by each, walked by none.
+"""In-memory index of sessions: by id, by start time, and unsealed ones.
 
-A season has thousands of sessions, and nearly all are sealed. What looks at every tick looks at the
-few that are not; a page of the list costs what is on it.
+A season has thousands of sessions, and nearly all are sealed. A tick visits the unsealed ones only;
+a page of the list visits the sessions on that page.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from collections.abc import Iterable, Iterator
 from storage.sessions.folder import Session
 
 Age = tuple[int, str]
-"""By what sessions are in order: when one was started, in ns UTC, and its id."""
+"""Sort key of sessions: start time, ns UTC, and id."""
 
 
 def age_of(session: Session) -> Age:
-    """Its place in the order."""
+    """Return the sort key of a session."""
     return session.started_t_ns, session.id
 
 
 class SessionIndex:
-    """Sessions, each once.
+    """Sessions by id and by start time.
 
     Args:
-        sessions: those to begin with.
+        sessions: initial content.
     """
 
     def __init__(self, sessions: Iterable[Session] = ()) -> None:
@@ -44,10 +44,10 @@ class SessionIndex:
         return self._by_id[session_id]
 
     def put(self, session: Session) -> None:
-        """Add a session, or replace the one of its id."""
-        known = self._by_id.get(session.id)
-        if known is None or age_of(known) != age_of(session):
-            if known is not None:
+        """Add a session, or replace the one with its id."""
+        previous = self._by_id.get(session.id)
+        if previous is None or age_of(previous) != age_of(session):
+            if previous is not None:
                 self.take(session.id)
             insort(self._ages, age_of(session))
         self._by_id[session.id] = session
@@ -60,7 +60,7 @@ class SessionIndex:
         """Remove a session and return it.
 
         Raises:
-            KeyError: there is none of this id.
+            KeyError: no session has this id.
         """
         session = self._by_id.pop(session_id)
         del self._ages[bisect_left(self._ages, age_of(session))]
@@ -68,11 +68,11 @@ class SessionIndex:
         return session
 
     def unsealed(self, node: str | None = None) -> list[Session]:
-        """Those that are not sealed, of all nodes or of one, in the order they came in."""
+        """Return unsealed sessions, of all nodes or of one, in order of addition."""
         return [each for each in self._unsealed.values() if node in (None, each.node)]
 
     def newest_first(self, before: Age | None = None) -> Iterator[Session]:
-        """All, or those before one, newest first; put and take nothing meanwhile."""
+        """Yield all sessions, or those before a key, newest first; change none meanwhile."""
         end = len(self._ages) if before is None else bisect_left(self._ages, before)
         for place in range(end - 1, -1, -1):
             yield self._by_id[self._ages[place][1]]

@@ -1,7 +1,7 @@
-"""One node as a server knows it: its streams, estimates, tares and clock.
+"""One node on the server: its streams, estimates, tares and clock.
 
-What has to outlive the server is on disk: the journals, the node's last hello, its tares, and the
-calibration that the server was told to use.
+On disk, for after a restart: the journals, the node's last hello, its tares, and the calibration
+assigned on the server.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class ServerNode:
     """One node, connected or remembered.
 
     Args:
-        folder: what is kept of it beside its journals.
+        folder: files of the node other than journals.
         journals: folder of its journals, one for each of its streams.
-        hello: what it said last.
+        hello: last hello of the node.
     """
 
     def __init__(self, folder: Path, journals: Path, hello: Hello) -> None:
@@ -53,27 +53,27 @@ class ServerNode:
         self.connected = False
         self.estimates = NodeEstimates(folder, hello)
         self.streams: dict[str, ServerStream] = {}
-        """By boot_id: those that are kept here, and those that it said it has."""
+        """Streams by id: stored here, or listed in hello."""
         self.unread: set[str] = set()
-        """Kept here, but their journals cannot be read now: nothing is known of their frames."""
+        """Ids of streams whose journals cannot be read now: their frames are unknown."""
         self.has_words = False
-        """Has it said what is not written down yet? `keep` does, before its frames are promised."""
+        """True if hello is not saved yet; `save` saves it before its frames are acknowledged."""
         self.has_spoken = False
-        """Has it said hello since the server was started?"""
+        """True if the node has sent hello since the server was started."""
         self.greeted_t_ns: int | None = None
-        """When it last said hello, server's UTC."""
+        """Arrival time of the last hello, server's UTC."""
         self.storage_problem: str | None = None
         self.troubles: tuple[str, ...] = ()
-        """What is wrong with its array or its disk, as it said last."""
+        """Faults of its array or disk, from its last status."""
         self.fault_counts: dict[str, dict[str, int]] = {}
-        """How often what went wrong in its stream, by serial and reason, as it said last."""
+        """Faults of the present stream by serial and reason, from its last status."""
         self.refused_ahead_frames = 0
-        """Frames of this stream that were refused because they are ahead of their time."""
+        """Frames of the present stream that were refused because they are ahead of time."""
         self.last_seq: int | None = None
         self.last_t_ns: int | None = None
         self.last_seen_t_ns: int | None = None
         self.shown_t_ns: int | None = None
-        """Instant of the newest frame on the screens, in the node's UTC."""
+        """Time of the newest frame that was published to subscribers, node's UTC."""
         self._folder = folder
         self._journals_folder = journals
         self._pace = Pace()
@@ -85,18 +85,18 @@ class ServerNode:
                     self._found += stream.problems
                 except DamagedFileError as error:
                     self._found.append(f"a journal is left out: {error}")
-                except FootTileError as error:  # a disk that is full, or another version wrote it
+                except FootTileError as error:  # a full disk, or another version's file
                     self.unread.add(path.name)
                     self._found.append(f"a journal is left out until it can be read: {error}")
         self._found += self.estimates.damages
         for text in self._found:
             log.warning("node %s: %s", self.name, text)
         self.present = self._stream_of(self.info)
-        """The stream that it takes now."""
+        """Stream to which the node adds frames now."""
 
     @property
     def problems(self) -> list[str]:
-        """What was found damaged of what is kept of it, and what became of it, in words."""
+        """Damage found in its files, and the consequence, as text."""
         return [f"node {self.name}: {text}" for text in self._found]
 
     @property
@@ -106,17 +106,17 @@ class ServerNode:
 
     @property
     def boot_id(self) -> str:
-        """Name of the present stream."""
+        """Id of the present stream."""
         return self.info.boot_id
 
     @property
     def order(self) -> tuple[str, ...]:
-        """Its streams by boot_id, oldest first, as it said last; the present one is the last."""
+        """Ids of its streams from its last hello, oldest first; the present one is last."""
         return (*(each.array_info.boot_id for each in self.hello.earlier), self.boot_id)
 
     @property
     def journals(self) -> dict[str, Journal]:
-        """Journals by boot_id, for streams that have sent frames."""
+        """Journals by stream id, for streams that have sent frames."""
         return {name: s.journal for name, s in self.streams.items() if s.journal is not None}
 
     @property
@@ -126,12 +126,12 @@ class ServerNode:
 
     @property
     def clock(self) -> ClockOffset | None:
-        """How its clock differs in the present stream; None before it was measured."""
+        """Latest offset of its clock in the present stream; None before the first measurement."""
         return self.present.clock
 
     @property
     def missing(self) -> Intervals:
-        """Numbers of the present stream that should be here and are not: lost, or still to come."""
+        """Frames of the present stream that are not stored: lost, or still to come."""
         newest = -1 if self.last_seq is None else self.last_seq
         if self.has_spoken:
             newest = max(newest, self.hello.next_seq - 1)
@@ -139,21 +139,21 @@ class ServerNode:
 
     @property
     def backlog_frames(self) -> int:
-        """How many of the missing frames the node still has."""
+        """Number of missing frames that the node can still send."""
         return (self.missing & self.present.may_come).count
 
     @property
     def lost(self) -> dict[str, int]:
-        """How many of the missing frames are lost, by reason."""
-        gone = self.missing - self.present.may_come
-        named = {why: lost.count for why, lost in self.present.lost.within(gone).items()}
-        if unnamed := gone.count - sum(named.values()):
+        """Number of lost frames of the present stream, by reason."""
+        unobtainable = self.missing - self.present.may_come
+        named = {why: lost.count for why, lost in self.present.lost.within(unobtainable).items()}
+        if unnamed := unobtainable.count - sum(named.values()):
             named[NODE_RESTARTED] = named.get(NODE_RESTARTED, 0) + unnamed
         return named
 
     @property
     def refusals(self) -> list[str]:
-        """Warnings of frames of this stream that were refused."""
+        """Warnings about refused frames of the present stream."""
         if not self.refused_ahead_frames:
             return []
         return [
@@ -163,16 +163,16 @@ class ServerNode:
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames a second over the last second, by the node's clock; 0 if none came in it."""
+        """Frames per second over the last second, by the node's clock; 0 if none came."""
         seen_t_ns = self.present.last_seen_t_ns
         silent_ns = None if seen_t_ns is None else utc_ns() - seen_t_ns
         return self._pace.rate_hz(self.info.nominal_rate_hz, silent_ns)
 
     def attach(self, hello: Hello, now_t_ns: int) -> None:
-        """The node has connected, and said which frames it has.
+        """Update streams and estimates from hello of a node that has connected.
 
         Args:
-            hello: its message; every stream in it has the array that it had before.
+            hello: its message; every known stream in it has the array of before.
             now_t_ns: the server's UTC.
         """
         if hello.array_info.boot_id != self.boot_id or self.last_seq is None:
@@ -186,13 +186,13 @@ class ServerNode:
             stream.owed = Intervals()
             if stream.boot_id not in self.order and not hello.has_more:
                 stream.is_gone()
-                if stream.journal is None:  # nothing of it ever came
+                if stream.journal is None:  # no frame ever came
                     del self.streams[stream.boot_id]
         for earlier in hello.earlier:
             self._stream_of(earlier.array_info).has_ended(earlier)
         self.present = self._stream_of(hello.array_info)
         self.present.is_present(hello, now_t_ns)
-        # What is here but was never acknowledged, because the link broke before: acknowledge it.
+        # Acknowledge stored frames again: a link may have broken before their acknowledgement.
         for name in self.order:
             stream = self.streams[name]
             stream.owed = stream.held & stream.may_come
@@ -200,42 +200,42 @@ class ServerNode:
         self.has_words = True
 
     def lacks(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
-        """Frames to ask it for: first what sessions need, then the rest of the present stream.
+        """Return the frames to request: first those needed by sessions, then the others.
 
         Args:
-            needed: numbers by stream.
+            needed: frames that sessions need, by stream id.
         """
         found = []
         for name in self.order:
             stream, present = self.streams[name], name == self.boot_id
             wanted = needed.get(name, Intervals())
-            asked = stream.lacks(wanted, all_of_it=present)
-            first = (asked & wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
-            numbers = _joined([*first, *asked - first])
+            requested = stream.lacks(wanted, all_of_it=present)
+            first = (requested & wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
+            numbers = _joined([*first, *requested - first])
             if numbers:
                 found.append(StreamNumbers(boot_id=name, numbers=with_open_ends(numbers)))
         return tuple(found)
 
     def detach(self) -> None:
-        """The node has gone; what it sent stays."""
+        """Mark the node as disconnected; its frames stay."""
         self.connected = False
         self._pace.clear()
 
     def take(
         self, stream: ServerStream, payload: bytes, now_t_ns: int
     ) -> tuple[int, int, list[Estimated]]:
-        """One message of frames: kept, and estimated if it is news.
+        """Store one message of frames, and estimate the frames newer than all before.
 
         Args:
-            stream: whose frames they are.
+            stream: stream of the frames.
             payload: the message.
             now_t_ns: the server's UTC.
 
         Returns:
-            First and last number of the message, and the frames whose estimates are now due.
+            First and last number of the message, and the frames whose estimates are due.
 
         Raises:
-            LinkError: it is not a message of this stream's frames, or they break a rule of theirs.
+            LinkError: the message is not of this stream, or its frames break a rule.
         """
         try:
             frames = stream.decoder.decode(payload)
@@ -245,14 +245,14 @@ class ServerNode:
             stream.take(frames, payload, now_t_ns)
         except FileFormatError as error:
             raise LinkError(f"node {self.name!r}: {error}") from error
-        except StorageError as error:  # the live picture goes on; nothing is acknowledged
+        except StorageError as error:  # live goes on; nothing is acknowledged
             self.storage_problem = str(error)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         self.last_seen_t_ns = now_t_ns
         if stream is not self.present:
             return first, last, []
         if self.last_seq is not None and last <= self.last_seq:
-            self._look_for_tare()  # sent again for the journal; the picture is further on
+            self._look_for_tare()  # resent for the journal; live is further
             return first, last, []
         if self.last_seq is not None and first <= self.last_seq:
             frames = frames.rows(self.last_seq + 1 - first, len(frames))
@@ -263,27 +263,25 @@ class ServerNode:
         return first, last, due
 
     def take_tare(self, reason: str = "") -> RecordedTare:
-        """Tare from an unloaded interval of the last seconds, and put it in force.
+        """Tare from an unloaded interval of the last seconds, and put the tare in force.
 
         Raises:
             TareError: the foot was loaded, or there is nothing to tare.
-            StateError: the node is away.
-            StorageError: it cannot be kept.
+            StateError: the node is not connected.
+            StorageError: the tare cannot be stored.
         """
         if not self.connected:
-            raise StateError(
-                f"node {self.name!r} is away", remedy="Tare when it is connected again"
-            )
+            raise StateError(f"node {self.name!r} is not connected", remedy="Connect it and retry")
         return self.estimates.tare_keeper.by_hand(reason)
 
     def read_again(self) -> None:
-        """Try the journals again that could not be read."""
+        """Retry opening the journals that could not be read."""
         for name in sorted(self.unread):
             stream = self.streams.get(name)
             try:
                 if stream is None or stream.journal is None:
                     opened = ServerStream.open(self._journals_folder / name)
-                    if stream is not None:  # the node has said something of it
+                    if stream is not None:  # the node has listed it
                         stream.journal = opened.journal
                     else:
                         self.streams[name] = opened
@@ -296,29 +294,32 @@ class ServerNode:
             self.unread.discard(name)
 
     def server_t_ns(self, t_ns: int) -> int:
-        """An instant of the node's UTC in the server's; the same while no offset is measured."""
+        """Convert a time of the node's UTC to the server's; unchanged without an offset."""
         return t_ns + (self.clock.server_minus_node_ns if self.clock is not None else 0)
 
     def node_t_ns(self, t_ns: int) -> int:
-        """An instant of the server's UTC in the node's."""
+        """Convert a time of the server's UTC to the node's."""
         return t_ns - (self.clock.server_minus_node_ns if self.clock is not None else 0)
 
     def prune(self, keep: Mapping[str, Intervals]) -> bool:
-        """Delete what is older than the ring and not in `keep`, by stream.
+        """Delete frames older than the ring and not in `keep`, at most one whole journal per call.
+
+        Args:
+            keep: frames to keep, by stream id.
 
         Returns:
-            Was a journal deleted as a whole? Then there may be more: no more than one is at a time,
-            for a node that was switched on a thousand times has as many.
+            True if a whole journal was deleted: call again. A node that was switched on a thousand
+            times has as many.
 
         Raises:
             StorageError: a file cannot be deleted.
         """
         for name, stream in list(self.streams.items()):
-            kept = keep.get(name, Intervals())
+            needed = keep.get(name, Intervals())
             if stream is self.present:
                 if self.last_t_ns is not None:
-                    stream.prune(self.last_t_ns - RING_NS, kept)
-            elif not kept:
+                    stream.prune(self.last_t_ns - RING_NS, needed)
+            elif not needed:
                 is_there = stream.journal is not None
                 stream.delete()
                 if name not in self.order:
@@ -328,7 +329,7 @@ class ServerNode:
         return False
 
     def keep(self) -> None:
-        """Write down what the node said, for after a restart; may run in another thread.
+        """Save hello for after a restart. Runs in any thread.
 
         Raises:
             StorageError: the disk is full or not writable.
@@ -337,11 +338,11 @@ class ServerNode:
         with storage_errors(self._folder):
             make_folder(self._folder)
         write_checked(self._folder / HELLO_FILE, hello.model_dump_json().encode())
-        if hello is self.hello:  # it may have said it anew meanwhile
+        if hello is self.hello:  # a newer hello may have come meanwhile
             self.has_words = False
 
     def _refuse_ahead(self, frames: FrameBatch, why: str) -> None:
-        """Count frames that are ahead of their time; the first ones of a stream are logged."""
+        """Count frames that are ahead of time; log the first ones of a stream."""
         if not self.refused_ahead_frames:
             first, last = int(frames.seq[0]), int(frames.seq[-1])
             log.warning(
@@ -356,7 +357,7 @@ class ServerNode:
         return self.streams[info.boot_id]
 
     def _look_for_tare(self) -> None:
-        if self.storage_problem is not None:  # it could not be kept
+        if self.storage_problem is not None:  # a tare could not be stored
             return
         try:
             self.estimates.look_for_tare(self.journal, lambda: self.present.may_come)
@@ -365,7 +366,7 @@ class ServerNode:
 
 
 def _joined(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The same numbers in the same order; neighbours that follow each other are joined."""
+    """Return the same ranges in the same order, with adjacent ones joined."""
     joined: list[tuple[int, int]] = []
     for first, last in numbers:
         if joined and joined[-1][1] + 1 == first:

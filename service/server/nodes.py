@@ -1,4 +1,4 @@
-"""The nodes that a server knows, and which of them may connect."""
+"""Registry of the nodes of a server, with checks of their names and streams."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from storage.durable import put_aside, storage_errors
 log = logging.getLogger("foottile.nodes")
 
 _NODES_MAX = 1000
-"""Whoever says ever new names fills neither memory nor disk."""
+"""Limit on node names, so that ever new names fill neither memory nor disk."""
 _NODE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 
 
 class ServerNodes:
     """All nodes of a server.
 
-    A node whose description is damaged is not known until it says hello again; all that is kept of
-    it, journals, sessions and tares, waits for that.
+    A node whose description is damaged is unknown until its next hello; its journals, sessions and
+    tares stay on the disk until then.
 
     Args:
         data: the server's data folder.
@@ -69,60 +69,60 @@ class ServerNodes:
 
     @property
     def problems(self) -> list[str]:
-        """What was found damaged of what is kept of nodes, and what became of it, in words."""
+        """Damage found in the files of nodes, and the consequence, as text."""
         return self._problems + [text for node in self for text in node.problems]
 
     def _problem(self, what: str) -> None:
-        text = printable(what)
-        log.warning("%s", text)
-        self._problems.append(text)
+        what = printable(what)
+        log.warning("%s", what)
+        self._problems.append(what)
 
     def __iter__(self) -> Iterator[ServerNode]:
         return iter(self._nodes.values())
 
     def find(self, name: str) -> ServerNode | None:
-        """The node called `name`; None if there is none."""
+        """Return the node called `name`; None if there is none."""
         return self._nodes.get(name)
 
     def get(self, name: str) -> ServerNode:
-        """The node called `name`.
+        """Return the node called `name`.
 
         Raises:
-            UnknownError: there is none.
+            UnknownError: no node has this name.
         """
         if name not in self._nodes:
-            known = ", ".join(self._nodes) or "none so far"
-            raise UnknownError(f"no node {name[:80]!r}", expected=f"one of: {known}")
+            names = ", ".join(self._nodes) or "none so far"
+            raise UnknownError(f"no node {name[:80]!r}", expected=f"one of: {names}")
         return self._nodes[name]
 
     def greet(self, hello: Hello) -> ServerNode:
-        """The node that says this hello, made if it is new. It is not attached yet.
+        """Return the node that sent this hello, created if new. It is not connected yet.
 
         Raises:
-            LinkError: a name in it cannot be a folder's, its streams contradict each other or what
-                it said before, or its files here are damaged.
+            LinkError: a name in it is no folder name, its streams contradict each other or an
+                earlier hello, or the node's files are damaged.
         """
         info = hello.array_info
         _check(hello)
         if info.node not in self._nodes:
             if len(self._nodes) >= _NODES_MAX:
                 raise LinkError(
-                    f"this server knows {len(self._nodes)} nodes already",
-                    remedy="Delete the folders in nodes/ of those that are gone, and start it anew",
+                    f"this server has {len(self._nodes)} nodes already",
+                    remedy="Delete the folders of unused nodes in nodes/, and restart the server",
                 )
             try:
                 self._nodes[info.node] = self._make(hello)
             except FootTileError as error:
-                raise LinkError(f"node {info.node!r} cannot be taken in: {error}") from error
+                raise LinkError(f"node {info.node!r} cannot be accepted: {error}") from error
         node = self._nodes[info.node]
-        for said in (info, *(each.array_info for each in hello.earlier)):
-            known = node.streams.get(said.boot_id)
-            if known is not None and known.info != said:
-                raise LinkError(f"stream {said.boot_id} was announced with another array")
+        for announced in (info, *(each.array_info for each in hello.earlier)):
+            stored = node.streams.get(announced.boot_id)
+            if stored is not None and stored.info != announced:
+                raise LinkError(f"stream {announced.boot_id} was announced with another array")
         return node
 
     def forget(self, name: str) -> None:
-        """A node that said hello for the first time, and could not be taken in after all."""
+        """Remove a node whose first hello could not be accepted."""
         self._nodes.pop(name, None)
 
     def _make(self, hello: Hello) -> ServerNode:
@@ -131,26 +131,26 @@ class ServerNodes:
 
 
 def _read_hello(path: Path) -> Hello:
-    """What a node said last.
+    """Read the last hello of a node.
 
     Raises:
-        FileNotFoundError: nothing.
-        DamagedFileError: that is damaged, or was said by another node.
-        FileFormatError: it was said to another version.
+        FileNotFoundError: there is none.
+        DamagedFileError: it is damaged, or of another node.
+        FileFormatError: it is of another protocol version.
         StorageError: it cannot be read now.
     """
     text = read_checked(path).text
-    again = "it is known again when it connects"
+    again = "the node is unknown until it connects"
     try:
-        said = json.loads(text)
-        protocol = said["protocol"]
+        content = json.loads(text)
+        protocol = content["protocol"]
         hello = Hello.model_validate_json(text) if protocol == PROTOCOL else None
         if hello is not None:
             _check(hello)
     except (ValueError, KeyError, TypeError, RecursionError, LinkError) as error:
         what = " ".join(str(error).split())[:200]
         raise DamagedFileError(
-            f"not what this node said last: {what}", where=str(path), remedy=again.capitalize()
+            f"not this node's last hello: {what}", where=str(path), remedy=again.capitalize()
         ) from error
     if hello is None:
         raise FileFormatError(
@@ -162,7 +162,7 @@ def _read_hello(path: Path) -> Hello:
 
 
 def is_node_name(name: str) -> bool:
-    """Return whether this can be the name of a node, and of its folder."""
+    """Return whether a text is valid as the name of a node and of its folder."""
     return _NODE_NAME.fullmatch(name) is not None
 
 

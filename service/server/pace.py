@@ -1,4 +1,4 @@
-"""How many frames a second a node takes, by its own clock."""
+"""Frame rate of a node, by its own clock."""
 
 from __future__ import annotations
 
@@ -9,28 +9,29 @@ _JITTER = 1.02
 
 
 class Pace:
-    """Of the last second."""
+    """Frame rate over the last second."""
 
     def __init__(self) -> None:
         self._noted: deque[tuple[int, int]] = deque()
 
     def clear(self) -> None:
-        """What comes next does not follow on this."""
+        """Drop all samples: the next frame does not follow the last one."""
         self._noted.clear()
 
     def note(self, t_mono_ns: int, seq: int) -> None:
-        """Instant and number of the newest frame."""
+        """Add time and number of the newest frame."""
         noted = self._noted
         noted.append((t_mono_ns, seq))
         while noted[-1][0] - noted[0][0] > _OVER_NS and len(noted) > 2:
             noted.popleft()
 
     def rate_hz(self, nominal_hz: float, silent_ns: int | None) -> float | None:
-        """Frames a second; 0 if none came lately; None where that cannot be told.
+        """Return frames per second; 0 if none came lately; None if unknown.
 
         Args:
-            nominal_hz: what bus and node can do: a little more in one second is its jitter.
-            silent_ns: for how long nothing has come; None: nothing ever has.
+            nominal_hz: rate limit of bus and node: a slightly higher rate over one second is
+                jitter.
+            silent_ns: time since the last frame; None: no frame yet.
         """
         if len(self._noted) < 2:  # a rate needs two instants
             return None

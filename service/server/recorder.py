@@ -1,7 +1,7 @@
-"""Recording: starts, stops, gives up, deletes and restores sessions, and reports them.
+"""Recording commands: start, stop, abandon, delete and restore sessions, and report them.
 
-Starting and stopping only note numbers and instants; the frames are in the journals anyway.
-`service.server.settling` does what follows.
+Starting and stopping only note numbers and times; the frames are in the journals anyway.
+`service.server.sealer` does the rest.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ log = logging.getLogger("foottile.recorder")
 
 BEHIND_S = 2.0
 CLOCK_ROW_OFF_NS = 60_000_000_000
-"""Eight probes may take 40 s on a link that hardly carries anything."""
+"""Tolerance: eight probes take up to 40 s on a very poor link."""
 
 
 class Recorder:
-    """Records on the nodes of a server.
+    """Recording on the nodes of a server.
 
     Args:
-        book: its sessions.
-        nodes: whose frames are recorded.
-        settling: ends and seals sessions.
+        store: sessions of the server.
+        nodes: nodes to record on.
+        sealer: ends and seals sessions.
     """
 
     def __init__(self, book: SessionBook, nodes: ServerNodes, settling: Settling) -> None:
@@ -51,16 +51,16 @@ class Recorder:
             book.note(self._with_clock(session))
 
     def know(self, node: ServerNode) -> None:
-        """A node has said hello: its sessions get what they lack of its clock measurements.
+        """Add missing clock measurements to the sessions of a node that has connected.
 
-        They lack those of a node that was not known before, and of streams in which they went on.
+        Those are missing after a first contact, and for streams into which a session was extended.
         """
         for session in self._book.unsealed(node.name):
             if session.state != "sealing":
                 self._book.note(self._with_clock(session))
 
     def recording_on(self, node: str) -> list[Session]:
-        """Sessions that are being recorded on a node."""
+        """Return the sessions that are being recorded on a node."""
         return [s for s in self._book.unsealed(node) if s.state == "recording"]
 
     def start(
@@ -75,26 +75,24 @@ class Recorder:
         take: str | None = None,
         asked: Asked | None = None,
     ) -> Session:
-        """Begin a session with the next frame, or `pre_roll_s` earlier if the ring reaches so far.
+        """Start a session with the next frame, or `pre_roll_s` earlier if still stored.
 
-        Others may be recorded on the same node at the same time. Whether it was `asked` for before
-        is for the caller to look up: `SessionBook.begun_by`.
+        Several sessions may be recorded on one node at a time. The caller looks up an earlier
+        sending of the same request: `SessionStore.find_by_idempotency_key`.
 
         Raises:
-            UnknownError: no such node.
-            StateError: it is away, or has sent nothing yet.
-            StorageError: the session cannot be written down; nothing was started then.
+            UnknownError: no node has this name.
+            StateError: it is not connected, or has sent no frame yet.
+            StorageError: the session cannot be saved; nothing was started then.
         """
         node = self._nodes.get(node_name)
         if not node.connected or node.last_seq is None or node.last_t_ns is None:
-            raise StateError(
-                f"node {node_name!r} is not sending", remedy="Record when it is connected"
-            )
+            raise StateError(f"node {node_name!r} sends no frames", remedy="Connect it and retry")
         behind_s = (node.node_t_ns(utc_ns()) - node.last_t_ns) * 1e-9
         if node.clock is not None and behind_s > BEHIND_S:
             raise StateError(
                 f"node {node_name!r} is {behind_s:.1f} s behind: its link is too slow",
-                remedy="Record when it has caught up",
+                remedy="Retry when it has caught up",
             )
         part = following.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
         session = begun(
@@ -115,13 +113,13 @@ class Recorder:
         return self._book.keep(session)
 
     def stop(self, session_id: str) -> Session:
-        """End a session at this instant; it is sealed as soon as all its frames are there.
+        """Stop a session now; it is sealed as soon as all its frames are here.
 
-        One that was stopped before stays as it is: a stop that is sent again is the same stop.
+        A stopped session is unchanged: a repeated stop is the same stop.
 
         Raises:
-            UnknownError: no such session.
-            StorageError: that cannot be written down.
+            UnknownError: no session has this id.
+            StorageError: the session cannot be saved.
         """
         session = self._book.get(session_id)
         if session.state != "recording":
@@ -131,12 +129,12 @@ class Recorder:
         return self._book.get(session_id)
 
     def give_up(self, session_id: str) -> Session:
-        """Seal a pending session without what has not come: its node never will.
+        """Seal a pending session without its missing frames: its node never comes back.
 
         Raises:
-            UnknownError: no such session.
+            UnknownError: no session has this id.
             StateError: it is not pending.
-            StorageError: that cannot be written down.
+            StorageError: the session cannot be saved.
         """
         session = self._book.get(session_id)
         if session.state != "pending":
@@ -147,7 +145,7 @@ class Recorder:
             )
         node = self._nodes.find(session.node)
         if node is not None and following.is_unread(session, node):
-            # What a journal holds that cannot be read is given up; what followed it is elsewhere.
+            # Frames in an unreadable journal are abandoned; later streams have their own journals.
             self._book.keep(session.model_copy(update={"given_up": True}))
             self._settling.follow(node)
             session = self._book.get(session_id)
@@ -160,12 +158,12 @@ class Recorder:
         """Move a session to the trash.
 
         Args:
-            session_id: of the session.
-            only_if: only if `said_of` it is still this; None: whatever it is.
+            session_id: id of the session.
+            if_revision: expected `session_revision`; None: any.
 
         Raises:
-            UnknownError: no such session.
-            ChangedError: what people say of it is not this any more.
+            UnknownError: no session has this id.
+            ChangedError: its revision is another one.
             StateError: it is being recorded, or sealed.
             StorageError: it cannot be moved.
         """
@@ -181,7 +179,7 @@ class Recorder:
         self._settling.forget(session_id)
 
     def restore(self, session_id: str) -> Session:
-        """Restore a session from the trash; if it was pending, it stays pending.
+        """Restore a session from the trash; a pending one stays pending.
 
         Raises:
             UnknownError: it is not in the trash.
@@ -194,11 +192,11 @@ class Recorder:
         return book.get(session_id)
 
     def note_clock(self, node: ServerNode, row: ClockRow, now_t_ns: int) -> None:
-        """Keep a new measurement of a node's clock, with its sessions too.
+        """Record a measurement of a node's clock, in its stream and its sessions.
 
-        The stream's log has it already; sessions are written with their next change. A row says
-        what this server's own clock showed some seconds ago: one that is far from that is not kept,
-        nor is one that is far from the node's clock as hello stated it.
+        The stream's log has it already; sessions are saved with their next change. A measurement
+        whose server time is far from the present time is dropped, as is one that is far from the
+        node's clock as hello stated it.
         """
         said_t_ns = row.t_mono_ns + node.info.utc_offset_ns + row.server_minus_node_ns
         if abs(said_t_ns - now_t_ns) > CLOCK_ROW_OFF_NS + row.uncertainty_ns:
@@ -219,7 +217,7 @@ class Recorder:
             return
         try:
             node.present.note_clock(row)
-        except StorageError as error:  # it counts all the same
+        except StorageError as error:  # the measurement is used all the same
             log.warning("node %s: %s", node.name, error)
         offset = node.present.clock_rows[-1]
         for session in self._book.unsealed(node.name):
@@ -229,29 +227,29 @@ class Recorder:
                 self._book.note(session.model_copy(update={"clock": clock}))
 
     def ledger(self, session_id: str) -> Ledger:
-        """What became of every frame of a session, as of now.
+        """Return the present ledger of a session: the fate of every frame.
 
         Raises:
-            UnknownError: no such session.
+            UnknownError: no session has this id.
         """
         return self.ledger_of(self._book.get(session_id))
 
     def ledger_of(self, session: Session) -> Ledger:
-        """The same of a session that may be in the trash."""
+        """Return the present ledger of a session that may be in the trash."""
         return ledger_now(session, self._nodes.find(session.node))
 
     def completeness_of(self, session: Session) -> Completeness:
-        """What there is of a session, as of now."""
+        """Return the present completeness of a session."""
         return self.ledger_of(session).completeness
 
     def problem_of(self, session: Session) -> str | None:
-        """What a person should know of a session as it is now."""
+        """Return the user-visible problem of a session, if any."""
         return self._settling.problem_of(session)
 
     def duration_s(self, session: Session, frames: int) -> float:
-        """Its length: exact for a sealed session, else as long as frames have come for it.
+        """Return the session's length: exact if sealed, else the time over which frames have come.
 
-        No shorter than its frames take at the nominal rate, which is the fastest there is.
+        It is at least the time of its frames at the nominal rate, which is the fastest.
         """
         node = self._nodes.find(session.node)
         if session.state == "sealed" or node is None:
@@ -262,7 +260,7 @@ class Recorder:
         return max(frames / node.info.nominal_rate_hz, lasted_s)
 
     def waits_for(self, session: Session, ledger: Ledger) -> Literal["frames", "end"] | None:
-        """What a pending session waits for: frames, or only to be told that there are no more."""
+        """Return the reason why a session is pending: missing frames, or an unknown end."""
         if session.state != "pending":
             return None
         if ledger.pending:
@@ -270,18 +268,18 @@ class Recorder:
         return "end" if session.parts[-1].seq_last is None else None
 
     def sources(self, session_id: str) -> Sources:
-        """Sources that a session can be sealed or exported from.
+        """Collect the inputs from which a session can be sealed or exported.
 
         Raises:
-            UnknownError: no such session, or its node is not known here.
+            UnknownError: no session has this id, or its node is unknown here.
         """
         session = self._book.get(session_id)
         return self._settling.sources(session)
 
     def needed(self, node_name: str) -> dict[str, Intervals]:
-        """Numbers by boot_id that sessions of a node, not sealed yet, need in its journals.
+        """Return the frames that unsealed sessions of a node need in its journals, by stream id.
 
-        A session in the trash can be restored, so it needs its frames as well.
+        A session in the trash can be restored, so its frames count as well.
         """
         node = self._nodes.find(node_name)
         if self._book.has_unreadable and node is not None:
@@ -294,7 +292,7 @@ class Recorder:
         )
 
     def wanted(self, node_name: str) -> Wanted:
-        """The same numbers as the message that the node gets."""
+        """Return `needed_frames` as the message to the node."""
         streams = tuple(
             StreamNumbers(boot_id=boot_id, numbers=with_open_ends(numbers))
             for boot_id, numbers in sorted(self.needed(node_name).items())
@@ -308,14 +306,14 @@ class Recorder:
         try:
             for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
                 stream = node.streams.get(boot_id)
-                known = [row.t_mono_ns for row in session.clock if row.boot_id == boot_id]
-                # A log may be long: it is read for what is in it and not in the session.
+                times_ns = [row.t_mono_ns for row in session.clock if row.boot_id == boot_id]
+                # A log may be long: read it only if the session lacks its newest row.
                 if (
                     stream is not None
                     and stream.clock is not None
-                    and (stream.clock.t_mono_ns > max(known, default=-1))
+                    and (stream.clock.t_mono_ns > max(times_ns, default=-1))
                 ):
                     session = session.with_clock(stream.all_clock_rows())
-        except StorageError as error:  # its frames are worth more than its clock
+        except StorageError as error:  # frames matter more than clock measurements
             log.warning("session %s: %s", session.id, error)
         return session

@@ -1,4 +1,4 @@
-"""One server process: its nodes, recorder, subscribers and links, and its tick."""
+"""One server process: its nodes, recorder, subscribers and links, and its periodic tick."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from service.server.screens.views import Counted, NodeView, SessionView
 from service.server.settling import Settling
 from service.server.streams import ServerStream
 from service.server.takes import Takes
+from service.server.weighings import Weighings
 from service.server_clock import utc_ns
 from service.sessions.comparison_series import SeriesKept
 from service.sessions.so_far import SoFars
@@ -37,51 +38,51 @@ from storage.sessions.folder import Session, SessionFolder
 log = logging.getLogger("foottile.server")
 
 TICK_S = 0.2
-"""How often frames are synced and acknowledged: a server that is killed has not promised more."""
+"""Period of sync and acknowledgement."""
 _SLOW_TICK_S = 1.0
 _PRUNE_EVERY_S = 30.0
 _PRUNE_MOST_S = 0.1
-"""In one tick: frames are synced and acknowledged again before there is more of it."""
+"""Time budget of deletion in one tick: sync and acknowledgement come first."""
 _SAY_AGAIN_S = 60.0
 
 
 class Link:
-    """One node's connection, as far as others may use it."""
+    """Connection of one node, as seen by the rest of the server."""
 
     def __init__(self, node: ServerNode) -> None:
         self.node = node
         self.stream: ServerStream = node.present
-        """Whose frames come."""
+        """Stream of the frames that are being received."""
         self.wanted: Wanted | None = None
-        """What sessions need, as the node was told last."""
+        """Last retention request sent to the node."""
         self.news = asyncio.Event()
-        """Set when there is something to tell the node."""
+        """Event: something has to be sent to the node."""
         self._acks: dict[str, Intervals] = {}
         self.closing: tuple[Close, str] | None = None
         self.ended = asyncio.Event()
 
     def acknowledge(self, boot_id: str, numbers: Intervals) -> None:
-        """Tell the node that these frames are on the disk."""
+        """Queue an acknowledgement: these frames are on the disk."""
         self._acks[boot_id] = self._acks.get(boot_id, Intervals()) | numbers
         self.news.set()
 
     def acks(self) -> dict[str, Intervals]:
-        """Take the acknowledgements that wait to be sent; each is returned once."""
+        """Remove and return the queued acknowledgements, by stream id."""
         acks, self._acks = self._acks, {}
         return acks
 
     def end(self, code: Close, reason: str) -> None:
-        """Ask for the connection to be closed."""
+        """Request that the connection is closed."""
         self.closing = self.closing or (code, reason)
         self.ended.set()
 
 
 class Server:
-    """The state of a server; all of it is used from one event loop.
+    """State of a server; used from one event loop.
 
     Args:
-        data: its data folder.
-        exact: are estimates of recorded sessions not rounded?
+        data: data folder.
+        exact: True: estimates of recorded sessions are not rounded.
 
     Raises:
         StorageError: the folder cannot be written.
@@ -92,9 +93,9 @@ class Server:
         register_folder(data)
         self.folder = DataFolder(data)
         self.id = self.folder.id
-        """Name of this data folder: a node keeps what this server needs apart from others."""
+        """Id of the data folder: a node tracks separately what each server needs."""
         self._unkept: set[str] = set()
-        """Nodes of which was said that nothing is kept."""
+        """Nodes whose storage error has been reported."""
         try:
             remove_stale_temporaries(data)
             self.check_storage()
@@ -110,21 +111,24 @@ class Server:
             self.recorder = Recorder(self.sessions, self.nodes, self.settling)
             self.takes = Takes(self.recorder, self.sessions, self.nodes)
             self.fits = Fits(self.sessions, self.calibrations)
+            self.weighings = Weighings(
+                self.sessions, self.recorder, self.settling, self.fits, self.calibrations
+            )
         except FootTileError:
             self.folder.close()
             raise
         self.so_fars = SoFars(data)
-        """What those who look at a session that is not sealed are shown."""
+        """Previews of unsealed sessions."""
         self.series = SeriesKept()
-        """What sessions were compared with, for those who look at it."""
+        """Cache of comparison series."""
         self.links: dict[str, Link] = {}
         self._counts: dict[str, Counted] = {}
-        """What screens were told last, by session."""
+        """Progress that subscribers were sent last, by session."""
         self._failing: dict[str, tuple[str, float]] = {}
-        """What has failed in the last tick, how, and when that was said."""
+        """Steps that failed in the last tick, with error and time of the log line."""
 
     async def run(self) -> None:
-        """Sync, acknowledge, settle, prune and tell, until cancelled."""
+        """Run the tick until cancelled: sync, acknowledge, seal, delete, notify."""
         slow_s = prune_s = 0.0
         while True:
             await asyncio.sleep(TICK_S)
@@ -136,6 +140,9 @@ class Server:
                 folder_is_there = True
             if not folder_is_there:
                 continue
+            with self._alone("guided calibrations"):
+                for node in self.nodes:
+                    self.weighings.check(node, now_s)
             with self._alone("sessions"):
                 self.settling.settle()
             for link in list(self.links.values()):
@@ -150,13 +157,13 @@ class Server:
                 prune_s = now_s + _PRUNE_EVERY_S
 
     async def _prune(self) -> bool:
-        """Delete what nobody needs; False: there is more of it, for the next tick.
+        """Delete unneeded journals; return False if the time budget ended before the work.
 
-        One journal after the other, and between two of them everybody else has a turn.
+        One journal after the other, and other tasks run in between.
         """
         until_s = time.monotonic() + _PRUNE_MOST_S
         for node in list(self.nodes):
-            with self._alone(f"node {node.name}, deleting what nobody needs"):
+            with self._alone(f"node {node.name}, deleting unneeded journals"):
                 while node.prune(self.recorder.needed(node.name)):
                     await asyncio.sleep(0)
                     if time.monotonic() >= until_s:
@@ -164,9 +171,10 @@ class Server:
         return True
 
     async def _check_folder(self) -> None:
-        """While the folder is away nothing is settled or deleted, and every node says so.
+        """Check the data folder; while it is away, report that on every node.
 
-        Only here another one is taken for it, when nothing is open in the one before.
+        Nothing is sealed or deleted then. The folder is reopened only here, when no file of the
+        former one is open.
 
         Raises:
             StorageError: it is away.
@@ -180,13 +188,14 @@ class Server:
                     stream.let_go()
                     with suppress(StorageError):
                         await asyncio.to_thread(stream.sync)
-            # Not before: frames that are synced where nobody looks must not be acknowledged.
+            # Not before: frames synced to the former folder must not be acknowledged.
             self.folder.take_again()
 
     async def close(self) -> None:
-        """End the links and what is being fitted, and wait for what is being sealed."""
+        """Close the links, cancel the calibration job, wait for running sealing."""
         for link in list(self.links.values()):
-            link.end(Close.RESTART, "the server is going down; connect again")
+            link.end(Close.RESTART, "the server is stopping; reconnect")
+        await self.weighings.close()
         await self.fits.close()
         await self.settling.close()
         for node in self.nodes:
@@ -199,17 +208,17 @@ class Server:
         self.folder.close()
 
     def check_storage(self) -> None:
-        """Whether something can be written.
+        """Check that the data folder is writable.
 
         Raises:
-            FolderGoneError: the data folder is not there.
-            StorageError: it cannot.
+            FolderGoneError: it is not in its place.
+            StorageError: it is not writable.
         """
         self.folder.check_writable()
 
     @property
     def problems(self) -> list[str]:
-        """What was found damaged in the data folder, and what became of it, in words."""
+        """Damage found in the data folder, and the consequence, as text."""
         return [
             *self.folder.problems,
             *self.nodes.problems,
@@ -219,15 +228,15 @@ class Server:
         ]
 
     def accept_replacement(self, node: str, fingerprint: str) -> None:
-        """Take the machine that asked last for a node from now on, as a person has decided.
+        """Accept the machine that was refused last for a node, by a person's decision.
 
         Args:
             node: name of the node.
-            fingerprint: of the machine.
+            fingerprint: fingerprint of the machine.
 
         Raises:
-            UnknownError: there is no such node.
-            StateError, ChangedError, StorageError: as `NodeIdentities.accept`.
+            UnknownError: no node has this name.
+            StateError, ChangedError, StorageError: as `NodeIdentities.accept_replacement`.
         """
         the_node = self.nodes.find(node)
         if the_node is None and node not in self.identities.replacements:
@@ -240,37 +249,37 @@ class Server:
             self.tell_node(the_node)
 
     async def empty_trash(self) -> tuple[int, int]:
-        """Delete what is in the trash for good; return the number of sessions and of bytes.
+        """Delete all sessions in the trash; return the number of sessions and of bytes.
 
         Raises:
-            StorageError: one of them cannot be deleted.
+            StorageError: a file cannot be deleted.
         """
         doomed = self.sessions.trash.doom()
         return len(doomed), await asyncio.to_thread(destroy, doomed)
 
     def view_node(self, node: ServerNode) -> NodeView:
-        """Return a node as it is now, for answers and screens."""
+        """Return a node's present state, for answers and subscribers."""
         return NodeView.of(node, self.recorder, self.identities.replacements.get(node.name))
 
     def node_as_json(self, node: ServerNode) -> dict[str, Any] | None:
-        """How a node is, for screens; None if that cannot be said, which is said in the log."""
-        with self._alone(f"node {node.name}, as screens see it"):
+        """Return a node's present state as JSON; None on an error, which is logged."""
+        with self._alone(f"node {node.name}, as JSON"):
             return self.view_node(node).model_dump(mode="json")
         return None
 
     def tell_node(self, node: ServerNode) -> None:
-        """Tell every screen how a node is."""
+        """Send a node's present state to all subscribers."""
         if self.hub.subscribers and (view := self.node_as_json(node)) is not None:
             self.hub.notice({"type": "node", "node": view})
 
     def _tell_wanted(self, link: Link) -> None:
-        """Tell a node what sessions need, if that has changed."""
-        with self._alone(f"node {link.node.name}, what sessions need of it"):
+        """Notify a node if its retention request has changed."""
+        with self._alone(f"node {link.node.name}, retention request"):
             if link.wanted is not None and self.recorder.wanted(link.node.name) != link.wanted:
                 link.news.set()
 
     def _tell_counts(self) -> None:
-        """Tell screens how far unsealed sessions are, where that has changed: by the ledger."""
+        """Send the progress of unsealed sessions to subscribers, where it has changed."""
         counts: dict[str, Counted] = {}
         for session in self.sessions.unsealed() if self.hub.subscribers else ():
             if session.state in ("recording", "pending"):
@@ -281,7 +290,7 @@ class Server:
 
     @contextmanager
     def _alone(self, what: str) -> Iterator[None]:
-        """Whatever fails here ends nothing else; it is said when it begins, not at every tick."""
+        """Context manager: log an error of the block and go on; a repeated one rarely."""
         try:
             yield
         except Exception as error:
@@ -298,7 +307,7 @@ class Server:
     def _ask_again(self, node: ServerNode) -> None:
         link = self.links.get(node.name)
         if link is not None:
-            link.end(Close.RESTART, "frames are damaged here; send what the server lacks")
+            link.end(Close.RESTART, "frames are damaged here; resend the missing ones")
 
     def _tell_session(self, session: Session) -> None:
         if self.hub.subscribers:
@@ -331,9 +340,9 @@ class Server:
             self._tell_session(session)
 
     async def _sync(self, node: ServerNode) -> None:
-        """Sync a node's journals to disk, then acknowledge the frames that were in them before."""
-        with self._alone(f"node {node.name}, bringing its frames to the disk"):
-            if node.storage_problem is not None:  # perhaps not even a journal could be begun
+        """Sync a node's journals to disk, then acknowledge the frames in them."""
+        with self._alone(f"node {node.name}, syncing to the disk"):
+            if node.storage_problem is not None:  # perhaps not even a journal was created
                 await self._try_again(node)
                 return
             if node.has_words:
@@ -348,24 +357,24 @@ class Server:
 
     async def _sync_stream(self, node: ServerNode, stream: ServerStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()
-        owed, stream.owed = stream.owed, Intervals()
+        unacked, stream.owed = stream.owed, Intervals()
         try:
             await asyncio.to_thread(stream.sync)
             self.folder.check()
         except Exception as error:
             self._cannot_keep(node, error)
-            # The kernel may forget what it could not write: the node has to send it again.
+            # The kernel may drop pages that it could not write: the node has to send them again.
             stream.disown(stream.unsynced | unsynced)
             stream.unsynced, stream.owed = Intervals(), Intervals()
             if not isinstance(error, StorageError):
                 raise
             return
         link = self.links.get(node.name)
-        if link is not None and owed:
-            link.acknowledge(stream.boot_id, owed)
+        if link is not None and unacked:
+            link.acknowledge(stream.boot_id, unacked)
 
     async def _try_again(self, node: ServerNode) -> None:
-        """After a full disk: once it can be written again, ask the node for what is missing."""
+        """Retry after a storage error; once the disk is writable, request the missing frames."""
         try:
             await asyncio.to_thread(self.check_storage)
         except StorageError:
@@ -376,13 +385,13 @@ class Server:
         self.tell_node(node)
         if node.name in self.links:
             self.links[node.name].end(
-                Close.RESTART, "the server can write again; send what it lacks"
+                Close.RESTART, "the server can write again; resend the missing frames"
             )
 
     def _cannot_keep(self, node: ServerNode, error: Exception) -> None:
-        """What a node sends is not kept: say it once, here and on every screen."""
+        """Record that a node's frames cannot be stored; log and notify once."""
         node.storage_problem = str(error)
         if node.name not in self._unkept:
             self._unkept.add(node.name)
-            log.warning("node %s: nothing of it is kept: %s", node.name, error)
+            log.warning("node %s: its frames are not stored: %s", node.name, error)
             self.tell_node(node)

@@ -1,7 +1,7 @@
-"""Sessions on their way to the sealed file: followed through their node's streams, then sealed.
+"""Background sealing of sessions: follows their nodes' streams, then writes the sealed files.
 
-A session that was stopped while its node was away is `pending` until the node has brought what it
-took before the stop. Sealing runs in a thread and is tried again if the disk is full.
+A session that was stopped while its node was away is `pending` until the node has sent the frames
+from before the stop. Sealing runs in a thread and is retried if the disk is full.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ log = logging.getLogger("foottile.settling")
 
 _SEAL_AGAIN_S = 10.0
 _COMPILED_S = 0.1
-_UNREAD = "a journal of it cannot be read now, and is tried again: see what the server says of it"
+_UNREAD = "a journal cannot be read now, and is retried: see the server's problems"
 
 
 class Settling:
-    """Sees to it that sessions end and are sealed.
+    """Finds the ends of sessions and seals them.
 
     Args:
-        book: the sessions.
-        nodes: whose frames they are made of.
-        ask_again: called with a node that may still have frames that are damaged here.
-        exact: are estimates not rounded?
+        store: sessions to seal.
+        nodes: nodes with the sessions' frames.
+        request_resend: called with a node that may still have frames that are damaged here.
+        exact: True: estimates are not rounded.
     """
 
     def __init__(
@@ -59,13 +59,13 @@ class Settling:
         self._not_sealed: dict[str, str] = {}
 
     def follow(self, node: ServerNode) -> None:
-        """The node has said which streams it took: its sessions go on in them.
+        """Extend the sessions of a node into the streams that its hello lists.
 
-        If its tiles are others now, a session of its own takes up a recording: a file describes
-        one array.
+        If its tiles have changed, a new session continues the recording: a file describes one
+        array.
 
         Raises:
-            StorageError: that cannot be written down.
+            StorageError: a session cannot be saved.
         """
         for session in self._book.unsealed(node.name):
             if session.state != "sealing":
@@ -75,42 +75,42 @@ class Settling:
                     self._disown(session, error)
 
     def sources(self, session: Session) -> Sources:
-        """What a session can be sealed or exported from."""
+        """Collect the inputs from which a session can be sealed or exported."""
         return sources_now(session, self._nodes.get(session.node), exact=self._exact)
 
     def settle(self) -> None:
-        """Find the end of stopped sessions, and seal those whose frames are all there."""
+        """Find the ends of stopped sessions, and seal those whose frames are all here."""
         for session in self._book.unsealed():
             if time.monotonic() < self._again_after.get(session.id, 0.0):
                 continue
             try:
                 self._settle(session)
-            except FootTileError as error:  # it must not hold up the others
+            except FootTileError as error:  # other sessions must not wait for this one
                 log.warning("session %s: %s", session.id, error)
                 self._again_after[session.id] = time.monotonic() + _SEAL_AGAIN_S
 
     async def settled(self, session_id: str, timeout_s: float) -> Session:
-        """The session once it is sealed, or as it is after `timeout_s`."""
+        """Return the session once it is sealed, or its present state after `timeout_s`."""
         end = time.monotonic() + timeout_s
         while self._book.get(session_id).state != "sealed" and time.monotonic() < end:
             await asyncio.sleep(0.02)
         return self._book.get(session_id)
 
     async def close(self) -> None:
-        """Wait for what is being sealed."""
+        """Wait for the sessions that are being sealed."""
         await asyncio.gather(*self._sealing.values(), return_exceptions=True)
 
     def is_sealing(self, session_id: str) -> bool:
-        """Is it being sealed now?"""
+        """Return whether a session is being sealed now."""
         return session_id in self._sealing
 
     def forget(self, session_id: str) -> None:
-        """Forget that sealing failed: try again at once, and do not report the failure."""
+        """Drop the record of a failed sealing: retry at once and do not report the failure."""
         self._again_after.pop(session_id, None)
         self._not_sealed.pop(session_id, None)
 
     def problem_of(self, session: Session) -> str | None:
-        """What a person should know of a session as it is now."""
+        """Return the user-visible problem of a session, if any."""
         return self._not_sealed.get(session.id, session.problem)
 
     def _settle(self, session: Session) -> None:
@@ -134,27 +134,27 @@ class Settling:
             self._sealing[session.id] = asyncio.create_task(self._seal(session.id))
 
     def _follow(self, session: Session) -> Session:
-        """The session as far as its node's streams go by now."""
+        """Extend a session into its node's streams, and save the change."""
         node = self._nodes.find(session.node)
         if node is None:
             return session
         followed = following.followed(session, node)
         # Save the sessions that continue it first: if the server is killed between, none is lost.
-        further = followed[1:]
-        if further and not any(
-            known.continues == session.id for known in self._book.newest_first()
+        continuations = followed[1:]
+        if continuations and not any(
+            other.continues == session.id for other in self._book.newest_first()
         ):
-            for each in reversed(further):
+            for each in reversed(continuations):
                 self._book.keep(each)
         return session if followed[0] is session else self._book.keep(followed[0])
 
     def drop_damaged(self, node: ServerNode, error: DamagedFramesError, whose: str) -> None:
-        """Drop frames damaged on disk: get them from the node again, or count them as lost.
+        """Invalidate frames that are damaged on disk: request them again, or count them as lost.
 
         Args:
-            node: whose journal has them.
-            error: which they are.
-            whose: who wanted to read them, for the log.
+            node: node of the journal.
+            error: error with the frames' numbers.
+            reader: reader that found the damage, for the log.
         """
         folder = Path(error.where).parent
         for stream in node.streams.values():
@@ -170,14 +170,14 @@ class Settling:
 
     async def _seal(self, session_id: str) -> None:
         book = self._book
-        while is_warming():  # or it would compile here, and everything would wait for that
+        while is_warming():  # else this thread compiles, and the event loop waits
             await asyncio.sleep(_COMPILED_S)
         try:
             session, folder = book.get(session_id), book.folder.path(session_id)
             node = self._nodes.get(session.node)
             sources, ledger = self.sources(session), ledger_now(session, node)
             if not is_all_here(session, node):
-                # A disk did not keep what it had taken: these frames have to come once more.
+                # The disk lost frames that it had accepted: the node has to send them again.
                 book.keep(session.model_copy(update={"state": "pending"}))
                 return
             sealed = await asyncio.to_thread(seal, sources, folder, ledger)
@@ -197,7 +197,7 @@ class Settling:
                 log.exception("session %s: this is a bug", session_id)
             log.warning("session %s cannot be sealed: %s", session_id, error)
             self._again_after[session_id] = time.monotonic() + _SEAL_AGAIN_S
-            self._not_sealed[session_id] = f"cannot be sealed yet, and is tried again: {error}"
+            self._not_sealed[session_id] = f"cannot be sealed yet, and is retried: {error}"
             book.changed(book.get(session_id))
         finally:
             del self._sealing[session_id]

@@ -1,10 +1,10 @@
-"""Upper bounds of a running stream: how late its frames can be dated, and how far numbered, by now.
+"""Upper bounds for frames of a running stream: latest plausible time and number.
 
 The bounds follow from hello, in which a node states its clock and its next number, and from the
 server's clock, which counts suspend and never steps (`service.server_clock`). A node's clock gains
 no more on it than `FAST`; it may fall behind, where the node was suspended. So neither a date that
-was set nor an offset that the node measured changes them, and what was taken in the past is never
-beyond them.
+was set nor an offset that the node measured changes them, and frames of the past are never beyond
+them.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class StreamLimit:
     """Upper bounds of one stream, from its last hello.
 
     Attributes:
-        hello_t_ns: when the server received hello, server's UTC.
-        t_mono_ns: the node's clock, as hello states it.
+        hello_t_ns: arrival time of hello, server's UTC.
+        t_mono_ns: node's clock, as hello states it.
         next_seq: number of the next frame, as hello states it.
         rate_hz: nominal rate of the array.
     """
@@ -41,12 +41,12 @@ class StreamLimit:
 
     @classmethod
     def of(cls, hello: Hello, now_t_ns: int) -> StreamLimit:
-        """Return the limit of the present stream of a node that says hello now."""
+        """Return the limit for the present stream of a node, from its hello."""
         rate_hz = hello.array_info.nominal_rate_hz
         return cls(now_t_ns, hello.t_mono_ns, hello.next_seq, rate_hz)
 
     def violation(self, frames: FrameBatch, now_t_ns: int) -> str:
-        """Return why frames cannot have been taken yet, in words; empty if they can.
+        """Return why frames are ahead of time, as text; empty if they are plausible.
 
         Args:
             frames: of one message.
@@ -62,11 +62,11 @@ class StreamLimit:
         return ""
 
     def is_of_clock(self, t_mono_ns: int, uncertainty_ns: int, now_t_ns: int) -> bool:
-        """Return whether an instant that was just measured is one of the node's clock.
+        """Return whether a time that was just measured fits the node's clock.
 
         Args:
-            t_mono_ns: the instant, by the node's clock.
-            uncertainty_ns: half the time that measuring it took.
+            t_mono_ns: the time, by the node's clock.
+            uncertainty_ns: half the duration of the measurement.
             now_t_ns: the server's UTC.
         """
         off_ns = abs(t_mono_ns - self._clock_ns(now_t_ns))

@@ -1,7 +1,7 @@
-"""One stream of a node as the server keeps it: its journal, and what the node has said of it.
+"""One stream of a node as stored on the server: its journal and the node's report.
 
-What the node said is in `stream.json` beside the journal, so that a server that was restarted still
-knows why frames are missing and where a stream ended. `sync` writes it.
+The report is stored in `stream.json` beside the journal: a restarted server still has the reasons
+of losses and the stream's end. `sync` writes it.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from storage.wire import Decoder
 log = logging.getLogger("foottile.streams")
 
 CLOCK_ROWS = 128
-"""Clock measurements that are kept in memory for a pre-roll; the log has all of them."""
+"""Clock measurements kept in memory for a pre-roll; the log has all."""
 _AROUND_MAX = 32
 
 
 class ServerStream:
-    """One stream: what is here of it, what may come, what is lost.
+    """Server's copy of one stream: frames stored, obtainable and lost.
 
     Args:
-        folder: its own; made when there is something to keep.
-        info: description of its array.
+        folder: the stream's own; created with its first frames.
+        info: description of the array.
     """
 
     def __init__(self, folder: Path, info: ArrayInfo) -> None:
@@ -46,22 +46,22 @@ class ServerStream:
         self.journal: Journal | None = None
         self.notes = StreamNotes(array_info=info)
         self.node_has: Intervals | None = None
-        """What the node may still give; None: it has not said so since the server was started."""
+        """Frames that the node can still send; None: no report since the server was started."""
         self.t_ns_first: int | None = None
-        """Instant of the oldest frame that the node has of an earlier stream, in its UTC."""
+        """Time of the oldest frame that the node has of an earlier stream, node's UTC."""
         self.clock_rows: deque[ClockOffset] = deque(maxlen=CLOCK_ROWS)
-        """How the node's clock differs, as measured, oldest first."""
+        """Measured offsets of the node's clock, oldest first."""
         self.last_seen_t_ns: int | None = None
-        """When its last frame came, server's UTC."""
+        """Arrival time of the last frame, server's UTC."""
         self.missed_slots = 0
         self.limit: StreamLimit | None = None
-        """Upper bounds of its frames; None: since the server was started it was never present."""
+        """Upper bounds of its frames; None: not the present stream since the server was started."""
         self.unsynced = Intervals()
         """Frames appended to the journal since the last sync."""
         self.owed = Intervals()
-        """Frames to be acknowledged once the journal is synced."""
+        """Frames to acknowledge once the journal is synced."""
         self.problems: list[str] = []
-        """What was found damaged when it was opened, and what became of it, in words."""
+        """Damage found when the stream was opened, and the consequence, as text."""
         self._first_seq: int | None = None
         self._refused = Intervals()
         self._forgotten = Intervals()
@@ -73,17 +73,19 @@ class ServerStream:
 
     @classmethod
     def open(cls, folder: Path) -> ServerStream:
-        """A stream that was kept before.
+        """Open a stream that is on the disk.
 
         Raises:
-            FileFormatError: nothing readable is in its folder.
+            FileFormatError: nothing in its folder is readable.
             StorageError: it cannot be read.
         """
         journal = Journal.open(folder, writes_later=True)
         stream = cls(folder, journal.info)
         stream.journal = journal
         stream.problems = list(journal.problems)
-        notes = StreamNotes.load_whole(folder, stream.problems)  # without, the node says it again
+        notes = StreamNotes.load_whole(
+            folder, stream.problems
+        )  # without notes the node reports again
         if notes is not None:
             stream.notes = stream._notes_on_disk = notes
             stream.missed_slots = notes.missed_slots
@@ -96,23 +98,23 @@ class ServerStream:
         newest = journal.held.last
         if newest is not None:
             stream._first_seq = next(iter(journal.held))[0]
-            # Most likely it was deleted because nothing needed it.
+            # Most likely these frames were deleted as unneeded.
             stream._guessed = True
             stream._forgotten = journal.held.missing(0, newest) - stream.lost.all
         return stream
 
     @property
     def boot_id(self) -> str:
-        """Its name."""
+        """Id of the stream."""
         return self.info.boot_id
 
     @property
     def clock(self) -> ClockOffset | None:
-        """How the node's clock differs; None before it was measured."""
+        """Latest offset of the node's clock; None before the first measurement."""
         return self.clock_rows[-1] if self.clock_rows else None
 
     def all_clock_rows(self) -> tuple[ClockOffset, ...]:
-        """Every measurement since the stream began, oldest first.
+        """Read all clock measurements of the stream, oldest first.
 
         Raises:
             StorageError: the log cannot be read.
@@ -120,10 +122,10 @@ class ServerStream:
         return self._clock_log.rows()
 
     def note_clock(self, row: ClockRow) -> None:
-        """Keep a measurement of the node's clock.
+        """Record a measurement of the node's clock.
 
         Raises:
-            StorageError: the log cannot be written; it is known all the same.
+            StorageError: the log cannot be written; the measurement is used all the same.
         """
         offset = ClockOffset(boot_id=self.boot_id, **row.model_dump(exclude={"type"}))
         self.clock_rows.append(offset)
@@ -132,18 +134,18 @@ class ServerStream:
 
     @property
     def held(self) -> Intervals:
-        """Numbers that are here."""
+        """Frames in the journal."""
         return self.journal.held if self.journal is not None else Intervals()
 
     @property
     def may_come(self) -> Intervals:
-        """Numbers that the node may still give, or has given."""
-        known = Intervals([(0, NO_END)]) if self.node_has is None else self.node_has
-        return known - Losses(self.notes.lost).all
+        """Frames that the node can still send, or has sent."""
+        reported = Intervals([(0, NO_END)]) if self.node_has is None else self.node_has
+        return reported - Losses(self.notes.lost).all
 
     @property
     def lost(self) -> Losses:
-        """Numbers that will not come, and why. What is held is not lost, whatever is said here."""
+        """Frames that will not come, by reason; a stored frame is never lost."""
         lost = Losses(self.notes.lost)
         if self.journal is not None:
             for reason, numbers in self.journal.lost.by_reason.items():
@@ -151,10 +153,10 @@ class ServerStream:
         return lost
 
     def for_session(self, offset_ns: int | None) -> SessionStream:
-        """The stream as sessions see it.
+        """Return the stream's facts for the rules of sessions.
 
         Args:
-            offset_ns: what to add to its instants for the server's.
+            offset_ns: added to the stream's times to get server time.
         """
         return SessionStream(
             held=self.held,
@@ -172,21 +174,21 @@ class ServerStream:
         )
 
     def around(self, t_ns: int, *, at_least: int, waiting: bool = False) -> tuple[int, int] | None:
-        """Numbers held next to an instant of the node's UTC: the last until it, the first after.
+        """Return the stored frames next to a time: the last one until it, the first one after.
 
-        Asked again and again while frames between them are waited for; the journal's index is read
-        only when such frames have come.
+        The result is cached: callers repeat the query while frames are missing. The journal's index
+        is read again only when frames between the two have come.
 
-        Args, result and errors: as for `around_in`; and
-            waiting: look again only when all of those frames have come, or never will.
+        Args, result and errors as for the function `find_seqs_around`; with `wait_for_missing` the
+        cached result is kept until all frames between have come or are lost.
         """
         if self.journal is None:
             return None
-        found, held = self._around.get((t_ns, at_least)), self.held
+        found, stored = self._around.get((t_ns, at_least)), self.held
         if found is not None:
             last, after = found
-            ends = held.within(after, after) and (last < at_least or held.within(last, last))
-            missing = held.missing(last + 1, after - 1) if after > last + 1 else Intervals()
+            ends = stored.within(after, after) and (last < at_least or stored.within(last, last))
+            missing = stored.missing(last + 1, after - 1) if after > last + 1 else Intervals()
             none_came = missing.count == after - last - 1
             if ends and (none_came or (waiting and missing & self.may_come)):
                 return found
@@ -199,68 +201,68 @@ class ServerStream:
         return found
 
     def missing(self, newest: int) -> Intervals:
-        """Numbers that should be here and are not, from the first known frame to `newest`."""
+        """Return the frames that are not stored, from the first known one to `newest_seq`."""
         if self._first_seq is None or newest < self._first_seq:
             return Intervals()
         return self.held.missing(self._first_seq, newest) - self._forgotten
 
     def lacks(self, needed: Intervals, *, all_of_it: bool) -> Intervals:
-        """Numbers that the node has and that are missing here.
+        """Return the frames to request: the node has them, and they are not stored.
 
         Args:
-            needed: numbers that sessions need.
-            all_of_it: ask for all that is missing; False: only for `needed`.
+            needed: frames that sessions need.
+            include_unneeded: request all missing frames; False: only those in `needed`.
         """
         if self.node_has is None:
             return Intervals()
-        asked = self.may_come - self.held
+        requested = self.may_come - self.held
         if all_of_it:
-            return asked - (self._forgotten - needed)
-        return asked & needed
+            return requested - (self._forgotten - needed)
+        return requested & needed
 
     def is_present(self, hello: Hello, now_t_ns: int) -> None:
-        """The node takes this stream now."""
+        """Handle hello of the node for which this is the present stream."""
         self.limit = StreamLimit.of(hello, now_t_ns)
         self.node_has = Intervals((*hello.held, (hello.next_seq, NO_END)))
         self._said(hello.lost, next_seq=None)
         self._see_from(min((first for first, _ in hello.held), default=hello.next_seq))
 
     def has_ended(self, said: EarlierStream) -> None:
-        """The node has taken it before, and says how it ended."""
+        """Handle the node's report of how this stream ended."""
         self.node_has = Intervals(said.held)
         self.t_ns_first = said.t_ns_first
-        # A node that was killed may know an older count than it had told.
+        # A node that was killed may have an older count than it had reported.
         self.missed_slots = max(self.missed_slots, said.missed_slots)
-        # What a node lost with its power may have come here before.
+        # Frames that a node lost in a power failure may be stored here.
         beyond = max(0, (-1 if self.held.last is None else self.held.last) + 1 - said.next_seq)
         tail = max(0, said.unsynced_tail_max - beyond)
         self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)
 
     def is_gone(self) -> None:
-        """The node has not mentioned it: nothing more will come, and the next sync closes it."""
+        """Handle a hello without this stream: nothing more will come; the next sync closes it."""
         self.node_has = Intervals()
         if self.journal is not None:
             self.journal.retire()
 
     def note_losses(self, lost: PairsByReason) -> None:
-        """Note all frames of this stream that the node has lost so far."""
+        """Replace the losses that the node has reported for this stream."""
         notes = self.notes
         self._said(lost, next_seq=notes.next_seq, unsynced_tail_max=notes.unsynced_tail_max)
 
     def check(self, frames: FrameBatch, now_t_ns: int) -> str:
-        """Check frames that came; those that break a rule are never asked for again.
+        """Check received frames; frames that break a rule are never requested again.
 
         Args:
             frames: of one message.
             now_t_ns: the server's UTC.
 
         Returns:
-            Why they may not be kept now, in words: they are ahead of their time. Frames with the
-            same numbers may still come. Empty if they may be kept.
+            Reason why the frames are ahead of time and must not be stored now; frames with the same
+            numbers may still come. Empty if they may be stored.
 
         Raises:
-            FileFormatError: they break a rule that `verify` asks for as well.
-            StorageError: what stands beside them cannot be read.
+            FileFormatError: they break a rule that `verify` checks as well.
+            StorageError: the frames stored next to them cannot be read.
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         end = self.notes.next_seq
@@ -284,10 +286,10 @@ class ServerStream:
         return ""
 
     def take(self, frames: FrameBatch, payload: bytes, now_t_ns: int) -> None:
-        """Keep frames that came.
+        """Append received frames to the journal.
 
         Raises:
-            StorageError: the disk is full or not writable; they are not kept.
+            StorageError: the disk is full or not writable; the frames are not stored.
         """
         if self.journal is None:
             self.journal = Journal(self.folder, self.info, writes_later=True)
@@ -301,7 +303,7 @@ class ServerStream:
         self.owed.add(first, last)
 
     def sync(self) -> None:
-        """Sync journal and notes to the disk; may run in another thread.
+        """Sync journal and notes to the disk. Runs in any thread.
 
         Raises:
             StorageError: the disk refused.
@@ -318,18 +320,18 @@ class ServerStream:
 
     @property
     def has_news(self) -> bool:
-        """Is there anything to be synced or acknowledged?"""
+        """True if anything has to be synced or acknowledged."""
         unsaved = self._notes_to_keep != self._notes_on_disk and self.journal is not None
         closing = self.journal is not None and self.journal.is_closing
         return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced or closing)
 
     @property
     def is_open(self) -> bool:
-        """Is a file of it open?"""
+        """True if a file of the stream is open."""
         return self.journal is not None and self.journal.is_open
 
     def disown(self, doubtful: Intervals, *, corrupt: bool = False) -> None:
-        """Stop holding these frames: the disk may not have what was written."""
+        """Remove frames from the stored ones: the disk may not have them."""
         if self.journal is None:
             return
         self.journal.disown(doubtful)
@@ -337,7 +339,7 @@ class ServerStream:
             self.journal.lost.add(doubtful - self.held, CORRUPT)
 
     def prune(self, before_t_ns: int, keep: Intervals) -> None:
-        """Delete what is older and not in `keep`.
+        """Delete frames older than `before_t_ns` and not in `keep`.
 
         Raises:
             StorageError: a file cannot be deleted.
@@ -346,7 +348,7 @@ class ServerStream:
             self._forgotten = self._forgotten | self.journal.prune(before_t_ns, keep)
 
     def close(self) -> None:
-        """Sync everything, and close the journal.
+        """Sync everything and close the journal.
 
         Raises:
             StorageError: the disk refused.
@@ -358,10 +360,7 @@ class ServerStream:
                 self.journal.close()
 
     def let_go(self) -> None:
-        """The disk is not there: what was not synced is not held, and open files are to be closed.
-
-        The next `sync` closes them.
-        """
+        """Drop unsynced frames: the data folder is away. The next `sync` closes open files."""
         self.disown(self.unsynced)
         self.unsynced, self.owed = Intervals(), Intervals()
 
@@ -390,7 +389,7 @@ class ServerStream:
 
     @property
     def _notes_to_keep(self) -> StreamNotes:
-        """The notes, with what is damaged here, and what the node has counted, by now."""
+        """Notes with the damage found here and the missed slots counted up to now."""
         lost = self.journal.lost.by_reason if self.journal is not None else {}
         now = {"damaged": tuple(lost.get(CORRUPT, ())), "missed_slots": self.missed_slots}
         if all(getattr(self.notes, name) == value for name, value in now.items()):

@@ -1,7 +1,7 @@
-"""A take: several nodes recorded together, one session each, found again by its id.
+"""Takes: several nodes recorded together, one session each, found by the take's id.
 
-It has no file of its own: each session says of which take it is, and a take is its sessions. What
-fails on one node is said of that node and keeps no other one from being recorded.
+A take has no file: each session names its take. A failure on one node is reported for that node and
+does not affect the others.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from service.server_clock import utc_ns
 from storage.sessions.folder import Asked, Session
 
 _FAILED_KEPT = 1000
-_NOT_THEN = "it could not be recorded when this take was begun"
+_NOT_THEN = "it could not be recorded when this take was started"
 TAKE_ID = re.compile(r"[0-9a-f]{12}")
 
 
 @dataclass
 class Take:
-    """A take, or what came of something that was done to all of it."""
+    """A take, or the result of a command on all of its sessions."""
 
     id: str
     sessions: list[Session] = field(default_factory=list)
-    """One of each node, but for nodes that came back with other tiles."""
+    """One session of each node, and more for a node that came back with other tiles."""
     failed: dict[str, str] = field(default_factory=dict)
-    """By node why it was not done there."""
+    """Error by node, where the command failed."""
 
 
 class Takes:
     """Records, marks and stops several nodes together.
 
     Args:
-        recorder: starts and stops.
-        book: has all sessions.
-        nodes: all there are.
+        recorder: starts and stops sessions.
+        store: all sessions.
+        nodes: all nodes.
     """
 
     def __init__(self, recorder: Recorder, book: SessionBook, nodes: ServerNodes) -> None:
@@ -49,7 +49,7 @@ class Takes:
         self._book = book
         self._nodes = nodes
         self._failed: OrderedDict[str, dict[str, str]] = OrderedDict()
-        """What was said of the nodes that could not be recorded, by take, the newest last."""
+        """Errors of the nodes that could not be recorded, by take, the newest last."""
 
     def start(
         self,
@@ -62,26 +62,26 @@ class Takes:
         tags: tuple[str, ...] = (),
         asked: Asked | None = None,
     ) -> Take:
-        """Begin a session on each node, with the same name.
+        """Start a session on each node, with the same name.
 
-        What was asked for before is not begun again, nor is a node of it that could not be
-        recorded then: it would begin at another time.
+        A repeated request creates nothing, not even on a node that failed then: it would begin at
+        another time.
 
         Args:
-            name: of each session.
-            nodes: which; None: all that are connected.
-            pre_roll_s: begin so much earlier.
+            name: name of each session.
+            nodes: names of the nodes; None: all connected ones.
+            pre_roll_s: length of the pre-roll.
             subject: of each session.
             notes: of each session.
             tags: of each session.
-            asked: with which key; None: without.
+            request: request with its idempotency key; None: without a key.
 
         Raises:
-            StateError: it could be recorded on none.
+            StateError: no node could be recorded.
             UsageError: the key came with another request before.
         """
-        if begun := self._book.begun_by(asked):
-            return self._begun(begun, nodes or ())
+        if earlier := self._book.begun_by(asked):
+            return self._begun(earlier, nodes or ())
         if nodes is None:
             nodes = sorted(node.name for node in self._nodes if node.connected)
         take = Take(secrets.token_hex(6))
@@ -104,7 +104,7 @@ class Takes:
         if not take.sessions:
             raise StateError(
                 "no node is connected" if not take.failed else _in_words(take.failed),
-                remedy="Record when a node is connected and sends",
+                remedy="Connect a node and retry",
             )
         if asked is not None:
             self._failed[take.id] = take.failed
@@ -119,10 +119,10 @@ class Takes:
         return Take(take_id, begun, dict(self._failed.get(take_id, lacking)))
 
     def get(self, take_id: str) -> Take:
-        """Its sessions as they are now, by node; not those in the trash.
+        """Return a take with its present sessions, by node; without those in the trash.
 
         Raises:
-            UnknownError: there is no session of this take.
+            UnknownError: no session names this take.
         """
         found = [one for one in self._book.newest_first() if one.take == take_id]
         if not TAKE_ID.fullmatch(take_id) or not found:
@@ -130,11 +130,11 @@ class Takes:
         return Take(take_id, sorted(found, key=lambda one: (one.node, one.started_t_ns)))
 
     def stop(self, take_id: str) -> Take:
-        """Stop all of its sessions that are being recorded; those that were stopped stay so.
+        """Stop all of its sessions that are being recorded; stopped ones are unchanged.
 
         Raises:
-            UnknownError: no such take.
-            StateError: none of them could be stopped.
+            UnknownError: no session names this take.
+            StateError: no session could be stopped.
         """
         take = self.get(take_id)
         for session in take.sessions:
@@ -145,11 +145,11 @@ class Takes:
         return self._of_those_done(take, take.sessions)
 
     def mark(self, take_id: str, label: str, t_ns: int | None, event_id: str | None = None) -> Take:
-        """Note an event in all of its sessions that are being recorded, at one instant.
+        """Add a marker at one time to all of its sessions that are being recorded.
 
         Raises:
-            UnknownError: no such take.
-            StateError: none of them is.
+            UnknownError: no session names this take.
+            StateError: no session is being recorded.
         """
         t_ns = utc_ns() if t_ns is None else t_ns
         event_id = event_id or secrets.token_hex(6)
@@ -158,7 +158,7 @@ class Takes:
         if not running:
             raise StateError(
                 f"take {take_id} was stopped already",
-                expected="one of which a session is recording",
+                expected="a take that is being recorded",
             )
         for session in running:
             try:

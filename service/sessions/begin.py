@@ -1,4 +1,4 @@
-"""How a session begins: by hand, or because an array became another one while it was recorded."""
+"""Creation of sessions: by a command, or to continue one whose array has changed."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def begun(
     calibration: Calibration | None,
     **content: Any,
 ) -> Session:
-    """A session that begins now.
+    """Create a session that begins now.
 
     Args:
         info: array of its first part.
-        name: as people call it.
-        part: its first part.
-        scene_content: of the node's scene file.
-        calibration: in use when it begins.
-        content: more fields of a session, or others.
+        name: user-given name.
+        part: first part.
+        scene_content: content of the node's scene file.
+        calibration: calibration in use at the beginning.
+        fields: further fields of a session, or other values of the above.
     """
     facts: dict[str, Any] = {
         "id": new_session_id(datetime.now(UTC)),
@@ -55,24 +55,24 @@ def taken_up(
     calibration: Calibration | None,
     calibration_source: Literal["node", "server"] = "node",
 ) -> tuple[Session, Session]:
-    """A session whose node came back with other tiles, and the one that takes it up.
+    """Return a session whose tiles have changed, closed, and its continuation.
 
-    A file describes one array, so the recording goes on in a session of its own.
+    A file describes one array, so the recording goes on in another session.
 
     Args:
-        session: with an end of its last part.
-        info: the array that the node has now.
-        begin_t_ns: when its stream began, by the clock that sessions are stopped by.
-        scene_content: of the node's scene file.
-        calibration: of the tiles that it has now.
-        calibration_source: who said which that is.
+        session: session whose last part is closed.
+        info: present array of the node.
+        begin_t_ns: begin of its stream, by the clock that gives the times of stops.
+        scene_content: content of the node's scene file.
+        calibration: calibration of the present tiles.
+        calibration_source: origin of the calibration.
     """
     problem = "the node came back with other tiles: recording ended"
     update: dict[str, object] = {"problem": problem}
     if session.state == "recording":
         update |= {"state": "pending", "stopped_t_ns": begin_t_ns}
     name, number = numbered(session.name)
-    further = begun(
+    continuation = begun(
         info,
         f"{name} ({number + 1})",
         Part(boot_id=info.boot_id, seq_first=0),
@@ -85,10 +85,10 @@ def taken_up(
         continues=session.id,
         **{field: getattr(session, field) for field in ("subject", "notes", "tags", "take")},
     )
-    return session.model_copy(update=update), further
+    return session.model_copy(update=update), continuation
 
 
 def numbered(name: str) -> tuple[str, int]:
-    """The name given to a recording, and the number of this session in it: 2 for `mud (2)`."""
+    """Split a session's name into the given name and its number: 2 for `mud (2)`, else 1."""
     match = re.fullmatch(r"(.*) \((\d+)\)", name)
     return (match[1], int(match[2])) if match else (name, 1)

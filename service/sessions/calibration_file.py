@@ -1,4 +1,4 @@
-"""A calibration as a file: read from its text, and written."""
+"""Calibration files: parsing and writing."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from storage.checked_json import checked, with_check, write_checked
 
 
 def calibration_of(content: bytes, *, where: str) -> Calibration:
-    """The calibration in a file, which may have been written by hand: then its name says so.
+    """Parse a calibration file; the name of a file written by hand is marked as such.
 
     Raises:
-        CalibrationError: it is not one, or not what its hashes are of.
+        CalibrationError: it is no calibration, or its hashes do not match.
     """
-    with suppress(UnicodeDecodeError):  # with which `checked` finds damage
-        content = decode_text(content).encode()  # as an editor may have saved it
+    with suppress(UnicodeDecodeError):  # `checked` reports this as damage
+        content = decode_text(content).encode()  # encodings of editors
     try:
         text = checked(content, where=where).text
     except DamagedFileError as error:
@@ -30,12 +30,12 @@ def calibration_of(content: bytes, *, where: str) -> Calibration:
 
 
 def not_one(what: str, where: str) -> CalibrationError:
-    """Of a file that is no calibration."""
+    """Return the error for a file that is no calibration."""
     return CalibrationError(f"not a calibration: {what}", where=where, remedy=EDITED)
 
 
 def content_of(calibration: Calibration) -> bytes:
-    """All bytes of its file."""
+    """Return all bytes of a calibration's file."""
     return with_check(calibration.to_json().encode())
 
 

@@ -1,7 +1,7 @@
-"""What a session was compared with at any zoom: bins with least and greatest, so no peak hides.
+"""Reference series of a comparison at any zoom: bins with minimum and maximum.
 
-The bins are those of `storage.sessions.pyramid`. A series is read whole once, and held against its
-hash; then its coarser levels are in memory, and of the file a zoom reads its row groups only.
+The bins are those of `storage.sessions.pyramid`. A series is read and verified once; then its
+coarser levels are in memory, and a zoom reads its row groups only.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from storage.sessions.footer import stamps_of
 from storage.sessions.pyramid import FACTOR, ROWS, Bins, levels_over, merged
 
 GAP_STEPS = 3.5
-"""Frames that are further apart than so many usual steps have something missing between them."""
+"""Distance of two frames that counts as a gap, in median steps."""
 _BINNED = ("reference_grf_n", "reference_cop_x_m", "reference_cop_y_m")
 _KEPT = 4
 
 
 class Series:
-    """One comparison's series, as far as it is in memory: 1.3 MB for a million frames.
+    """Series of one comparison, with its coarser levels in memory: 1.3 MB for a million frames.
 
     Args:
-        folder: of the comparison.
-        table: its series, whole, as it was read and proven just now.
+        folder: folder of the comparison.
+        table: whole series, just verified.
 
     Raises:
-        DamagedFileError: it is not there any more.
+        DamagedFileError: the file is gone.
         StorageError: it cannot be read now.
     """
 
@@ -45,20 +45,19 @@ class Series:
         self._levels = levels_over(merged(frames, ROWS)) if len(table) else []
 
     def seen(self, begin_ns: int, part: Slice, points: int) -> tuple[Bins, int]:
-        """Some time of it, as `points` bins at least and four times as many at most.
+        """Return a slice as `points` to four times as many bins.
 
-        There are fewer where there are fewer frames, and more where gaps break them: no bin reaches
-        over a gap.
+        Fewer where there are fewer frames, and more where gaps split them: no bin spans a gap.
 
         Args:
-            begin_ns: of the session's first frame.
-            part: which time; its columns do not count.
-            points: how many bins.
+            begin_ns: time of the session's first frame.
+            time_slice: time interval; its columns are ignored.
+            points: least number of bins.
 
         Returns:
-            `t_first_ns`, `t_last_ns`, `frames`, `missing` (how often something is, in the bin or
-            just before it), and of the reference and of `error_n`, ours less that, `_min` and
-            `_max`, NaN where neither is known; and how many frames a bin has at the most.
+            `t_first_ns`, `t_last_ns`, `frames`, `missing` (number of gaps in the bin or just before
+            it), and `_min` and `_max` of the reference and of `error_n`, ours minus the reference,
+            NaN where unknown; and the greatest number of frames per bin.
 
         Raises:
             DamagedFileError: a row group is damaged.
@@ -77,43 +76,43 @@ class Series:
 
 
 class SeriesKept:
-    """Series that were asked for last, for as long as their files are the same."""
+    """Cache of the most recently used series, while their files are unchanged."""
 
     def __init__(self) -> None:
         self._of: OrderedDict[Path, tuple[tuple[int, ...], Series]] = OrderedDict()
         self._one_at_a_time = threading.Lock()
 
     def of(self, folder: Path) -> Series | None:
-        """The series of a comparison; None: an older version wrote none.
+        """Return the series of a comparison; None: an older version wrote none.
 
         Raises:
-            DamagedFileError: it is not what was written.
+            DamagedFileError: the file is damaged.
             StorageError: it cannot be read now.
         """
         path = folder / SERIES_NAME
         with self._one_at_a_time:
             stamps = stamps_of(path)
-            kept = self._of.pop(path, None)
-            if kept is None or kept[0] != stamps:
+            cached = self._of.pop(path, None)
+            if cached is None or cached[0] != stamps:
                 table = read_series(folder)
                 if table is None:
                     return None
-                kept = stamps, Series(folder, table)
-            self._of[path] = kept
+                cached = stamps, Series(folder, table)
+            self._of[path] = cached
             while len(self._of) > _KEPT:
                 self._of.popitem(last=False)
-            return kept[1]
+            return cached[1]
 
 
 def _bins_of(table: pa.Table, gap_ns: float) -> Bins:
-    """A bin for each frame; a part is what no gap breaks."""
+    """Return a bin for each frame; gaps separate parts."""
     t_ns: Array = table["t_ns"].to_numpy()
     gaps = np.zeros(len(t_ns), np.bool_)
     gaps[1:] = np.diff(t_ns) > gap_ns
     bins: Bins = {
         "t_first_ns": t_ns,
         "t_last_ns": t_ns,
-        "part": np.cumsum(gaps).astype(np.uint16),  # it is enough that neighbours differ
+        "part": np.cumsum(gaps).astype(np.uint16),  # only neighbours have to differ
         "frames": np.ones(len(t_ns), np.uint32),
         "missing": gaps.astype(np.uint32),
     }
@@ -125,7 +124,7 @@ def _bins_of(table: pa.Table, gap_ns: float) -> Bins:
 
 
 def _within(bins: Bins, begin_ns: int | None, end_ns: int | None) -> Bins:
-    """Those with frames of some time; they are in its order."""
+    """Return the bins with frames in an interval; they are in its order."""
     first = 0 if begin_ns is None else int(np.searchsorted(bins["t_last_ns"], begin_ns))
     end = None if end_ns is None else int(np.searchsorted(bins["t_first_ns"], end_ns))
     return {name: values[first:end] for name, values in bins.items()}

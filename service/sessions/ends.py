@@ -1,13 +1,12 @@
-"""Where the parts of a session end: rules on what is known of its streams, nothing kept here.
+"""Ends of the parts of sessions: stateless rules on the facts of its streams.
 
-A session ends with the last frame that was taken before it was stopped, by the clock that it
-was stopped by. A stream that ended before that ends its part. Where frames are missing, the end is
-placed by the rate; where a node has not said how its stream ended, the frames that it may have
-taken unheard are bounded.
+A session ends with the last frame before its stop, by the clock that gave the stop's time. A stream
+that ended before that ends its part. Where frames are missing, the end is placed by the rate; where
+a node has not reported how its stream ended, the number of unsent frames is bounded.
 
-A *node's stream* (`NodeStream`) is what the node takes and keeps, a *server's stream*
-(`ServerStream`) what a server has of it. Both, and a journal that is opened after a crash, give
-the facts of a `SessionStream`; ends, ledger and sources of a session follow from these alone.
+A *node's stream* (`NodeStream`) is the node's own, a *server's stream* (`ServerStream`) the
+server's copy. Both, and a journal that is opened after a crash, give the facts of a
+`SessionStream`; ends, ledger and inputs of a session follow from these alone.
 """
 
 from __future__ import annotations
@@ -26,59 +25,61 @@ from storage.sessions.ledger import StreamState
 
 
 class Around(Protocol):
-    """Looks up the frames next to an instant of a stream."""
+    """Lookup of the frames next to a time of a stream."""
 
     def __call__(
         self, t_ns: int, *, at_least: int, waiting: bool = False
     ) -> tuple[int, int] | None:
-        """As `around_in`; `waiting`: may return an earlier result while frames between may come."""
+        """Return the same as `find_seqs_around`, possibly from a cache with `wait_for_missing`."""
 
 
 @dataclass(frozen=True)
 class SessionStream(StreamState):
-    """What is known of one stream, for the sessions that it is part of.
+    """Facts of one stream, for the sessions with a part in it.
 
     Attributes:
-        info: description of its array; None: not known.
+        info: description of its array; None: unknown.
         journal: its frames; None: there are none.
-        around: looks up the frames next to an instant.
-        offset_ns: what to add to its instants for those of the clock by which sessions are
-            stopped; None: not known, or no session ends by that clock.
-        last_seen_t_ns: when a frame of it came last, by that clock; None: not known.
+        find_seqs_around: lookup of the frames next to a time.
+        offset_ns: offset from its times to the clock that gives the stop's time; None: unknown, or
+            no session is stopped by that clock.
+            None: not known, or no session ends by that clock.
+        last_seen_t_ns: arrival time of its last frame, by that clock; None: unknown.
     """
 
     info: ArrayInfo | None = None
     journal: Journal | None = None
     around: Around | None = None
+    """lookup of the frames next to a time."""
     offset_ns: int | None = None
     last_seen_t_ns: int | None = None
 
     def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
-        """Its own UTC of the newest frame held up to `seq`, or of the oldest from `seq` on."""
+        """Return the node's time of the newest frame up to `seq`, or of the oldest from it."""
         return self.journal.t_ns_near(seq, newest=newest) if self.journal is not None else None
 
 
 def around_in(
     journal: Journal, t_ns: int, *, at_least: int, waiting: bool = False
 ) -> tuple[int, int] | None:
-    """Numbers held next to an instant of the node's UTC: the last until it, the first after.
+    """Return the stored frames next to a time: the last one until it, the first one after.
 
     Args:
-        journal: of the stream.
-        t_ns: the instant.
-        at_least: earlier numbers do not count; the last is `at_least` - 1 if there is none.
-        waiting: has no effect here, because nothing is remembered.
+        journal: journal of the stream.
+        t_ns: the time, node's UTC.
+        min_seq: earlier numbers do not count; the last is `min_seq` - 1 if there is none.
+        wait_for_missing: ignored, since nothing is cached here.
 
     Returns:
-        Both; None while the stream has not passed the instant.
+        Both numbers; None while the stream has not passed the time.
 
     Raises:
-        DamagedFramesError: the frames that tell are damaged.
+        DamagedFramesError: the frames at that time are damaged.
     """
     last = journal.last_seq_until(t_ns, at_least=at_least)
     if last is None:
         return None
-    # Where time runs back, frames after the instant may have lower numbers than those before it.
+    # If the clock steps back, frames after that time may have lower numbers than earlier ones.
     after = journal.held.within(last + 1, NO_END).first
     return last, last + 1 if after is None else after
 
@@ -90,15 +91,15 @@ Streams = Mapping[str, SessionStream]
 
 
 def at_stop(session: Session, streams: Streams, *, waiting: bool = False) -> Session:
-    """The session with the parts ended whose stream has passed the stop.
+    """Close the open parts whose stream has passed the stop.
 
     Args:
         session: the session.
-        streams: by boot_id, of all of its parts.
-        waiting: leave a part open while frames may come that were taken nearer to the stop.
+        streams: facts by stream id, for all of its parts.
+        wait_for_missing: keep a part open while frames closer to the stop may come.
 
     Raises:
-        DamagedFramesError: the frames that tell are damaged.
+        DamagedFramesError: the frames at the stop are damaged.
     """
     for part in session.parts:
         if part.seq_last is None:
@@ -109,13 +110,13 @@ def at_stop(session: Session, streams: Streams, *, waiting: bool = False) -> Ses
 
 
 def at_end(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
-    """The session with every open part ended where its stream ended.
+    """Close every open part at the end of its stream.
 
     Args:
         session: the session.
-        streams: by boot_id, of all of its parts.
-        now_t_ns: a stream whose end is not known may have gone on until then; None: its session
-            ends with the newest frame there is.
+        streams: facts by stream id, for all of its parts.
+        now_t_ns: a stream without a known end may have gone on until then; None: its session ends
+            with the newest stored frame.
     """
     for part in session.parts:
         if part.seq_last is None:
@@ -125,24 +126,24 @@ def at_end(session: Session, streams: Streams, now_t_ns: int | None = None) -> S
             if stream.next_seq is None:
                 session = ended(session, part, beyond - 1, _unheard(session, stream, now_t_ns))
             else:
-                # What a node lost with its power may have come here before.
+                # Frames that a node lost in a power failure may be stored here.
                 tail = stream.unsynced_tail_max - max(0, beyond - stream.next_seq)
                 session = ended(session, part, max(stream.next_seq, beyond) - 1, max(0, tail))
     return session
 
 
 def broken_off(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
-    """The session with every part ended by the frames that are here: no more will come.
+    """Close every part at its stored frames: no more will come.
 
-    If it was never stopped, it was stopped with its newest frame.
+    A session without a stop gets the time of its newest frame as stop.
 
     Args:
         session: the session.
-        streams: by boot_id, of all of its parts.
-        now_t_ns: as for `at_end`.
+        streams: facts by stream id, for all of its parts.
+        now_t_ns: as for `close_at_stream_end`.
 
     Raises:
-        DamagedFramesError: the frames that tell are damaged.
+        DamagedFramesError: the frames at the stop are damaged.
     """
     session = at_end(at_stop(session, streams), streams, now_t_ns)
     if session.stopped_t_ns is None:
@@ -156,7 +157,7 @@ def broken_off(session: Session, streams: Streams, now_t_ns: int | None = None) 
 
 
 def ended(session: Session, part: Part, seq_last: int, tail: int = 0) -> Session:
-    """The session with this end of a part; up to `tail` frames may have followed it."""
+    """Return the session with a part closed at a number; up to `tail` lost frames may follow."""
     closed = part.model_copy(update={"seq_last": max(seq_last, part.seq_first - 1)})
     parts = tuple(closed if each is part else each for each in session.parts)
     update: dict[str, object] = {"parts": parts}
@@ -166,7 +167,7 @@ def ended(session: Session, part: Part, seq_last: int, tail: int = 0) -> Session
 
 
 def open_tail(stream: SessionStream) -> int:
-    """How many frames a stream may have had after its newest one, as far as that is known."""
+    """Return the upper bound of frames that a stream had after its newest stored one."""
     if stream.next_seq is not None:
         return stream.unsynced_tail_max
     return max(stream.unsynced_tail_max, unsynced_tail_max(_rate_hz(stream)))
@@ -175,7 +176,7 @@ def open_tail(stream: SessionStream) -> int:
 def _seq_at_stop(
     session: Session, part: Part, stream: SessionStream, *, waiting: bool
 ) -> int | None:
-    """The last frame of a stream before the stop; None if the stream has not passed it."""
+    """Return the last frame of a stream before the stop; None if the stream has not passed it."""
     if session.stopped_t_ns is None or stream.around is None or stream.offset_ns is None:
         return None
     stop_t_ns = session.stopped_t_ns - stream.offset_ns
@@ -187,25 +188,25 @@ def _seq_at_stop(
         return last
     if waiting and stream.may_come & Intervals([(last + 1, after - 1)]):
         return None
-    # The stop lies among lost frames: the rate tells how many of them came after it.
+    # The stop lies among lost frames: the rate gives the number of those after it.
     after_t_ns = stream.t_ns_near(after, newest=False) or stop_t_ns
     late = math.ceil((after_t_ns - stop_t_ns) * 1e-9 * _rate_hz(stream))
     return min(after - 1, max(last, after - late))
 
 
 def _unheard(session: Session, stream: SessionStream, now_t_ns: int | None) -> int:
-    """How many frames there may have been after the last known one.
+    """Return the upper bound of frames after the last known one.
 
-    Until the stop or now, whichever was first; if neither is known, until the newest was synced.
+    Until the earlier of stop and now; if neither is known, until the newest was synced.
     """
-    known = [t_ns for t_ns in (session.stopped_t_ns, now_t_ns) if t_ns is not None]
-    if not known:
+    limits_ns = [t_ns for t_ns in (session.stopped_t_ns, now_t_ns) if t_ns is not None]
+    if not limits_ns:
         return open_tail(stream)
-    # Frames that were sent late came later than they were taken.
+    # Arrival times of delayed frames are too late.
     newest_t_ns, seen_t_ns = stream.t_ns_near(NO_END, newest=True), stream.last_seen_t_ns
     if newest_t_ns is not None and (stream.offset_ns is not None or seen_t_ns is None):
         seen_t_ns = newest_t_ns + (stream.offset_ns or 0)
-    silent_s = (min(known) - (seen_t_ns or session.started_t_ns)) / 1e9
+    silent_s = (min(limits_ns) - (seen_t_ns or session.started_t_ns)) / 1e9
     return max(1, stream.unsynced_tail_max, math.ceil(silent_s * _rate_hz(stream)))
 
 

@@ -1,8 +1,8 @@
-"""Frames of a session with their estimates; where the estimator is not installed, raw frames.
+"""Frames of a session with their estimates; raw frames where the estimator is not installed.
 
-They are what is sealed, and what a session that is still recorded or pending gives away as CSV or
-Arrow. This is the only door to the estimator for a node: it seals, and so does `foottile recover`,
-where neither numba nor scipy is installed.
+They are sealed, and exported as CSV or Arrow from a session that is still recorded or pending. Only
+here does a node use the estimator: it seals, and so does `foottile recover`, where neither numba
+nor scipy is installed.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ TARE_LOST = (
 class SessionFrames:
     """Frames of a session, with the column `part` and, where possible, estimates.
 
-    Once the first frames are there, `notes` is what a file says of their estimates, and `problem`
-    why there are none, or not for all frames.
+    After the first frames, `notes` has the file's metadata of the estimates, and `problem` the
+    reason why there are none, or not for all frames.
     """
 
     def __init__(self, sources: Sources) -> None:
@@ -75,7 +75,7 @@ class SessionFrames:
             yield frames, columns
 
     def _without_estimates(self, reason: object) -> None:
-        """Say why there are no estimates, and keep what `foottile estimate` needs for them."""
+        """Note why there are no estimates, and what `foottile estimate` needs to add them."""
         calibration, tares = self._sources.calibration, self._sources.tares
         self.problem = f"no estimates: {reason}"
         self.notes = {"estimates": self.problem}
@@ -85,19 +85,19 @@ class SessionFrames:
             self.notes["tares"] = [tare.as_dict() for tare in tares]
 
     def raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Frames with the column `part` only."""
+        """Yield frames with the column `part` only."""
         return raw_from(self._sources)
 
 
 def raw_from(
     sources: Sources, number: int = 0, seq: int = 0
 ) -> Iterator[tuple[FrameBatch, Columns]]:
-    """Frames from the journals in order, with the column `part` only.
+    """Yield frames from the journals in order, with the column `part` only.
 
     Args:
-        sources: of the session.
-        number: of the part to begin with.
-        seq: its frames before this number are left out.
+        inputs: inputs of the session.
+        first_part: number of the first part.
+        first_seq: frames of this part before this number are left out.
     """
     for i, part in list(enumerate(sources.session.parts))[number:]:
         journal = sources.journals.get(part.boot_id)

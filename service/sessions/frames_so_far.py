@@ -1,8 +1,7 @@
-"""Frames of a session that is not sealed, some time of it or all of it.
+"""Frames of an unsealed session with their estimates: a slice, or all.
 
-What some time costs does not depend on where it is, as far as the session was looked at before. And
-however it was looked at: a frame has the estimate that it has in one go over all frames there are
-by now.
+The cost of a slice does not depend on its place, up to the newest checkpoint. A frame's estimate
+does not depend on the slice: it is that of one run over all present frames.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ Pieces = Iterator[tuple[FrameBatch, Columns]]
 
 
 class FramesSoFar:
-    """Some time of a session that is not sealed.
+    """Slice of an unsealed session.
 
     Args:
-        so_far: what is known of it.
-        sources: of now.
-        part: which time.
+        preview: preview of the session.
+        inputs: present inputs.
+        time_slice: time interval.
 
     Attributes:
-        notes: what a file says of the estimates; known with `content`.
+        notes: file metadata of the estimates; known after `make_content`.
     """
 
     def __init__(self, so_far: SoFar, sources: Sources, part: Slice) -> None:
@@ -46,7 +45,7 @@ class FramesSoFar:
         self._axis = NODE_AXIS
 
     def content(self) -> Content:
-        """Its frames, with estimates if there are any; the first of them are read.
+        """Return the frames, with estimates if there are any; reads the first ones.
 
         Raises:
             UsageError: there are no frames.
@@ -60,36 +59,36 @@ class FramesSoFar:
         legs = self._legs(begin_ns, end_ns)
         pieces = chain.from_iterable(self._run(*leg, end_ns) for leg in legs)
         some = next(pieces, None)
-        if some is None:  # none is of that time: then these say which columns there are
+        if some is None:  # no frame in the interval: use the columns of the first ones
             some = next(self._run(0, 1, None))
         return content_of(chain((some,), pieces), span_ns, self._axis)
 
     def _legs(self, begin_ns: int | None, end_ns: int | None) -> list[tuple[int, int]]:
-        """Between which places are frames of some time? Behind the last one is what follows."""
+        """Return the ranges of checkpoints with frames of an interval; the last one is open."""
         newest = len(self._places) - 1
         wanted = [
-            at
-            for at, place in enumerate(self._places[:newest])
-            if place.left < self._places[at + 1].left
+            index
+            for index, place in enumerate(self._places[:newest])
+            if place.left < self._places[index + 1].left
             and self._axis.may_overlap(place.begin_ns, place.end_ns, begin_ns, end_ns)
         ]
         last = self._places[newest].last
-        # Those that wait there are younger than the last one that does not, or of a later part.
+        # Frames without an estimate are newer than the last one with one, or of a later part.
         if end_ns is None or last is None or self._is_before(*last, end_ns):
             wanted.append(newest)
         legs: list[tuple[int, int]] = []
-        for at in wanted:
-            begin = legs.pop()[0] if legs and legs[-1][1] == at else at
-            legs.append((begin, at + 1))
+        for index in wanted:
+            begin = legs.pop()[0] if legs and legs[-1][1] == index else index
+            legs.append((begin, index + 1))
         return legs
 
     def _run(self, begin: int, end: int, end_ns: int | None) -> Pieces:
-        """Frames between two places, with their estimates; none that is certainly too young."""
+        """Yield the frames between two checkpoints, with estimates, up to an end time."""
         places = self._places
-        left = places[end].left if end < len(places) else NO_END
-        at, stream = self._milestones.stream_at(places, begin, self._sources)
-        ahead, count = places[begin].left - places[at].left, left - places[at].left
-        pieces: Pieces = raw_from(self._sources, places[at].part, places[at].seq)
+        end_count = places[end].left if end < len(places) else NO_END
+        start, stream = self._milestones.stream_at(places, begin, self._sources)
+        ahead, count = places[begin].left - places[start].left, end_count - places[start].left
+        pieces: Pieces = raw_from(self._sources, places[start].part, places[start].seq)
         if stream is not None:
             pieces = stream.run(pieces)
         for frames, columns in pieces:
@@ -107,22 +106,22 @@ class FramesSoFar:
                 return
 
     def _is_before(self, part: int, t_ns: int, end_ns: int) -> bool:
-        """Whether a frame, or a later one than it, may be before an instant of the time axis."""
+        """Return whether a frame, or a later one, may be before a time of the time axis."""
         return min(t_ns + self._axis.shift_ns(part), self._begins_ns(part + 1)) < end_ns
 
     def _begins_ns(self, number: int) -> int:
-        """No frame of this part, nor of a later one, is older than that on the time axis."""
+        """Return a lower bound of times in this and later parts, on the time axis."""
         begins = [
-            t_ns + self._axis.shift_ns(at)
-            for at, part in enumerate(self._sources.session.parts)
-            if at >= number
+            t_ns + self._axis.shift_ns(index)
+            for index, part in enumerate(self._sources.session.parts)
+            if index >= number
             and (journal := self._sources.journals.get(part.boot_id)) is not None
             and (t_ns := journal.t_ns_near(part.seq_first, newest=False)) is not None
         ]
         return min(begins, default=NO_END)
 
     def _latest_ns(self) -> int:
-        """Instant of the youngest frame on the time axis."""
+        """Return the time of the newest frame on the time axis."""
         latest = -NO_END
         for number, part in enumerate(self._sources.session.parts):
             journal = self._sources.journals.get(part.boot_id)

@@ -1,8 +1,8 @@
-"""Places in a session that is not sealed from which its estimates can go on, with the same bits.
+"""Checkpoints of an unsealed session, from which its estimates can be resumed bit by bit.
 
-What an estimator remembers there lies in a scratch file, some ten thousand bytes every some
-thousand frames; in memory is only where. So any slice costs what lies between it and the place
-before it, be it at the beginning or hours later.
+The estimator's state is in a scratch file, some ten thousand bytes every some thousand frames;
+memory has only its place. So a slice costs the frames between it and the checkpoint before it, be
+it at the beginning or hours later.
 """
 
 from __future__ import annotations
@@ -22,72 +22,76 @@ from storage.schema import Array
 from storage.scratch import Kept, Scratch
 
 EVERY = 6144
-"""Frames between two places at least; more by less than a piece of a journal. Those of eight tiles
-are estimated in some 60 ms, with all models."""
+"""Least distance between two checkpoints, in frames. Estimating so many frames of eight tiles takes
+some 60 ms, with all models."""
 MOST = 8192
-"""Places: then every other one is forgotten, and they are twice as far apart."""
+"""Limit of checkpoints: beyond it every other one is dropped, and their distance doubled."""
 _EVER_NS = 2**63 - 1
 
 
 @dataclass(slots=True)
 class Milestone:
-    """A place, and what is known of the frames from there on.
+    """Checkpoint, and facts of the frames from there on.
 
     Attributes:
-        part: of the next frame to take.
-        seq: least number it can have.
-        taken: frames that were taken before.
-        left: whose estimates have left by then; others wait for their look-ahead.
-        newest_ns: greatest `t_ns` of those taken.
-        last: part and `t_ns` of the frame that left last; None: none has.
-        kept: what the estimator remembers; None: nothing yet.
-        begin_ns: least `t_ns` of those that leave from here on until the next place.
-        end_ns: the greatest.
+        part: part of the next frame.
+        seq: least number of the next frame.
+        fed_frames: frames fed before.
+        estimated_frames: frames estimated before; others wait for their look-ahead.
+        newest_ns: greatest `t_ns` of the fed frames.
+        last_estimated: part and `t_ns` of the last estimated frame; None: there is none.
+        state: saved state of the estimator; None: initial state.
+        begin_ns: least `t_ns` of the frames estimated from here to the next checkpoint.
+        end_ns: greatest `t_ns` of these frames.
     """
 
     part: int = 0
     seq: int = 0
     taken: int = 0
+    """frames fed before."""
     left: int = 0
+    """frames estimated before; others wait for their look-ahead."""
     newest_ns: int = -_EVER_NS
     last: tuple[int, int] | None = None
+    """part and `t_ns` of the last estimated frame; None: there is none."""
     kept: Kept | None = None
+    """saved state of the estimator; None: initial state."""
     begin_ns: int = _EVER_NS
     end_ns: int = -_EVER_NS
 
 
 class Milestones:
-    """Those of one session, in their order. One thread adds; any may read.
+    """Checkpoints of one session, in order. One thread adds; any thread reads.
 
     Args:
-        folder: on whose disk estimators' memories are.
+        folder: folder on the disk for the scratch file.
     """
 
     def __init__(self, folder: Path) -> None:
         self.all: Sequence[Milestone] = (Milestone(),)
-        """The first is the beginning. Never changed, but replaced."""
+        """The first is the beginning. The sequence is replaced, never changed."""
         self.every = EVERY
         self._scratch = Scratch(folder)
 
     def note(self, t_ns: Array) -> None:
-        """Frames that have left since the newest place."""
+        """Extend the time span of the newest checkpoint by estimated frames."""
         newest = self.all[-1]
         newest.begin_ns = min(newest.begin_ns, int(t_ns.min()))
         newest.end_ns = max(newest.end_ns, int(t_ns.max()))
 
     def add(self, place: Milestone, memory: Columns | None) -> None:
-        """Another place; none, if the disk does not take what is remembered there.
+        """Add a checkpoint; without effect if the disk is full.
 
         Args:
-            place: behind those there are.
-            memory: of the estimator; None where nothing is estimated.
+            checkpoint: checkpoint behind all present ones.
+            state: state of the estimator; None without estimates.
         """
         if memory is not None:
             content = io.BytesIO()
             np.savez(content, allow_pickle=False, **memory)
             try:
                 place.kept = self._scratch.put(content.getvalue())
-            except StorageError:  # frames need the disk more
+            except StorageError:  # a full disk is left to frames
                 return
         found = [*self.all, place]
         if len(found) > MOST:
@@ -98,7 +102,7 @@ class Milestones:
         self.all = tuple(found)
 
     def go_back(self, count: int) -> None:
-        """Forget all but the first so many; of frames behind the last one nothing is known."""
+        """Remove all but the first checkpoints, and the time span of the last one."""
         newest = self.all[count - 1]
         newest.begin_ns, newest.end_ns = _EVER_NS, -_EVER_NS
         self.all = tuple(self.all[:count])
@@ -106,22 +110,22 @@ class Milestones:
     def stream_at(
         self, places: Sequence[Milestone], at: int, sources: Sources
     ) -> tuple[int, EstimateStream | None]:
-        """An estimate that goes on from a place, or from one before it if that cannot be read.
+        """Resume estimates from a checkpoint, or from one before it if that cannot be read.
 
         Args:
-            places: of `all`.
-            at: which of them.
-            sources: of which `places` are true.
+            checkpoints: valid checkpoints.
+            index: index of the checkpoint.
+            inputs: inputs for which the checkpoints are valid.
 
         Returns:
-            From which; and the estimate, None where nothing is estimated.
+            Index of the checkpoint used; and the stream, None without estimates.
         """
         stream = stream_of(sources)
-        while stream is not None and (kept := places[at].kept) is not None:
+        while stream is not None and (state := places[at].kept) is not None:
             try:
-                with np.load(io.BytesIO(self._scratch.get(kept)), allow_pickle=False) as memory:
+                with np.load(io.BytesIO(self._scratch.get(state)), allow_pickle=False) as memory:
                     stream.go_on(dict(memory))
-            except Exception:  # damaged bytes may cause any error; the beginning has none
+            except Exception:  # damaged bytes cause any error; the first checkpoint has no bytes
                 at, stream = at - 1, stream_of(sources)
             else:
                 break
@@ -129,7 +133,7 @@ class Milestones:
 
 
 def stream_of(sources: Sources) -> EstimateStream | None:
-    """As frames are estimated before they are sealed; None: there is nothing to do that with."""
+    """Return the estimate stream of an unsealed session; None without calibration or tare."""
     if sources.calibration is None or not sources.tares:
         return None
     options = EstimateOptions(

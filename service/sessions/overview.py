@@ -1,7 +1,7 @@
-"""The overview of a sealed session: gathered while frames are written, or made again from the file.
+"""Overview of a sealed session at any zoom: built while frames are written, or rebuilt later.
 
-Asked for some time and so many points it answers with bins, the coarsest level that has as many;
-and where that is finer than any level, with bins of the frames themselves.
+For a slice and a number of points it returns bins of the coarsest level with enough bins; beyond
+the finest level, bins of the frames themselves.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ log = logging.getLogger("foottile.overview")
 
 POINTS_MAX = 8000
 _VALUES_MAX = 1 << 18
-"""Numbers of frames that are read at once for a zoom, of which little is left: 2 MiB."""
-_NOT_WRITTEN = f"{OVERVIEW_NAME} was not written, and is made again when it is asked for"
+"""Values read at once for a zoom into frames: 2 MiB."""
+_NOT_WRITTEN = f"{OVERVIEW_NAME} was not written, and is rebuilt on request"
 
 
 class OverviewBeside:
-    """Gathers the overview of frames that are being sealed, and writes it beside these.
+    """Builder of the overview of frames that are being sealed.
 
-    Whatever goes wrong with that holds no session up: it is said, and it is made again later.
+    A failure does not affect the session: it is reported, and the overview is rebuilt later.
 
     Attributes:
-        problem: why it is not there; None: it is.
+        problem: reason why it is missing; None: it is written.
     """
 
     def __init__(self, tiles: int) -> None:
@@ -63,15 +63,17 @@ class OverviewBeside:
         self._pyramid = Pyramid()
 
     def feed(self, frames: FrameBatch, columns: Mapping[str, Array]) -> None:
-        """Take the next frames with their columns."""
+        """Add the next frames with their columns."""
         if self.problem is not None:
             return
         try:
             wanted = frame_columns(estimated="grf_n" in columns)
-            known = {name: columns[name] for name in (*wanted, "part") if name in columns}
-            own = {name: getattr(frames, name) for name in wanted if name not in known}
-            self._pyramid.feed(known | own)
-        except Exception as error:  # a session is worth more than what can be made from it again
+            given_columns = {name: columns[name] for name in (*wanted, "part") if name in columns}
+            frame_fields = {
+                name: getattr(frames, name) for name in wanted if name not in given_columns
+            }
+            self._pyramid.feed(given_columns | frame_fields)
+        except Exception as error:  # never fail a session for a derived file
             log.exception("overview: this is a bug")
             self.problem = f"{_NOT_WRITTEN}: {error}"
 
@@ -91,36 +93,39 @@ class OverviewBeside:
 
 @dataclass(frozen=True)
 class Seen:
-    """Some time of a session as bins.
+    """Slice of a session as bins.
 
     Attributes:
-        bins: of `storage.sessions.pyramid`, in the order of the file, instants on the time axis.
-        frames_in_bin: how many frames a bin stands for: 1, these are the frames themselves.
+        bins: bins as in `storage.sessions.pyramid`, in the order of the file, times on the time
+            axis.
+        frames_per_bin: number of frames per bin; 1: these are the frames themselves.
         begin_ns: `t_ns` of the session's first frame.
-        end_ns: last instant on the axis.
-        axis: the session's time axis.
+        end_ns: last time on the axis.
+        time_axis: time axis of the session.
     """
 
     bins: Bins
     frames_in_bin: int
+    """number of frames per bin; 1: these are the frames themselves."""
     begin_ns: int
     end_ns: int
     axis: TimeAxis
+    """time axis of the session."""
 
 
 def overview_of_session(
     session: SessionReader, part: Slice, points: int, *, frames_sha256: str
 ) -> Seen:
-    """Some time of a sealed session, as `points` bins at least and four times as many at most.
+    """Return a slice of a sealed session as `points` to four times as many bins.
 
-    There are fewer where there are fewer frames. An overview that is missing, damaged or of other
-    frames is made again, and kept if the folder can be written to.
+    Fewer only where there are fewer frames. A missing, damaged or outdated overview is rebuilt, and
+    stored if the folder is writable.
 
     Args:
-        session: its frames, open for slices.
-        part: which time; its columns do not count.
-        points: how many bins.
-        frames_sha256: file hash of its frames.
+        session: frames of the session, open for slices.
+        time_slice: time interval; its columns are ignored.
+        points: least number of bins.
+        frames_sha256: hash of the file of frames.
 
     Raises:
         FileFormatError: the frames are damaged.
@@ -129,8 +134,8 @@ def overview_of_session(
     begin_ns, end_ns = session.span_ns()
     bounds = part.bounds_ns(begin_ns)
     try:
-        with open_overview(path) as kept:
-            found = _of_levels(kept, frames_sha256, bounds, points, session.axis)
+        with open_overview(path) as stored:
+            found = _of_levels(stored, frames_sha256, bounds, points, session.axis)
     except (FileNotFoundError, FileFormatError, StorageError):
         with _made(path, session, frames_sha256) as made:
             found = _of_levels(made, frames_sha256, bounds, points, session.axis)
@@ -147,12 +152,12 @@ def _of_levels(
     points: int,
     axis: TimeAxis,
 ) -> tuple[Bins, int] | int:
-    """Bins of the coarsest level that has enough, and of how many frames each is.
+    """Return bins of the coarsest level with enough bins, and the frames per bin.
 
-    If none has: about how many frames there are.
+    If no level has enough: the approximate number of frames.
 
     Raises:
-        DamagedFileError: a piece is damaged, or the overview is of other frames.
+        DamagedFileError: a chunk is damaged, or the overview is of other frames.
     """
     if overview.index.frames_sha256 != frames_sha256:
         raise DamagedFileError("is of other frames")
@@ -167,7 +172,7 @@ def _of_levels(
 def _of_frames(
     session: SessionReader, part: Slice, begin_ns: int, points: int, rows: int
 ) -> tuple[Bins, int]:
-    """Bins of the frames themselves: of 16 or 4 frames, or each of one."""
+    """Return bins of 16, 4 or 1 frames, and the frames per bin."""
     size = 1
     while rows // (size * FACTOR) >= points:
         size *= FACTOR
@@ -184,8 +189,8 @@ def _of_frames(
         frames = {name: values[inside] for name, values in piece.items()}
         if not len(frames["seq"]):
             continue
-        of = int(frames["part"][0]) if "part" in frames else 0
-        before = last[1] if last is not None and last[0] == of else None
+        first_part = int(frames["part"][0]) if "part" in frames else 0
+        before = last[1] if last is not None and last[0] == first_part else None
         found.append(bins_of_frames(frames, before))
         last = int(frames["part"][-1]) if "part" in frames else 0, int(frames["seq"][-1])
     bins = on_axis(joined([{name: piece[name] for name in types} for piece in found]), session.axis)
@@ -201,7 +206,7 @@ def _pyramid_of(session: SessionReader) -> Pyramid:
 
 
 def _made(path: Path, session: SessionReader, frames_sha256: str) -> Overview:
-    """A new one, kept beside the frames if their folder can be written to."""
+    """Rebuild the overview, and store it if the folder is writable."""
     levels, tiles = _pyramid_of(session).levels(), len(session.info.tiles)
     try:
         write_overview(path, levels, tiles=tiles, frames_sha256=frames_sha256)

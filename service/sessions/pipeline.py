@@ -1,8 +1,7 @@
-"""Frames to estimates for a recording that comes in pieces: finds the tare, then estimates.
+"""Estimation of a recording that comes in batches: finds the tare, then estimates.
 
-Used by `simulate` while frames are taken, by `estimate` from a file, and by the server live and
-when a session is sealed. Frames wait until a tare is known, and estimates leave together with the
-frames they are about.
+Used by `simulate` during acquisition, by `estimate` from a file, and by the server live and at
+sealing. Frames wait until a tare is known; estimates are returned together with their frames.
 """
 
 from __future__ import annotations
@@ -34,25 +33,25 @@ Columns = dict[str, npt.NDArray[Any]]
 _ESTIMATED = tuple(f.name for f in fields(Estimates) if f.name not in ("seq", "t_ns"))
 
 CHUNK = 1024
-"""Rows per step: more are no faster, and keep more of a wide array's columns in memory."""
+"""Rows per step: more are no faster, and need more memory for a wide array."""
 
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """What an estimate of a recording is asked to be."""
+    """Options of the estimate of a recording."""
 
     calibration: Calibration
     models: tuple[str, ...]
     lag_ms: float
     tare_s: tuple[float, float] | None = None
     tares: tuple[Tare, ...] = ()
-    """Tares that were taken while the stream ran, oldest first; they win over what can be found."""
+    """Tares of the time of recording, oldest first; they win over a tare found in the frames."""
     exact: bool = False
-    """Is nothing rounded?"""
+    """True: nothing is rounded."""
 
 
 class EstimateRun:
-    """Estimates of consecutive frames with one tare, each leaving with the frames it is about."""
+    """Estimates of consecutive frames with one tare, returned together with the frames."""
 
     def __init__(self, plan: EstimationPlan) -> None:
         self.plan = plan
@@ -60,40 +59,40 @@ class EstimateRun:
         self._held: deque[tuple[FrameBatch, Extra]] = deque()
 
     def kept(self) -> Columns:
-        """What it remembers, and the frames that still wait for their look-ahead."""
-        held: Columns = {}
+        """Return the state, with the frames that wait for their look-ahead."""
+        waiting: Columns = {}
         if self._held:
             frames = FrameBatch.concatenate([frames for frames, _ in self._held])
-            held = {f"held/{name}": column for name, column in vars(frames).items()}
+            waiting = {f"held/{name}": column for name, column in vars(frames).items()}
             for name in self._held[0][1]:
-                held[f"with/{name}"] = np.concatenate([extra[name] for _, extra in self._held])
-        return {f"run/{name}": c for name, c in self._estimator.kept().items()} | held
+                waiting[f"with/{name}"] = np.concatenate([extra[name] for _, extra in self._held])
+        return {f"run/{name}": c for name, c in self._estimator.kept().items()} | waiting
 
     @classmethod
     def going_on(cls, plan: EstimationPlan, kept: Columns) -> Self:
-        """One that goes on with what another has kept, as `Estimator.going_on`."""
+        """Create a run from the state of another one, as `Estimator.from_state`."""
         new = cls(plan)
         new._estimator = Estimator.going_on(plan, _under("run/", kept))
-        if held := _under("held/", kept):
-            new._held.append((FrameBatch(**held), _under("with/", kept)))
+        if waiting := _under("held/", kept):
+            new._held.append((FrameBatch(**waiting), _under("with/", kept)))
         return new
 
     def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Take the next frames; return those whose estimates are due, in order.
+        """Add the next frames; yield those whose estimates are due, in order.
 
-        In one piece for each `CHUNK` of frames: what is done for a piece is done the more rarely.
+        One batch per `ROWS_PER_STEP` frames, since each batch has a fixed cost.
         """
         for begin in range(0, len(frames), CHUNK):
             end = min(begin + CHUNK, len(frames))
             rows, rows_of = frames, extra
-            if end - begin < len(frames):  # a message that comes live is not cut
+            if end - begin < len(frames):  # do not copy a whole live message
                 rows = frames.rows(begin, end)
                 rows_of = {name: v[begin:end] for name, v in extra.items()}
             self._held.append((rows, rows_of))
             yield from _paired(self._held, self._estimator.step(rows))
 
     def finish(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Return the frames that still wait for their look-ahead: no more frames will come."""
+        """Yield the frames that still wait for their look-ahead: no more frames will come."""
         last = self._estimator.finish()
         self._estimator = Estimator(self.plan)
         if last is not None:
@@ -101,12 +100,12 @@ class EstimateRun:
 
 
 class EstimateStream:
-    """Estimates of one stream; `plan` is there once the tare is known.
+    """Estimates of one stream; `plan` is known once the tare is.
 
     Attributes:
-        plan: what the estimates begin with.
-        rounding: of all of them; known with `plan`.
-        tare: in force in the frames that came last.
+        plan: first plan of the estimates.
+        rounding: rounding of all estimates; known with `plan`.
+        tare: tare of the newest frames.
     """
 
     def __init__(self, info: ArrayInfo, options: EstimateOptions) -> None:
@@ -117,9 +116,9 @@ class EstimateStream:
         self._options = options
         self._run: EstimateRun | None = None
         self._over = 0
-        """So many changes of the tare have been."""
+        """Number of changes of the tare up to now."""
         self._last_t_mono_ns = 0
-        # Refuse now what would fail later: unknown models, tiles without calibration.
+        # Fail early: unknown models, tiles without calibration.
         if options.tare_s is not None and not 0 <= options.tare_s[0] < options.tare_s[1]:
             raise UsageError(
                 f"--tare-s {options.tare_s[0]:g},{options.tare_s[1]:g} is no interval",
@@ -131,11 +130,12 @@ class EstimateStream:
     def run(
         self, pieces: Iterable[tuple[FrameBatch, Extra]], *, ends: bool = True
     ) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Frames with their extra columns and estimates, rounded, in order, every frame once.
+        """Yield frames with their extra columns and estimates, rounded, in order, every frame once.
 
         Args:
-            pieces: the next frames.
-            ends: no more frames will come; else `kept` has those that wait for their look-ahead.
+            batches: next frames.
+            is_final: True: no more frames will come; else `state_dict` has the frames that wait for
+                their look-ahead.
 
         Raises:
             TareError: no tare can be found.
@@ -144,21 +144,21 @@ class EstimateStream:
             yield frames, self.rounding.rounded(columns)
 
     def kept(self) -> Columns:
-        """All that it remembers, for another one to go on with.
+        """Return the whole state, to resume from.
 
         Raises:
             TareError: no frame has come yet, so there is no tare.
         """
         if self.plan is None or self._run is None:
             raise TareError("the recording has no frames")
-        said = [self.plan.tare.as_dict(), self._over, self._last_t_mono_ns]
-        return {"stream": np.array(json.dumps(said)), **self._run.kept()}
+        content = [self.plan.tare.as_dict(), self._over, self._last_t_mono_ns]
+        return {"stream": np.array(json.dumps(content)), **self._run.kept()}
 
     def go_on(self, kept: Columns) -> None:
-        """Go on with what another stream of the same array and options has kept.
+        """Resume from the state of another stream with the same array and options.
 
         Raises:
-            ValueError: it is of another one.
+            ValueError: the state is of another one.
         """
         tare, self._over, self._last_t_mono_ns = json.loads(str(kept["stream"]))
         first = Tare.from_dict(tare, tiles=len(self._info.tiles))
@@ -168,10 +168,10 @@ class EstimateStream:
         self._run = EstimateRun.going_on(self.plan_of(self.tare), kept)
 
     def find_tare(self, pieces: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
-        """The tare that `run` would find in a recording; read is no more of it than that takes.
+        """Find the tare that `estimate_batches` would use; read no more than needed.
 
         Raises:
-            TareError: none can be found.
+            TareError: there is none.
         """
         return self._find_tare([frames for frames, _ in self._until_tare(iter(pieces))])
 
@@ -183,23 +183,23 @@ class EstimateStream:
             if self._options.tares:
                 run = self._begin(self._options.tares[0])
             else:
-                taken = self._until_tare(pieces)
-                run = self._begin(self._find_tare([frames for frames, _ in taken]))
-                pieces = chain(taken, pieces)
+                read_ahead = self._until_tare(pieces)
+                run = self._begin(self._find_tare([frames for frames, _ in read_ahead]))
+                pieces = chain(read_ahead, pieces)
         for frames, extra in pieces:
             rest, rest_of = frames, extra
             if not len(rest):
                 continue
-            if int(rest.t_mono_ns[0]) < self._last_t_mono_ns:  # the node was switched on again
+            if int(rest.t_mono_ns[0]) < self._last_t_mono_ns:  # the node was restarted
                 yield from run.finish()
             self._last_t_mono_ns = int(rest.t_mono_ns[-1])
             while (tare := self._next_tare()) is not None and int(rest.t_ns[-1]) > tare.t_ns:
-                at = int(np.searchsorted(rest.t_ns, tare.t_ns, side="right"))
-                if at:
-                    head = {name: v[:at] for name, v in rest_of.items()}
-                    yield from run.feed(rest.rows(0, at), head)
-                    rest = rest.rows(at, len(rest))
-                    rest_of = {name: v[at:] for name, v in rest_of.items()}
+                count = int(np.searchsorted(rest.t_ns, tare.t_ns, side="right"))
+                if count:
+                    head = {name: v[:count] for name, v in rest_of.items()}
+                    yield from run.feed(rest.rows(0, count), head)
+                    rest = rest.rows(count, len(rest))
+                    rest_of = {name: v[count:] for name, v in rest_of.items()}
                 yield from run.finish()
                 self._run = run = EstimateRun(self.plan_of(tare))
                 self.tare = tare
@@ -224,15 +224,15 @@ class EstimateStream:
     def _until_tare(
         self, pieces: Iterator[tuple[FrameBatch, Extra]]
     ) -> list[tuple[FrameBatch, Extra]]:
-        """Take pieces until the tare's interval has passed."""
-        taken: list[tuple[FrameBatch, Extra]] = []
+        """Read batches until the tare's interval has passed."""
+        batches: list[tuple[FrameBatch, Extra]] = []
         for piece in pieces:
-            taken.append(piece)
-            if self._tare_is_in(taken):
+            batches.append(piece)
+            if self._tare_is_in(batches):
                 break
-        if not taken:
+        if not batches:
             raise TareError("the recording has no frames")
-        return taken
+        return batches
 
     def _find_tare(self, frames: list[FrameBatch]) -> Tare:
         return take_tare(
@@ -244,7 +244,7 @@ class EstimateStream:
         )
 
     def plan_of(self, tare: Tare) -> EstimationPlan:
-        """Constants of the estimates with this tare."""
+        """Make the plan of the estimates with this tare."""
         options = self._options
         return make_plan(
             self._info, options.calibration, tare, models=options.models, lag_ms=options.lag_ms
@@ -261,34 +261,34 @@ class EstimateStream:
 
 
 def _under(prefix: str, kept: Columns) -> Columns:
-    """What is kept under a prefix, without it."""
+    """Return the columns with a prefix, without it."""
     return {n.removeprefix(prefix): column for n, column in kept.items() if n.startswith(prefix)}
 
 
 def _paired(
     held: deque[tuple[FrameBatch, Extra]], estimates: Estimates
 ) -> Iterator[tuple[FrameBatch, Columns]]:
-    """The oldest of the held frames, as many as there are estimates, with them.
+    """Yield the oldest waiting frames with their estimates, as many as there are.
 
-    In one piece as far as their numbers follow: a screen is told of a gap by what is between two.
+    One batch per run of consecutive numbers: subscribers see a gap between two batches.
     """
     pieces: list[tuple[FrameBatch, Extra]] = []
-    given = at = 0
-    while at < len(estimates):
+    first = end = 0
+    while end < len(estimates):
         frames, extra = held.popleft()
-        lack = len(estimates) - at
+        lack = len(estimates) - end
         if lack < len(frames):
             rest = {name: values[lack:] for name, values in extra.items()}
             held.appendleft((frames.rows(lack, len(frames)), rest))
             frames = frames.rows(0, lack)
             extra = {name: values[:lack] for name, values in extra.items()}
         if pieces and int(frames.seq[0]) != int(pieces[-1][0].seq[-1]) + 1:
-            yield _joined(pieces, estimates.rows(given, at))
-            pieces, given = [], at
+            yield _joined(pieces, estimates.rows(first, end))
+            pieces, first = [], end
         pieces.append((frames, extra))
-        at += len(frames)
+        end += len(frames)
     if pieces:
-        yield _joined(pieces, estimates.rows(given, at) if given else estimates)
+        yield _joined(pieces, estimates.rows(first, end) if first else estimates)
 
 
 def _joined(
@@ -302,19 +302,19 @@ def _joined(
 
 
 def estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
-    """Columns of a sealed file; `seq` and `t_ns` are the frames' own."""
+    """Return the estimates as columns of a sealed file, without `seq` and `t_ns`."""
     return {name: getattr(estimates, name) for name in _ESTIMATED}
 
 
 def notes_of(
     plan: EstimationPlan, rounding: Rounding, tares: tuple[Tare, ...] = ()
 ) -> dict[str, object]:
-    """What a file says of how its estimates were made; enough to make them again.
+    """Return the file metadata of the estimates; enough to compute them again.
 
     Args:
-        plan: constants of the estimate.
-        rounding: of its columns.
-        tares: all tares of the recording, if they were taken while it ran.
+        plan: plan of the estimates.
+        rounding: rounding of the columns.
+        tares: all tares of the recording, if they are of its time.
     """
     notes: dict[str, object] = {
         "calibration_id": plan.calibration.id,

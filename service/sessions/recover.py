@@ -1,9 +1,10 @@
-"""After a crash, without a server: journals are mended, and sessions completed from them.
+"""Recovery after a crash, without a server: mends journals and completes sessions.
 
-A session is sealed if all its frames are here or can never come; what is missing then is lost, for
-a reason. On a server's folder a node may still bring frames: such a session waits, unless it is
-given up. Every sealed file is read again and proven before it counts as recovered. It can be
-killed at any time: what was written is whole, and a second run comes to the same.
+A session is sealed if all its frames are stored or cannot come any more; the missing ones are lost,
+for a reason. On a server's folder a node may still send frames: such a session waits, unless its
+missing frames are abandoned. Every sealed file is read again and verified before it counts as
+recovered. Recovery can be killed at any time: files are written atomically, and a second run gives
+the same result.
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ Streams = Mapping[tuple[str, str], OpenedStream]
 
 @dataclass(frozen=True)
 class Recovered:
-    """What became of one session.
+    """Result of recovery for one session.
 
     Attributes:
-        session: as it is now.
-        outcome: waiting: its node may still bring frames.
-        problem: why it failed, or what it waits for.
-        ledger: what became of its frames, as far as that is known.
+        session: its new state.
+        outcome: waiting: its node may still send frames.
+        problem: reason of a failure or of waiting.
+        ledger: fate of its frames, if known.
     """
 
     session: Session
@@ -56,27 +57,31 @@ class Recovered:
 
 @dataclass
 class Recovery:
-    """What was done.
+    """Result of recovery for a data folder.
 
     Attributes:
-        sessions: that were not sealed before.
-        removed: half-written files of dead processes.
-        cut: bytes that were cut off, by journal; they are set aside, not deleted.
-        mended: sessions whose `events.parquet` was written again.
-        restored: sessions whose `session.json` was, from what lies beside it.
-        problems: what could not be recovered, beside sessions.
+        sessions: formerly unsealed sessions.
+        removed_temporaries: half-written files of dead processes.
+        cut_bytes: bytes that were cut off, by journal; they are set aside, not deleted.
+        rewritten_markers: sessions whose `events.parquet` was written again.
+        rebuilt_sessions: sessions whose `session.json` was rebuilt from the files beside it.
+        problems: further failures.
     """
 
     sessions: list[Recovered] = field(default_factory=list)
     removed: list[Path] = field(default_factory=list)
+    """half-written files of dead processes."""
     cut: dict[str, int] = field(default_factory=dict)
+    """bytes that were cut off, by journal; they are set aside, not deleted."""
     mended: list[str] = field(default_factory=list)
+    """sessions whose `events.parquet` was written again."""
     restored: list[str] = field(default_factory=list)
+    """sessions whose `session.json` was rebuilt from the files beside it."""
     problems: list[str] = field(default_factory=list)
 
     @property
     def is_nothing(self) -> bool:
-        """Was there nothing to do?"""
+        """True if there was nothing to do."""
         done = any(one.outcome != "waiting" for one in self.sessions)
         made = (self.removed, self.cut, self.mended, self.restored, self.problems)
         return not (done or any(made))
@@ -94,30 +99,30 @@ def recover(
     tell: Callable[[str], None] = _silent,
     now: Callable[[], datetime] = lambda: datetime.now(UTC),
 ) -> Recovery:
-    """Complete what a crash has left in a data folder, a server's or a node's.
+    """Complete a data folder, of a server or of a node, after a crash.
 
     Args:
-        data: the folder, whose lock the caller holds.
-        streams: make sessions for frames that belong to no session.
-        give_up: on a server's folder, seal what its nodes have not brought as lost.
-        tell: told what is being done.
-        now: for the ids of new sessions.
+        data: data folder; the caller holds its lock.
+        make_sessions: create sessions for frames that belong to no session.
+        abandon_missing: on a server's folder, seal frames that its nodes have not sent as lost.
+        report_step: called with a description of each step.
+        now: returns the time for ids of new sessions.
 
     Raises:
-        StorageError: the disk is full or not writable; what was done until then is whole.
+        StorageError: the disk is full or not writable; the steps before are complete.
     """
     recovery = Recovery()
     sessions = SessionFolder(data / "sessions")
     recovery.removed += remove_stale_temporaries(data)
     before = _unread(data)
     if _is_local(data):
-        settle_left_over(data)  # a killed node leaves its frames in flight in a file
+        settle_left_over(data)  # frames in flight of a killed node
     opened, recovery.problems = open_streams(data, tell, is_local=_is_local(data))
     for path in sorted(_unread(data) - before):
         name = f"{path.parent.parent.name}/{path.parent.name}"
         recovery.cut[name] = recovery.cut.get(name, 0) + path.stat().st_size
-    known, unreadable = sessions.load_all()
-    known.sort(key=lambda session: session.id)
+    loaded, unreadable = sessions.load_all()
+    loaded.sort(key=lambda session: session.id)
     for session_id, error in sorted(unreadable.items()):
         if not any(sessions.path(session_id).iterdir()):
             continue
@@ -127,7 +132,7 @@ def recover(
             recovery.restored.append(session_id)
     strays = [*sessions.strays(), *SessionFolder(data / "trash").strays()]
     recovery.problems += [str(stray.error) for stray in strays]
-    for session in known:
+    for session in loaded:
         if session.state == "sealed":
             if _mend_events(session, sessions.path(session.id)):
                 recovery.mended.append(session.id)
@@ -135,7 +140,7 @@ def recover(
         tell(f"session {session.id} ({session.name})")
         recovery.sessions.append(_complete(data, sessions, session, opened, give_up=give_up))
     if streams:
-        for session in _of_no_session(data, known, opened, now):
+        for session in _of_no_session(data, loaded, opened, now):
             tell(f"session {session.id} ({session.name})")
             recovery.sessions.append(_complete(data, sessions, session, opened, give_up=True))
     return recovery
@@ -144,22 +149,22 @@ def recover(
 def _complete(
     data: Path, sessions: SessionFolder, session: Session, opened: Streams, *, give_up: bool
 ) -> Recovered:
-    """Seal one session if that can be; say why not otherwise."""
-    own = {part.boot_id: opened.get((session.node, part.boot_id)) for part in session.parts}
-    for stream in own.values():
+    """Seal one session, or return the reason why not."""
+    own_streams = {part.boot_id: opened.get((session.node, part.boot_id)) for part in session.parts}
+    for stream in own_streams.values():
         if stream is not None:
-            with suppress(StorageError):  # its frames are worth more than its clock
+            with suppress(StorageError):  # frames matter more than clock measurements
                 session = session.with_clock(ClockLog(stream.journal.folder).rows())
     is_local, give_up = _is_local(data), give_up or session.given_up
-    session = _with_ends(session, own, is_local=is_local, give_up=give_up)
+    session = _with_ends(session, own_streams, is_local=is_local, give_up=give_up)
     if any(part.seq_last is None for part in session.parts):
         return Recovered(session, "waiting", "its node may still be recording it")
     for part in session.parts:
-        stream = own[part.boot_id]
+        stream = own_streams[part.boot_id]
         if stream is not None and part.seq_last is not None:
             stream.disown_damaged(part.seq_first, part.seq_last)
             stream.note_losses()
-    streams = _described(session, own, is_local=is_local)
+    streams = _described(session, own_streams, is_local=is_local)
     ledger = ledger_of(session.parts, states_of(session, streams), finished=True)
     if pending := ledger.pending:
         text = f"{pending} frames may still come from node {session.node}"
@@ -191,23 +196,23 @@ def _with_ends(
     is_local: bool,
     give_up: bool,
 ) -> Session:
-    """The session with its ends, as far as they are known."""
+    """Return the session with its parts closed, as well as they are known."""
     while True:
         streams = _described(session, own, is_local=is_local)
         try:
             if is_local or give_up:
-                ended = broken_off(session, streams)
-                return ended.model_copy(update={"given_up": not is_local})
+                closed = broken_off(session, streams)
+                return closed.model_copy(update={"given_up": not is_local})
             return at_stop(session, streams, waiting=True)
-        except DamagedFramesError as error:  # the frames that tell: ask the others
+        except DamagedFramesError as error:  # at the stop: retry without these frames
             _disown(own.values(), error)
 
 
 def _disown(streams: Iterable[OpenedStream | None], error: DamagedFramesError) -> None:
-    """Hold damaged frames no longer.
+    """Remove damaged frames from the stored ones.
 
     Raises:
-        DamagedFramesError: the same, if no stream held them.
+        DamagedFramesError: the same error, if no stream had these frames.
     """
     for stream in streams:
         if stream is not None and stream.journal.folder == Path(error.where).parent:
@@ -219,7 +224,7 @@ def _disown(streams: Iterable[OpenedStream | None], error: DamagedFramesError) -
 
 
 def _is_local(data: Path) -> bool:
-    """Is this a node's own folder? Then no more frames will come."""
+    """Return whether this is a node's own folder: then no more frames will come."""
     return not (data / "nodes").is_dir()
 
 
@@ -236,22 +241,22 @@ def _described(
 def _of_no_session(
     data: Path, known: list[Session], streams: Streams, now: Callable[[], datetime]
 ) -> list[Session]:
-    """Sessions for frames that belong to no session, one for each run of a stream."""
+    """Return new sessions for frames that belong to no session, one for each run of a stream."""
     # Frames of a deleted session must not come back as a new one. A session in the trash that
-    # cannot be read does not say which frames it has.
+    # cannot be read has unknown frames.
     known = [*known, *SessionFolder(data / "trash").load_all()[0]]
     found = []
     for (node, boot_id), stream in streams.items():
         parts = (part for session in known if session.node == node for part in session.parts)
-        taken = numbers_of(parts).get(boot_id, Intervals())
+        used = numbers_of(parts).get(boot_id, Intervals())
         journal, hello = stream.journal, hello_of(data, node)
         # Lost frames do not split a run; frames that belong to a session do.
-        own = (journal.held | stream.lost.all | stream.damaged) - taken
-        for run in own:
-            held = list(journal.held.within(*run))
-            if not held:
+        unused = (journal.held | stream.lost.all | stream.damaged) - used
+        for run in unused:
+            stored = list(journal.held.within(*run))
+            if not stored:
                 continue
-            first, last = held[0][0], held[-1][1]
+            first, last = stored[0][0], stored[-1][1]
             session = begun(
                 journal.info,
                 f"recovered {node} {boot_id}",
@@ -272,7 +277,7 @@ def _of_no_session(
 
 
 def _unread(data: Path) -> set[Path]:
-    """Files with what followed the last whole batch of a segment."""
+    """Return the files with bytes behind the last whole batch of a segment."""
     return set(data.glob("journal/*/*/*" + UNREAD_SUFFIX))
 
 

@@ -1,4 +1,4 @@
-"""The streams of a data folder that nothing uses: every journal opened, mended and described."""
+"""Streams of a data folder without a running process: every journal opened and mended."""
 
 from __future__ import annotations
 
@@ -23,23 +23,24 @@ from storage.sessions.folder import Session
 
 @dataclass
 class OpenedStream:
-    """One stream's journal, opened after a crash.
+    """Journal of one stream, opened after a crash.
 
     Attributes:
         journal: its frames.
         notes: its `stream.json`; None if there is none.
-        damaged: numbers that were here and cannot be read any more.
-        is_local: is it in its own node's folder?
+        damaged: frames that were stored and cannot be read any more.
+        is_node_folder: True: the stream is in its own node's folder.
     """
 
     journal: Journal
     notes: StreamNotes | None
     damaged: Intervals
     is_local: bool
+    """True: the stream is in its own node's folder."""
 
     @property
     def lost(self) -> Losses:
-        """Numbers that are known not to come, by reason."""
+        """Frames that cannot come any more, by reason."""
         lost = Losses(self.notes.lost if self.notes is not None else None)
         if self.is_local:
             lost.add(self.damaged, CORRUPT)
@@ -47,7 +48,7 @@ class OpenedStream:
         return lost
 
     def for_session(self, session: Session) -> SessionStream:
-        """What a session knows of it."""
+        """Return the stream's facts for a session."""
         notes, lost = self.notes or StreamNotes(array_info=self.journal.info), self.lost
         rows = [row for row in session.clock if row.boot_id == self.journal.info.boot_id]
         measured_ns = rows[-1].server_minus_node_ns if rows else None
@@ -66,10 +67,10 @@ class OpenedStream:
         )
 
     def note_losses(self) -> None:
-        """Write down what was found damaged: once it is cut off, nothing else says so.
+        """Save the damage found: once cut off, no other record exists.
 
-        On a server's folder they are not lost yet: the node may have these frames. Notes that
-        could not be read are replaced.
+        On a server's folder these frames are not lost yet: the node may have them. Unreadable notes
+        are replaced.
 
         Raises:
             StorageError: the disk is full or not writable.
@@ -86,21 +87,21 @@ class OpenedStream:
             self.notes.save(self.journal.folder)
 
     def disown_damaged(self, first: int, last: int) -> None:
-        """Read the frames held from `first` to `last`; those with a wrong checksum count as lost.
+        """Read the stored frames from `first` to `last`; frames with a wrong checksum are lost.
 
         Raises:
             StorageError: it cannot be read.
         """
-        at = first
-        while at <= last:
+        seq = first
+        while seq <= last:
             try:
-                for _ in self.journal.messages(at, last):
+                for _ in self.journal.messages(seq, last):
                     pass
             except DamagedFramesError as error:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
                 self.journal.disown(damaged)
                 self.damaged = self.damaged | (damaged - self.journal.held)
-                at = error.seq_last + 1
+                seq = error.seq_last + 1
             else:
                 return
 
@@ -108,15 +109,15 @@ class OpenedStream:
 def open_streams(
     data: Path, tell: Callable[[str], None], *, is_local: bool
 ) -> tuple[dict[tuple[str, str], OpenedStream], list[str]]:
-    """Open every journal of a data folder, which cuts off what is not whole and syncs the rest.
+    """Open every journal of a data folder; this cuts off partial batches and syncs the rest.
 
     Args:
         data: the data folder.
-        tell: told what is being done.
-        is_local: is it a node's own folder?
+        report_step: called with a description of each step.
+        is_node_folder: True: a node's own folder.
 
     Returns:
-        Streams by node and boot_id, and what could not be opened, in words.
+        Streams by node and stream id, and failures as text.
 
     Raises:
         StorageError: the disk is full or not writable.
@@ -144,7 +145,7 @@ def open_streams(
 
 
 def hello_of(data: Path, node: str) -> dict[str, Any]:
-    """The node's last hello as the server kept it; empty if there is none."""
+    """Read the node's last hello on the server's disk; empty if there is none."""
     try:
         content = json.loads(read_checked(data / "nodes" / node / "hello.json").text)
     except (OSError, ValueError, RecursionError):

@@ -1,9 +1,8 @@
-"""A sealed session whose `session.json` is damaged or gone, made again from the files beside it.
+"""Rebuilding of a damaged or missing `session.json` of a sealed session from the files beside it.
 
-The sealed file says of which session it is, with its parts and its ledger, and proves that; events
-and clock prove themselves. What only `session.json` had, subject, notes and tags, is lost, and the
-session says so. Of a session that is not sealed nothing else says which frames it needs: its
-folder stays as it is.
+The sealed file has the session's id, parts and ledger, with a checksum; so have markers and clock.
+Subject, notes and tags, which only `session.json` had, are lost, and the session reports that. For
+an unsealed session no other file has its needed frames: its folder is left unchanged.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ _T = TypeVar("_T")
 
 
 def restore(sessions: SessionFolder, session_id: str) -> Session | None:
-    """Set a damaged `session.json` aside, and write it again.
+    """Set a damaged `session.json` aside, and rebuild it.
 
     Args:
-        sessions: where the session is; the caller holds the lock of the data folder.
-        session_id: of a session that cannot be read.
+        sessions: folder of the session; the caller holds the lock of the data folder.
+        session_id: id of a session that cannot be read.
 
     Returns:
-        The session; None if nothing proves what it was, if it is of another version, or if its
+        Session; None if no file proves its content, if it is of another version, or if its
         `session.json` cannot be read now.
 
     Raises:
@@ -45,7 +44,7 @@ def restore(sessions: SessionFolder, session_id: str) -> Session | None:
     path = folder / SESSION_NAME
     try:
         if read_checked(path).is_proven:
-            return None  # whole, and written by another version
+            return None  # intact, but of another version
     except FileNotFoundError:
         what = f"its {SESSION_NAME} was gone"
     except StorageError:
@@ -88,7 +87,7 @@ def _session_of(folder: Path, what: str) -> Session | None:
         "calibration_source": notes.get("calibration_source", "node"),
         "events": events.events if events is not None else (),
         "clock": clock.offsets if clock is not None else (),
-        "problem": f"{what} and was made again from {FRAMES_NAME}; lost are {', '.join(lost)}",
+        "problem": f"{what} and was rebuilt from {FRAMES_NAME}; lost are {', '.join(lost)}",
         "ledger": file.ledger,
         "frames": file.frames,
         "duration_s": _duration_s(file),

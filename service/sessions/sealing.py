@@ -1,4 +1,4 @@
-"""From journals to a sealed session: frames in one Parquet file, what lies beside, its ledger."""
+"""Sealing of a session: journals to one Parquet file, its sidecars, and the ledger."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     """Write the session's files; return the sealed session.
 
     Args:
-        sources: what to seal; every part has an end.
-        folder: the session's own.
-        ledger: final.
+        inputs: inputs to seal; every part is closed.
+        folder: folder of the session.
+        ledger: final ledger.
 
     Raises:
         FootTileError: the disk is full, or a journal is damaged. The journals are untouched.
     """
     session = sources.session
     if not ledger.recorded:
-        update = {"state": "sealed", "ledger": ledger, "problem": "not one frame was recorded"}
+        update = {"state": "sealed", "ledger": ledger, "problem": "no frame was recorded"}
         return session.model_copy(update=update)
     frames, stances = SessionFrames(sources), StancesBeside()
     overview = OverviewBeside(len(sources.info.tiles))
@@ -82,4 +82,4 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
 
 
 _IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
-"""What the sealed file says of its session; names and notes may change later and are not in it."""
+"""Fields of a session in the sealed file; names and notes may change later and are not in it."""

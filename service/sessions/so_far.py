@@ -1,9 +1,8 @@
-"""What there is by now of a session that is not sealed: each frame is estimated once, on demand.
+"""Preview of unsealed sessions: each frame is estimated once, on demand.
 
-Frames come from the journals, so a restart of the server loses nothing of the picture, and nobody
-who does not look costs anything. Estimates are as they are live, with the tares that are known now.
-They are provisional: frames may still come between them, tares may follow, and sealing looks
-further ahead.
+Frames come from the journals, so a restart of the server loses nothing of a preview, and a session
+without viewers costs nothing. Estimates are as live, with the tares known now. They are
+provisional: further frames and tares may come, and sealing uses a longer look-ahead.
 """
 
 from __future__ import annotations
@@ -26,20 +25,20 @@ from storage.sessions.pyramid import frame_columns, on_axis
 from storage.sessions.so_far import BinsSoFar, thinned
 
 AT_ONCE_S = 0.5
-"""So long an answer may take to catch up; a long session is there after some of them."""
+"""Time budget of one update; a long session is complete after several."""
 _KEPT = 4
-"""Sessions of which something is remembered."""
+"""Number of sessions with a preview in memory."""
 _REST = 10
-"""What came too late between the others has those behind it estimated anew, in one tenth of the
-time."""
+"""Pause after repeated work, as a multiple of its time: late frames have those behind them
+estimated again."""
 
 
 class SoFar:
-    """A session as far as it was estimated.
+    """Estimates of one unsealed session up to some frame.
 
     Args:
-        sources: of the session.
-        folder: on whose disk estimators' memories are (`service.sessions.milestones`).
+        inputs: inputs of the session.
+        folder: folder on the disk for states of estimators (`service.sessions.checkpoints`).
     """
 
     def __init__(self, sources: Sources, folder: Path) -> None:
@@ -49,41 +48,41 @@ class SoFar:
         self._stream = stream_of(sources)
         self._at = Milestone()
         self._again = 0
-        """So many frames will leave that have left before."""
+        """Number of frames that will be estimated a second time."""
         self._once = 0
-        """So many frames were taken before it went back."""
+        """Number of frames that were fed before the last rewind."""
         self.took_s = 0.0
-        """What taking them again has cost."""
+        """Time spent on repeated work."""
         self.is_behind = False
-        """Is there more in the journals?"""
+        """True if the journals have more frames."""
 
     @property
     def is_estimated(self) -> bool:
-        """Are there forces, or only raw counts?"""
+        """True if there are estimates, not only raw counts."""
         return self._stream is not None
 
     def is_of(self, sources: Sources) -> bool:
-        """Is anything of what was taken still true?"""
+        """Return whether part of the preview is valid for these inputs."""
         before = self._sources
         same = sources.info == before.info and sources.calibration == before.calibration
         tares = sources.tares[: len(before.tares)]
         return same and tares == before.tares and (stream_of(sources) is None) != self.is_estimated
 
     def places(self, sources: Sources) -> list[Milestone]:
-        """Places up to which everything is still as it was: the beginning, and perhaps more."""
-        known = self.milestones.all
+        """Return the checkpoints before any change: the beginning, and perhaps more."""
+        checkpoints = self.milestones.all
         if not self.is_of(sources):
             return [Milestone()]
-        count = bisect_left(known, True, key=lambda place: not self._is_true(place, sources))
-        return list(known[: max(1, count)])
+        count = bisect_left(checkpoints, True, key=lambda place: not self._is_true(place, sources))
+        return list(checkpoints[: max(1, count)])
 
     def take(self, sources: Sources) -> None:
-        """Estimate what has come since; `is_of` is true of `sources`, which are those of now.
+        """Estimate the frames that have come; `can_use` is true of `inputs`, the present ones.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
         """
-        if self.is_estimated and is_warming():  # or it would compile here
+        if self.is_estimated and is_warming():  # else it would compile here
             self.is_behind = True
             return
         begun_s, is_again = time.monotonic(), self._at.taken < self._once
@@ -104,31 +103,31 @@ class SoFar:
             self.took_s += time.monotonic() - begun_s
 
     def is_overtaken(self, sources: Sources) -> bool:
-        """Is something else now of what was taken?"""
+        """Return whether frames or tares before the present position have changed."""
         return not self._is_true(self._at, sources)
 
     def go_back(self, sources: Sources) -> None:
-        """Forget what is behind the last place up to which everything is as it was."""
+        """Drop everything after the last valid checkpoint."""
         all_, true = self.milestones.all, self.places(sources)
-        kept = self._bins.cut(true[-1].left)
-        # One frame at least comes again, so that it is known what the next one follows.
-        at = max(0, bisect_left(true, max(kept, 1), key=lambda place: place.left) - 1)
-        at, self._stream = self.milestones.stream_at(all_, at, sources)
-        self.milestones.go_back(at + 1)
-        place = all_[at]
+        kept_frames = self._bins.cut(true[-1].left)
+        # Repeat one frame at least: its number shows whether the next one follows it.
+        index = max(0, bisect_left(true, max(kept_frames, 1), key=lambda place: place.left) - 1)
+        index, self._stream = self.milestones.stream_at(all_, index, sources)
+        self.milestones.go_back(index + 1)
+        place = all_[index]
         self.begin_again(self)
         self._at = Milestone(
             place.part, place.seq, place.taken, place.left, place.newest_ns, place.last
         )
-        self._again = kept - place.left
+        self._again = kept_frames - place.left
         self._sources = sources
 
     def begin_again(self, before: SoFar) -> None:
-        """What another has taken is taken again."""
+        """Start measuring repeated work, up to the position of another preview."""
         self._once, self.took_s = before._at.taken, 0.0
 
     def seen(self, part: Slice, points: int) -> Seen:
-        """Some time of it as bins, four times as many as points at most.
+        """Return a slice as bins, at most four times as many as points.
 
         Raises:
             StateError: there is no frame yet.
@@ -146,46 +145,52 @@ class SoFar:
         return Seen(found, count * self._bins.frames_in_bin, begin_ns, end_ns, axis)
 
     def _feed(self, frames: FrameBatch, extra: Columns) -> None:
-        """Take the next frames."""
-        at = self._at
+        position = self._at
         pieces = [(frames, extra)]
         due = iter(pieces) if self._stream is None else self._stream.run(pieces, ends=False)
         names = frame_columns(estimated=self.is_estimated)
-        for left, columns in due:
-            own = {name: getattr(left, name) for name in names if name not in columns}
-            own |= {name: columns[name] for name in (*names, "part") if name in columns}
-            self._again -= self._bins.feed(own, there=self._again)
-            self.milestones.note(left.t_ns)
-            at.left += len(left)
-            at.last = int(columns["part"][-1]), int(left.t_ns[-1])
-        at.part, at.seq = int(extra["part"][-1]), int(frames.seq[-1]) + 1
-        at.taken += len(frames)
-        at.newest_ns = max(at.newest_ns, int(frames.t_ns.max()))
-        if at.taken - self.milestones.all[-1].taken >= self.milestones.every:
-            place = Milestone(at.part, at.seq, at.taken, at.left, at.newest_ns, at.last)
+        for estimated, columns in due:
+            fields = {name: getattr(estimated, name) for name in names if name not in columns}
+            fields |= {name: columns[name] for name in (*names, "part") if name in columns}
+            self._again -= self._bins.feed(fields, there=self._again)
+            self.milestones.note(estimated.t_ns)
+            position.left += len(estimated)
+            position.last = int(columns["part"][-1]), int(estimated.t_ns[-1])
+        position.part, position.seq = int(extra["part"][-1]), int(frames.seq[-1]) + 1
+        position.taken += len(frames)
+        position.newest_ns = max(position.newest_ns, int(frames.t_ns.max()))
+        if position.taken - self.milestones.all[-1].taken >= self.milestones.every:
+            place = Milestone(
+                position.part,
+                position.seq,
+                position.taken,
+                position.left,
+                position.newest_ns,
+                position.last,
+            )
             self.milestones.add(place, None if self._stream is None else self._stream.kept())
 
     def _is_true(self, place: Milestone, sources: Sources) -> bool:
-        """Is everything before a place as it was when it was taken?"""
+        """Return whether nothing before a checkpoint has changed since."""
         tares = sources.tares[len(self._sources.tares) :]
         if any(tare.t_ns < place.newest_ns for tare in tares):
             return False
-        held = 0
+        stored_frames = 0
         for i, each in enumerate(sources.session.parts[: place.part + 1]):
             journal = sources.journals.get(each.boot_id)
             ends = [place.seq - 1] if i == place.part else []
             ends += [each.seq_last] if each.seq_last is not None else []
             last = min(ends, default=-1)
             if journal is not None and last >= each.seq_first:
-                held += journal.held.within(each.seq_first, last).count
-        return held == place.taken
+                stored_frames += journal.held.within(each.seq_first, last).count
+        return stored_frames == place.taken
 
 
 class SoFars:
-    """What is remembered of sessions that are not sealed; of few, those asked for last.
+    """Previews of unsealed sessions; only the most recently used are kept.
 
     Args:
-        folder: on whose disk it is, as far as it is not in memory.
+        folder: folder on the disk for states of estimators.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -195,7 +200,7 @@ class SoFars:
         self._one_at_a_time = threading.Lock()
 
     def taken(self, sources: Sources) -> SoFar:
-        """A session with what has come by now.
+        """Return a session's preview, updated with the present frames.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
@@ -204,16 +209,16 @@ class SoFars:
             return self._taken(sources)
 
     def nearly(self, sources: Sources) -> SoFar:
-        """The same, but that nobody waits until it has caught up.
+        """Return a session's preview without waiting for a long catch-up.
 
         Raises:
-            FootTileError: likewise.
+            FootTileError: a journal is damaged, or cannot be read.
         """
         so_far = self._of.get(sources.session.id)
         return so_far if so_far is not None and so_far.is_behind else self.taken(sources)
 
     def forget(self, session_id: str) -> None:
-        """It is sealed, or gone."""
+        """Remove the preview of a session that is sealed or gone."""
         self._of.pop(session_id, None)
         self._again_s.pop(session_id, None)
 

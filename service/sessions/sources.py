@@ -1,6 +1,6 @@
-"""What a session is made from: its frames, the array, calibration, tares, notes for its file.
+"""Inputs of a session: frames, array, calibration, tares, metadata.
 
-The same for a session that is sealed, given away before that, recovered, or recorded on a node.
+The same whether a session is sealed, exported before that, recovered, or recorded on a node.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from storage.sessions.time_axis import NODE_AXIS, PartSpan, TimeAxis, time_axis
 
 @dataclass(frozen=True)
 class Sources:
-    """What a session is sealed from.
+    """Inputs from which a session is sealed.
 
     Attributes:
-        session: intervals, events, clock.
+        session: intervals, markers, clock.
         info: description of the array in its first part.
-        journals: by boot_id.
-        calibration: to estimate with; None: raw frames only.
-        problem: why there is none.
-        tares: that were in force, oldest first; `Tare.lost` where one is lost.
-        notes: more for the file's metadata.
-        exact: are estimates not rounded?
+        journals: journals by stream id.
+        calibration: calibration for estimates; None: raw frames only.
+        problem: reason why there is none.
+        tares: tares in force, oldest first; `Tare.lost` where one is lost.
+        notes: further metadata for the file.
+        exact: True: estimates are not rounded.
     """
 
     session: Session
@@ -48,26 +48,26 @@ class Sources:
 
     @property
     def streams(self) -> tuple[StreamFacts, ...]:
-        """What is known of the clocks of the session's streams."""
+        """Facts about the clocks of the session's streams."""
         boot_ids = dict.fromkeys(part.boot_id for part in self.session.parts)
-        known = {boot_id: journal.info for boot_id, journal in self.journals.items()}
-        known[self.info.boot_id] = self.info
+        infos = {boot_id: journal.info for boot_id, journal in self.journals.items()}
+        infos[self.info.boot_id] = self.info
         return tuple(
             StreamFacts(boot_id, info.utc_offset_ns, info.clock_set)
-            if (info := known.get(boot_id)) is not None
+            if (info := infos.get(boot_id)) is not None
             else StreamFacts(boot_id)
             for boot_id in boot_ids
         )
 
     def clock_table(self) -> ClockTable:
-        """The clock table of a session that is not sealed yet."""
+        """Return the clock table of a session that is not sealed yet."""
         parts = [part.boot_id for part in self.session.parts]
         where = f"session {self.session.id}"
         rows = rows_by_stream(self.session.clock, where=where)
         return ClockTable(rows, self.streams, parts, where=where)
 
     def time_axis(self) -> TimeAxis:
-        """Find the time axis of a session that is not sealed yet, by what there is of it.
+        """Compute the time axis of a session that is not sealed yet, from its present frames.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
@@ -81,12 +81,12 @@ class Sources:
             if journal is None:
                 continue
             end = NO_END if part.seq_last is None else part.seq_last
-            held = journal.held.within(part.seq_first, end)
-            if held.first is None or held.last is None:
+            stored = journal.held.within(part.seq_first, end)
+            if stored.first is None or stored.last is None:
                 continue
             first, last = (
                 FrameBatch.concatenate(list(journal.read(seq, seq)))
-                for seq in (held.first, held.last)
+                for seq in (stored.first, stored.last)
             )
             t_mono_ns = int(first.t_mono_ns[0]), int(last.t_mono_ns[-1])
             t_ns = int(first.t_ns[0]), int(last.t_ns[-1])
@@ -104,15 +104,15 @@ def sources_of(
     no_array: ArrayInfo | None = None,
     exact: bool = False,
 ) -> Sources:
-    """What a session is made from.
+    """Collect the inputs of a session.
 
     Args:
         session: the session.
-        streams: by boot_id, of all of its parts.
-        tares: gives those of its node; None: nothing is kept of them.
-        emulated: are its frames emulated? None: not known.
-        no_array: used as the array if no stream describes one.
-        exact: are estimates not rounded?
+        streams: facts by stream id, for all of its parts.
+        load_tares: returns the tares of its node; None: there is no history.
+        emulated: True: its frames are emulated; None: unknown.
+        default_array: array if no stream describes one.
+        exact: True: estimates are not rounded.
     """
     infos = [streams[part.boot_id].info for part in session.parts]
     info = next((info for info in infos if info is not None), no_array or _no_array(session))
@@ -154,10 +154,10 @@ def _calibration_of(session: Session) -> tuple[Calibration | None, str | None]:
 def _tares_of(
     session: Session, streams: Mapping[str, SessionStream], history: TareHistory, info: ArrayInfo
 ) -> tuple[tuple[Tare, ...], str | None]:
-    """Tares that were in force while it was recorded, by the frames' own instants.
+    """Return the tares in force during the session, by the frames' times.
 
     Returns:
-        The tares, oldest first; none, and a reason, if there are tares, but none of that time.
+        Tares, oldest first; none, and a reason, if all tares are of another time.
     """
     first, last = session.parts[0], session.parts[-1]
     seq_last = last.seq_last if last.seq_last is not None else NO_END
@@ -172,7 +172,7 @@ def _tares_of(
 
 
 def _no_array(session: Session) -> ArrayInfo:
-    """Stands for the array of a session that has no frames left."""
+    """Return the array of a session without frames."""
     return ArrayInfo(
         node=session.node,
         boot_id=session.parts[0].boot_id,

@@ -1,6 +1,6 @@
-"""Stances of sealed sessions: gathered while frames are written, or made again from the file.
+"""Stances of sealed sessions: found while frames are written, or later from the file.
 
-They are of the numbers that are in the file, in single precision: both ways come to the same bytes.
+They are computed from the numbers in the file, in single precision: both ways give the same bytes.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ log = logging.getLogger("foottile.stances")
 
 _NEEDED = (*GATHERED, "part")
 _ROWS = 1 << 14
-"""Frames that wait until they are looked at together: half a megabyte of a minute or less."""
-_NOT_WRITTEN = f"{STANCES_NAME} was not written, and is made again when it is asked for"
+"""Number of frames that are analysed together: half a megabyte, a minute or less."""
+_NOT_WRITTEN = f"{STANCES_NAME} was not written, and is rebuilt on request"
 
 
 class StancesBeside:
-    """Gathers the stances of frames that are being sealed, and writes them beside these.
+    """Finder of the stances of frames that are being sealed.
 
-    Whatever goes wrong with that holds no session up: it is said, and they are made again later.
+    A failure does not affect the session: it is reported, and the stances are found later.
 
     Attributes:
-        problem: why they are not there; None: they are, or there are no estimates.
+        problem: reason why they are missing; None: they are written, or there are no estimates.
     """
 
     def __init__(self) -> None:
@@ -53,18 +53,18 @@ class StancesBeside:
         t_ns: npt.NDArray[np.int64],
         columns: Mapping[str, npt.NDArray[Any]],
     ) -> None:
-        """Take the next frames with their columns; without estimates there are no stances."""
+        """Add the next frames with their columns; without estimates there are no stances."""
         if self.problem is not None or "contact" not in columns:
             return
         self._has_estimates = True
-        kept = {name: columns[name] for name in _NEEDED if name in columns}
-        self._waiting.append({"seq": seq, "t_ns": t_ns, **kept})
+        needed = {name: columns[name] for name in _NEEDED if name in columns}
+        self._waiting.append({"seq": seq, "t_ns": t_ns, **needed})
         self._rows += len(seq)
         if self._rows >= _ROWS:
             self._take_waiting()
 
     def write(self, folder: Path, frames_sha256: str) -> None:
-        """Write `stances.parquet`; without estimates, take away what an attempt before has left."""
+        """Write `stances.parquet`; without estimates, delete the file of an earlier attempt."""
         path = folder / STANCES_NAME
         if not self._has_estimates:
             with suppress(OSError):
@@ -80,13 +80,13 @@ class StancesBeside:
                 self.problem = f"{_NOT_WRITTEN}: {error}"
 
     def table(self) -> pa.Table:
-        """All stances; no more frames will come."""
+        """Return all stances; no more frames will come."""
         self._take_waiting()
         self._over += self._gathered.finish()
         return stances_table(stance.as_dict() for stance in self._over)
 
     def _take_waiting(self) -> None:
-        """Many frames at once: what is done for a piece is done the more rarely."""
+        """Analyse the waiting frames together, which is faster than piece by piece."""
         waiting, self._waiting, self._rows = self._waiting, [], 0
         if not waiting or self.problem is not None:
             return
@@ -96,7 +96,7 @@ class StancesBeside:
                 for name in waiting[0]
             }
             self._over += self._gathered.feed(columns["seq"], columns["t_ns"], columns)
-        except Exception as error:  # a session is worth more than what can be made from it again
+        except Exception as error:  # never fail a session for a derived file
             log.exception("stances: this is a bug")
             self.problem = f"{_NOT_WRITTEN}: {error}"
 
@@ -104,12 +104,12 @@ class StancesBeside:
 def stances_of_session(
     folder: Path, *, frames_sha256: str | None = None, keep: bool = False
 ) -> pa.Table:
-    """The stances of a sealed session as a table: those beside it, else made from its frames.
+    """Return the stances of a sealed session as a table: from their file, else from its frames.
 
     Args:
-        folder: the session's.
-        frames_sha256: file hash of its frames, if it is known; else it is computed.
-        keep: write those that had to be made beside the frames, if the folder can be written to.
+        folder: folder of the session.
+        frames_sha256: hash of the file of frames; computed if None.
+        store: store stances that had to be computed, if the folder is writable.
 
     Raises:
         UnknownError: it has no estimates.
@@ -131,7 +131,7 @@ def stances_of_session(
 
 
 def stances_in(session: SessionReader) -> pa.Table:
-    """Stances of a sealed file.
+    """Compute the stances of a sealed file.
 
     Raises:
         UnknownError: it has no estimates.
@@ -161,5 +161,5 @@ def _hash_of(path: Path) -> str:
 
 
 def _single(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Numbers as the file keeps them."""
+    """Convert numbers to the precision of the file."""
     return values.astype(np.float32) if values.dtype == np.float64 else values

@@ -1,8 +1,8 @@
-"""`tares.json`: the tares of one node on disk, each of which proves itself.
+"""File `tares.json` with the tares of one node, each with a checksum.
 
-A tare is a line with a hash of its own text, and says which of how many it is. So whatever is
-changed in the file, cut off, taken out, doubled or moved: the tares that are whole are read, and
-where others are missing among them is known. What they said is not: a `LostTares` stands for them.
+A line per tare, with a hash of the line, its number and the total. Whatever is changed in the file,
+cut off, removed, doubled or moved: the whole tares are read, and the places of missing ones are
+known. A `LostTares` stands for those.
 """
 
 from __future__ import annotations
@@ -33,30 +33,33 @@ _LINE = re.compile(
 
 @dataclass(frozen=True)
 class RecordedTare:
-    """A tare, the tiles it is of, why it was taken, and what became of it."""
+    """Tare of certain tiles, with its reason."""
 
     id: str
     serials: tuple[str, ...]
     tare: Tare
     undone: bool = False
     reason: str = ""
-    """In words."""
+    """Reason, as text."""
     chips: tuple[tuple[int, ...], ...] | None = None
-    """Coefficients of the tiles' chips; None in tares of older versions, which kept none."""
+    """Coefficients of the tiles' chips; None in tares of older versions."""
 
     def is_of(self, info: ArrayInfo) -> bool:
-        """Does it belong to these tiles? A swapped part has the same serial but another chip."""
+        """Return whether it is of these tiles, by serials and chips.
+
+        A swapped part has the same serial but another chip.
+        """
         return self.serials == info.serials and self.chips in (None, chips_of(info))
 
     @property
     def is_automatic(self) -> bool:
-        """Did it come unasked?"""
+        """True if it was taken in flight."""
         return self.tare.source == "flight"
 
 
 @dataclass(frozen=True)
 class LostTares:
-    """One tare, or some in a row, of which nothing is known but their place in the order."""
+    """One or more lost tares in a row, of unknown content."""
 
 
 Entry = RecordedTare | LostTares
@@ -65,12 +68,12 @@ LOST = LostTares()
 
 @dataclass(frozen=True)
 class TaresFound:
-    """What a file holds.
+    """Content of a file.
 
     Attributes:
-        entries: in the order in which they were taken.
-        problem: what is wrong with it, in words; None: it is as it was written.
-        is_damaged: is it to be set aside?
+        entries: tares in their order of time.
+        problem: error of the file, as text; None: it is whole.
+        is_damaged: True: it has to be set aside.
     """
 
     entries: tuple[Entry, ...]
@@ -79,12 +82,12 @@ class TaresFound:
 
 
 def chips_of(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
-    """Coefficients of an array's chips."""
+    """Return the coefficients of an array's chips."""
     return tuple(tuple(tile.coefficient_words) for tile in info.tiles)
 
 
 def read_tares(path: Path) -> TaresFound:
-    """Whatever can be proven in a file, and a `LostTares` wherever something else was.
+    """Read all intact tares of a file, with a `LostTares` in place of others.
 
     Raises:
         StorageError: it cannot be read now.
@@ -95,7 +98,7 @@ def read_tares(path: Path) -> TaresFound:
         return _missing(path)
     except DamagedFileError as error:
         return TaresFound((LOST,), f"{error.what}: all of its tares are lost", is_damaged=True)
-    is_proven, what = False, "it is no whole list of tares"
+    is_proven, what = False, "not a complete list of tares"
     try:
         is_proven = checked(text, where=str(path)).is_proven
         older = None if is_proven else _of_older_version(text)
@@ -110,7 +113,7 @@ def read_tares(path: Path) -> TaresFound:
 
 
 def write_tares(path: Path, entries: Sequence[Entry]) -> None:
-    """Write all of them, in the order in which they were taken.
+    """Write all tares, in their order of time.
 
     Raises:
         StorageError: the disk is full or not writable; the old file is still there then.
@@ -124,7 +127,7 @@ def write_tares(path: Path, entries: Sequence[Entry]) -> None:
 
 
 def _missing(path: Path) -> TaresFound:
-    """No file: there were no tares, unless a damaged file was set aside and no other written."""
+    """Return the content without a file: none, unless a damaged file was set aside."""
     try:
         was_set_aside = any(path.parent.glob(path.name + ASIDE + "*"))
     except OSError:
@@ -143,14 +146,14 @@ def _in_words(lost: int | None) -> str:
 
 
 def _proven(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
-    """Entries in order, and how many of them were lost now; None: not even that is known."""
+    """Return entries in order, and the number of lost ones; None: not even that is known."""
     places: dict[int, set[bytes]] = {}
     totals = set()
     for line in _LINE.finditer(text):
-        body, number, of, digits = line.groups()
+        body, number, total, digits = line.groups()
         if _hash(body) == digits:
             places.setdefault(int(number), set()).add(body)
-            totals.add(int(of))
+            totals.add(int(total))
     if len(totals) != 1:
         return (LOST,), None
     entries: list[Entry] = []
@@ -164,12 +167,12 @@ def _proven(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
 
 
 def in_order(entries: Iterable[Entry]) -> tuple[Entry, ...]:
-    """The same; of lost ones in a row one stands for all."""
-    kept: list[Entry] = []
+    """Return the entries with each run of lost ones merged into one."""
+    merged: list[Entry] = []
     for entry in entries:
-        if not (isinstance(entry, LostTares) and kept and kept[-1] == entry):
-            kept.append(entry)
-    return tuple(kept)
+        if not (isinstance(entry, LostTares) and merged and merged[-1] == entry):
+            merged.append(entry)
+    return tuple(merged)
 
 
 def _content(entry: Entry) -> dict[str, object]:
@@ -186,7 +189,7 @@ def _content(entry: Entry) -> dict[str, object]:
 
 
 def _entry(content: Mapping[str, Any]) -> Entry | None:
-    """None if it is of another version."""
+    """Parse an entry; None if it is of another version."""
     if content.get("lost") is True:
         return LOST
     try:
@@ -208,7 +211,7 @@ def _recorded(entry: Mapping[str, Any]) -> RecordedTare:
 
 
 def _of_older_version(text: bytes) -> tuple[RecordedTare, ...] | None:
-    """Tares of a plain list, as it was written before there were hashes; None if it is none."""
+    """Parse a plain list of an older version, without hashes; None if it is none."""
     try:
         content = json.loads(text)
         if not isinstance(content, list):

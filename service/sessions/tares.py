@@ -1,8 +1,8 @@
-"""The tares of one node: which is in force, which were before, which were undone. Kept on disk.
+"""History of one node's tares, stored on disk: in force, former, undone.
 
-Automatic tares (source "flight") come unasked, so they have rules of their own: of many the older
-ones are thinned out, never one that was taken by hand; and when one is undone, no other follows
-until one is taken by hand: an undone tare says that automatic ones are not trusted now.
+Automatic tares (source "flight") have rules of their own: the older ones are thinned out, never one
+by hand; and after an undone one no other follows until a tare by hand: an undo means that automatic
+tares are not trusted now.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from storage.durable import make_folder, set_aside, storage_errors
 
 KEPT_MAX = 1000
 AUTOMATIC_KEPT_MAX = 200
-"""Above this number the older half is thinned out, which keeps the trend over hours."""
+"""Limit of automatic tares; beyond it the older half is thinned out, which preserves the trend."""
 REASON_LENGTH_MAX = 200
 
 
 class TareHistory:
-    """Tares in the order they were taken; the newest that was not undone is in force.
+    """Tares in their order of time; the newest that was not undone is in force.
 
-    If one of them is damaged on disk, nothing is in force from the one before it until the next: it
-    is not known whose tiles it was of, nor whether it was undone, and none that is older takes its
-    place. What was damaged is set aside, and the others are written anew.
+    If a tare is damaged on disk, no tare is in force from the one before it until the next: its
+    tiles and whether it was undone are unknown, and no older one takes its place. The damaged file
+    is set aside, and the other tares are written again.
 
     Args:
-        path: file to keep them in.
+        path: file of the history.
 
     Raises:
-        StorageError: it cannot be read now, or is damaged and not set aside: it may hold what is
-            nowhere else, so nothing is written in its place.
+        StorageError: it cannot be read now, or is damaged and not set aside: it may hold the only
+            copy, so nothing is written in its place.
     """
 
     def __init__(self, path: Path) -> None:
@@ -53,61 +53,61 @@ class TareHistory:
         found = read_tares(path)
         self._entries: tuple[Entry, ...] = found.entries
         self.problem: str | None = None
-        """What was wrong with the file when it was read, and what became of it."""
+        """Damage of the file when it was read, and the consequence."""
         if found.problem is not None:
             self._mend(found.problem, is_damaged=found.is_damaged)
 
     def _mend(self, problem: str, *, is_damaged: bool) -> None:
-        done = f"it is kept as {set_aside(self._path).name}" if is_damaged else "it is written anew"
+        done = f"it is kept as {set_aside(self._path).name}" if is_damaged else "it is rewritten"
         try:
             self._keep(self._entries)
         except StorageError as error:
-            done = f"that cannot be mended: {error}"
+            done = f"it cannot be rewritten: {error}"
         self.problem = f"{self._path}: {problem}; {done}"
 
     @property
     def all(self) -> list[RecordedTare]:
-        """All that are known, oldest first."""
+        """All known tares, oldest first."""
         return [entry for entry in self._entries if isinstance(entry, RecordedTare)]
 
     def is_empty(self, info: ArrayInfo) -> bool:
-        """Was there never a tare that may be of this array, or were all undone?"""
+        """Return whether no tare of this array is in the history, counting lost ones."""
         return not self._of(info) and not any(isinstance(e, LostTares) for e in self._entries)
 
     def in_force(self, info: ArrayInfo) -> RecordedTare | None:
-        """The one in force for an array; tares of other tiles do not count.
+        """Return the tare in force for an array; None if there is none, or if it is lost.
 
-        None if there is none, or if it is lost.
+        Tares of other tiles do not count.
         """
         fitting = self._since_lost(info)
         return fitting[-1] if fitting else None
 
     def is_lost(self, info: ArrayInfo) -> bool:
-        """Is one lost that may be the one in force?"""
+        """Return whether a lost tare may be the one in force."""
         lost = any(isinstance(entry, LostTares) for entry in self._entries)
         return lost and not self._since_lost(info)
 
     def may_have_held(self, t_ns: int) -> bool:
-        """May one that is lost have been taken at this instant?"""
+        """Return whether a lost tare may have this time."""
         return any(first <= t_ns <= last for first, last in self._gaps())
 
     def to_use(self, info: ArrayInfo) -> Tare | None:
-        """What to estimate with: the tare in force, what stands for a lost one, or none."""
+        """Return the tare for estimates: in force, the stand-in of a lost one, or None."""
         in_force = self.in_force(info)
         if in_force is not None:
             return in_force.tare
         return Tare.lost(tiles=len(info.tiles), t_ns=0) if self.is_lost(info) else None
 
     def anchor(self, info: ArrayInfo) -> RecordedTare | None:
-        """What automatic tares are compared with: the last other tare, else the oldest.
+        """Return the reference of automatic tares: the last other one, else the oldest.
 
-        None before a lost one counts: that may have been the last other tare.
+        Tares before a lost one do not count: the lost one may have been the last other tare.
         """
         fitting = self._since_lost(info)
         return next((t for t in reversed(fitting) if not t.is_automatic), (*fitting, None)[0])
 
     def is_automatic_paused(self, info: ArrayInfo) -> bool:
-        """Was an automatic tare undone, with no other kind taken since?"""
+        """Return whether an automatic tare was undone, with no other kind of tare since."""
         for recorded in reversed(self.all):
             if not recorded.is_of(info):
                 continue
@@ -118,22 +118,22 @@ class TareHistory:
         return False
 
     def valid(self, info: ArrayInfo) -> tuple[Tare, ...]:
-        """All that were not undone, in the order they were taken."""
+        """Return all tares that were not undone, in their order of time."""
         return tuple(recorded.tare for recorded in self._of(info))
 
     def during(self, info: ArrayInfo, begin_t_ns: int, end_t_ns: int) -> tuple[Tare, ...]:
-        """Tares that were in force at some time of an interval, oldest first.
+        """Return the tares in force at some time of an interval, oldest first.
 
-        Those are the last one before it and all within; if it began without, the first within
-        serves from the beginning on. Where one is lost, `Tare.lost` stands for it from the instant
-        on at which it may have been in force.
+        Those are the last one before it and all within; without one before, the first within is
+        used from the beginning on. `Tare.lost` stands for a lost one, from the earliest time at
+        which it may have been in force.
         """
         gaps = list(self._gaps())
-        known = [(recorded.tare.t_ns, recorded.tare) for recorded in self._of(info)]
+        valid = [(recorded.tare.t_ns, recorded.tare) for recorded in self._of(info)]
         fitting = [
             (t_ns, tare)
-            for t_ns, tare in known
-            # A lost one may have been taken after it.
+            for t_ns, tare in valid
+            # A lost tare may be newer than this one.
             if not any(first < t_ns < last for first, last in gaps)
         ]
         tiles = len(info.tiles)
@@ -146,11 +146,11 @@ class TareHistory:
         return tuple(before + within)
 
     def _gaps(self) -> Iterator[tuple[int, int]]:
-        """Between which instants lost tares were taken: those of the tares next to them."""
-        for at, entry in enumerate(self._entries):
+        """Yield the intervals of lost tares: between the times of their neighbours."""
+        for index, entry in enumerate(self._entries):
             if isinstance(entry, LostTares):
-                beside = self._t_ns(at - 1, _EVER[0]), self._t_ns(at + 1, _EVER[1])
-                # A clock that was set back in between has them the other way round.
+                beside = self._t_ns(index - 1, _EVER[0]), self._t_ns(index + 1, _EVER[1])
+                # A clock that was set back reverses their order.
                 yield min(beside), max(beside)
 
     def _t_ns(self, at: int, otherwise: int) -> int:
@@ -158,15 +158,15 @@ class TareHistory:
         return entry.tare.t_ns if isinstance(entry, RecordedTare) else otherwise
 
     def add(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
-        """Put a tare in force.
+        """Add a tare and put it in force.
 
         Args:
             tare: the tare.
             info: the array.
-            reason: why, in words; what its source says if none is given.
+            reason: reason, as text; default: by its source.
 
         Raises:
-            StorageError: it cannot be kept; it is not in force then.
+            StorageError: it cannot be stored; it is not in force then.
         """
         reason = (reason or REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
         recorded = RecordedTare(
@@ -176,11 +176,11 @@ class TareHistory:
         return recorded
 
     def undo(self, tare_id: str) -> None:
-        """Take a tare out of force; the one before it is in force again.
+        """Undo a tare; the one before it is in force again.
 
         Raises:
-            UnknownError: there is no such tare, or it was undone already.
-            StorageError: that cannot be kept; nothing has changed then.
+            UnknownError: no such tare, or it was undone already.
+            StorageError: that cannot be stored; nothing has changed then.
         """
         if not any(tare.id == tare_id and not tare.undone for tare in self.all):
             raise UnknownError(f"no tare {tare_id!r} that could be undone")
@@ -197,7 +197,7 @@ class TareHistory:
         return [t for t in self.all if t.is_of(info) and not t.undone]
 
     def _since_lost(self, info: ArrayInfo) -> list[RecordedTare]:
-        """The same, after the last that is lost."""
+        """Return the valid tares after the last lost one."""
         fitting: list[RecordedTare] = []
         for entry in self._entries:
             if isinstance(entry, LostTares):
@@ -219,8 +219,8 @@ _EVER = (-(2**63), 2**63 - 1)
 def _bounded(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
     automatic = [t for t in entries if isinstance(t, RecordedTare) and t.is_automatic]
     if len(automatic) > AUTOMATIC_KEPT_MAX:
-        # Drop the tare that says least: in the older half, the one with the closest neighbours. The
-        # very first stays, because others may be compared with it.
+        # Drop the least informative tare: in the older half, the closest to its neighbours. The
+        # very first stays: it may be the reference of automatic tares.
         gaps_ns = {
             now.id: after.tare.t_ns - before.tare.t_ns
             for before, now, after in zip(automatic, automatic[1:], automatic[2:], strict=False)

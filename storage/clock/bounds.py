@@ -1,17 +1,18 @@
-"""One stream's clock against the server's: rows that bound the offset, and what follows between.
+"""One stream's clock against the server's: measured bounds of the offset, and bounds in between.
 
-Each row says that the offset lay within +-`uncertainty_ns` at its instant: half the shortest round
-trip bounds it however lopsided the way there and back were, so rows are intersected, never
-averaged; a mean of lopsided ways would have a small sigma around a wrong value. What connects two
-instants is how fast one clock can gain on the other:
+Each row bounds the offset to +-`uncertainty_ns` at its instant: half the shortest round trip is a
+bound however asymmetric the two ways were. So rows are intersected, never averaged; a mean over
+asymmetric ways would have a small sigma around a wrong value. Two instants are connected by how
+fast one clock can gain on the other:
 
-- never more than `CRYSTAL`, two uncompensated crystals of 50 ppm each, and
-- within `WANDER` of its mean over the stretch, the frequency tolerance of RFC 5905 (PHI).
+- never more than `CRYSTAL_RATE_LIMIT`, two uncompensated crystals of 50 ppm each, and
+- within `RATE_TOLERANCE` of its mean over the stretch, the frequency tolerance of RFC 5905 (PHI).
 
-From every row the offset can thus only lie in a cone that opens with time; where all cones of a
-stretch overlap is the bound. Nothing is assumed of the network's delays. Rows that no such clock
-connects are a step, and begin another stretch. A step, or a clock being slewed, that hides within
-the rows' own uncertainties cannot be seen, and makes the bound wrong by as much between two rows.
+From every row the offset can thus only lie in a cone that opens with time; the intersection of all
+cones of a stretch is the bound. No assumption is made about the network's delays. Rows that no such
+clock connects are a step, and begin another stretch. A step, or a clock being slewed, that hides
+within the rows' own uncertainties cannot be seen, and makes the bound wrong by as much between two
+rows.
 
 Rates are ns of offset per ns of the node's time: 1 ppm is 1e-6.
 """
@@ -27,30 +28,30 @@ Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 
 CRYSTAL = 100e-6
-"""Two uncompensated crystals, each 50 ppm off at most over temperature and age."""
+"""Rate limit of two uncompensated crystals, each 50 ppm off at most over temperature and age."""
 WANDER = 15e-6
-"""RFC 5905, PHI: how far a clock's frequency may be from what was measured."""
+"""Frequency tolerance around the measured rate (RFC 5905, PHI)."""
 FAST = 500e-6
-"""How far Linux lets a clock be disciplined (the `tolerance` of adjtimex); drift only if steady."""
+"""Linux's limit of clock discipline (`tolerance` of adjtimex); accepted only for a steady rate."""
 
 _READING_NS = 1.0
-"""Both clocks are read in whole ns."""
+"""Resolution of both clocks' readings."""
 _ROUNDING_NS = 4
-"""Bounds and their middle are whole ns."""
+"""Rounding of bounds and their middle to whole ns."""
 _FIRST_LOOK_ROWS = 64
-"""Rows looked at first, then twice as many: a clock that often steps costs no quadratic time."""
+"""First search window in rows, doubled each time: frequent steps cost no quadratic time."""
 _STEADY_ROWS_MIN = 4
-"""A step between two rows or three looks like a steady rate."""
+"""Fewest rows of a steady rate: a step between two or three rows looks like one."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Measurements in order of time: int64[n] each; their ranges are checked where they are read.
+    """Measurements in order of time: int64[n] each; their ranges are checked at reading.
 
     Attributes:
-        t_mono_ns: when, by the node's clock that never steps.
-        offset_ns: the server's UTC minus the `t_ns` of a frame taken then.
-        uncertainty_ns: the offset lies within plus or minus this.
+        t_mono_ns: instant by the node's clock that never steps.
+        offset_ns: the server's UTC minus the `t_ns` of a frame of that instant.
+        uncertainty_ns: bound of the offset's error, plus or minus.
     """
 
     t_mono_ns: Int64
@@ -61,16 +62,16 @@ class Rows:
         return len(self.t_mono_ns)
 
     def part(self, begin: int, end: int) -> Rows:
-        """Rows `begin` to `end`, the latter not included."""
+        """Return rows `begin` to `end`, the latter not included."""
         s = slice(begin, end)
         return Rows(self.t_mono_ns[s], self.offset_ns[s], self.uncertainty_ns[s])
 
 
 class _Cones:
-    """Where the cones of all rows overlap, for rates from `slowest` to `fastest`.
+    """Intersection of the cones of all rows, for rates from `slowest` to `fastest`.
 
-    Entry k of an "ahead" array is about the first k rows, whose cones open towards later; entry k
-    of a "behind" one about the others, whose cones open towards earlier.
+    Entry k of an "ahead" array covers the first k rows, whose cones open towards later; entry k of
+    a "behind" one the others, whose cones open towards earlier.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class _Cones:
         self._behind_low = np.concatenate((most((low - fastest * x)[::-1])[::-1], -none))
 
     def at(self, x: Float64, rows_before: npt.NDArray[np.intp]) -> tuple[Float64, Float64]:
-        """Lowest and highest offset at `x`, with so many rows at or before it."""
+        """Return least and greatest offset at `x`, given the number of rows up to it."""
         high = np.minimum(
             self.fastest * x + self._ahead_high[rows_before],
             self.slowest * x + self._behind_high[rows_before],
@@ -99,17 +100,17 @@ class _Cones:
 
 
 class Stretch:
-    """Rows that one clock without a step can have given.
+    """Measurements that one clock without a step can explain.
 
     Args:
-        rows: one at least, in order of time.
+        rows: at least one, in order of time.
         limit: bound of its rate.
     """
 
     def __init__(self, rows: Rows, limit: float = CRYSTAL) -> None:
         self.rows = rows
         self.steady = True
-        """Does a rate within `WANDER` of its mean explain all rows?"""
+        """True: a rate within `RATE_TOLERANCE` of its mean explains all rows."""
         self.mean_rate: tuple[float, float] = (-limit, limit)
         """Bounds of the mean rate from the first row to the last."""
         self._limit = limit
@@ -130,16 +131,16 @@ class Stretch:
 
     @property
     def end_ns(self) -> int:
-        """Instant of its last row."""
+        """Instant of its last row, `t_mono_ns`."""
         return int(self.rows.t_mono_ns[-1])
 
     @property
     def drift_bounds(self) -> tuple[float, float] | None:
-        """Bounds of the mean rate; None if the rows say no more than that it is a crystal's."""
+        """Bounds of the mean rate; None if the rows do not narrow it beyond a crystal's."""
         return None if self.mean_rate == (-self._limit, self._limit) else self.mean_rate
 
     def bounds(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
-        """Lowest and highest offset in ns at any instants, also before and after the rows."""
+        """Compute least and greatest offset in ns at any instants, also outside the rows."""
         low, high = self._cones.at(
             self._x(t_mono_ns), np.searchsorted(self.rows.t_mono_ns, t_mono_ns, side="right")
         )
@@ -154,7 +155,7 @@ class Stretch:
         return x
 
     def _fit(self, x: Float64, low: Float64, high: Float64, limit: float, wander: float) -> bool:
-        """Bounds of rate and offset; False if no clock has rates within `wander` of their mean."""
+        """Fit bounds of rate and offset; False if no rate within `wander` of its mean fits."""
         before = np.searchsorted(x, x, side="right")
         self.mean_rate = (-limit, limit)
         self._cones = _Cones(x, low, high, -limit, limit)
@@ -176,10 +177,10 @@ class Stretch:
 
 
 class ClockMap:
-    """The offset of one stream's clock to the server's, with its bound, at every instant.
+    """Offset of one stream's clock to the server's, with its bound, at every instant.
 
     Args:
-        rows: one at least, in any order.
+        rows: at least one, in any order.
     """
 
     def __init__(self, rows: Rows) -> None:
@@ -190,10 +191,10 @@ class ClockMap:
         self._ends_ns = np.array([s.end_ns for s in self.stretches], dtype=np.int64)
 
     def at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
-        """Offset and its bound at each instant, both in ns; every instant by itself.
+        """Compute the offset and its bound at each instant, in ns; every instant independently.
 
-        Between two stretches it is not known where the step was, and the bound reaches over both.
-        The truth is within plus or minus the bound, which is no standard deviation.
+        Between two stretches the instant of the step is unknown, and the bound covers both
+        stretches. The truth is within plus or minus the bound, which is no standard deviation.
 
         Args:
             t_mono_ns: int64[n], in any order, absolute value below `T_MONO_NS_END`.
@@ -216,15 +217,15 @@ class ClockMap:
         return offset, np.maximum(high - offset, offset - low)
 
     def reach(self, begins_ns: Int64, ends_ns: Int64) -> tuple[Int64, Int64, npt.NDArray[np.bool_]]:
-        """Bounds of the offset at all instants from one to another, n times.
+        """Compute bounds of the offset over n time ranges.
 
         Args:
             begins_ns: int64[n], `t_mono_ns`, absolute values below `T_MONO_NS_END`.
             ends_ns: int64[n], the same, not before them.
 
         Returns:
-            Least and greatest offset, int64[n], and whether they are sure, bool[n]: a step that may
-            lie between the two instants has no bound.
+            Least and greatest offset, int64[n], and whether they are certain, bool[n]: a step that
+                may lie in the range has no bound.
         """
         sure = np.ones(len(begins_ns), dtype=np.bool_)
         if len(self.stretches) > 1:
@@ -232,13 +233,13 @@ class ClockMap:
                 sure &= (ends_ns < begun_ns) | (begins_ns >= begun_ns)
                 sure &= (ends_ns <= ended_ns) | (begins_ns > ended_ns)
         one, other = self.at(begins_ns)[0], self.at(ends_ns)[0]
-        # Within a stretch an offset has no jumps, and no clock gains faster than that.
+        # Within a stretch the offset has no jumps, and no clock gains faster than this limit.
         slack_ns = np.ceil(FAST * (ends_ns - begins_ns)).astype(np.int64) + _ROUNDING_NS
         return np.minimum(one, other) - slack_ns, np.maximum(one, other) + slack_ns, sure
 
 
 def _intervals(rows: Rows) -> tuple[Float64, Float64]:
-    """Lowest and highest offset at each row, relative to the first row's."""
+    """Return lowest and highest offset at each row, relative to the first row's."""
     offset = _since(rows.offset_ns, rows.offset_ns[0])
     # The server read its clock at some instant of the round trip; the row is about the middle.
     half = rows.uncertainty_ns.astype(np.float64) * (1 + FAST) + _READING_NS
@@ -246,14 +247,14 @@ def _intervals(rows: Rows) -> tuple[Float64, Float64]:
 
 
 def _since(values: Int64, first: np.int64) -> Float64:
-    """Differences: exact, or, where they wrap in 64 bits, to a microsecond."""
+    """Return differences to `first`: exact, or, where they wrap in 64 bits, to a microsecond."""
     steps = values - first
     does_wrap = ((values ^ first) & (values ^ steps)) < 0
     return np.where(does_wrap, values.astype(np.float64) - float(first), steps.astype(np.float64))
 
 
 def _reach(rows: Rows, limit: float) -> int:
-    """How many of the first rows one clock with a rate within the limit can have given."""
+    """Count the first rows that one clock with a rate within the limit can explain."""
     look = _FIRST_LOOK_ROWS
     while True:
         part = rows.part(0, look)
@@ -270,7 +271,7 @@ def _reach(rows: Rows, limit: float) -> int:
 
 
 def _steady_reach(rows: Rows, at_least: int) -> int:
-    """As `_reach`, for a clock that is off by more than crystals are, but steadily; or 0."""
+    """Count the first rows that a clock with a steady rate beyond a crystal's explains; or 0."""
     shortest, longest = at_least, _reach(rows, FAST)
     if longest <= at_least or not Stretch(rows.part(0, at_least + 1), FAST).steady:
         return 0
@@ -303,7 +304,7 @@ def _stretches(rows: Rows) -> tuple[Stretch, ...]:
 
 
 def _certain_end(rows: Rows, begin: int, end: int, later: Stretch) -> int:
-    """Number of rows that cannot belong to the later stretch: the step was after them."""
+    """Return the end of the rows that cannot belong to the later stretch."""
     part = rows.part(begin, end)
     low, high = later.bounds(part.t_mono_ns)
     half = part.uncertainty_ns + part.uncertainty_ns // 2000 + 2  # as in _intervals, rounded up

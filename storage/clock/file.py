@@ -33,7 +33,7 @@ _STREAMS = TypeAdapter(tuple[StreamFacts, ...])
 
 
 def write_clock(path: Path, rows: Sequence[ClockOffset], streams: Sequence[StreamFacts]) -> None:
-    """Write a session's clock rows, and what is known of its streams into the metadata.
+    """Write a session's clock measurements, with the facts about its streams as metadata.
 
     Raises:
         StorageError: the disk is full or not writable.
@@ -47,12 +47,12 @@ def write_clock(path: Path, rows: Sequence[ClockOffset], streams: Sequence[Strea
 
 @dataclass(frozen=True)
 class StoredClock:
-    """What `clock.parquet` holds.
+    """Content of `clock.parquet`.
 
     Attributes:
-        rows: measurements by boot_id.
-        facts: of streams, by boot_id.
-        is_proven: False: an older version wrote it, without a hash.
+        rows: measurements by stream_id.
+        facts: facts about streams, by stream_id.
+        is_proven: False: an older version wrote it without a hash.
     """
 
     rows: dict[str, Rows]
@@ -61,7 +61,7 @@ class StoredClock:
 
     @property
     def offsets(self) -> tuple[ClockOffset, ...]:
-        """The rows as they were measured, stream by stream."""
+        """Measurements as single rows, stream by stream."""
         return tuple(
             ClockOffset(
                 boot_id=boot_id,
@@ -80,21 +80,21 @@ class StoredClock:
 
 
 def read_clock(path: Path) -> StoredClock:
-    """Read `clock.parquet`.
+    """Read `clock.parquet` and verify it.
 
     Raises:
-        FileNotFoundError: there is none.
-        FileFormatError: it is damaged, no clock table, or a row holds what no clock can say.
+        FileNotFoundError: there is no such file.
+        FileFormatError: it is damaged, no clock table, or a row has impossible numbers.
     """
     read = read_table(path)
     try:
         table = read.table.select(_SCHEMA.names).cast(_SCHEMA)
         table.validate(full=True)
-        said = read.table.schema.metadata or {}
-        facts = _STREAMS.validate_json(said.get(STREAMS_KEY, b"[]"))
+        metadata = read.table.schema.metadata or {}
+        facts = _STREAMS.validate_json(metadata.get(STREAMS_KEY, b"[]"))
         boot_ids = np.asarray(table.column("boot_id").to_pylist(), dtype=object)
         arrays = [table.column(name).to_numpy() for name in _NUMBERS]
-    except Exception as error:  # bytes that nothing proves may cause any error
+    except Exception as error:  # unproven bytes may cause any error
         raise DamagedFileError(
             f"cannot be read as a clock table: {' '.join(str(error).split())[:300]}",
             where=str(path),

@@ -1,9 +1,8 @@
-"""The measurements of one stream's clock as they come: `clock.jsonl` in its journal folder.
+"""Log of one stream's clock measurements: `clock.jsonl` in its journal folder.
 
-One JSON object a line, each with a CRC-32 of its own. A line is only ever appended, and what a
-power cut left of the last ones is cut off before the next. A line that is not to the letter what
-was written is left out: every row only narrows the bounds of the offset, so without it they are
-wider, and still right.
+One JSON object a line, each with its own CRC-32. Lines are only appended; a torn end, as after a
+power cut, is cut off before the next append. A line that differs from what was written is skipped:
+every row only narrows the bounds of the offset, so without it they are wider, and still right.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ from storage.durable import (
 
 NAME = "clock.jsonl"
 _BYTES_MAX = 1 << 30
-"""A stream of two years."""
+"""Upper limit of a log: a stream of two years."""
 _WINDOW = 1024
-"""Bytes, of some lines."""
+"""First window in bytes for the search of the last whole line: some lines."""
 
 
 @dataclass(frozen=True)
 class ClockLines:
-    """What a log holds.
+    """Content of a log.
 
     Attributes:
-        rows: of the lines that are whole, in the order they came.
-        damaged: how many other lines there are before the last whole one.
-        is_torn: does it end with something else, as after a power cut, or while it is written?
+        rows: rows of whole lines, in the order of the file.
+        damaged: number of other lines before the last whole one.
+        is_torn: True: the log ends with an incomplete line, as after a power cut or during a write.
     """
 
     rows: tuple[ClockOffset, ...] = ()
@@ -49,19 +48,19 @@ class ClockLines:
 
 
 class ClockLog:
-    """The clock rows of one stream. One thread appends; any may read or sync meanwhile.
+    """Clock measurements of one stream on disk. One thread appends; any may read or sync.
 
-    Nothing is kept open or in memory between calls.
+    No file is open and no row in memory between calls.
 
     Args:
-        folder: the stream's own; made at the first row if absent.
+        folder: the stream's own; created with the first row.
     """
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
 
     def append(self, row: ClockOffset) -> None:
-        """Add a row, at the same cost however many there are; on the disk after `sync`.
+        """Append a row in constant time; it is on the disk after `sync`.
 
         Raises:
             StorageError: the disk is full or not writable. Earlier rows are untouched.
@@ -86,7 +85,7 @@ class ClockLog:
                 os.close(descriptor)
 
     def sync(self) -> None:
-        """Return when every row appended before is on the disk; may run in another thread.
+        """Return when all earlier rows are on the disk; may run in another thread.
 
         Raises:
             StorageError: the disk refused.
@@ -103,18 +102,18 @@ class ClockLog:
             sync_folder(self.path.parent)
 
     def rows(self) -> tuple[ClockOffset, ...]:
-        """All rows that can be read, in the order they came; none if there is no log.
+        """Read all readable rows in the order of the file; empty if there is no log.
 
         Raises:
-            StorageError: it is there and cannot be read.
+            StorageError: the log cannot be read.
         """
         return self.lines().rows
 
     def lines(self) -> ClockLines:
-        """The same, and what else is in it.
+        """Read the rows, with the number of damaged lines and whether the end is torn.
 
         Raises:
-            StorageError: it is there and cannot be read.
+            StorageError: the log cannot be read.
         """
         try:
             content = read_whole(self.path, bytes_max=_BYTES_MAX)
@@ -133,9 +132,9 @@ class ClockLog:
 
 
 def _end_of_whole(descriptor: int, size: int) -> int:
-    """Where the last whole line ends; looks no further back than to it.
+    """Return the offset behind the last whole line; reads no further back than that.
 
-    Of a log without one, whoever wrote it, only a line that has no end is cut.
+    If no line is whole, only an unterminated last line is cut.
     """
     window = _WINDOW
     while True:
@@ -166,7 +165,7 @@ def _row(line: bytes) -> ClockOffset | None:
         row = ClockOffset.model_validate(content)
     except (ValueError, ValidationError, TypeError, KeyError, RecursionError):
         return None
-    # The checksum is not enough: a line that parses alike but is spelt differently was edited.
+    # The checksum is not enough: a line of equal content in another spelling was edited.
     return row if _line(row) == line + b"\n" else None
 
 
@@ -177,7 +176,7 @@ def _write(descriptor: int, data: bytes) -> None:
 
 
 class ClockOffset(BaseModel):
-    """How far the server's UTC was from the `t_ns` of a stream, at one instant."""
+    """Measured offset of the server's UTC to the `t_ns` of a stream, at one instant."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -185,4 +184,4 @@ class ClockOffset(BaseModel):
     t_mono_ns: int
     server_minus_node_ns: int
     uncertainty_ns: int
-    """The truth is within plus or minus this: half the probe's round trip."""
+    """Bound of the error, plus or minus: half the probe's round trip."""

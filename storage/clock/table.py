@@ -1,7 +1,7 @@
-"""A session's clock table: from every stream's own time to the server's UTC, applied when reading.
+"""Clock table of a session: maps each stream's own time to the server's UTC when it is read.
 
-Raw instants stay as they are. A stream whose offset was not measured gets no server's time at all:
-an offset is never invented, nor taken over from another stream, whose anchor is another one.
+Raw instants stay as they are. A stream without a measured offset gets no server time at all: an
+offset is never invented, nor copied from another stream, which has another anchor.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from storage.clock.log import ClockOffset
 from storage.schema import NO_INSTANT, Array
 
 UNCERTAINTY_END_NS = 2**59
-"""18 years; with `OFFSET_NS_END` it fits 64 bits. What comes from a node is far below."""
+"""Exclusive upper limit of an uncertainty, 18 years; with `OFFSET_NS_END` it fits 64 bits."""
 
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """What is known of a stream besides its measurements.
+    """Facts about a stream besides its measurements.
 
     Attributes:
-        boot_id: its name.
-        utc_offset_ns: `t_ns` minus `t_mono_ns` of its frames; None: not known.
-        clock_set: was the node's clock set before the stream started? None: not known.
+        boot_id: its id.
+        utc_offset_ns: `t_ns` minus `t_mono_ns` of its frames; None: unknown.
+        clock_set: True: the node's clock was set before the stream started; None: unknown.
     """
 
     boot_id: str
@@ -41,16 +41,16 @@ class StreamFacts:
 
 
 class ClockTable:
-    """Maps instants of a session's streams to the server's UTC.
+    """Map from instants of a session's streams to the server's UTC.
 
     Args:
-        rows: measurements by boot_id, of any streams and in any order.
-        streams: facts of the session's streams, each once.
-        parts: boot_id of each part of the session, by its number.
-        where: for errors: where the rows are from.
+        rows: measurements by stream_id, of any streams and in any order.
+        streams: facts about the session's streams, each once.
+        parts: stream_id of each part of the session, by its number.
+        where: source of the rows, for errors.
 
     Raises:
-        FileFormatError: a row holds no instant, offset or uncertainty.
+        FileFormatError: a row has an impossible instant, offset or uncertainty.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class ClockTable:
                 self._maps[stream.boot_id] = ClockMap(own)
 
     def columns(self, t_mono_ns: Int64, t_ns: Int64, part: Array | None) -> dict[str, Array]:
-        """Server's time of frames: each by itself, so any split into batches gives the same.
+        """Compute the server's time of frames; every frame independently of the others.
 
         Args:
             t_mono_ns: int64[n], of one or several parts, in any order.
@@ -79,8 +79,8 @@ class ClockTable:
             part: uint16[n]; None: all are of the first part.
 
         Returns:
-            `t_server_ns` and `t_server_uncertainty_ns`, int64[n]; `NO_INSTANT` in both where the
-            stream's offset was not measured.
+            `t_server_ns` and `t_server_uncertainty_ns`, int64[n]; `UNKNOWN_T_NS` in both where the
+                stream's offset was not measured.
         """
         t_server_ns = np.full(len(t_ns), NO_INSTANT, dtype=np.int64)
         uncertainty_ns = t_server_ns.copy()
@@ -100,15 +100,15 @@ class ClockTable:
     def reach(
         self, begins_ns: Int64, ends_ns: Int64, part: int
     ) -> tuple[Int64, Int64, npt.NDArray[np.bool_]] | None:
-        """Bounds of `t_server_ns - t_ns` of all frames of a part between two instants, n times.
+        """Compute bounds of `t_server_ns - t_ns` over n time ranges of a part.
 
         Args:
-            begins_ns: int64[n], `t_mono_ns`.
-            ends_ns: int64[n], not before them.
-            part: its number.
+            begins_ns: int64[n], `t_mono_ns` of each begin.
+            ends_ns: int64[n], `t_mono_ns` of each end, not before its begin.
+            part: number of the part.
 
         Returns:
-            As of `ClockMap.reach`; None: this part's clock was never compared.
+            As of `ClockOffsets.bound_ranges`; None: this part's clock was never measured.
         """
         clock = self._maps.get(self._parts[part]) if part < len(self._parts) else None
         if clock is None:
@@ -120,7 +120,7 @@ class ClockTable:
         return least, greatest, sure & sane
 
     def summary(self) -> ClockSummary:
-        """Stretches, drifts, steps and flags of every stream, in the order of the session."""
+        """Return stretches, drifts, steps and state of every stream, in the session's order."""
         return ClockSummary(streams=tuple(self._summary(stream) for stream in self._streams))
 
     def _summary(self, stream: StreamFacts) -> StreamSummary:
@@ -139,7 +139,7 @@ class ClockTable:
 
 
 def rows_by_stream(rows: Iterable[ClockOffset], *, where: str = "") -> dict[str, Rows]:
-    """The measurements of a session as columns by boot_id.
+    """Group the measurements of a session by stream_id, as columns.
 
     Raises:
         FileFormatError: a number is too large for a column.
@@ -158,7 +158,7 @@ def rows_by_stream(rows: Iterable[ClockOffset], *, where: str = "") -> dict[str,
 
 
 def check_rows(rows: Rows, boot_id: str, where: str) -> None:
-    """Refuse what no clock can say.
+    """Refuse measurements that no clock can give.
 
     Raises:
         FileFormatError: a row is out of range.
@@ -222,6 +222,7 @@ def _utc(t_mono_ns: int, stream: StreamFacts) -> int | None:
 
 
 State = Literal["measured", "unmeasured", "unsynchronised"]
+"""Clock state of a stream."""
 
 
 class _Fact(BaseModel):
@@ -232,34 +233,36 @@ class StretchSummary(_Fact):
     """Measurements between which neither clock was set."""
 
     begin_t_ns: int | None = Field(
-        description="First measurement, in the node's `t_ns`; null: that stream's UTC is unknown."
+        description="First measurement, in the node's `t_ns`; null: the stream has no known UTC."
     )
-    end_t_ns: int | None = Field(description="Last measurement.")
-    rows: int = Field(description="Measurements in it that cannot belong to another stretch.")
+    end_t_ns: int | None = Field(description="Last measurement, in the node's `t_ns`.")
+    rows: int = Field(description="Measurements that cannot belong to another stretch.")
     offset_ns: int = Field(description="Server's UTC minus the node's, half-way through.")
     uncertainty_ns: int = Field(description="Bound of `offset_ns`: the truth is within it.")
     drift_ppm: float | None = Field(
-        description="Mean rate at which the server's clock gains on the node's; null: the rows say "
-        "no more than that both are crystals."
+        description="Mean rate at which the server's clock gains on the node's; null: the rows do "
+        "not narrow it beyond the tolerance of two crystals."
     )
     drift_uncertainty_ppm: float | None = Field(description="Bound of `drift_ppm`.")
 
 
 class StepSummary(_Fact):
-    """One of the clocks was set, or stood still while its machine slept."""
+    """Step of one of the clocks: it was set, or stood still while its machine slept."""
 
-    after_t_ns: int | None = Field(description="It was after this instant of the node's `t_ns`.")
-    before_t_ns: int | None = Field(description="And before this one.")
-    jump_ns: int = Field(description="By how much the offset changed.")
+    after_t_ns: int | None = Field(
+        description="Lower bound of the step's instant, in the node's `t_ns`."
+    )
+    before_t_ns: int | None = Field(description="Upper bound of the step's instant.")
+    jump_ns: int = Field(description="Change of the offset.")
     jump_uncertainty_ns: int = Field(description="Bound of `jump_ns`.")
 
 
 class StreamSummary(_Fact):
-    """One stream's clock."""
+    """Clock of one stream."""
 
     boot_id: str
     state: State = Field(
-        description="unmeasured: its offset is not known; unsynchronised: nor was its clock set."
+        description="unmeasured: offset unknown; unsynchronised: the node's clock was unset, too."
     )
     rows: int = Field(description="Measurements of the offset.")
     stretches: tuple[StretchSummary, ...]
@@ -267,6 +270,6 @@ class StreamSummary(_Fact):
 
 
 class ClockSummary(_Fact):
-    """How a session's clocks go against the server's."""
+    """Clocks of a session's streams against the server's."""
 
     streams: tuple[StreamSummary, ...]

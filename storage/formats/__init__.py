@@ -1,5 +1,5 @@
-"""Other formats, read and written: a module for each.
+"""Readers and writers of other formats, one module each.
 
-Exports stand on `storage.sessions`, `storage.clock` and `storage.schema`, load traces on
-`devices.emulation`. Touches no journal.
+Exports use `storage.sessions`, `storage.clock` and `storage.schema`; load traces use
+`devices.emulation`. No module reads a journal.
 """

@@ -1,8 +1,7 @@
-"""A session, or a slice of it, as a format is given it: frames in pieces, and facts.
+"""Export of a session or a slice: frames in chunks, and metadata.
 
-Columns are the flat ones of a sealed file, whatever the format; memory stays bounded as long as the
-format writes what it is given. What an emulated or a measured session has is what is given; nothing
-is resampled here.
+Columns are the flat columns of a sealed file, for every format. Memory is bounded if the format
+writes each chunk before it reads the next. Frames are not resampled here.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from storage.sessions.time_axis import NODE_AXIS, TIME_AXIS_NOTE, TimeAxis
 
 ClockName = Literal["node", "server"]
 CLOCKS: tuple[ClockName, ...] = get_args(ClockName)
-"""Whose time goes with the frames: the node's own only, or the server's beside it."""
+"""Clocks of an export: the node's time only, or the server's time as well."""
 
 _MADE = {column.name: "Ask for the clock `server` as well" for column in SERVER_TIME}
 _MADE |= {column.name: "Ask for marks as well" for column in MARKS}
@@ -48,20 +47,20 @@ _MADE |= {column.name: "Ask for marks as well" for column in MARKS}
 _TIME_NAMES = tuple(column.name for column in TIMES)
 
 Flat = Mapping[str, Array]
-"""Flat columns by name, n rows each; what is not known is what it is in memory."""
+"""Flat columns by name, n rows each; unknown numbers as in memory."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """The frames a session has.
+    """Source of the frames of a session.
 
     Attributes:
         names: its quantities, of `storage.schema.KNOWN`, in the order of their columns.
-        read: gives these flat columns, and others if it likes, of frames in order.
+        read: reads the named flat columns, and possibly more, of frames in order, in chunks.
         begin_t_ns: `t_ns` of the session's first frame.
-        end_t_ns: the latest instant on the time axis; None: `read` gives the session from its
-            first frame to its last, not only where the slice is, and gives it once.
-        axis: the session's time axis.
+        end_t_ns: latest instant on the time axis; None: `read` yields all frames of the session,
+            also outside of the slice, and can be called once.
+        axis: time axis of the session.
     """
 
     names: Sequence[str]
@@ -76,39 +75,39 @@ def content_of(
     span_ns: tuple[int, int] | None = None,
     axis: TimeAxis = NODE_AXIS,
 ) -> Content:
-    """The content of a session of which frames are given; the first of them are read.
+    """Return the source of given frames; consumes the first batch that is not empty.
 
     Args:
         pieces: frames with their further columns, in order.
-        span_ns: first and last instant on the session's time axis; None: these are all frames.
-        axis: the session's time axis.
+        span_ns: first and last instant on the session's time axis; None: `pieces` has all frames.
+        axis: time axis of the session.
 
     Raises:
         UsageError: there are no frames.
     """
-    there = ((frames, extra) for frames, extra in pieces if len(frames))
-    first = next(there, None)
+    nonempty = ((frames, extra) for frames, extra in pieces if len(frames))
+    first = next(nonempty, None)
     if first is None:
         raise UsageError("the session has no frames")
     names = [column.name for column in FRAMES] + list(first[1])
-    flat = (_flat(frames, extra) for frames, extra in chain((first,), there))
+    flat = (_flat(frames, extra) for frames, extra in chain((first,), nonempty))
     begin_t_ns, end_t_ns = span_ns or (int(first[0].t_ns[0]), None)
     return Content(names, lambda _: flat, begin_t_ns, end_t_ns, axis)
 
 
 @dataclass(frozen=True)
 class Export:
-    """What a format is given to write.
+    """Input of an export format: frames of a session or slice, with metadata.
 
     Attributes:
-        content: the frames.
-        info: the array.
-        notes: of the session, whatever else a reader should know.
-        part: rows and columns that are wanted.
-        clock: adds `t_server_ns` and its bound, and how they were found to the notes; None: not.
-        marks: adds `event`, and what became of each mark to the notes; None: not.
-        source: which session it is of, and its hashes.
-        options: of the format.
+        content: source of the frames.
+        info: array of the node.
+        notes: notes of the session.
+        part: requested rows and columns.
+        clock: clock table; adds `t_server_ns`, its bound, and a summary to the notes; None: none.
+        marks: placed markers; adds `event`, and each marker to the notes; None: none.
+        source: session and its hashes.
+        options: options of the format.
     """
 
     content: Content
@@ -122,15 +121,17 @@ class Export:
 
     @property
     def called(self) -> str:
-        """Which session it is, for people."""
-        named = self.source.get("session")
-        return f"session {named} of {self.info.node}" if named else f"session of {self.info.node}"
+        """Name of the session, for error messages and notes."""
+        session = self.source.get("session")
+        return (
+            f"session {session} of {self.info.node}" if session else f"session of {self.info.node}"
+        )
 
     @property
     def about(self) -> dict[str, object]:
-        """What the file is of, what was chosen of it, and its facts (`storage.formats.facts`).
+        """Metadata of the file as JSON: session, slice, clock, facts (`storage.formats.facts`).
 
-        As JSON; who resamples or fills says so in its place.
+        A format that resamples or fills replaces the facts concerned.
         """
         part = self.part
         chosen: dict[str, object] = {
@@ -147,7 +148,7 @@ class Export:
 
     @property
     def all_notes(self) -> dict[str, object]:
-        """The session's, with what is known of clock and marks, if they are in it; as JSON."""
+        """Notes of the session as JSON, with the clock's summary and the markers if included."""
         notes = dict(self.notes)
         if self.clock is not None:
             notes["clock"] = self.clock.summary().model_dump(mode="json")
@@ -157,17 +158,17 @@ class Export:
 
     @property
     def has_forces(self) -> bool:
-        """Was it estimated?"""
+        """True if the session has estimates."""
         return "grf_n" in self.content.names
 
     def chosen(self, columns: Sequence[str] = ()) -> dict[str, str]:
-        """Flat name, and of which quantity it is, of each of these columns, in their order.
+        """Return the quantity of each selected column by flat name, in order.
 
         Args:
-            columns: names, of all tiles or of one; empty: those that the slice names, or all.
+            columns: names, of all tiles or of one; empty: the slice's columns, or all.
 
         Raises:
-            UsageError: one is not there.
+            UsageError: a column does not exist.
         """
         present = [*_TIME_NAMES, *self.content.names, *self._made]
         chosen = _chosen(present, len(self.info.tiles), columns or self.part.columns)
@@ -176,7 +177,7 @@ class Export:
         return {name: of for name, of in chosen.items() if of not in _TIME_NAMES}
 
     def at_ns(self, columns: Mapping[str, Array]) -> Times:
-        """Return instants of frames on the session's time axis, int64[n].
+        """Return the instants of frames on the session's time axis, int64[n].
 
         Args:
             columns: `t_ns`, and `part` if the session has parts.
@@ -184,18 +185,18 @@ class Export:
         return self.content.axis.at(columns["t_ns"], columns.get("part"))
 
     def pieces(self, columns: Sequence[str] = ()) -> Iterator[dict[str, Array]]:
-        """Flat columns of the slice's frames, in pieces of some thousand rows.
+        """Read the flat columns of the slice's frames in chunks of some thousand rows.
 
         Args:
-            columns: as for `chosen`.
+            columns: as for `select_columns`.
 
         Yields:
-            One piece at least, of no rows if the slice lies in a gap; all others have rows. Of a
-            session that is not sealed they come once.
+            At least one chunk; it has no rows if the slice has no frames, else all chunks have
+            rows. Frames of a session that is not sealed can be read once.
 
         Raises:
-            UsageError: a column is not there, or the slice begins after the session's end; before
-                the first piece.
+            UsageError: a column does not exist, or the slice begins after the session's end;
+                raised before the first chunk.
         """
         chosen, made, content = self.chosen(columns), self._made, self.content
         end_t_ns = content.begin_t_ns if content.end_t_ns is None else content.end_t_ns
@@ -232,7 +233,7 @@ class Export:
         yield header
 
     def tables(self) -> Iterator[pa.Table]:
-        """The same as Arrow tables, with units, array and notes in their metadata."""
+        """Read the slice's frames as Arrow tables, with units, array and notes as metadata."""
         chosen, notes = self.chosen(), self.all_notes
         metadata: dict[bytes | str, bytes | str] = {
             ARRAY_INFO_KEY: self.info.model_dump_json().encode(),
@@ -249,14 +250,15 @@ class Export:
             yield pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=metadata))
 
     def whole(self, columns: Sequence[str], *, frames_max: int) -> dict[str, Array]:
-        """All of these columns at once, for a format that cannot be written in pieces.
+        """Read all frames of the slice at once, for a format that cannot be written in chunks.
 
         Args:
-            columns: as for `chosen`, and `t_ns` among them.
+            columns: as for `select_columns`, including `t_ns`.
             frames_max: limit of the format.
 
         Raises:
-            UsageError: as for `pieces`, or there are more frames: it names the slice to ask for.
+            UsageError: as for `read_chunks`, or there are too many frames; the error names a slice
+                that fits.
         """
         pieces: list[dict[str, Array]] = []
         left = frames_max
@@ -280,15 +282,15 @@ class Export:
         }
 
     def _with_tile(self, plain: pa.Field[Any], tile: int | None) -> pa.Field[Any]:
-        """With number and serial of its tile, also in its name if that is asked for."""
+        """Return the field with its tile as metadata, and the serial in its name on request."""
         if tile is None:
             return plain
         serial = self.info.tiles[tile].serial
-        said: dict[bytes | str, bytes | str] = dict((plain.metadata or {}).items())
-        said |= {b"tile": str(tile).encode(), b"serial": serial.encode()}
+        metadata: dict[bytes | str, bytes | str] = dict((plain.metadata or {}).items())
+        metadata |= {b"tile": str(tile).encode(), b"serial": serial.encode()}
         if self.options.names == "serial":
             plain = plain.with_name(f"{plain.name.removesuffix(f'_{tile}')}_{serial}")
-        return plain.with_metadata(said)
+        return plain.with_metadata(metadata)
 
     @property
     def _made(self) -> list[str]:
@@ -306,7 +308,7 @@ def _flat(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def _of_rows(flat: Flat, rows: Array) -> dict[str, Array]:
-    """These rows; where they are one piece, as in a slice of time they are, without a copy."""
+    """Return the selected rows, without a copy if they are contiguous."""
     at = np.flatnonzero(rows)
     begin, end = (int(at[0]), int(at[-1]) + 1) if len(at) else (0, 0)
     if end - begin == len(at):
@@ -317,14 +319,14 @@ def _of_rows(flat: Flat, rows: Array) -> dict[str, Array]:
 def _needed(
     chosen: Mapping[str, str], made: Sequence[str], names: Sequence[str], *, has_parts: bool
 ) -> list[str]:
-    """Columns to read: those chosen, and those by which rows are found and others made."""
+    """Return the columns to read: selected columns, and those needed to select rows and derive."""
     by = ["t_ns", *(("t_mono_ns", "seq") if made else ()), *(("part",) if has_parts else ())]
     read = [name for name, of in chosen.items() if of not in (*made, *_TIME_NAMES)]
     return list(dict.fromkeys([*read, *(name for name in by if name in names)]))
 
 
 def _chosen(present: Sequence[str], tiles: int, asked: Sequence[str]) -> dict[str, str]:
-    """Flat and logical name of every column asked for, in that order, each once."""
+    """Return the quantity of every requested column by flat name, in order, without duplicates."""
     flat = {f: name for name in present for f in KNOWN[name].flat_names(tiles)}
     if not asked:
         return flat

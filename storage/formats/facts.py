@@ -1,4 +1,4 @@
-"""What every export states of itself: time base, axes, and what is not as it was measured."""
+"""Facts that every export states: completeness, time base, axes, resampling, masked values."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 Complete = bool | Literal["lossy"] | None
-"""Is every frame of the session there? None: nothing says so, as of a simulation."""
+"""Completeness of a session: True, False or "lossy". None: unknown, as for a simulation."""
 
 AXES = (
     "Foot frame: x forward, y to the left, z along the segment towards the ankle, origin at the "
@@ -15,12 +15,13 @@ AXES = (
     "under the ankle at angle 0. Forces are those of the ground on the foot, positive upwards."
 )
 MASKED = (
-    "Estimates are missing where they are not known, and estimate_status says why: no centre of "
+    "Unknown estimates are missing, and estimate_status says why: no centre of "
     "pressure without contact or in doubt (16), no GRF with a tile saturated (1) or missing (32). "
-    "Nothing stands in their place."
+    "Of tiles in one row the COP is not measured across the row. "
+    "They are not replaced."
 )
-_NODES = "The node's clock (t_ns), UTC since 1970, as its node had it set."
-_SERVERS = (
+_NODE_TIME_BASE = "The node's clock (t_ns), UTC since 1970, as set on the node."
+_SERVER_TIME_BASE = (
     "The server's clock (t_server_ns), UTC since 1970, within t_server_uncertainty_ns; the node's "
     "own is t_ns."
 )
@@ -29,18 +30,18 @@ _SERVERS = (
 def facts_of(
     notes: Mapping[str, object], source: Mapping[str, object], *, has_server_time: bool
 ) -> dict[str, object]:
-    """Facts of an export of frames as they were measured, as JSON.
+    """Return the facts of an export of unmodified frames, as JSON.
 
     Args:
-        notes: of the session, with its ledger if it is sealed.
-        source: with the `state` of one that is not.
-        has_server_time: was it asked for?
+        notes: notes of the session, with its ledger if it is sealed.
+        source: session and hashes; has `state` if the session is not sealed.
+        has_server_time: True if the export has the server's time.
     """
     complete, lost = completeness(notes, source)
     return {
         "complete": complete,
         "lost": lost,
-        "time_base": _SERVERS if has_server_time else _NODES,
+        "time_base": _SERVER_TIME_BASE if has_server_time else _NODE_TIME_BASE,
         "axes": AXES,
         "resampled": "nothing",
         "filled": "nothing",
@@ -51,8 +52,8 @@ def facts_of(
 def completeness(
     notes: Mapping[str, object], source: Mapping[str, object]
 ) -> tuple[Complete, dict[str, int]]:
-    """Is it complete, and how many frames are lost for which reason."""
-    if "state" in source:  # it is not sealed: more may come
+    """Return the completeness of a session, and its number of lost frames by reason."""
+    if "state" in source:  # not sealed: frames may follow
         return False, {}
     ledger = notes.get("ledger")
     if not isinstance(ledger, dict):

@@ -1,9 +1,9 @@
-"""Recorded loads, from any table of forces; what cannot be a load is refused.
+"""Reader of recorded loads, from any table of forces; implausible loads are refused.
 
-Columns, whatever their case: `time_s`, and either `fz_n, cop_x_m, cop_y_m` or one force per tile,
-`cell1_n, cell2_n, ...`; optionally `angle_rad`. Others are ignored. A session of ours, sealed or
-exported, has `t_ns` instead, and is translated (`storage.formats.session_load`); force platforms
-and OpenSim's ground reactions are read as references are.
+Columns, in any case: `time_s`, and either `fz_n, cop_x_m, cop_y_m` or one force per tile,
+`cell1_n, cell2_n, ...`; optionally `angle_rad`. Others are ignored. A FootTile session, sealed or
+exported, has `t_ns` instead, and is converted (`storage.formats.session_load`). Force platforms
+and OpenSim's ground reactions are read like references.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from storage.formats.tables.table import INSTANTS, OURS, Column, Table
 from storage.formats.tables.times import spread_even
 
 NUMBERS_MAX = 20_000_000
-"""Rows times columns: an hour of eight cells at 500 rows a second, and 160 MB in memory."""
+"""Limit of rows times columns: an hour of eight cells at 500 Hz, 160 MB in memory."""
 
 NUMBER_MAX = 1e9
-"""More than any second, newton or metre can be."""
+"""Limit of plausible values, in s, N and m."""
 
 _COLUMN = re.compile(r"time_s|fz_n|cop_[xy]_m|angle_rad|cell\d+_n")
-"""A pattern of those that are read."""
+"""Pattern of the columns that are read."""
 
 _NAME_THEM = "Or name them: --map time_s=COLUMN,grf_n=COLUMN,cop_x_m=COLUMN,cop_y_m=COLUMN"
 _UNITS = {"time": "time_s", "fz": "fz_n", "cop_x": "cop_x_m", "cop_y": "cop_y_m"}
@@ -41,11 +41,12 @@ def read_load_trace(path: Path, stated: Stated | None = None) -> LoadTrace:
     """Read a load trace.
 
     Args:
-        path: of the file.
-        stated: what a user says of it; of columns, units, sign and rate it is read as a reference.
+        path: path of the file.
+        stated: options of the user. With columns, units, sign or rate the file is read like a
+            reference.
 
     Raises:
-        LoadTraceError: unreadable, a session whose bytes are not those that were sealed, a column
+        LoadTraceError: unreadable, a session whose bytes differ from the sealed ones, a column
             is missing or in another unit, times do not rise, or a force is not a number.
     """
     where = str(path)
@@ -114,7 +115,7 @@ def _is_needed(name: str) -> bool:
 
 
 def _read(path: Path, stated: Stated) -> tuple[dict[str, Column], list[str]]:
-    """Return the columns of a trace by name in lower case, and the names of all in the file."""
+    """Return the columns of a trace by lower-case name, and the names of all columns."""
     named = stated.names
     try:
         table = read_table(
@@ -195,7 +196,7 @@ def _numbers(
 
 
 def _other_unit(columns: Iterable[str], name: str) -> str:
-    """What to say if the quantity is there under another unit's name."""
+    """Return the expected text of an error if the quantity exists in another unit; else empty."""
     stem = next((stem for stem, full in _UNITS.items() if full == name), None)
     for other in columns:
         if stem is not None and re.fullmatch(rf"{stem}(_[a-z]+)?", other):

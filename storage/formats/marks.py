@@ -1,8 +1,8 @@
-"""Where people's marks stand in a session: each at the frame nearest to it in the server's time.
+"""Placement of markers: each at the nearest frame of its session in the server's time.
 
-A mark may be made after the session was sealed, so no file of frames holds any: they are placed
-when the session is read. One that has no frame within a second of it stands nowhere, and that is
-said; so does one whose frames have no server's time, because their clock was never compared.
+Markers may be set after a session was sealed, so no file of frames has them: they are placed when
+the session is read. A marker without a frame within a second has no frame, and so has a marker
+whose frames have no server's time, because their clock was never compared. The reason is stated.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from storage.sessions.folder import Event
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 NEAREST_NS = 1_000_000_000
-"""A mark further from every frame than this stands at none of them."""
+"""Largest distance in time between a marker and its frame."""
 BETWEEN = "; "
-"""Between the labels of marks at one frame, in the order of their instants."""
+"""Separator of the labels of several markers at one frame, in the order of their instants."""
 
 TIMES = ("seq", "t_mono_ns", "t_ns")
-"""Columns by which marks are placed, besides `part`."""
+"""Columns by which markers are placed, besides `part`."""
 
 _FAR = np.iinfo(np.uint64).max
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What became of one event.
+    """Marker with its frame, or with the reason why it has none.
 
     Attributes:
-        event: what was marked, and when.
-        frame: part and number of the frame at which it stands; None: at none.
-        apart_ns: how far that frame is from it in time.
-        uncertainty_ns: how far the frame's server's time may be from the truth.
-        left_out: why it is not in the data; empty if it is.
+        event: label and instant.
+        frame: part and number of its frame; None: no frame.
+        apart_ns: distance in time between marker and frame.
+        uncertainty_ns: bound of the error of the frame's server time.
+        left_out: reason why the marker is not in the data; empty if it is.
     """
 
     event: Event
@@ -49,7 +49,7 @@ class Mark:
     left_out: str = ""
 
     def as_dict(self) -> dict[str, object]:
-        """For the notes of a file."""
+        """Return the marker as JSON, for the notes of a file."""
         part, seq = self.frame or (None, None)
         return {
             **self.event.model_dump(mode="json"),
@@ -62,10 +62,10 @@ class Mark:
 
 
 class Marks:
-    """Events at frames.
+    """Markers of a session, placed at frames.
 
     Args:
-        marks: in the order of their instants.
+        marks: markers in the order of their instants.
     """
 
     def __init__(self, marks: Sequence[Mark]) -> None:
@@ -80,15 +80,15 @@ class Marks:
 
     @property
     def left_out(self) -> tuple[Mark, ...]:
-        """Those that are not in the data."""
+        """Markers that are not in the data."""
         return tuple(mark for mark in self.all if mark.left_out)
 
     def column(self, seq: Array, part: Array | None) -> Array:
-        """Labels of frames, object[n]: text, or None where nothing was marked.
+        """Return the labels of frames, object[n]: text, or None without a marker.
 
         Args:
-            seq: uint64[n], numbers of frames.
-            part: uint16[n], their parts; None: the first.
+            seq: uint64[n], numbers of the frames.
+            part: uint16[n], their parts; None: the first part.
         """
         labels = np.full(len(seq), None, dtype=object)
         for row in np.flatnonzero(np.isin(seq, self._seqs)):
@@ -104,19 +104,16 @@ def place(
     begin_t_ns: int | None = None,
     axis: TimeAxis = NODE_AXIS,
 ) -> Marks:
-    """Find the frame of every event.
+    """Place every marker at its nearest frame; of two equally near frames at the earlier one.
 
     Args:
-        events: in any order.
-        pieces: columns `TIMES` of all frames of the session, and `part` if it has parts; those
-            that are further than `NEAREST_NS` from every event may be left out.
-        clock: of the session.
-        part: the slice that is wanted; a mark whose frame is not in it is left out.
-        begin_t_ns: instant of the session's first frame; None: the first that comes.
-        axis: of the session.
-
-    Returns:
-        The marks. Of two frames that are as near the earlier one has it.
+        events: markers in any order.
+        pieces: columns `TIMES` of all frames of the session, and `part` if it has parts. Frames
+            further than `NEAREST_NS` from every marker may be omitted.
+        clock: clock table of the session.
+        part: the requested slice; a marker with a frame outside is left out.
+        begin_t_ns: instant of the session's first frame; None: of the first frame in `pieces`.
+        axis: time axis of the session.
     """
     ordered = sorted(events, key=lambda event: event.t_ns)
     nearest = _Nearest(np.array([event.t_ns for event in ordered], dtype=np.int64))
@@ -132,7 +129,7 @@ def place(
 
 @dataclass
 class _Nearest:
-    """The nearest frame so far of each of n instants."""
+    """Running search for the nearest frame of each of n instants."""
 
     t_ns: Array
     apart_ns: Array = field(init=False)
@@ -146,7 +143,7 @@ class _Nearest:
     def look_at(
         self, piece: Mapping[str, Array], times: Mapping[str, Array], inside: Array
     ) -> None:
-        """Compare with further frames."""
+        """Update the nearest frames by further frames."""
         t_server_ns = times["t_server_ns"]
         known = np.flatnonzero(t_server_ns != NO_INSTANT)
         if not len(known) or not len(self.t_ns):
@@ -154,7 +151,7 @@ class _Nearest:
         rows = known[np.argsort(t_server_ns[known], kind="stable")]
         rising_ns = t_server_ns[rows]
         after = np.searchsorted(rising_ns, self.t_ns)
-        # Of frames with one instant the first.
+        # The first of several frames with one instant.
         before = np.searchsorted(rising_ns, rising_ns[np.maximum(after - 1, 0)])
         values = {
             "seq": piece["seq"],
@@ -170,7 +167,7 @@ class _Nearest:
                 column[nearer] = values[name][rows[at[nearer]]]
 
     def mark(self, i: int, event: Event) -> Mark:
-        """What became of instant number i."""
+        """Return the marker of instant number i with its frame."""
         if self.apart_ns[i] > NEAREST_NS:
             return Mark(event, left_out=_NO_FRAME if self.apart_ns[i] != _FAR else _NO_CLOCK)
         facts: dict[str, Any] = {name: column[i].item() for name, column in self.facts.items()}
@@ -189,6 +186,6 @@ _NOT_IN_SLICE = "its frame is not in this slice"
 
 
 def _apart(a_ns: Array, b_ns: Array) -> Array:
-    """Distances of int64 instants, which may be too large for an int64, as uint64."""
+    """Return distances of int64 instants as uint64: an int64 might overflow."""
     a, b = a_ns.astype(np.uint64), b_ns.astype(np.uint64)
     return np.where(a_ns > b_ns, a - b, b - a)

@@ -1,9 +1,9 @@
-"""Force and centre of pressure of a reference, whatever its file; units are never guessed.
+"""Reader of a reference's force and centre of pressure from any file; units are never guessed.
 
-A file's own columns are mapped to `time_s`, `grf_n`, `cop_x_m` and `cop_y_m`. A column that has our
-name has its unit and sign by that; of any other the file states them, or the user. The sign of a
-force platform follows from the load that it bears. What cannot be a measurement is refused here;
-what is odd, and what was left out, stands in `notes`.
+Columns of the file are mapped to `time_s`, `grf_n`, `cop_x_m` and `cop_y_m`. A column with one of
+these names has its unit and sign; for any other column the file or the user states them. The sign
+of a force platform is inferred from the load. Implausible values are refused; unusual and dropped
+samples are described in `notes`.
 """
 
 from __future__ import annotations
@@ -28,37 +28,37 @@ FACTORS: Mapping[str, Mapping[str, float]] = {
     "grf": {"N": 1.0, "kN": 1e3, "mN": 1e-3},
     "cop": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
 }
-"""Of each quantity the units that can be stated, in SI units."""
+"""Factors to SI units by quantity and unit."""
 
 SIGNS: Mapping[str, float] = {"+": 1.0, "-": -1.0}
-"""What a force is under load."""
+"""Factors by the stated sign of a force under load."""
 
 NUMBER_MAX = 1e9
 TIME_MAX_S = 1e11
-"""Unix time is far below that in seconds, and beyond it in any other unit."""
+"""Limit of times: Unix time in seconds is far below it, and above it in any other unit."""
 GAP_STEPS = 3.5
 PEAK_S = 0.02
 LOADED_SIGMA = 12.0
-"""A plate is loaded clearly if its force goes over so many sigma of its noise."""
+"""Lowest range of a loaded plate's force, in sigma of its noise."""
 SIGN_RATIO = 3.0
-"""Peaks of both signs within this factor do not tell which of them is the load."""
+"""Lowest ratio of the peaks of both signs that tells the sign of the load."""
 BEARS = 0.05
-"""Of its greatest force: below that a plate's centre of pressure is noise over noise."""
+"""Load threshold relative to the peak force; below it the centre of pressure is noise."""
 TURNED = 2.0
-"""A force that goes so many times further below zero than above it is negative under load."""
+"""Ratio of negative to positive range from which a force counts as negative under load."""
 
 
 @dataclass(frozen=True)
 class Stated:
-    """What a user says of a file.
+    """Options of the user for reading a reference file.
 
     Attributes:
-        columns: of `QUANTITIES` the column's name in the file; "-" before it turns its sign.
-        units: of "time", "grf" and "cop", as in `FACTORS`.
-        sign: of the force under load, "+" or "-".
-        rate_hz: of samples whose times are not in the file, or in it as numbers of samples.
-        text: how it is laid out, if it is a text.
-        sole_m: length, and width if it is known, of an insole whose file states parts of them.
+        columns: name of the file's column by quantity of `QUANTITIES`; a leading "-" negates it.
+        units: units of "time", "grf" and "cop", as in `FACTORS`.
+        sign: sign of the force under load, "+" or "-".
+        rate_hz: sample rate, if the file has no times, or sample numbers instead.
+        text: layout of a text file.
+        sole_m: length, and width if known, of an insole whose file states fractions, in m.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -70,7 +70,7 @@ class Stated:
 
     @property
     def names(self) -> set[str]:
-        """Names of columns of the file; of a sum its own, and those of its parts."""
+        """Names of the mapped columns of the file; for a sum, the sum and its summands."""
         given = {name.removeprefix("-") for name in self.columns.values()}
         return given | {part for name in given for part in _parts(name)}
 
@@ -91,15 +91,15 @@ class Stated:
 
 @dataclass(frozen=True)
 class ReferenceData:
-    """A reference in SI units, its force positive under load; n samples.
+    """Reference of n samples in SI units, its force positive under load.
 
     Attributes:
-        where: the file.
+        where: path of the file.
         time_s: (n,), rising.
         grf_n: (n,), finite.
-        cop_m: (n, 2), NaN where it is not stated; None if the file has none.
-        epoch_ns: UTC of time zero, if the file knows.
-        notes: what a user should know of it.
+        cop_m: (n, 2), NaN where unknown; None if the file has no centre of pressure.
+        epoch_ns: UTC of time zero; None if the file does not state it.
+        notes: remarks for the user.
     """
 
     where: str
@@ -116,8 +116,7 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
     Raises:
         FileFormatError: unreadable, empty, a column is missing, times do not rise, or no sample has
             a force.
-        UsageError: a unit or the sign is neither stated nor given by the file, or a stated one
-            differs from the file's.
+        UsageError: neither user nor file states a unit or the sign, or they contradict each other.
     """
     named = stated.names
     table = read_session(path, named)
@@ -131,7 +130,7 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
 
 
 def as_reference(table: Table, stated: Stated) -> ReferenceData:
-    """Return the force and centre of pressure that a table holds, in SI units.
+    """Return force and centre of pressure of a table, in SI units.
 
     Raises:
         FileFormatError, UsageError: as for `read_reference`.
@@ -146,7 +145,7 @@ def as_reference(table: Table, stated: Stated) -> ReferenceData:
         if name in stated.columns or name in table.columns
     ]
     notes = [*table.notes, *sign_note]
-    if len(cop) == 1:  # as of a treadmill, or a line of cells
+    if len(cop) == 1:  # a treadmill, or a line of cells
         has_x = "cop_x_m" in stated.columns or "cop_x_m" in table.columns
         nothing = np.full(len(grf_n), np.nan)
         cop = [cop[0], nothing] if has_x else [nothing, cop[0]]
@@ -197,13 +196,13 @@ def _parts(name: str) -> list[str]:
 
 
 def _times(table: Table, stated: Stated, count: int) -> Floats:
-    """Return the times of all samples in s, by their numbers where their rate is stated."""
+    """Return the times of all samples in s, computed from their numbers if the rate is stated."""
     if stated.rate_hz is None:
         return _column(table, stated, "time_s")
     numbers = table.columns.get(stated.columns.get("time_s", ""), np.arange(count))
     if not np.array_equal(numbers, np.rint(numbers)):
         raise UsageError(
-            f"--rate-hz goes with numbers of samples, and {stated.columns['time_s']!r} has others",
+            f"--rate-hz needs sample numbers, and {stated.columns['time_s']!r} has others",
             where=table.where,
             remedy="Leave out --rate-hz, or the time from --map",
         )
@@ -211,11 +210,11 @@ def _times(table: Table, stated: Stated, count: int) -> Floats:
 
 
 def _column(table: Table, stated: Stated, name: str) -> Floats:
-    """Return a quantity in SI units, with NaN where a cell is empty.
+    """Return a quantity in SI units, with NaN for empty cells.
 
     Raises:
-        FileFormatError: there is no such column, or a time or force is larger than any can be.
-        UsageError: its unit is not stated, or is stated otherwise than by the file.
+        FileFormatError: the column is missing, or a time or force is implausibly large.
+        UsageError: the unit is not stated, or differs from the file's.
     """
     given = stated.columns.get(name, name)
     turned, theirs = given.startswith("-"), given.removeprefix("-")
@@ -254,7 +253,7 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
         )
     total = sum(table.columns[part] for part in parts)
     values = np.asarray(total * factors[unit], dtype=np.float64)
-    # A centre of pressure may be anywhere while nothing bears: `_drop_far_cop`.
+    # Without load a centre of pressure may be arbitrarily large: `_drop_far_cop`.
     greatest = {"time": TIME_MAX_S, "grf": NUMBER_MAX}.get(quantity)
     if greatest is not None and len(bad := np.flatnonzero(np.abs(values) >= greatest)):
         raise FileFormatError(
@@ -267,7 +266,7 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
 
 
 def _remedy_of_absent(table: Table, name: str) -> str:
-    """Return what to do about a quantity without a column."""
+    """Return the remedy for a quantity without a column."""
     remedies = [f"Name it: --map {name}=COLUMN"]
     if "column1" in table.names and not any(one.endswith("_fz") for one in table.names):
         remedies.append("no line was found that names columns: --skip-rows states where it is")
@@ -297,7 +296,7 @@ def _size_of_sole(column: str, unit: str, stated: Stated, where: str) -> float:
 def _with_sign(
     table: Table, stated: Stated, grf_n: Floats, time_s: Floats
 ) -> tuple[Floats, tuple[str, ...]]:
-    """Return a force that is positive under load, and a note of how that was found."""
+    """Return the force, positive under load, and a note about how its sign was found."""
     name = stated.columns.get("grf_n", "grf_n")
     if stated.sign is not None:
         return SIGNS[stated.sign] * grf_n, ()
@@ -305,7 +304,7 @@ def _with_sign(
     parts = {bare} if bare in table.columns else set(_parts(bare))
     if parts <= table.positive:
         return grf_n, ()
-    if parts <= table.plates:  # one that the user has turned is as they say
+    if parts <= table.plates:  # the user's "-" states the sign
         return (grf_n, ()) if name != bare else _positive_under_load(grf_n, time_s, table.where)
     raise UsageError(
         f"the sign of column {name!r} is not stated",
@@ -317,25 +316,25 @@ def _with_sign(
 def _positive_under_load(
     grf_n: Floats, time_s: Floats, where: str
 ) -> tuple[Floats, tuple[str, ...]]:
-    """Return the force of a plate, positive under load: a plate bears load, and lifts nobody.
+    """Return the force of a plate, positive under load: a plate pushes and never pulls.
 
-    A peak is what is reached for `PEAK_S` altogether, so that a spike is none.
+    A peak is exceeded for `PEAK_S` in total, so that a spike does not count.
 
     Raises:
-        UsageError: the load does not tell.
+        UsageError: the load is too small, or peaks of both signs are similar.
     """
     known = np.sort(grf_n[np.isfinite(grf_n)])
     if len(known) < 2:
         return grf_n, ()
     step_s = float(np.median(np.diff(time_s)))
-    held = min(len(known) - 1, max(1, round(PEAK_S / step_s)) if step_s > 0.0 else 1)
-    low_n, high_n = min(0.0, float(known[held - 1])), max(0.0, float(known[-held]))
+    rank = min(len(known) - 1, max(1, round(PEAK_S / step_s)) if step_s > 0.0 else 1)
+    low_n, high_n = min(0.0, float(known[rank - 1])), max(0.0, float(known[-rank]))
     small_n, great_n = sorted((-low_n, high_n))
     middle_n = float(np.median(known))
-    # Third differences are of noise: a load changes little in three samples.
+    # Third differences are mostly noise: a load changes little in three samples.
     third_n = np.diff(grf_n[np.isfinite(grf_n)], 3)
     noise_n = 1.4826 * float(np.median(np.abs(third_n))) / np.sqrt(20.0) if len(third_n) else 0.0
-    is_loaded = float(known[-held] - known[held - 1]) > LOADED_SIGMA * noise_n
+    is_loaded = float(known[-rank] - known[rank - 1]) > LOADED_SIGMA * noise_n
     if not is_loaded or great_n < SIGN_RATIO * small_n or great_n == 0.0:
         raise UsageError(
             "the load does not tell the sign of the force: it goes from "
@@ -354,10 +353,10 @@ def _positive_under_load(
 
 
 def _drop_far_cop(cop_m: Floats, grf_n: Floats, where: str) -> list[str]:
-    """Set a centre of pressure to NaN that is nowhere, while the plate bears next to nothing.
+    """Set implausibly far centres of pressure without load to NaN; return a note.
 
     Raises:
-        FileFormatError: it is nowhere under load.
+        FileFormatError: a centre of pressure is implausibly far under load.
     """
     far = (np.abs(cop_m) >= NUMBER_MAX).any(axis=1)
     if not far.any():

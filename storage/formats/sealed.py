@@ -1,4 +1,4 @@
-"""A sealed file with what lies beside it, exported: its frames, the server's time, the marks."""
+"""Export of a sealed file with its sidecars: frames, the server's time, markers."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from storage.sessions.folder import Event
 from storage.sessions.reader import SessionReader
 
 _NEAR_NS = NEAREST_NS + 1_000_000
-"""Rather a group too many; sums of instants as float64, which do not wrap, are off by 2 us."""
+"""Search distance with a margin: float64 sums of instants do not wrap, but are off by 2 us."""
 
 
 def marks_of(reader: SessionReader, events: Sequence[Event], part: Slice) -> Marks:
-    """Where events stand in a sealed file; at no frame if no sound clock table lies beside it.
+    """Place markers at frames of a sealed file; at none if its clock table is missing or damaged.
 
     Raises:
         FileFormatError: the file is damaged.
@@ -32,7 +32,7 @@ def marks_of(reader: SessionReader, events: Sequence[Event], part: Slice) -> Mar
         return Marks(())
     try:
         clock = clock_beside(reader)
-    except (UsageError, FileFormatError) as error:  # the frames are worth more than the marks
+    except (UsageError, FileFormatError) as error:  # export the frames without markers
         return Marks([Mark(event, left_out=error.what) for event in events])
     names = (*TIMES, "part") if reader.has("part") else TIMES
     pieces = reader.columns(*names, groups=_near(reader, clock, events))
@@ -40,17 +40,17 @@ def marks_of(reader: SessionReader, events: Sequence[Event], part: Slice) -> Mar
 
 
 def _near(reader: SessionReader, clock: ClockTable, events: Sequence[Event]) -> list[int]:
-    """Row groups in which a mark may stand, by what the footer says of their times.
+    """Return the row groups that may have a marker's frame, by the times in the footer.
 
-    If none of them is one whose clock was compared, such a one as well: who finds no frame near a
-    mark has to know whether any frame's time is known.
+    At least one row group with a compared clock is included, if there is one: a marker without a
+    frame is reported differently if no frame has the server's time.
     """
     names = (*TIMES[1:], "part") if reader.has("part") else TIMES[1:]
-    said = zip(*(reader.extremes(name) for name in names), strict=True)
+    extremes = zip(*(reader.extremes(name) for name in names), strict=True)
     near: set[int] = set()
-    known: list[int] = []
+    compared: list[int] = []
     by_part: dict[int, list[tuple[int, ...]]] = {}
-    for group, (t_mono_ns, t_ns, *part) in enumerate(said):
+    for group, (t_mono_ns, t_ns, *part) in enumerate(extremes):
         of_part = part[0] if part else (0, 0)
         if t_mono_ns is None or t_ns is None or of_part is None or of_part[0] != of_part[1]:
             near.add(group)
@@ -62,13 +62,13 @@ def _near(reader: SessionReader, clock: ClockTable, events: Sequence[Event]) -> 
         reach = clock.reach(begins, ends, number)
         if reach is None:
             continue
-        known += groups.tolist()
+        compared += groups.tolist()
         least, greatest, sure = reach
         first = np.searchsorted(marks_ns, earliest.astype(np.float64) + least - _NEAR_NS)
         behind = np.searchsorted(marks_ns, latest.astype(np.float64) + greatest + _NEAR_NS)
         near.update(groups[~sure | (first < behind)].tolist())
-    if near.isdisjoint(known):
-        near.update(sorted(known)[:1])
+    if near.isdisjoint(compared):
+        near.update(sorted(compared)[:1])
     return sorted(near)
 
 
@@ -80,10 +80,10 @@ def export_of(
     marks: Marks | None = None,
     options: FormatOptions = NO_OPTIONS,
 ) -> Export:
-    """A sealed file as formats are given it: what the slice needs of it is read, and no more.
+    """Return the export of a sealed file, which reads only the data that the slice needs.
 
     Raises:
-        UsageError: the server's time is asked for, and no clock table is there.
+        UsageError: the server's time is requested, and the clock table is missing.
         FileFormatError: the file or its clock table is damaged.
     """
     extra = [name for name in KNOWN if name not in FRAME_COLUMNS and reader.has(name)]

@@ -1,10 +1,9 @@
-"""The load in a session of ours, sealed or exported, as the columns of a load trace.
+"""Load of a FootTile session, sealed or exported, as columns of a load trace.
 
-What was pressed is taken if the file knows it (`true_*`, of an emulation), else what was estimated;
-forces of tiles (`force_n_0`, ...) before their sum with its centre of pressure (`grf_n`). A bare
-reference tile bears nothing and has no column. Rows at the beginning and at the end of which a
-number is not known, as before the tare or the servo's first answer, are left out; one in between is
-for the reader of the trace to refuse.
+True loads of an emulation (`true_*`) take precedence over estimates, and forces of tiles
+(`force_n_0`, ...) over GRF with centre of pressure (`grf_n`). An unloaded reference tile has no
+column. Leading and trailing rows with an unknown number are dropped, as before the tare or the
+servo's first answer; the reader of the trace refuses such rows in between.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 SESSION_COLUMN = re.compile(
     r"t_ns|part|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)",
 )
-"""A pattern of the columns that are needed."""
+"""Pattern of the needed columns."""
 
 _TOTAL = ("grf_n", "cop_x_m", "cop_y_m")
 
@@ -38,13 +37,13 @@ def as_load(
     """Return `time_s` and `cell1_n, ...` or `fz_n, cop_x_m, cop_y_m`, and `angle_rad` if known.
 
     Args:
-        columns: of a session; those that `SESSION_COLUMN` names.
-        schema: of its Parquet file, which may describe the array; None of text.
-        where: for errors.
-        axis: of the session.
+        columns: columns of a session that match `SESSION_COLUMN`.
+        schema: schema of its Parquet file, which may describe the array; None for text.
+        where: path of the file, for errors.
+        axis: time axis of the session.
 
     Raises:
-        LoadTraceError: it has no load in its columns, or `t_ns` are no instants.
+        LoadTraceError: no column has a load, no row has all numbers, or `t_ns` is not int64.
     """
     found: dict[str, Column] = {}
     for stem in ("true_", ""):
@@ -53,6 +52,7 @@ def as_load(
         elif all(stem + name in columns for name in _TOTAL):
             names = ("fz_n", *_TOTAL[1:])
             found = {name: columns[stem + old] for name, old in zip(names, _TOTAL, strict=True)}
+            found |= _across_row(found)
         if found:
             break
     if not found:
@@ -69,10 +69,10 @@ def as_load(
     t_ns = columns[INSTANTS]
     if t_ns.dtype.kind != "i":
         raise LoadTraceError("t_ns are no instants", where=where, expected="nanoseconds")
-    if axis.is_shifted:  # only a sealed file's is, and each of its rows has a part
+    if axis.is_shifted:  # only in sealed files, where each row has a part
         t_ns = axis.at(np.asarray(t_ns, np.int64), columns["part"].astype(np.int64))
     found["time_s"] = np.asarray((t_ns - t_ns[:1]) * 1e-9, dtype=np.float64)
-    # Where nothing presses there is no centre of pressure, and none is needed.
+    # Rows without load need no centre of pressure.
     needed = [column for name, column in found.items() if not name.startswith("cop_")]
     rows = np.flatnonzero(~np.any([np.isnan(column) for column in needed], axis=0))
     if not len(rows):
@@ -81,10 +81,21 @@ def as_load(
     return {name: column[begin:end] for name, column in found.items()}
 
 
+def _across_row(found: Mapping[str, Column]) -> dict[str, Column]:
+    """Return 0 for the coordinate of the COP that one row of tiles does not measure.
+
+    Any constant gives the same load: a trace's COP counts from its mean.
+    """
+    stated = {name: ~np.isnan(found[name]) for name in _TOTAL[1:]}
+    if not any(rows.any() for rows in stated.values()):
+        return {}
+    return {name: np.zeros(len(rows)) for name, rows in stated.items() if not rows.any()}
+
+
 def _cells(
     columns: Mapping[str, Column], schema: pa.Schema | None, stem: str, *, where: str
 ) -> list[Column]:
-    """Forces of the tiles that bear load, in their order."""
+    """Return the forces of the load-bearing tiles, in order of their numbers."""
     numbers = sorted(
         int(match[1]) for name in columns if (match := re.fullmatch(rf"{stem}force_n_(\d+)", name))
     )
@@ -105,7 +116,7 @@ def _cells(
 
 
 def _bare(schema: pa.Schema | None) -> set[int] | None:
-    """Numbers of the bare tiles; None if the file does not describe the array, as CSV."""
+    """Return the numbers of reference tiles; None if the file has no array info, as CSV."""
     if schema is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Which rows and columns of a session are wanted."""
+"""Slice of a session: rows by time, and columns."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from devices.errors import UsageError
 from storage.schema import Array
 
 SECONDS_MAX = 1e9
-"""Thirty years."""
+"""Longest time of a slice's bounds: thirty years."""
 
 
 @dataclass(frozen=True)
 class Slice:
-    """Which rows and columns.
+    """Selection of rows and columns of a session.
 
     Attributes:
-        start_s: from so many seconds after the first frame on; None: from the beginning.
-        end_s: before so many seconds; None: to the end.
-        columns: names of columns, either of one tile (`force_n_0`) or of all (`force_n`); empty:
-            all there are.
+        start_s: first instant, in seconds after the first frame; None: the beginning.
+        end_s: end, exclusive, in seconds after the first frame; None: the end of the session.
+        columns: names of columns, of one tile (`force_n_0`) or of all tiles (`force_n`); empty: all
+            columns.
 
     Raises:
-        UsageError: an instant is none, or the end is not after the start.
+        UsageError: an instant is out of range, or the end is not after the start.
     """
 
     start_s: float | None = None
@@ -46,16 +46,16 @@ class Slice:
 
     @property
     def is_all(self) -> bool:
-        """Is it the whole session?"""
+        """True for the whole session with all columns."""
         return self == Slice()
 
     @property
     def is_some(self) -> bool:
-        """Is it some time, and not all?"""
+        """True if the slice bounds time."""
         return self.start_s is not None or self.end_s is not None
 
     def bounds_ns(self, begin_t_ns: int) -> tuple[int | None, int | None]:
-        """The first instant that is in it, and the first that is not any more; None: no bound.
+        """Return the slice's first instant, and its end, exclusive; None: no bound.
 
         Args:
             begin_t_ns: instant of the session's first frame.
@@ -67,7 +67,7 @@ class Slice:
         return start, end
 
     def rows(self, t_ns: Array, begin_t_ns: int) -> Array:
-        """Which frames are in it, bool[n].
+        """Return the mask of the frames in the slice, bool[n].
 
         Args:
             t_ns: int64[n], instants of frames on the session's time axis.
@@ -82,5 +82,5 @@ class Slice:
         return rows
 
     def begins_after(self, end_s: float) -> bool:
-        """Does it begin after a session that ends so many seconds after its first frame?"""
+        """Return whether the slice begins after `end_s`, in seconds after the first frame."""
         return self.start_s is not None and self.start_s > end_s

@@ -1,8 +1,8 @@
-"""Sealed sessions as one zip file, made while it is sent: none of it is kept.
+"""Zip archive of sealed sessions, streamed without a temporary file.
 
-Files go into it as they are, stored and not deflated, since Parquet is compressed already. What a
-zip file is opened by, its directory, comes last; if a session turns out to be damaged or gone on
-the way, it never comes, and nothing can take what was sent for the whole.
+Files are stored, not deflated: Parquet is compressed already. The directory of a zip file is its
+end. If a session is damaged or removed meanwhile, the directory is never sent, so that no program
+opens the incomplete archive.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from storage.sessions.stances import STANCES_NAME
 
 _PIECE = 1 << 20
 _DATED_S = (315_619_200, 4_354_732_800)
-"""From 2 January 1980 to 30 December 2107, in any time zone: a zip file can state no other dates.
+"""Range of dates of a zip file: 2 January 1980 to 30 December 2107, in any time zone.
 
-A machine without a clock writes files of 1970; they get the nearest date.
+Files of 1970, from a machine without a clock, get the nearest date.
 """
 _BESIDE = (EVENTS_NAME, CLOCK_NAME, STANCES_NAME)
-"""Each has its own checksum; older sessions lack some."""
+"""Sidecars of a session. Each has its own checksum; older sessions lack some."""
 
 
 @dataclass(frozen=True)
 class Sealed:
-    """A sealed session to be put into a zip file."""
+    """Sealed session to put into a zip file."""
 
     folder: Path
     sha256: str
-    """Of its frames."""
+    """SHA-256 of its frames' file."""
 
 
 def zipped(sessions: Iterable[Sealed]) -> Generator[bytes, None, None]:
-    """The pieces of a zip file with a folder for each session, as `foottile verify` takes it.
+    """Yield a zip file in chunks: a folder for each session, which `foottile verify` accepts.
 
     Raises:
-        DamagedFileError: a session's frames are not those that were sealed.
-        StorageError: a file cannot be read, or is there no more.
+        DamagedFileError: a session's frames differ from the sealed ones.
+        StorageError: a file cannot be read, or was removed.
     """
     sink = _Sink()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED, allowZip64=True) as file:
@@ -55,7 +55,7 @@ def zipped(sessions: Iterable[Sealed]) -> Generator[bytes, None, None]:
             for name in _BESIDE:
                 if (session.folder / name).is_file():
                     yield from _put(file, sink, session.folder / name)
-            # Last: of a session that is taken away meanwhile it is missed, whatever else was there.
+            # Last: if the session is removed meanwhile, this file fails, whatever was sent before.
             yield from _put(file, sink, session.folder / SESSION_NAME)
     yield sink.taken()
 
@@ -83,23 +83,23 @@ def _put(
 
 
 class _Sink(io.RawIOBase):
-    """Keeps what was written until it is taken; zipfile sees that it cannot go back in it."""
+    """Buffer of written bytes until they are drained; not seekable, which zipfile detects."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
 
     def writable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def write(self, piece: object) -> int:
-        """Keep a piece."""
-        content = bytes(piece)  # type: ignore[call-overload]  # whatever has a buffer
+        """Append a chunk."""
+        content = bytes(piece)  # type: ignore[call-overload]  # any object with a buffer
         self._pieces.append(content)
         return len(content)
 
     def taken(self) -> bytes:
-        """What was written since the last time."""
+        """Remove and return the bytes written since the last call."""
         content = b"".join(self._pieces)
         self._pieces.clear()
         return content

@@ -1,8 +1,8 @@
-"""When the frames that a journal holds were taken, by the records of its segments.
+"""Times of the frames in a journal, by the records of its segments.
 
-A frame of an instant, and the instant of a frame, are searched for in the records. What comes has
-to fit between the frames that are there: those may be far away in the files, for frames come newest
-first and from behind. Only the ends of what is held count, and they are looked up once.
+Searches the frame of an instant, and the instant of a frame. Incoming frames have to fit between
+the stored ones, which may be far away in the files, since the newest frames and the backlog arrive
+alternately. Only the ends of stored intervals matter, and their times are cached.
 """
 
 from __future__ import annotations
@@ -20,38 +20,39 @@ from storage.wire import EncodedBatch
 
 
 class Instants:
-    """Of one journal.
+    """Time index of one journal: cached times of the ends of its stored intervals.
 
     Args:
-        look_up: node's UTC of a number that is held and ends an interval; True: its upper end.
+        look_up: returns the node's UTC of a stored number that ends an interval; True: its upper
+            end.
     """
 
     def __init__(self, look_up: Callable[[int, bool], int | None]) -> None:
         self._look_up = look_up
         self._known: dict[tuple[int, bool], int | None] = {}
-        """By number and whether it is an upper end: a batch of one frame is both."""
+        """Times by number and whether it is an upper end: a batch of one frame is both."""
 
     def note(self, message: EncodedBatch, held: Intervals) -> None:
-        """A message was written, and is among what is held."""
-        known, first, last = self._known, message.seq_first, message.seq_last
-        known[first, False], known[last, True] = message.t_ns_first, message.t_ns_last
+        """Update the cache with a written message that is among the stored ones."""
+        t_ns_by_end, first, last = self._known, message.seq_first, message.seq_last
+        t_ns_by_end[first, False], t_ns_by_end[last, True] = message.t_ns_first, message.t_ns_last
         before, after = held.neighbours(first, last)
-        if before == first - 1:  # joined to it: neither is an end any more
-            known.pop((first - 1, True), None)
-            known.pop((first, False), None)
+        if before == first - 1:  # joined to it: the two numbers are no ends any more
+            t_ns_by_end.pop((first - 1, True), None)
+            t_ns_by_end.pop((first, False), None)
         if after == last + 1:
-            known.pop((last + 1, False), None)
-            known.pop((last, True), None)
+            t_ns_by_end.pop((last + 1, False), None)
+            t_ns_by_end.pop((last, True), None)
 
     def forget(self) -> None:
-        """Some of what was held is not any more: look again."""
+        """Clear the cache: numbers are no longer stored."""
         self._known.clear()
 
     def misplaced(self, frames: FrameBatch, held: Intervals) -> str:
-        """Why frames cannot stand among those that are held, in words; empty if they can.
+        """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Args:
-            frames: of one message; those that are held already do not count.
+            frames: frames of one message; those that are stored already are ignored.
             held: numbers in the journal.
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
@@ -65,7 +66,7 @@ class Instants:
                 (begin_ns, end_ns, a),
                 *([] if after_ns is None else [(after_ns, after_ns, after)]),
             ]
-            # The rule of `frame_rules.runs_back`, of two or three at every message: not as arrays.
+            # The rule of `frame_rules.find_time_reversals`, without arrays for two or three spans.
             for (_, before_end_ns, _), (next_begin_ns, _, seq) in pairwise(spans):
                 if next_begin_ns < before_end_ns:
                     return f"time runs back before frame {seq}"
@@ -79,10 +80,10 @@ class Instants:
 
 
 def first_seq_since(segments: Iterable[Segment], t_ns: int) -> int | None:
-    """The first number of a batch of which anything was taken at `t_ns` or later, if there is one.
+    """Return the first number of the oldest batch with a frame at `t_ns` or later, if any.
 
     Raises:
-        StorageError: an index cannot be read; so for all that search.
+        StorageError: an index cannot be read; so for all searches here.
     """
     young = []
     for segment in segments:
@@ -95,10 +96,10 @@ def first_seq_since(segments: Iterable[Segment], t_ns: int) -> int | None:
 
 
 def t_ns_near(segments: Sequence[Segment], seq: int, *, newest: bool) -> int | None:
-    """Node's UTC of the end of the batch with `seq`, or of its beginning.
+    """Return the node's UTC of the end (upper) or beginning of the batch with `seq`.
 
-    The record of a batch may be damaged: then the nearest one before, or after, that is whole
-    tells; None if there is none.
+    If the batch's record is damaged, the nearest valid one before or after it counts; None if there
+    is none.
     """
     holding = [segment for segment in segments if segment.held.within(seq, seq)]
     found = _nearest(holding, seq, newest=newest) or _nearest(segments, seq, newest=newest)
@@ -106,7 +107,7 @@ def t_ns_near(segments: Sequence[Segment], seq: int, *, newest: bool) -> int | N
 
 
 def _nearest(segments: Iterable[Segment], seq: int, *, newest: bool) -> list[tuple[int, int]]:
-    """First number and instant of each segment's last batch up to `seq`, or first from it on."""
+    """Return number and time of each segment's last batch up to `seq`, or first from it on."""
     found: list[tuple[int, int]] = []
     for segment in segments:
         records = segment.records()
@@ -126,13 +127,13 @@ def last_seq_until(
     at_least: int,
     read: Callable[[int, int], Iterable[FrameBatch]],
 ) -> int | None:
-    """The last number taken at `t_ns` or before, as `Journal.last_seq_until` says.
+    """Return the last number at `t_ns` or before, as `Journal.find_last_seq_until`.
 
     Args:
-        segments: of the journal.
+        segments: segments of the journal.
         t_ns: node's UTC.
-        at_least: batches before this number are not looked at.
-        read: gives the frames of a batch by its first and last number.
+        at_least: batches before this number are skipped.
+        read: returns the frames of a batch by its first and last number.
     """
     segments = [segment for segment in segments if segment.span[1] >= at_least]
     if all(segment.t_ns_last <= t_ns for segment in segments):

@@ -1,9 +1,9 @@
-"""The frames of one stream on disk: Arrow IPC stream segments, each with an index beside it.
+"""Journal of one stream on disk: Arrow IPC stream segments, each with an index beside it.
 
 `<folder>/<first_seq>.arrows` begins with the schema message; each batch is appended as the bytes in
-which it came. Appending does not wait for the disk; `sync` does, and only what was synced may be
-promised. Opening a journal takes in the segments that are there and cuts off what is not
-whole. Nothing is held twice: a number that is there already is left as it is.
+which it came. Appending does not wait for the disk; `sync` does, and only synced frames may be
+promised. Opening a journal recovers its segments and cuts off incomplete batches. No number is
+stored twice: a batch that is stored already is skipped.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ from storage.schema import array_info, wire_schema
 from storage.wire import EncodedBatch, decode, encode
 
 RING_NS = 600_000_000_000
-"""How long frames of no session are kept, for pre-roll and for late starts."""
+"""Retention time of frames that no session needs, for pre-roll and for late starts."""
 _WINDOW_FRAMES = 1 << 16
-"""Frames whose index is in memory at once while a journal of any length is read."""
+"""Frames whose index is in memory at once during a read."""
 
 
 class Journal:
-    """The frames of one stream (one `boot_id` of one node). One thread writes; any may read.
+    """Frames of one stream (one `stream_id` of one node). One thread writes; any may read.
 
     Args:
-        folder: the stream's own folder; made if absent.
+        folder: the stream's own folder; created if absent.
         info: description of the stream's array.
-        writes_later: who appends never waits for the disk. What is appended waits in memory until
-            it is synced or read, and what the disk then refuses is held until it is disowned.
+        writes_later: `append` never waits for the disk. Appended batches wait in memory until they
+            are synced or read; those that the disk then refuses count as stored until `invalidate`.
     """
 
     def __init__(self, folder: Path, info: ArrayInfo, *, writes_later: bool = False) -> None:
@@ -63,9 +63,9 @@ class Journal:
         self.held = Intervals()
         """Numbers that were appended, synced or not."""
         self.lost = Losses()
-        """Numbers that were held, or should have been, and why they are not."""
+        """Numbers that were or should have been stored, by the reason why they are not."""
         self.problems: list[str] = []
-        """What was found damaged when it was opened, and what became of it, in words."""
+        """Damage found when the journal was opened, and how it was handled, as messages."""
         self._schema = wire_schema(info)
         self._segments: list[Segment] = []
         header = self._schema.serialize().to_pybytes()
@@ -82,13 +82,13 @@ class Journal:
                 self.lost.add(damaged, CORRUPT)
                 if segment is not None:
                     self._take_in(segment)
-                elif is_indexed:  # else it was just begun when its process was killed
+                elif is_indexed:  # else its process was killed just after creating it
                     self.problems.append(
                         printable(f"{path}: no frame in it is proven by its index")
                     )
             for path in folder.glob("*" + INDEX_SUFFIX):
-                # A power cut may take the name of a segment and leave that of its index. Nothing in
-                # it was promised then; but a person may have deleted it, so the index is set aside.
+                # A power cut may lose the name of a segment and keep that of its index. None of its
+                # frames was promised then; but a person may have deleted it: set the index aside.
                 if not path.with_suffix(SUFFIX).exists():
                     with suppress(OSError):
                         path.rename(unread_of(path))
@@ -96,10 +96,10 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path, *, writes_later: bool = False) -> Journal:
-        """A journal that is there already; its description is in its notes or its segments.
+        """Open an existing journal; its array's description is in its notes or segments.
 
         Raises:
-            DamagedFileError: no readable segment in it.
+            DamagedFileError: it has no readable segment.
             FileFormatError: another version wrote its notes.
             StorageError: it cannot be read.
         """
@@ -108,8 +108,8 @@ class Journal:
             notes = StreamNotes.load_whole(folder, problems)
             info = notes.array_info if notes is not None else _described(folder)
         if info is None:
-            said = "; ".join(("no readable journal segment", *problems))
-            raise DamagedFileError(said, where=str(folder))
+            what = "; ".join(("no readable journal segment", *problems))
+            raise DamagedFileError(what, where=str(folder))
         journal = cls(folder, info, writes_later=writes_later)
         journal.problems[:0] = problems
         if notes is not None:
@@ -118,21 +118,21 @@ class Journal:
 
     @property
     def size_bytes(self) -> int:
-        """What it takes on the disk, nearly."""
+        """Approximate size on disk."""
         return sum(segment.size_bytes for segment in self._segments)
 
     @property
     def is_open(self) -> bool:
-        """Is a segment open, or not closed yet?"""
+        """True if a segment is open, or not closed yet."""
         return bool(self._open.paths)
 
     @property
     def is_closing(self) -> bool:
-        """Is a segment to be closed by the next sync?"""
+        """True if the next sync closes a segment."""
         return self._open.is_closing
 
     def misplaced(self, frames: FrameBatch) -> str:
-        """Why frames cannot stand among those that are held, in words; empty if they can.
+        """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Raises:
             StorageError: an index cannot be read.
@@ -141,20 +141,20 @@ class Journal:
             return self._instants.misplaced(frames, self.held)
 
     def append(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
-        """Hold the frames of `batch` that are not held yet; return their numbers.
+        """Append the frames of `batch` that are not stored yet; return their numbers.
 
         Args:
             batch: frames, `seq` rising by one.
-            payload: the batch as it came over the wire; else it is encoded here.
+            payload: the batch as it came over the wire; None: it is encoded here.
 
         Raises:
-            StorageError: the disk is full or not writable. What of the batch could not be written
-                is not held then.
+            StorageError: the disk is full or not writable. The frames that could not be written do
+                not count as stored.
         """
         first, last = int(batch.seq[0]), int(batch.seq[-1])
         new = self.held.missing(first, last)
         for a, b in new:
-            if (a, b) == (first, last):  # nearly always; views of the batch would cost a fifth more
+            if (a, b) == (first, last):  # the usual case, without the cost of views
                 payload = encode(batch, self._schema) if payload is None else payload
                 self._write(EncodedBatch.of(batch, payload))
             else:
@@ -163,10 +163,10 @@ class Journal:
         return new
 
     def append_message(self, message: EncodedBatch) -> None:
-        """The same for a message that this machine has encoded: it is not read again.
+        """Append a message that this machine has encoded, without decoding it.
 
         Raises:
-            StorageError: as for `append`.
+            StorageError: as for `append_new_frames`.
         """
         if self.held.missing(message.seq_first, message.seq_last) == message.numbers:
             self._write(message)
@@ -174,7 +174,7 @@ class Journal:
             self.append(decode(message.payload, self._schema), message.payload)
 
     def sync(self) -> None:
-        """Return when everything appended before is on the disk; may run in another thread.
+        """Return when all earlier batches are on the disk; may run in another thread.
 
         Raises:
             StorageError: the disk refused.
@@ -182,10 +182,10 @@ class Journal:
         self._open.sync()
 
     def disown(self, doubtful: Intervals) -> None:
-        """Stop holding batches within `doubtful`: they could not be synced, or are damaged.
+        """Remove batches within `doubtful_numbers`, unsynced or damaged, from the stored ones.
 
-        A segment that was closed forgets them for good, so that a copy that comes later is the one
-        that counts after a restart.
+        In a closed segment they are removed from the index on disk, so that a later copy is the
+        valid one after a restart.
         """
         written = self._open.paths
         for segment in self._segments:
@@ -202,10 +202,10 @@ class Journal:
         self._open.retire_all()
 
     def read(self, seq_first: int, seq_last: int) -> Iterator[FrameBatch]:
-        """Frames from `seq_first` to `seq_last` that are held, in order, some thousand at a time.
+        """Yield the stored frames from `seq_first` to `seq_last`, in order, in pieces.
 
         Raises:
-            DamagedFramesError: a batch on disk is damaged; which one, it says.
+            DamagedFramesError: a batch on disk is damaged; the error has its numbers.
             StorageError: a segment cannot be read.
         """
         with BatchReader(self._runs) as reader:
@@ -215,10 +215,10 @@ class Journal:
                     yield frames.rows(begin, end)
 
     def messages(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
-        """Batches with any of these frames, whole, in order, as the bytes in which they came.
+        """Yield the complete batches with any of these frames, in order, as they came.
 
         Raises:
-            DamagedFramesError: a batch on disk is damaged; which one, it says.
+            DamagedFramesError: a batch on disk is damaged; the error has its numbers.
             StorageError: a segment cannot be read.
         """
         with BatchReader(self._runs) as reader:
@@ -226,17 +226,17 @@ class Journal:
                 yield from reader.messages(batches)
 
     def first_seq_since(self, t_ns: int) -> int | None:
-        """The first number held that was taken at `t_ns` (node's UTC) or later, roughly.
+        """Return the first stored number at `t_ns` (node's UTC) or later, to a batch.
 
-        By whole batches, so up to one batch earlier; None if nothing so young is held.
+        It is up to one batch earlier; None if no stored frame is that young.
         """
         self._open.write()
         return instants.first_seq_since(self._segments, t_ns)
 
     def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
-        """Node's UTC of the newest frame held up to `seq`, or of the oldest from `seq` on.
+        """Return the node's UTC of the newest frame up to `seq`, or of the oldest from `seq` on.
 
-        By whole batches; None if there is no such frame.
+        To a batch; None if there is no such frame.
         """
         near = self.held.within(0, seq).last if newest else self.held.within(seq, NO_END).first
         if near is None:
@@ -245,16 +245,19 @@ class Journal:
         return instants.t_ns_near(self._segments, near, newest=newest)
 
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
-        """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
+        """Return the last number at `t_ns` or before, if later frames are stored too.
 
-        None while the stream has not passed `t_ns`. Batches before `at_least` are not looked at;
-        `at_least` - 1 if all of them were taken later.
+        None while the stream has not passed `t_ns`. Batches before `at_least` are skipped;
+        `at_least` - 1 if all others are later.
         """
         self._open.write()
         return instants.last_seq_until(self._segments, t_ns, at_least=at_least, read=self.read)
 
     def prune(self, before_t_ns: int, keep: Intervals) -> Intervals:
-        """Delete segments that end before `before_t_ns` and hold nothing of `keep`; their numbers.
+        """Delete segments that end before `before_t_ns` and have no number of `keep`.
+
+        Returns:
+            The deleted numbers.
 
         Raises:
             StorageError: a file cannot be deleted.
@@ -275,7 +278,7 @@ class Journal:
         return gone
 
     def evict(self, keep: Intervals) -> Intervals:
-        """Delete the oldest segment that holds nothing of `keep`; its numbers, if there is one.
+        """Delete the oldest segment without a number of `keep`; return its numbers, if any.
 
         Raises:
             StorageError: it cannot be deleted.
@@ -286,18 +289,18 @@ class Journal:
         return Intervals()
 
     def delete(self) -> None:
-        """Close the journal and delete all of it."""
+        """Close the journal and delete its folder."""
         self._open.abandon()
         self._segments = []
         self.held = Intervals()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def retire(self) -> None:
-        """Take nothing more into what is open: the next sync closes it, an append begins anew."""
+        """Stop appending to the open segments: the next sync closes them."""
         self._open.retire_all()
 
     def close(self) -> None:
-        """Sync what is open and close it; a later append opens a new segment.
+        """Sync and close the open segments; a later append opens a new one.
 
         Raises:
             StorageError: the disk refused.
@@ -306,7 +309,7 @@ class Journal:
         self.sync()
 
     def _take_in(self, segment: Segment) -> None:
-        """Take in a segment that was there; what was disowned once may be in two of them."""
+        """Add a recovered segment; after an invalidation two segments may have equal numbers."""
         if segment.held & self.held:
             segment.disown(self.held)
         if segment.held:
@@ -326,7 +329,7 @@ class Journal:
         self.lost.found(numbers_)
 
     def _found(self, seq_first: int, seq_last: int) -> Iterator[Batches]:
-        """Batches with any of these frames, some ten thousand frames at a time."""
+        """Yield batches with any of these frames, some ten thousand frames at a time."""
         at = max(0, seq_first - FRAMES_MAX)
         while (held := list(self.held.within(at, seq_last))) and held[0][0] <= seq_last:
             at = held[0][0]
@@ -348,7 +351,7 @@ class Journal:
 
 
 def _described(folder: Path) -> ArrayInfo | None:
-    """The array that the oldest readable segment says it is of; None if there is none."""
+    """Return the array description of the oldest readable segment; None if there is none."""
     for path in sorted(folder.glob("*" + SUFFIX)):
         with suppress(FileFormatError):
             schema = read_header(path)[0] if stat.S_ISREG(path.lstat().st_mode) else None

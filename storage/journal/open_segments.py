@@ -1,7 +1,7 @@
-"""The segments of one journal that are being written, and those that are to be closed.
+"""Segments of one journal that are being written, or wait to be closed.
 
-Frames may come out of order, newest first and what was missed behind them: two segments are open,
-and each takes only what follows its last frame, so that within a file time never runs back.
+Frames may come out of order, newest first and then the backlog: two segments are open, and each
+accepts only frames after its last one, so that within a file time never runs back.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from storage.journal.segment_writer import SegmentWriter
 from storage.wire import EncodedBatch
 
 SEGMENT_NS = 60_000_000_000
-"""A segment is closed after a minute of frames: what is not needed is deleted by segments."""
+"""Longest segment: a minute of frames, since only complete segments are deleted."""
 _OPEN_MAX = 2
 
 
 class OpenSegments:
-    """One thread appends; `sync` may run in another one.
+    """Open segments of a journal. One thread appends; `sync` may run in another one.
 
     Args:
-        folder: the journal's.
+        folder: the journal's folder.
         header: schema message with which a segment begins.
-        writes_later: `append` does not write; `write` and `sync` do, in whatever thread.
+        writes_later: `append` does not write; `write` and `sync` do, in any thread.
     """
 
     def __init__(self, folder: Path, header: bytes, *, writes_later: bool) -> None:
@@ -38,7 +38,7 @@ class OpenSegments:
         self._closing: list[SegmentWriter] = []
         self._has_new_names = False
         self._lock = threading.Lock()
-        """Guards the lists; never held while the disk works."""
+        """Guards the lists; never locked during disk I/O."""
 
     @property
     def paths(self) -> set[Path]:
@@ -48,11 +48,11 @@ class OpenSegments:
 
     @property
     def is_closing(self) -> bool:
-        """Is there a file that the next sync closes?"""
+        """True if the next sync closes a file."""
         return bool(self._closing)
 
     def append(self, message: EncodedBatch) -> SegmentWriter:
-        """Add a batch to the segment in which it may follow; all of it, or none.
+        """Append a batch to the segment where it fits; all of it, or none.
 
         Raises:
             StorageError: the disk is full or not writable.
@@ -62,28 +62,28 @@ class OpenSegments:
             with storage_errors(writer.segment.path):
                 writer.append(message)
         except StorageError:
-            # The end of the file is not known now: the next batch begins another file.
+            # The end of the file is unknown now: the next batch begins another file.
             self._retire(writer)
             raise
         return writer
 
     def write(self) -> None:
-        """Return when everything appended before is in the files.
+        """Return when all earlier batches are in the files.
 
         Raises:
-            StorageError: the disk is full or not writable; it goes on waiting.
+            StorageError: the disk is full or not writable; the batches go on waiting.
         """
         with self._lock:
             writers = [*self._open, *self._closing]
         with storage_errors(self._folder):
             for writer in writers:
-                # Of a segment that is closed meanwhile all is written, or its sync has failed: then
-                # what waited was not acknowledged, and is asked for again.
+                # A segment that is closed meanwhile is written completely, or its sync has failed:
+                # then its waiting batches were not acknowledged, and are requested again.
                 with suppress(ValueError):
                     writer.write()
 
     def sync(self) -> None:
-        """Return when everything appended before is on the disk.
+        """Return when all earlier batches are on the disk.
 
         Raises:
             StorageError: the disk refused.
@@ -109,13 +109,13 @@ class OpenSegments:
                 raise failed
 
     def retire_all(self) -> None:
-        """Take nothing more into these segments; the next sync closes them."""
+        """Stop appending to these segments; the next sync closes them."""
         with self._lock:
             self._closing += self._open
             self._open = []
 
     def abandon(self) -> None:
-        """Close all files as they are, for they are to be deleted."""
+        """Close all files as they are: they are about to be deleted."""
         with self._lock:
             writers = [*self._open, *self._closing]
             self._open, self._closing, self._has_new_names = [], [], False
@@ -123,7 +123,7 @@ class OpenSegments:
             writer.abandon()
 
     def _writer_for(self, seq_first: int, t_ns: int) -> SegmentWriter:
-        """The open segment that these frames may follow in: of several, the one that ends last."""
+        """Return the open segment that ends last before these frames, or a new one."""
         fitting = [w for w in self._open if w.segment.span[1] < seq_first]
         if fitting:
             writer = max(fitting, key=lambda w: w.segment.span[1])
@@ -134,10 +134,10 @@ class OpenSegments:
             self._retire(self._open[0])
         # After a failed write the name may be taken.
         path = self._folder / f"{seq_first:020d}{SUFFIX}"
-        taken = 1
+        suffix_number = 1
         while path.exists():
-            path = self._folder / f"{seq_first:020d}-{taken}{SUFFIX}"
-            taken += 1
+            path = self._folder / f"{seq_first:020d}-{suffix_number}{SUFFIX}"
+            suffix_number += 1
         check_held(path)
         with storage_errors(path):
             writer = SegmentWriter(path, self._header, writes_later=self._writes_later)
@@ -147,7 +147,7 @@ class OpenSegments:
         return writer
 
     def _retire(self, writer: SegmentWriter) -> None:
-        """Take nothing more into this segment; the next sync closes it."""
+        """Stop appending to this segment; the next sync closes it."""
         with self._lock:
             self._open.remove(writer)
             if writer.segment.held:

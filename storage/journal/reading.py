@@ -1,7 +1,7 @@
-"""Batches of a journal, found in the indexes of its segments, as messages or as frames.
+"""Reader of a journal's batches, found by the indexes of its segments, as messages or frames.
 
-Frames come in pieces of thousands, whatever the batches in which they were taken: a piece is read
-at once, and batch by batch only where something about it is not as it was written.
+Frames are returned in pieces of thousands, independent of the batches: a piece is read and decoded
+at once, and batch by batch only if a check fails.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from storage.run import RunReader
 from storage.wire import EncodedBatch, decode
 
 PIECE_FRAMES = 4096
-"""Frames in a piece, unless one message has more: as many as estimates are made of at a time."""
+"""Frames in a piece, unless one message has more: as many as the estimator handles at a time."""
 _OPEN_MAX = 8
-"""Segments that are open at once; frames that came out of order lie in two or three in turn."""
+"""Upper limit of open segments; out-of-order frames alternate between two or three."""
 
 
 @dataclass(frozen=True)
 class Batches:
-    """Batches in order of their frames.
+    """Index records of batches in order of their frames.
 
     Attributes:
-        records: of them, in the indexes.
+        records: index records.
         paths: segments.
-        segment: int64, in which of `paths` each is.
+        segment: int64, index of each batch's segment in `paths`.
     """
 
     records: Records
@@ -45,7 +45,7 @@ class Batches:
 
     @classmethod
     def of(cls, found: Sequence[tuple[Path, Records]]) -> Batches:
-        """Those of several segments."""
+        """Merge the records of several segments."""
         records = np.concatenate([np.zeros(0, RECORD), *(records for _, records in found)])
         segment = np.repeat(np.arange(len(found)), [len(records) for _, records in found])
         order = np.lexsort((records["count"], records["seq_first"]))
@@ -55,12 +55,12 @@ class Batches:
         return len(self.records)
 
     def since(self, seq: int) -> Batches:
-        """Those that do not end before this number."""
+        """Return the batches that do not end before this number."""
         keep = self.records["seq_first"] + self.records["count"] > seq
         return Batches(self.records[keep], self.paths, self.segment[keep])
 
     def pieces(self) -> Iterator[Batches]:
-        """The same, in as many as `PIECE_FRAMES` frames are in."""
+        """Split the batches into groups of up to `PIECE_FRAMES` frames."""
         frames = np.cumsum(self.records["count"], dtype=np.int64)
         begin = before = 0
         while begin < len(self):
@@ -71,10 +71,10 @@ class Batches:
 
 
 class BatchReader:
-    """Reads batches; the segments read last stay open until this is closed.
+    """Reader of batches; it keeps the last segments open until it is closed.
 
     Args:
-        runs: of the stream.
+        runs: decoder of the stream.
     """
 
     def __init__(self, runs: RunReader) -> None:
@@ -90,10 +90,10 @@ class BatchReader:
                 stack.callback(os.close, descriptor)
 
     def messages(self, batches: Batches) -> Iterator[EncodedBatch]:
-        """Each as the bytes in which it came.
+        """Yield each batch as the bytes in which it came.
 
         Raises:
-            DamagedFramesError: a batch on disk is damaged; which one, it says.
+            DamagedFramesError: a batch on disk is damaged; the error has its numbers.
             StorageError: a segment cannot be read.
         """
         for record, at in zip(batches.records, batches.segment.tolist(), strict=True):
@@ -107,17 +107,17 @@ class BatchReader:
             yield EncodedBatch(first, last, *t_ns, payload)
 
     def frames(self, batches: Batches) -> Iterator[FrameBatch]:
-        """Their frames, in pieces; what is before a batch that cannot be read comes before it.
+        """Yield the frames in pieces; those before an unreadable batch come before its error.
 
         Raises:
-            DamagedFramesError: as for `messages`.
-            FileFormatError: a batch is whole, and holds no frames of this stream.
-            StorageError: as for `messages`.
+            DamagedFramesError: as for `read_messages`.
+            FileFormatError: a batch is undamaged but holds no frames of this stream.
+            StorageError: as for `read_messages`.
         """
         for piece in batches.pieces():
             try:
                 content = self._content(piece)
-            except StorageError:  # a bad sector is in one batch: those before it are read
+            except StorageError:  # a bad sector is in one batch: read those before it
                 content = b""
             frames = self._runs.read(run_of(piece.records, content))
             if frames is not None:
@@ -131,7 +131,7 @@ class BatchReader:
                 yield frames
 
     def _content(self, batches: Batches) -> bytes:
-        """Their bytes, one behind the other; fewer if a segment was cut."""
+        """Read the bytes of adjacent batches; fewer if a segment was cut."""
         records, segment = batches.records, batches.segment
         ends = records["offset"] + records["length"]
         breaks = (segment[1:] != segment[:-1]) | (records["offset"][1:] != ends[:-1])

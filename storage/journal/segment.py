@@ -1,8 +1,8 @@
-"""One file of a journal: a schema message, then batches, each as the bytes in which it came.
+"""Segment: one file of a journal, with a schema message and then batches as they came.
 
-Beside it lies an index: for each batch where it is, which frames it holds and its CRC-32, because
-Arrow does not notice a flipped bit, nor a page that a power cut left empty. A batch that is not in
-the index was never promised to a server or a session. An index that is missing is rebuilt.
+Beside it lies an index: for each batch its position, its numbers and its CRC-32, because Arrow does
+not notice a flipped bit, nor a page that a power cut left empty. A batch without an index record
+was never promised to a server or a session. A missing index is rebuilt.
 """
 
 from __future__ import annotations
@@ -46,11 +46,12 @@ UNREAD_SUFFIX = ".unread"
 
 @dataclass
 class Segment:
-    """A file, and which of the frames in it count.
+    """File of batches, and which of its frames count.
 
     Attributes:
         path: the file; its index has the same name with another suffix.
-        held: numbers of frames. What was disowned, or is in another segment as well, is not there.
+        held: numbers of frames, without those that were invalidated or are in another segment as
+            well.
         t_ns_first: instant of its oldest frame, in the node's UTC.
         t_ns_last: instant of its newest frame.
         size_bytes: length of both files.
@@ -62,7 +63,7 @@ class Segment:
     t_ns_last: int = 0
     size_bytes: int = 0
     is_doubtful: bool = False
-    """Was part of it disowned while it was written? Then it is checked when it is opened."""
+    """True: frames were invalidated while it was written, so it is checked when it is opened."""
 
     @property
     def span(self) -> tuple[int, int]:
@@ -71,7 +72,7 @@ class Segment:
         return intervals[0][0], intervals[-1][1]
 
     def take_in(self, records: Records) -> None:
-        """Note batches that are in the file."""
+        """Add the numbers, times and size of batches in the file."""
         self.held.add_stretches(records["seq_first"], records["count"])
         if len(records):
             begin, end = int(records["t_ns_first"].min()), int(records["t_ns_last"].max())
@@ -81,7 +82,7 @@ class Segment:
             self.size_bytes += int(records["length"].sum()) + records.nbytes
 
     def note(self, message: EncodedBatch) -> None:
-        """Note one batch that was written: the same as `take_in` of its record, for every one."""
+        """Add the numbers, times and size of one written batch; faster than `register_records`."""
         self.held.add(message.seq_first, message.seq_last)
         fresh = not self.size_bytes
         begin, end = message.t_ns_first, message.t_ns_last
@@ -90,7 +91,7 @@ class Segment:
         self.size_bytes += len(message.payload) + RECORD.itemsize
 
     def records(self) -> Records:
-        """Index of the batches that count, in order of their frames.
+        """Read the index of the batches that count, in order of their frames.
 
         Raises:
             StorageError: the index cannot be read.
@@ -105,18 +106,18 @@ class Segment:
         return found[np.argsort(found["seq_first"], kind="stable")]
 
     def disown(self, doubtful: Intervals) -> None:
-        """Stop holding batches within these numbers, also those that the index does not know.
+        """Remove batches within these numbers, also those that are not in the index.
 
         The file under its name may be a copy that was made before they were written.
         """
-        known: Records | tuple[()] = ()
+        records: Records | tuple[()] = ()
         with suppress(StorageError):  # gone, or no descriptor is left
-            known = self.records()
-        batches = [Intervals([numbers(record)]) for record in known]
+            records = self.records()
+        batches = [Intervals([numbers(record)]) for record in records]
         self.held = (self.held - doubtful) | union(b for b in batches if b - doubtful)
 
     def rewrite_index(self) -> None:
-        """Write an index of only the batches that count, marked as closed.
+        """Write an index of only the batches that count, and mark it as closed.
 
         Raises:
             StorageError: the disk is full or not writable; the old index is still there then.
@@ -124,21 +125,21 @@ class Segment:
         _write_index(self.path, self.records())
 
     def delete(self) -> None:
-        """Delete both files.
+        """Delete the segment and its index.
 
         Raises:
             OSError: they cannot be deleted.
         """
-        # In this order: a segment without an index is recovered, an index without a segment is not.
+        # The index first: a segment without index is recovered, an index without segment is not.
         self.path.with_suffix(INDEX_SUFFIX).unlink(missing_ok=True)
         self.path.unlink(missing_ok=True)
 
 
 def set_aside_no_files(folder: Path) -> list[str]:
-    """Set aside what has the name of a segment or index and is none, or may not be read.
+    """Set aside segments and indexes that are no regular files or not readable.
 
     Returns:
-        What was found, and what became of it, in words.
+        Messages of what was found and where it is now.
     """
     problems = []
     for path in sorted((*folder.glob("*" + SUFFIX), *folder.glob("*" + INDEX_SUFFIX))):
@@ -150,14 +151,14 @@ def set_aside_no_files(folder: Path) -> list[str]:
 
 
 def unread_of(path: Path) -> Path:
-    """A free name beside a segment for what of it could not be read."""
-    taken = {each.name for each in path.parent.iterdir()}
+    """Return a free path beside a segment for its unreadable bytes."""
+    existing = {each.name for each in path.parent.iterdir()}
     names = (f"{path.stem}{f'.{n}' if n > 1 else ''}{UNREAD_SUFFIX}" for n in count(1))
-    return path.with_name(next(name for name in names if name not in taken))
+    return path.with_name(next(name for name in names if name not in existing))
 
 
 def had_records(path: Path, schema: pa.Schema) -> bool:
-    """Are batches in a segment's index, or were there any? Only the newest one may lack its record.
+    """Return whether the segment's index has or had batches; only the newest may lack its record.
 
     Raises:
         OSError: one of the two files cannot be read.
@@ -169,14 +170,15 @@ def had_records(path: Path, schema: pa.Schema) -> bool:
 
 
 def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
-    """Take in a segment that is there: what counts in it, and which frames in it are damaged.
+    """Open an existing segment; return it and the numbers of its damaged frames.
 
-    The segment is None, and gone, if there is no whole batch in it. What is not in the index is set
-    aside in a file beside it, not thrown away: most often it is a message that was cut. A segment
-    that was closed in order is not read through: its batches are checked when they are read.
+    The segment is None, and deleted, if no batch in it is complete. Bytes without an index record
+    are moved to a file beside it, not discarded: most often they are a message that was cut. A
+    segment that was closed in order is not read through: its batches are checked when they are
+    read.
 
     Raises:
-        OSError: it cannot be read, or not cut.
+        OSError: it cannot be read or truncated.
     """
     size = path.stat().st_size
     damaged, doubtful = Intervals(), Intervals()
@@ -202,8 +204,8 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
             if found is None and is_whole(record):
                 doubtful.add(*numbers(record))
             elif found is not None:
-                # Damage followed by a good batch happened after writing; damage at the end of
-                # an unclosed file was never promised.
+                # Damage followed by a good batch happened after writing; a damaged end of an
+                # unclosed file was never promised.
                 damaged, doubtful = damaged | doubtful, Intervals()
                 if found["count"]:
                     good.append(found)
@@ -218,7 +220,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
     records = np.array(good, RECORD)
     segment.take_in(records)
     os.truncate(path, end)
-    # A killed process leaves frames that only the kernel holds; from now on they are promised.
+    # A killed process leaves frames that only the kernel has; from now on they are promised.
     with path.open("rb") as file:
         os.fsync(file.fileno())
     _write_index(path, records)
@@ -226,7 +228,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
 
 
 def _set_aside(path: Path, content: bytes) -> None:
-    """All of it, or nothing: on a full disk it is tried again and again."""
+    """Write all bytes or no file: on a full disk recovery is retried again and again."""
     try:
         path.write_bytes(content)
     except OSError:
@@ -235,13 +237,13 @@ def _set_aside(path: Path, content: bytes) -> None:
 
 
 def _write_index(path: Path, records: Records) -> None:
-    """Replace a segment's index by one that says that it was closed."""
+    """Replace a segment's index, marked as closed."""
     content = records.tobytes() + closing_record()
     write_whole(path.with_suffix(INDEX_SUFFIX), content)
 
 
 def _checked(descriptor: int, record: Any, end: int, message: EncodedBatch | None) -> Any | None:
-    """The record if the batch's bytes agree with it; mended if only the record was damaged."""
+    """Return the record if the batch's bytes match it, repaired if only the record is damaged."""
     if is_whole(record):
         is_right = not record["count"] or payload_of(descriptor, record) is not None
         return record if is_right else None
@@ -252,7 +254,7 @@ def _checked(descriptor: int, record: Any, end: int, message: EncodedBatch | Non
 
 def _rebuilt_index(path: Path, begin: int, schema: pa.Schema) -> Records:
     records = bytearray()
-    # Without a whole header nothing after it is known to be a batch.
+    # Without a whole header no bytes after it can be trusted as a batch.
     for message in messages_from(path, begin, schema) if begin else ():
         records += record_of(message, begin)
         begin += len(message.payload)

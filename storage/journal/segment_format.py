@@ -1,7 +1,7 @@
-"""How a segment is read: its schema message and batches, and the index beside it.
+"""Format of a segment: its schema message and batches, and the index beside it.
 
-The index has a record for each batch: where it is, which frames it holds, and its CRC-32. A record
-without frames ends it: the segment was synced to its end and closed.
+The index has a record for each batch: its position, its numbers and its CRC-32. A record without
+frames ends it: the segment was synced to its end and closed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RECORD = np.dtype(
         ("check", "<u4"),
     ]
 )
-"""One batch in the index: `crc32` is of its bytes, `check` of this record before it."""
+"""Index record of one batch: `crc32` is of the batch's bytes, `check` of the record before it."""
 
 _CHECKED = RECORD.itemsize - 4
 _PACKED = struct.Struct("<QqqQIII")
@@ -46,7 +46,7 @@ Records = npt.NDArray[np.void]
 
 
 def record_of(message: EncodedBatch, offset: int) -> bytes:
-    """The index record of a batch."""
+    """Return the index record of a batch as bytes."""
     return _sealed(
         message.seq_first,
         message.t_ns_first,
@@ -59,24 +59,24 @@ def record_of(message: EncodedBatch, offset: int) -> bytes:
 
 
 def closing_record() -> bytes:
-    """The record that ends an index."""
+    """Return the record that ends an index, as bytes."""
     return _sealed(0, 0, 0, 0, 0, 0, 0)
 
 
 def numbers(record: Any) -> tuple[int, int]:
-    """First and last frame of a record with frames."""
+    """Return the first and last frame number of a record."""
     first = int(record["seq_first"])
     return first, first + int(record["count"]) - 1
 
 
 def is_whole(record: Any) -> bool:
-    """Is the record what was written? No writer of ours gives numbers that no stream reaches."""
+    """Return whether the record's checksum is right, and its numbers are possible."""
     is_checked = zlib.crc32(record.tobytes()[:_CHECKED]) == int(record["check"])
     return is_checked and int(record["seq_first"]) < SEQ_END and int(record["offset"]) < _OFFSET_END
 
 
 def are_whole(index: Records) -> npt.NDArray[np.bool_]:
-    """Which records are what was written?"""
+    """Return a mask of the records that `is_record_valid` accepts."""
     content = memoryview(np.ascontiguousarray(index).tobytes())
     begins = range(0, len(content), RECORD.itemsize)
     checks = [zlib.crc32(content[at : at + _CHECKED]) for at in begins]
@@ -85,22 +85,22 @@ def are_whole(index: Records) -> npt.NDArray[np.bool_]:
 
 
 def is_closed(index: Records) -> bool:
-    """Does it say that its segment was closed in order?"""
+    """Return whether the index marks its segment as closed in order."""
     return bool(len(index)) and is_whole(index[-1]) and not index[-1]["count"]
 
 
 def batches_in(index: Records) -> Records:
-    """Its whole records with frames."""
+    """Return the valid records with frames."""
     return index[(index["count"] > 0) & are_whole(index)]
 
 
 def end_of(index: Records) -> int:
-    """Where the last of some batches ends in the segment; 0 without any."""
+    """Return the offset behind the last of some batches in the segment; 0 without any."""
     return int((index["offset"] + index["length"]).max(initial=0))
 
 
 def read_index(path: Path) -> Records:
-    """All records of a segment's index, right or not; a cut one at its end is left out.
+    """Read all records of a segment's index, valid or not; a cut one at its end is skipped.
 
     Raises:
         OSError: there is none, or it cannot be read.
@@ -110,7 +110,7 @@ def read_index(path: Path) -> Records:
 
 
 def read_header(path: Path) -> tuple[pa.Schema | None, int]:
-    """Schema of a segment, and where its first batch begins; None and 0 if the schema is cut off.
+    """Read a segment's schema and the offset of its first batch; None and 0 if it is cut off.
 
     Raises:
         OSError: there is no such file.
@@ -123,7 +123,7 @@ def read_header(path: Path) -> tuple[pa.Schema | None, int]:
 
 
 def messages_from(path: Path, begin: int, schema: pa.Schema) -> Iterator[EncodedBatch]:
-    """Batches from a position on, up to the first bytes that are not a whole batch.
+    """Yield batches from an offset on, up to the first bytes that are not a complete batch.
 
     Raises:
         OSError: there is no such file.
@@ -142,11 +142,11 @@ def messages_from(path: Path, begin: int, schema: pa.Schema) -> Iterator[Encoded
 
 
 def payload_of(descriptor: int, record: Any) -> bytes | None:
-    """A batch's bytes from an open segment; None if they are not the ones that were written.
+    """Read a batch's bytes from an open segment; None if their CRC-32 is wrong.
 
     Args:
         descriptor: the segment.
-        record: of the batch, in the index.
+        record: index record of the batch.
 
     Raises:
         OSError: they cannot be read.
@@ -157,17 +157,17 @@ def payload_of(descriptor: int, record: Any) -> bytes | None:
 
 
 def run_of(records: Records, content: bytes) -> Run:
-    """Batches that are to be read at once.
+    """Combine index records and bytes into a batch of messages to decode at once.
 
     Args:
-        records: in order of their frames.
-        content: their bytes, in the same order.
+        records: index records in order of their frames.
+        content: bytes of the batches, in the same order.
     """
     columns = (records[name] for name in ("length", "seq_first", "count", "crc32"))
     return Run(content, *columns)
 
 
 def _sealed(*values: int) -> bytes:
-    # Packed, which takes a tenth of the time of filling in an array of one.
+    # `struct` takes a tenth of the time of filling in an array of one record.
     content = _PACKED.pack(*values)
     return content + zlib.crc32(content).to_bytes(4, "little")

@@ -1,4 +1,4 @@
-"""Writes one segment of a journal: batches to its file, their records to the index beside it."""
+"""Writer of one segment of a journal: batches to its file, their records to the index beside it."""
 
 from __future__ import annotations
 
@@ -15,27 +15,26 @@ from storage.journal.segment_format import INDEX_SUFFIX, closing_record, end_of,
 from storage.wire import EncodedBatch
 
 _WAITING_MAX_BYTES = 4 << 20
-"""More than that does not wait in memory: the disk is far behind, and who appends waits for it."""
+"""Upper limit of bytes that wait in memory: beyond it the appending thread waits for the disk."""
 
 
 class SegmentWriter:
-    """Appends to a new segment. Nothing is synced here: what is promised needs `sync` first.
+    """Writer that appends to a new segment. Batches may be promised only after `sync`.
 
     Args:
-        path: the file, which must not be there.
+        path: the file, which must not exist.
         header: its schema message.
-        writes_later: what is appended waits in memory for `write` or `sync`, in whatever thread. To
-            write to a file, or only to ask where it ends, may wait until the disk has taken what
-            another thread is syncing.
+        writes_later: appended batches wait in memory for `write` or `sync`, in any thread. Even to
+            query a file's end may wait until the disk has taken what another thread is syncing.
 
     Raises:
-        OSError: it cannot be made; nothing is left behind then.
+        OSError: it cannot be created; no file is left behind.
     """
 
     def __init__(self, path: Path, header: bytes, *, writes_later: bool = False) -> None:
         self.segment = Segment(path)
         self.has_news = True
-        """Is anything not synced?"""
+        """True if any appended batch is not synced."""
         self._writes_later = writes_later
         self._waiting: list[tuple[bytes, bytes]] = []
         self._writing = threading.Lock()
@@ -55,10 +54,10 @@ class SegmentWriter:
             raise
 
     def append(self, message: EncodedBatch) -> None:
-        """Take a batch and its record; all of it, or none.
+        """Append a batch and its record; all of it, or none.
 
         Raises:
-            OSError: the disk is full or does not take it.
+            OSError: the disk is full or refuses it.
         """
         record = record_of(message, self._end)
         if self._writes_later and self._end - self._written < _WAITING_MAX_BYTES:
@@ -72,26 +71,26 @@ class SegmentWriter:
         self.segment.note(message)
 
     def write(self) -> None:
-        """Return when all that was appended before is in the files.
+        """Return when all earlier batches are in the files.
 
         Raises:
-            OSError: the disk is full or does not take it; it goes on waiting.
+            OSError: the disk is full or refuses them; they go on waiting.
         """
         with self._writing:
             self._write_waiting()
 
     def sync(self) -> None:
-        """Return when all that was appended before is on the disk.
+        """Return when all earlier batches are on the disk.
 
         Raises:
-            OSError: the disk refused; what it holds of this segment is not known then.
+            OSError: the disk failed; the segment's content on disk is unknown then.
         """
         self.has_news = False
         try:
             self.write()
             os.fsync(self._data.fileno())
             os.fsync(self._index.fileno())
-            # A file that was moved or deleted takes what is written, too, and keeps it for nobody.
+            # A file that was moved or deleted accepts writes, too, but under another name or none.
             there, ours = os.stat(self.segment.path), os.fstat(self._data.fileno())
             if (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino):
                 raise FileNotFoundError(errno.ENOENT, "another file is in its place")
@@ -100,24 +99,24 @@ class SegmentWriter:
             raise
 
     def close(self) -> None:
-        """Sync, and note in the index that this segment is whole, so that it need not be checked.
+        """Sync, and mark the index as closed, so that the segment need not be checked again.
 
         Raises:
-            OSError: the disk refused.
+            OSError: the disk failed.
         """
         try:
             self.sync()
             if self.segment.is_doubtful:
                 self._forget_doubtful()
                 return
-            with suppress(OSError):  # without it the batches are checked when it is opened again
+            with suppress(OSError):  # without it the batches are checked at the next open
                 write_all(self._index, closing_record())
                 os.fsync(self._index.fileno())
         finally:
             self.abandon()
 
     def _forget_doubtful(self) -> None:
-        """Keep only the batches that count: those disowned were written again elsewhere."""
+        """Remove invalidated batches: they were written again elsewhere."""
         with suppress(OSError, StorageError):
             records = self.segment.records()
             if not len(records):
@@ -128,12 +127,12 @@ class SegmentWriter:
             self.segment.rewrite_index()
 
     def abandon(self) -> None:
-        """Close the files as they are."""
+        """Close the files without a sync."""
         self._data.close()
         self._index.close()
 
     def _write_waiting(self) -> None:
-        waiting = self._waiting[:]  # more may come meanwhile, behind it
+        waiting = self._waiting[:]  # more may be appended meanwhile
         if waiting:
             self._put(
                 b"".join(data for data, _ in waiting), b"".join(index for _, index in waiting)
@@ -153,7 +152,7 @@ class SegmentWriter:
 
 
 def write_all(file: BinaryIO, data: bytes) -> None:
-    """Write all of `data`, or leave the file as long as it was."""
+    """Write all of `data`, or leave the file at its old length."""
     begin = file.tell()
     view = memoryview(data)
     try:

@@ -1,4 +1,4 @@
-"""What is kept of a stream beside its frames: which array it is of, how it ended, what it lost."""
+"""`stream.json`: a stream's array, end and losses, beside its frames."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from storage.intervals import AsPairs
 
 NOTES_FILE = "stream.json"
 PROMISE_S = 0.5
-"""The longest that a frame of a node is unsynced, unless its disk is slower."""
+"""Upper limit of the time that a node's frame is unsynced, unless its disk is slower."""
 _BATCH_S = 0.033
-"""The longest batch of a node."""
+"""Longest batch of a node."""
 
 
 def unsynced_tail_max(rate_hz: float, waited_s: float = 0.0) -> int:
-    """How many frames a power cut takes at most: what waited for the disk, and one batch.
+    """Compute how many frames a power cut loses at most: those that waited, and one batch.
 
     Args:
-        rate_hz: of the stream.
-        waited_s: the longest that frames are known to have waited for the disk.
+        rate_hz: frame rate of the stream.
+        waited_s: longest time that frames have waited for the disk.
     """
     return math.ceil(rate_hz * max(PROMISE_S, waited_s)) + math.ceil(rate_hz * _BATCH_S)
 
 
 class StreamNotes(BaseModel):
-    """`stream.json` in the stream's folder, replaced whole at every change."""
+    """Content of `stream.json` in the stream's folder, replaced atomically at every change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     array_info: ArrayInfo
     number: int = 0
-    """Streams of a node are numbered as they begin; their clocks may have been set in between."""
+    """Order in which a node's streams began; its clock may have been set in between."""
     kernel_boot_id: str | None = None
-    """Which start of the machine it was taken in; None if that is not known here."""
+    """Kernel's boot id while it was acquired; None if unknown."""
     next_seq: int | None = None
-    """The number after its last frame; None while it runs, or if that is not known."""
+    """Number after its last frame; None while it runs, or if unknown."""
     unsynced_tail_max: int = 0
-    """How many more frames there may have been if its end was not recorded."""
+    """Upper limit of further frames, lost if the end was not recorded."""
     missed_slots: int = 0
-    """Slots in which no frame was taken; they never had a number."""
+    """Slots without a frame; they never had a number."""
     sync_max_s: float = 0.0
-    """The longest that frames waited for the disk."""
+    """Longest time that frames waited for the disk."""
     lost: AsPairs = Field(default_factory=dict)
     damaged: tuple[tuple[int, int], ...] = ()
-    """On a server: numbers that were here and cannot be read; the node may give them once more."""
+    """Unreadable numbers on a server; the node may send them once more."""
 
     @property
     def has_ended(self) -> bool:
-        """Is it known where it ended?"""
+        """True if the stream's end is recorded."""
         return self.next_seq is not None
 
     def save(self, folder: Path) -> None:
-        """Write it.
+        """Write `stream.json`.
 
         Raises:
             StorageError: the disk is full or not writable.
@@ -67,21 +67,17 @@ class StreamNotes(BaseModel):
 
     @classmethod
     def load(cls, folder: Path) -> StreamNotes | None:
-        """Read it; None if there is none.
-
-        Raises:
-            As `load_checked`.
-        """
+        """Read `stream.json`; None if there is none. Raises as `load_with_proof`."""
         notes, _ = cls.load_checked(folder)
         return notes
 
     @classmethod
     def load_checked(cls, folder: Path) -> tuple[StreamNotes | None, bool]:
-        """Read it, and say whether it proves itself; an older version's does not.
+        """Read `stream.json`; also return whether a checksum proves it (not in older versions).
 
         Raises:
-            DamagedFileError: it is not what was written.
-            FileFormatError: it is, by another version.
+            DamagedFileError: its content has changed since it was written.
+            FileFormatError: another version wrote it.
             StorageError: it cannot be read now.
         """
         path = folder / NOTES_FILE
@@ -95,7 +91,7 @@ class StreamNotes(BaseModel):
             what = f"not a stream's notes: {' '.join(str(error).split())[:300]}"
             if not read.is_proven:
                 raise DamagedFileError(what, where=str(path)) from error
-            # A field that is not known here is not dropped in silence: it may bound what is lost.
+            # An unknown field is not dropped silently: it may bound the losses.
             raise FileFormatError(
                 f"{what}; another version wrote it, and it is left as it is",
                 where=str(path),
@@ -104,11 +100,11 @@ class StreamNotes(BaseModel):
 
     @classmethod
     def load_whole(cls, folder: Path, problems: list[str]) -> StreamNotes | None:
-        """As `load`, and what is damaged is set aside.
+        """Read `stream.json`; set a damaged one aside and return None.
 
         Args:
             folder: the stream's own.
-            problems: told what was found damaged and what became of it.
+            problems: a message of any damage is added here.
 
         Raises:
             FileFormatError: another version wrote it.

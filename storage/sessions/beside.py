@@ -1,4 +1,4 @@
-"""What lies beside a session's frames: events, that people marked, and the clock table."""
+"""Sidecar files of a session's frames: markers and the clock table."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EVENTS_NAME = "events.parquet"
 
 
 def write_events(session: Session, folder: Path) -> None:
-    """Write `events.parquet` into the session's folder, in place of the one that is there.
+    """Write `events.parquet` into the session's folder; an existing one is replaced.
 
     Raises:
         StorageError: the disk is full or not writable.
@@ -38,25 +38,25 @@ def write_events(session: Session, folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredEvents:
-    """What `events.parquet` holds."""
+    """Content of `events.parquet`."""
 
     events: tuple[Event, ...]
     is_proven: bool
-    """False: an older version wrote it, without a hash."""
+    """False: an older version wrote it without a hash."""
 
 
 def read_events(path: Path) -> StoredEvents:
-    """Read `events.parquet`.
+    """Read `events.parquet` and verify its hash.
 
     Raises:
-        FileNotFoundError: there is none.
-        DamagedFileError: it is not what was written, or no table of events.
+        FileNotFoundError: there is no such file.
+        DamagedFileError: its hash is wrong, or it is no table of markers.
         StorageError: it cannot be read now.
     """
     read = read_table(path)
     try:
         events = TypeAdapter(tuple[Event, ...]).validate_python(read.table.to_pylist())
-    except Exception as error:  # bytes that nothing proves may cause any error
+    except Exception as error:  # unproven bytes may cause any error
         raise DamagedFileError(
             f"cannot be read as a table of events: {' '.join(str(error).split())[:300]}",
             where=str(path),
@@ -66,7 +66,7 @@ def read_events(path: Path) -> StoredEvents:
 
 
 def clock_beside(reader: SessionReader) -> ClockTable:
-    """The clock table that lies beside a sealed session's frames.
+    """Load the clock table in the folder of a sealed session's frames.
 
     Raises:
         UsageError: there is none.
@@ -89,7 +89,7 @@ def clock_beside(reader: SessionReader) -> ClockTable:
 
 
 def stream_ids(reader: SessionReader) -> list[str]:
-    """Return the streams by number of part; a file that was never recorded has one part.
+    """Return the stream ids by number of part; a file that was never recorded has one part.
 
     Raises:
         FileFormatError: the session's notes are damaged.

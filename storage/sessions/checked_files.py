@@ -1,4 +1,4 @@
-"""Sealed sessions that a server opens often: proven once, their footers kept."""
+"""Cache of sealed sessions that a server opens often: verified files and parsed footers."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from storage.sessions.reader import SessionReader
 
 _KNOWN_MAX = 1000
 _FOOTERS_MAX_BYTES = 4 << 20
-"""As they are in their files; parsed they take some eleven times as much."""
+"""Most bytes of cached footers as in their files; parsed they take about eleven times as much."""
 
 
 class CheckedFiles:
-    """Each is held against its hash once, not every time, and its footer is parsed once.
+    """Cache of verified files and parsed footers. Thread-safe.
 
-    One whose stamps say that it is another file by now is held against its hash again; checksums
-    of pages are looked at whenever they are read. The footers used last are kept, up to a bound of
-    their bytes. May be used from several threads.
+    Each file is verified against its hash once, and its footer is parsed once. A file whose stamps
+    have changed is verified again; page checksums are verified at every read. The footers used last
+    are kept, up to a limit of their bytes.
     """
 
     def __init__(self) -> None:
@@ -27,14 +27,14 @@ class CheckedFiles:
         self._lock = Lock()
 
     def open(self, path: Path, *, only_slices: bool = False) -> SessionReader:
-        """Open a sealed session.
+        """Open a sealed session; verify it if it is not in the cache.
 
         Args:
             path: the file.
-            only_slices: as for `SessionReader`.
+            only_slices: as for `SealedFileReader`.
 
         Raises:
-            FileFormatError: as for `SessionReader`.
+            FileFormatError: as for `SealedFileReader`.
         """
         stamps = stamps_of(path)
         with self._lock:
@@ -57,6 +57,6 @@ class CheckedFiles:
                 del self._whole[next(iter(self._whole))]
             self._whole[stamps] = None
         self._footers[stamps] = footer
-        size_bytes = sum(kept.size_bytes for kept in self._footers.values())
+        size_bytes = sum(cached.size_bytes for cached in self._footers.values())
         while size_bytes > _FOOTERS_MAX_BYTES or len(self._footers) > _KNOWN_MAX:
             size_bytes -= self._footers.pop(next(iter(self._footers))).size_bytes

@@ -1,4 +1,4 @@
-"""Which sessions of many: by node, tag, take, text, time and completeness. Pure."""
+"""Filter of sessions by node, tag, take, text, time and completeness."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _T_NS_END = 2**63
 
 @dataclass(frozen=True)
 class Choice:
-    """What a session has to be; what is left empty may be anything.
+    """Filter of sessions; an empty field accepts every session.
 
     Attributes:
-        nodes: one of these has recorded it.
-        tags: it has all of these, in whatever case.
-        take: it is of this take.
-        q: text in id, name, subject, notes, node, scene or a tag, in whatever case.
-        from_t_ns: it was started at this instant or later, UTC.
-        to_t_ns: it was started before this one.
-        complete: what there is of it.
+        nodes: names of nodes, one of which recorded the session.
+        tags: tags that the session has, case-insensitive.
+        take: id of its take.
+        q: text in id, name, subject, notes, node, scene or a tag, case-insensitive.
+        from_t_ns: earliest start, UTC.
+        to_t_ns: end of the range of starts, exclusive, UTC.
+        complete: completeness of the session.
     """
 
     nodes: tuple[str, ...] = ()
@@ -37,11 +37,11 @@ class Choice:
     complete: Completeness | None = None
 
     def takes(self, session: Session, complete: Callable[[Session], Completeness]) -> bool:
-        """Is it one of these?
+        """Return whether a session passes the filter.
 
         Args:
-            session: as it is now.
-            complete: says what there is of one; asked last, since it may have to count.
+            session: the session now.
+            complete: returns a session's completeness; called last, since it may have to count.
         """
         tags = {tag.casefold() for tag in session.tags}
         return (
@@ -56,7 +56,7 @@ class Choice:
 
 
 def instant_ns(said: str, *, where: str) -> int:
-    """An instant in ns since 1970, UTC: such a number, or an ISO 8601 date, with or without time.
+    """Parse an instant in ns since 1970, UTC: such a number, or an ISO 8601 date or time.
 
     Args:
         said: without an offset it is UTC; a date alone is its midnight.
@@ -65,9 +65,10 @@ def instant_ns(said: str, *, where: str) -> int:
     Raises:
         UsageError: it is neither, or before 1970 or after 2261.
     """
-    text = said.strip()
+    stripped = said.strip()
+    is_number = re.fullmatch(r"[0-9]{9,}", stripped, re.ASCII)
     try:
-        t_ns = int(text[:20]) if re.fullmatch(r"[0-9]{9,}", text, re.ASCII) else _iso_ns(text)
+        t_ns = int(stripped[:20]) if is_number else _iso_ns(stripped)
     except (ValueError, OverflowError):
         t_ns = -1
     if not 0 <= t_ns < _T_NS_END:
@@ -86,17 +87,17 @@ def _iso_ns(text: str) -> int:
 
 
 def completeness_of(said: str, *, where: str) -> Completeness:
-    """What `true`, `false` and `lossy` stand for.
+    """Parse `true`, `false` or `lossy`.
 
     Raises:
         UsageError: it is none of these.
     """
-    known: dict[str, Completeness] = {"true": True, "false": False, "lossy": "lossy"}
-    if said not in known:
+    values: dict[str, Completeness] = {"true": True, "false": False, "lossy": "lossy"}
+    if said not in values:
         raise UsageError(f"{where} {said[:40]!r}", expected="true, false or lossy")
-    return known[said]
+    return values[said]
 
 
 def _mentions(session: Session, q: str) -> bool:
-    said = (session.id, session.name, session.subject, session.notes, session.node, session.scene)
-    return any(q in text.casefold() for text in (*said, *session.tags))
+    texts = (session.id, session.name, session.subject, session.notes, session.node, session.scene)
+    return any(q in text.casefold() for text in (*texts, *session.tags))

@@ -1,4 +1,4 @@
-"""What `session.json` says of a session: the server's own, or the one that `foottile pull` left."""
+"""Metadata of a session from `session.json`, the server's own or one of `foottile pull`."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from storage.sessions.folder import Ledger, Part, Session
 SESSION_NAME = "session.json"
 LEDGER_NAME = "ledger.json"
 PULLED_EVENTS_NAME = "events.json"
-"""`foottile pull` writes these two."""
+"""Markers; `foottile pull` writes this file and the ledger's."""
 
 
 @dataclass(frozen=True)
 class Claims:
-    """What a folder's `session.json` says, the server's own or one that was pulled."""
+    """Metadata from a folder's `session.json`, the server's own or a pulled one."""
 
     content: dict[str, Any]
     parts: tuple[Part, ...]
     ledger: Ledger | None
     whole: Session | None
-    """None for a pulled session, which says less."""
+    """Complete model; None for a pulled session, which has fewer fields."""
 
 
 def claims_in(
     folder: Path, text: bytes | None, problems: list[str], unproven: list[str]
 ) -> Claims | None:
-    """What a session's folder says of itself.
+    """Parse the metadata of a session's folder and verify its checksum.
 
     Args:
-        folder: the session's.
-        text: of its `session.json`; None if that is missing, or cannot be read.
-        problems: what is wrong is added here.
-        unproven: and here what the text cannot show.
+        folder: folder of the session.
+        text: content of its `session.json`; None if it is missing or unreadable.
+        problems: messages of damage are added here.
+        unproven: descriptions of facts without proof are added here.
 
     Returns:
-        None if it is not readable.
+        None if it cannot be parsed.
     """
     if text is None:
         is_there = os.path.lexists(folder / SESSION_NAME)
@@ -52,12 +52,10 @@ def claims_in(
         return None
     unchanged = is_unchanged(text)
     if unchanged is False:
-        problems.append(f"{SESSION_NAME} was changed: its text is not what its hash is of")
+        problems.append(f"{SESSION_NAME} was changed: its text does not match its hash")
     try:
         if unchanged is None:
-            unproven.append(
-                f"name, subject, notes and tags in {SESSION_NAME}: it states no hash of itself"
-            )
+            unproven.append(f"name, subject, notes and tags in {SESSION_NAME}: it has no hash")
         body = without_check(text)
         try:
             return claims_of(Session.model_validate_json(body))
@@ -69,14 +67,14 @@ def claims_in(
 
 
 def claims_of(session: Session) -> Claims:
-    """What a session says."""
+    """Return a session's model as metadata."""
     return Claims(session.model_dump(mode="json"), session.parts, session.ledger, session)
 
 
 def _pulled(
     folder: Path, content: dict[str, Any], problems: list[str], unproven: list[str]
 ) -> Claims:
-    """What `foottile pull` left: the API's view of the session, and beside it events and ledger."""
+    """Parse a pulled session: the API's view of it, and markers and ledger beside it."""
     text = _beside(folder / LEDGER_NAME, problems, unproven)
     _beside(folder / PULLED_EVENTS_NAME, problems, unproven)
     parts = tuple(Part.model_validate(part) for part in content["parts"])
@@ -93,12 +91,12 @@ def _beside(path: Path, problems: list[str], unproven: list[str]) -> bytes | Non
         problems.append(f"{path.name}: {error.what}")
         return None
     if not read.is_proven:
-        unproven.append(f"{path.name}: it states no hash of itself")
+        unproven.append(f"{path.name}: it has no hash")
     return read.text
 
 
 def bytes_of(path: Path) -> bytes | None:
-    """A file's content; None if there is none, or it cannot be read."""
+    """Read a file's content; None if there is none, or it cannot be read."""
     try:
         return read_whole(path)
     except (OSError, DamagedFileError):
@@ -106,5 +104,5 @@ def bytes_of(path: Path) -> bytes | None:
 
 
 def first_line(error: Exception) -> str:
-    """An error in one line of bounded length."""
+    """Return an error's text in one line of up to 300 characters."""
     return " ".join(str(error).split())[:300]

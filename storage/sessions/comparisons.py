@@ -1,8 +1,8 @@
-"""What a session was compared with: a folder for each reference, beside the session's frames.
+"""Stored comparisons of a session: a folder for each reference, beside the session's frames.
 
 `compare.json` has the figures, `compare.md` and `compare.png` are for people, and `series.parquet`
-has frame by frame what was compared. Names of folders are those of references, so they are looked
-up among those that there are, and never made into a path.
+has the compared frames. A folder's name is that of its reference, so it is looked up in the listing
+and never made into a path.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from storage.durable import open_own
 from storage.schema import Column
 
 COMPARISONS = "comparisons"
-"""In a session's folder: what it was compared with, a folder for each reference."""
+"""Folder in a session's folder with a subfolder for each reference."""
 REPORT_NAME = "compare.json"
 SERIES_NAME = "series.parquet"
 
 _F32 = pa.float32()
 _GROUP_ROWS = 1 << 16
-"""Of a row group: two minutes."""
+"""Rows of a row group: two minutes."""
 ROWS_MAX = 2_500_000
-"""Of a series: more would not be read at once (`storage.durable.BYTES_MAX`)."""
+"""Most rows of a series: a longer one would not be read at once (`MAX_READ_BYTES`)."""
 
 SERIES = (
     Column("t_ns", pa.int64(), "ns", "of our frame, on the session's time axis"),
@@ -42,7 +42,7 @@ SERIES = (
     Column("reference_cop_x_m", _F32, "m", "of the reference where it bears load, forward"),
     Column("reference_cop_y_m", _F32, "m", "likewise, to the left"),
 )
-"""What was compared: our frames at which the reference is known, in the order of time."""
+"""Columns of a series: our frames with a reference value, in the order of time."""
 
 SCHEMA = pa.schema(
     [column.field(column.name, column.type, nullable=column.type == _F32) for column in SERIES]
@@ -51,11 +51,11 @@ SCHEMA = pa.schema(
 
 @dataclass(frozen=True)
 class Report:
-    """What `compare.json` holds.
+    """Content of `compare.json`.
 
     Attributes:
         content: by name (docs/compare.md).
-        is_proven: it has the hash that it states.
+        is_proven: True: it has a checksum, which is right.
     """
 
     content: dict[str, Any]
@@ -63,17 +63,17 @@ class Report:
 
 
 def comparisons_of(session: Path) -> dict[str, Path]:
-    """Folders of what a session was compared with, by the reference's name, in their order.
+    """List a session's comparison folders by the reference's name, sorted.
 
     Args:
-        session: its folder.
+        session: folder of the session.
 
     Raises:
         StorageError: it cannot be read now.
     """
     try:
         found = sorted((session / COMPARISONS).iterdir())
-        # What points elsewhere is none of the session's.
+        # A link may lead out of the session's folder.
         return {path.name: path for path in found if path.is_dir() and not path.is_symlink()}
     except (FileNotFoundError, NotADirectoryError):
         return {}
@@ -86,7 +86,7 @@ def comparisons_of(session: Path) -> dict[str, Path]:
 
 
 def comparison_of(session: Path, name: str) -> Path:
-    """The folder of one comparison.
+    """Find the folder of one comparison.
 
     Raises:
         UnknownError: there is none of this name.
@@ -96,17 +96,17 @@ def comparison_of(session: Path, name: str) -> Path:
     if name not in found:
         raise UnknownError(
             f"the session was not compared with {name!r}",
-            expected=", ".join(found) or "a comparison: it was compared with nothing",
-            remedy="`foottile compare` does that",
+            expected=", ".join(found) or "a comparison: it has none",
+            remedy="Make one with `foottile compare`",
         )
     return found[name]
 
 
 def read_report(folder: Path) -> Report:
-    """What a comparison found.
+    """Read the report of a comparison and verify its checksum.
 
     Raises:
-        DamagedFileError: `compare.json` is not there, or not what was written.
+        DamagedFileError: `compare.json` is missing, or was changed.
         StorageError: it cannot be read now.
     """
     path = folder / REPORT_NAME
@@ -129,11 +129,11 @@ def read_report(folder: Path) -> Report:
 
 
 def write_series(path: Path, table: pa.Table) -> None:
-    """Write `series.parquet`, in place of the one that is there.
+    """Write `series.parquet`; an existing one is replaced.
 
     Args:
-        path: of the file.
-        table: of `SCHEMA`.
+        path: the file.
+        table: of `SERIES_SCHEMA`.
 
     Raises:
         StorageError: the disk is full or not writable.
@@ -142,10 +142,10 @@ def write_series(path: Path, table: pa.Table) -> None:
 
 
 def read_series(folder: Path) -> pa.Table | None:
-    """What was compared, frame by frame; None: an older version wrote none.
+    """Read the compared frames; None: an older version wrote no series.
 
     Raises:
-        DamagedFileError: it is not what was written.
+        DamagedFileError: it was changed, or is no series.
         StorageError: it cannot be read now.
     """
     path = folder / SERIES_NAME
@@ -164,7 +164,7 @@ def read_series(folder: Path) -> pa.Table | None:
 
 
 def series_footer(folder: Path) -> pq.FileMetaData:
-    """Where things are in a series that `read_series` has proven just now.
+    """Read the footer of a series that `read_series` has verified just now.
 
     Raises:
         DamagedFileError: it cannot be read as Parquet any more.
@@ -177,16 +177,16 @@ def series_footer(folder: Path) -> pq.FileMetaData:
 def series_within(
     folder: Path, footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None
 ) -> pa.Table:
-    """Some time of a series; read are its row groups only, their pages held against checksums.
+    """Read a time range of a series: only its row groups, with their page checksums.
 
     Args:
-        folder: of the comparison.
-        footer: of the very file.
-        begin_ns: of the first instant; None: from the beginning.
-        end_ns: of the instant behind the last; None: to the end.
+        folder: folder of the comparison.
+        footer: footer of this file.
+        begin_ns: first instant; None: from the beginning.
+        end_ns: instant behind the last; None: to the end.
 
     Raises:
-        DamagedFileError: a page is not what its checksum is of.
+        DamagedFileError: a page's checksum is wrong.
         StorageError: it cannot be read now.
     """
     where = pc.scalar(True)
@@ -204,9 +204,9 @@ def series_within(
 def _groups_within(footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None) -> list[int]:
     found = []
     for group in range(footer.num_row_groups):
-        said: Any = footer.row_group(group).column(0).statistics
-        is_after = begin_ns is None or said.max >= begin_ns
-        if is_after and (end_ns is None or said.min < end_ns):
+        statistics: Any = footer.row_group(group).column(0).statistics
+        is_after = begin_ns is None or statistics.max >= begin_ns
+        if is_after and (end_ns is None or statistics.min < end_ns):
             found.append(group)
     return found
 

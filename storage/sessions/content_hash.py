@@ -1,9 +1,8 @@
-"""Hashes with which a sealed file proves itself, without anything beside it.
+"""Hash of a sealed file's content, which the file carries in its footer.
 
-Two, because they answer two questions. The *content hash*, here, is of what the file says, whatever
-its row groups and encodings: of every column's numbers, of the array's description and of the
-notes. The *file hash* (`storage.file_hash`) is of its bytes. Both are in the footer, and the few
-lines that compute them in docs/formats.md.
+The *content hash* covers the values, whatever the row groups and encodings: every column's numbers,
+the array's description and the notes. The *file hash* (`storage.parquet_hash`) covers the bytes.
+Both are in the footer, and docs/formats.md has the few lines that compute them.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ _TILE_NUMBER = re.compile(r"_[0-9]+$")
 
 
 class ContentDigest:
-    """Hashes columns as they are written or read, in any cut into tables."""
+    """Incremental hash of columns, independent of how they are cut into tables."""
 
     def __init__(self) -> None:
         self.order = FrameOrder()
         self._hashes: dict[str, Any] = {}
 
     def feed(self, table: pa.Table) -> None:
-        """Take the next rows; every table must have the same columns in the same order."""
+        """Add the next rows; every table must have the same columns in the same order."""
         for name in table.column_names:
             column = column_values(name, table.column(name))
             self._hashes.setdefault(name, hashlib.sha256()).update(column)
@@ -46,7 +45,7 @@ class ContentDigest:
         return {name: hash_.hexdigest() for name, hash_ in self._hashes.items()}
 
     def content(self) -> dict[str, Any]:
-        """What a file says of its content: counts, and the hash of every column."""
+        """Return the description of the content: counts, and the hash of every column."""
         parts = self.order.parts
         return {
             "frames": sum(part.frames for part in parts),
@@ -58,7 +57,7 @@ class ContentDigest:
         }
 
     def metadata(self, array_info: bytes, notes: bytes) -> dict[str, str]:
-        """The entries of the footer; its own hash and the file's follow when the file is whole."""
+        """Return the footer's entries, with placeholders for the hashes of footer and file."""
         content = json.dumps(self.content())
         return {
             CONTENT_KEY.decode(): content,
@@ -69,15 +68,15 @@ class ContentDigest:
 
 
 def column_values(name: str, column: pa.ChunkedArray[Any] | pa.Array[Any]) -> bytes | memoryview:
-    """A column's bytes as they are hashed: little-endian numbers, what is null as it is in memory.
+    """Return a column's bytes for hashing: little-endian numbers, nulls as missing values.
 
     A text is its UTF-8 and a zero byte.
     """
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
         return b"".join((text or "").encode() + b"\0" for text in column.to_pylist())
     if column.null_count:
-        known = KNOWN.get(_TILE_NUMBER.sub("", name))
-        missing = known.missing if known is not None else None
+        quantity = KNOWN.get(_TILE_NUMBER.sub("", name))
+        missing = quantity.missing if quantity is not None else None
         if pa.types.is_floating(column.type):
             missing = float("nan")  # type: ignore[assignment]  # of this column's own type
         column = column.fill_null(pa.scalar(missing if missing is not None else 0, column.type))
@@ -86,5 +85,5 @@ def column_values(name: str, column: pa.ChunkedArray[Any] | pa.Array[Any]) -> by
 
 
 def content_hash(array_info: bytes, notes: bytes, content: bytes) -> str:
-    """The one hash of all that a file says."""
+    """Compute the hash over description, notes and column hashes."""
     return hashlib.sha256(b"\n".join((array_info, notes, content))).hexdigest()

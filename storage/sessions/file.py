@@ -1,12 +1,12 @@
-"""A sealed session: one Parquet file of flat columns, written here and nowhere else.
+"""Writer of a sealed session: one Parquet file of flat columns.
 
-Integers are delta-encoded or have a dictionary, floats are byte-stream-split, all of it zstd (6
-bytes a frame of four tiles where CSV takes 54, performance.md). No integer is byte-stream-split:
-DuckDB before 2.0 and pyarrow before 16 do not read that. A row group is about a minute, in sessions
-of more than an hour up to five: each costs who reads the footer some time. The file appears whole
-or not at all: it is written beside its place under a name of its own, synced, and renamed. Its
-footer states hashes of its content, of its bytes and of itself (`storage.sessions.content_hash`,
-`storage.file_hash`), so that it proves itself.
+Integers are delta-encoded or have a dictionary, floats are byte-stream-split, all compressed by
+zstd (6 bytes a frame of four tiles where CSV takes 54, performance.md). No integer is
+byte-stream-split: DuckDB before 2.0 and pyarrow before 16 do not read that. A row group is about a
+minute, in sessions of more than an hour up to five: each row group costs a reader of the footer
+some time. The file appears completely or not at all: it is written under a temporary name, synced,
+and renamed. Its footer has hashes of its content, of its bytes and of itself
+(`storage.sessions.content_hash`, `storage.parquet_hash`).
 """
 
 from __future__ import annotations
@@ -42,31 +42,31 @@ from storage.sessions.content_hash import ContentDigest
 from storage.sessions.footer import NOTES_KEY
 
 EXPORT_KEY = b"foottile.export"
-"""Only in what was made from a session: of which one, and what of it."""
+"""Key of an export's source: the session, and the selection of its frames."""
 EXPORT_COLUMN = "about"
-"""The same in CSV, which has no metadata: a column of which the first cell has it."""
+"""Column of an export's source in CSV, which has no metadata: its first cell has the JSON."""
 
 ROW_GROUP_NS = 60_000_000_000
-"""The shortest row group, and the pieces of which longer ones are made."""
+"""Duration of the shortest row group, and of the pieces of longer ones."""
 GROWS_AFTER = 30
-"""A row group is a thirtieth of what lies before it: in ten hours there are 180 instead of 600."""
+"""Ratio of the rows before a row group to its own: in ten hours there are 180 instead of 600."""
 ROW_GROUP_PIECES_MAX = 5
-"""And no longer than that: of eight tiles with estimates it takes 45 MB to write."""
+"""Most pieces of a row group: with eight tiles and estimates it takes 45 MB to write."""
 LEVEL = 5
-"""Of zstd."""
+"""Compression level of zstd."""
 _DELTA = frozenset({"servo_counts", "servo_age_us", "part", "padc"})
-"""Integers of short steps, beside those of 64 bits: numbers of frames, and instants."""
+"""Delta-encoded integers of short steps, beside those of 64 bits (frame numbers and instants)."""
 
 
 class SessionWriter:
-    """Writes frames, and whatever goes with them, to a Parquet file that appears when sealed.
+    """Writer of frames and their extra columns to a Parquet file that appears when sealed.
 
-    Use as a context manager: an exception in the block leaves nothing behind.
+    Use as a context manager: after an exception in the block no file is left behind.
 
     Args:
-        path: where the sealed file will be. A file there is replaced at sealing, not before.
+        path: path of the sealed file. An existing file is replaced at sealing, not before.
         info: description of the array.
-        notes: anything else a reader should know; JSON-able, kept in the file's metadata.
+        notes: other facts for readers; JSON-able, stored in the file's metadata.
     """
 
     def __init__(self, path: Path, info: ArrayInfo, notes: Mapping[str, object]) -> None:
@@ -83,22 +83,22 @@ class SessionWriter:
         self._head = b"", b""
 
     def add_notes(self, notes: Mapping[str, object]) -> None:
-        """Add what became known later; must precede the first minute's end."""
+        """Add notes; only before the first minute's end."""
         self._notes |= notes
 
     def append(self, frames: FrameBatch, extra: Mapping[str, Array]) -> None:
-        """Add frames with their extra columns, which must be the same ones in every call.
+        """Append frames with their extra columns, which must be the same ones in every call.
 
         Args:
             frames: n frames.
-            extra: columns of `storage.schema.KNOWN` by name, n rows each.
+            extra: columns of `storage.schema.COLUMNS_BY_NAME` by name, n rows each.
         """
         columns = {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
         begin = 0
         while begin < len(frames):
             t_mono_ns = int(frames.t_mono_ns[begin])
             if self._piece_end_ns is not None and t_mono_ns < self._piece_end_ns - ROW_GROUP_NS:
-                self._end_piece()  # the node was switched on again: another part begins
+                self._end_piece()  # the node was rebooted: another part begins
                 self._write_group()
             fresh = self._piece_end_ns is None
             if self._piece_end_ns is None:
@@ -112,11 +112,11 @@ class SessionWriter:
             begin = end
 
     def seal(self) -> None:
-        """Write what is left, sync, and give the file its name.
+        """Write the remaining frames, sync, and rename the file to its final name.
 
         Raises:
-            FileFormatError: not one frame was appended.
-            StorageError: the disk is full or not writable; raises as `whole_file`.
+            FileFormatError: no frame was appended.
+            StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
         """
         self._end_piece()
         self._write_group()
@@ -128,7 +128,7 @@ class SessionWriter:
             self._writer = None
             write_file_hash(self._temporary)
             self._temporary.replace(self.path)
-        with storage_errors(self.path, "The file is whole; its name may be lost with the power"):
+        with storage_errors(self.path, "The file is complete; a power cut may lose its name"):
             sync_folder(self.path.parent)
 
     def __enter__(self) -> Self:
@@ -147,7 +147,7 @@ class SessionWriter:
             self._discard()
 
     def _end_piece(self) -> None:
-        """Make columns of what waits; as many numbers are half as long as in memory."""
+        """Convert waiting frames to a table, which takes half of the memory."""
         if not self._waiting:
             return
         names = list(self._waiting[0])
@@ -191,7 +191,7 @@ class SessionWriter:
     def _discard(self) -> None:
         try:
             if self._writer is not None:
-                # A file that is thrown away needs no footer, and a full disk has no room for one.
+                # A discarded file needs no footer, and a full disk has no room for one.
                 with suppress(OSError, pa.ArrowException):
                     self._writer.close()
                 self._writer = None
@@ -202,7 +202,7 @@ class SessionWriter:
 def parquet_options(schema: pa.Schema) -> dict[str, Any]:
     """Return the options of `pq.ParquetWriter` for a sealed file of flat columns.
 
-    Without `column_encoding` they make a file that readers of 2021 open, 20 to 60 % larger.
+    Without `column_encoding` readers of 2021 can open the file, which is then 20 to 60 % larger.
     """
     encodings = {field.name: _encoding(field) for field in schema}
     return {
@@ -215,7 +215,7 @@ def parquet_options(schema: pa.Schema) -> dict[str, Any]:
 
 
 def _encoding(field: pa.Field[Any]) -> str | None:
-    """Return the encoding of a column; None: a dictionary, of texts and of integers with noise."""
+    """Return a column's encoding; None: a dictionary, for texts and noisy integers."""
     if pa.types.is_floating(field.type):
         return "BYTE_STREAM_SPLIT"
     quantity = re.sub(r"_\d+$", "", field.name)

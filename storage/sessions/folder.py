@@ -1,7 +1,7 @@
-"""A recorded session: which intervals of which streams, what people say of it, and its state.
+"""Models of a recorded session, and the folder of all sessions.
 
-Each has a folder `<sessions>/<id>/` with `session.json`, replaced whole at every change, and, once
-it is sealed, `frames.parquet`, `events.parquet` and `clock.parquet`.
+A session has a folder `<sessions>/<id>/` with `session.json`, replaced atomically at every change,
+and, once it is sealed, `frames.parquet`, `events.parquet` and `clock.parquet`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SESSION_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
 State = Literal["recording", "pending", "sealing", "sealed"]
 Completeness = bool | Literal["lossy"]
-"""True: every frame is there; False: some may still come; "lossy": some never will."""
+"""True: all frames are stored; False: some may still come; "lossy": some will not."""
 
 
 class _Record(BaseModel):
@@ -42,7 +42,7 @@ class _Record(BaseModel):
 
 
 class Part(_Record):
-    """An interval of one stream, both ends included; `seq_last` is None while it is recorded."""
+    """Interval of one stream, both ends included; `seq_last` is None during the recording."""
 
     boot_id: str
     seq_first: int
@@ -50,7 +50,7 @@ class Part(_Record):
 
 
 class PartLedger(_Record):
-    """Each number of a part, counted once: recorded, lost for a reason, or still to come."""
+    """Counts of a part's numbers, each once: recorded, lost for a reason, or pending."""
 
     boot_id: str
     seq_first: int
@@ -59,57 +59,58 @@ class PartLedger(_Record):
     lost: dict[str, int]
     pending: int
     unsynced_tail_max: int = 0
-    """How many more frames there may have been when the node stopped without a word."""
+    """Upper limit of further frames when the node stopped unexpectedly."""
 
 
 class Ledger(_Record):
-    """What became of every frame of a session."""
+    """Counts of a session's numbers."""
 
     complete: bool
     lossy: bool
     parts: tuple[PartLedger, ...]
     missed_slots: int
-    """Slots in which the node took no frame; they never had a number."""
+    """Slots in which the node sampled no frame; they never had a number."""
 
     @property
     def completeness(self) -> Completeness:
-        """What there is of the session, in a word."""
+        """Completeness of the session."""
         return "lossy" if self.lossy else self.complete
 
     @property
     def recorded(self) -> int:
-        """Frames that are here."""
+        """Number of stored frames."""
         return sum(part.recorded for part in self.parts)
 
     @property
     def pending(self) -> int:
-        """Frames that are still to come."""
+        """Number of frames still to come."""
         return sum(part.pending for part in self.parts)
 
     @property
     def lost(self) -> dict[str, int]:
-        """Frames that never come, by reason."""
+        """Number of lost frames by reason."""
         return dict(sum((Counter(part.lost) for part in self.parts), Counter()))
 
     @property
     def unsynced_tail_max(self) -> int:
-        """How many more frames there may have been where a part broke off."""
+        """Upper limit of further frames behind unexpected ends of parts."""
         return sum(part.unsynced_tail_max for part in self.parts)
 
 
 class Event(_Record):
-    """Something a person marked."""
+    """Marker that a person set."""
 
     id: str
     label: str
     t_ns: int
-    """In the server's UTC."""
+    """Instant in the server's UTC."""
 
 
 class Asked(_Record):
-    """With which key a recording was asked for, and what was asked: both as digests.
+    """Idempotency key and request that started a recording, both as digests.
 
-    It is kept with what was begun: so the same request, sent again, finds that and begins no other.
+    The record is stored with the session: a repeated request returns that session and starts no
+    other.
     """
 
     key: str
@@ -117,14 +118,14 @@ class Asked(_Record):
 
 
 class Session(_Record):
-    """One recorded session."""
+    """Recorded session."""
 
     id: str
     name: str
     node: str
     state: State
     started_t_ns: int
-    """When it was started, in the server's UTC."""
+    """Start in the server's UTC."""
     stopped_t_ns: int | None = None
     parts: tuple[Part, ...]
     subject: str = ""
@@ -132,30 +133,30 @@ class Session(_Record):
     tags: tuple[str, ...] = ()
     scene: str
     scene_content: dict[str, Any] = Field(default_factory=dict)
-    """The scene file of the node when it was started."""
+    """Scene file of the node at the start."""
     calibration: dict[str, Any] | None = None
-    """The calibration in use when it was started; a later one does not change a recording."""
+    """Calibration at the start; a later one does not change a recording."""
     calibration_source: Literal["node", "server"] = "node"
-    """Who said which: the node itself, or the server, where one was assigned to the node."""
+    """Origin of the calibration: the node itself, or an assignment on the server."""
     events: tuple[Event, ...] = ()
     clock: tuple[ClockOffset, ...] = ()
     missed_slots_at_start: int = 0
     missed_slots_at_stop: dict[str, int] = Field(default_factory=dict)
-    """By boot_id, of the stream in which it was stopped, if the node was there."""
+    """Count by stream_id, of the stream at the stop, if the node was connected."""
     unsynced_tail_max: dict[str, int] = Field(default_factory=dict)
-    """By boot_id, of parts that ended because the node went away."""
+    """Count by stream_id, of parts that ended because the node went away."""
     given_up: bool = False
-    """A person has given up the frames that are still to come."""
+    """True: a person has given up the pending frames."""
     take: str | None = None
-    """Id of the take in which it was recorded together with other nodes."""
+    """Id of the take that it was recorded in together with other nodes."""
     asked: Asked | None = None
-    """The `Idempotency-Key` of the request that began it, if it had one."""
+    """Record of the request that started it, if that had an `Idempotency-Key`."""
     continues: str | None = None
     """Id of the session that this one continues, with other tiles."""
     problem: str | None = None
-    """What a person should know: why it could not be sealed yet, why it has no estimates."""
+    """User-visible problem: why it is not sealed yet, or has no estimates."""
     ledger: Ledger | None = None
-    """Final once it is sealed."""
+    """Ledger; final once the session is sealed."""
     frames: int = 0
     duration_s: float = 0.0
     bytes: int | None = None
@@ -164,26 +165,26 @@ class Session(_Record):
     absolute_scale: Literal["measured", "assumed"] | None = None
 
     def with_clock(self, rows: Iterable[ClockOffset]) -> Session:
-        """The session with new clock measurements of one of its streams added."""
-        known = sorted(self.clock, key=lambda row: row.t_mono_ns)
-        newest = {row.boot_id: row.t_mono_ns for row in known}
+        """Return the session with newer clock measurements of one of its streams."""
+        sorted_rows = sorted(self.clock, key=lambda row: row.t_mono_ns)
+        newest = {row.boot_id: row.t_mono_ns for row in sorted_rows}
         further = [row for row in rows if row.t_mono_ns > newest.get(row.boot_id, -1)]
         return self.model_copy(update={"clock": (*self.clock, *further)})
 
 
 def new_session_id(now: datetime) -> str:
-    """An id that sorts by time and is its folder's name."""
+    """Return an id that sorts by time and is the name of its folder."""
     return f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
 
 
 @dataclass(frozen=True)
 class StraySession:
-    """A session whose folder was renamed or copied, so that it has another name than its id.
+    """Session whose folder was renamed or copied, so that its name is not the session's id.
 
     Attributes:
-        name: of the folder.
-        error: what is wrong, and what to do.
-        may_need_frames: is it not sealed, so that it is still to be made of frames?
+        name: name of the folder.
+        error: problem and remedy.
+        may_need_frames: True: it is not sealed, so it still needs journaled frames.
     """
 
     name: str
@@ -192,16 +193,16 @@ class StraySession:
 
 
 class SessionFolder:
-    """All sessions of a data folder."""
+    """Folder of all sessions, or of those in the trash."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def path(self, session_id: str) -> Path:
-        """Folder of a session.
+        """Return the folder of a session.
 
         Raises:
-            UnknownError: the id has not the form of one, so it can not leave the folder either.
+            UnknownError: the id has an invalid form, which might lead out of the folder.
         """
         if not SESSION_ID.fullmatch(session_id):
             raise UnknownError(f"no session {session_id[:80]!r}")
@@ -211,7 +212,7 @@ class SessionFolder:
         """Write `session.json`.
 
         Raises:
-            StorageError: the disk is full or not writable; the old one is still there then.
+            StorageError: the disk is full or not writable; the old file is unchanged.
         """
         folder = self.path(session.id)
         is_new = not folder.exists()
@@ -221,7 +222,7 @@ class SessionFolder:
                 make_folder(folder)
             write_checked(folder / "session.json", text)
         except StorageError:
-            if is_new:  # a full disk still takes an empty folder, and perhaps a file's name
+            if is_new:  # a full disk still accepts an empty folder, and perhaps a file's name
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 
@@ -245,7 +246,7 @@ class SessionFolder:
         return session
 
     def load_all(self) -> tuple[list[Session], dict[str, FootTileError]]:
-        """All sessions, newest first, and errors by id for those that cannot be read."""
+        """Load all sessions, newest first, and errors by id of unreadable ones."""
         found, unreadable = [], {}
         for session_id in self.ids():
             try:
@@ -255,7 +256,7 @@ class SessionFolder:
         return found, unreadable
 
     def strays(self) -> list[StraySession]:
-        """Find sessions in folders that have no session's name; they are left where they are."""
+        """Find sessions in folders without a session's name; they are not moved."""
         found: list[StraySession] = []
         if not self._folder.is_dir():
             return found
@@ -300,11 +301,11 @@ class SessionFolder:
         )
 
     def move(self, session_id: str, to: SessionFolder) -> None:
-        """Move a session's folder to those of `to`: it is in one place or the other, never both.
+        """Move a session's folder to `to`, atomically.
 
         Raises:
             UnknownError: there is no such session.
-            StorageError: it cannot be moved; it is where it was then.
+            StorageError: it cannot be moved, and is where it was.
         """
         source, target = self.path(session_id), to.path(session_id)
         if not source.is_dir():
@@ -316,14 +317,14 @@ class SessionFolder:
             sync_folder(source.parent)
 
     def doom(self, session_id: str) -> Path:
-        """Rename a session's folder so that it is no session any more.
+        """Rename a session's folder for deletion, so that it is no session any more.
 
         Returns:
             The renamed folder, to be deleted.
 
         Raises:
             UnknownError: there is no such session.
-            StorageError: it cannot be renamed; the session is unchanged then.
+            StorageError: it cannot be renamed; the session is unchanged.
         """
         folder = self.path(session_id)
         if not folder.is_dir():
@@ -336,7 +337,7 @@ class SessionFolder:
         return doomed
 
     def ids(self) -> Iterator[str]:
-        """Ids of all sessions, newest first."""
+        """Yield the ids of all sessions, newest first."""
         if self._folder.is_dir():
             names = [
                 path.name
@@ -347,8 +348,8 @@ class SessionFolder:
 
 
 def _holds_nothing(folder: Path) -> bool:
-    """Is it what is left of a session that was never begun: made, and nothing written whole?"""
+    """Return whether the folder has no complete file: its session was never created."""
     try:
         return all(path.match(".*.tmp") for path in folder.iterdir())
-    except OSError:  # a file, or not readable: then it may be one
+    except OSError:  # a file, or not readable: it may be a session
         return False

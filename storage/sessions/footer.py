@@ -1,7 +1,7 @@
-"""What the footer of a sealed session says: array, notes, content, and where its columns are.
+"""Footer of a sealed session: array, notes, content, and column positions.
 
-Reading it costs more the more row groups and columns there are, and it never changes. So it is an
-object of its own, that a server keeps (`storage.sessions.checked_files`).
+Reading it takes time with the number of row groups and columns, and it never changes. So a server
+caches it (`storage.sessions.verified_file_cache`).
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ Stamps = tuple[int, ...]
 
 
 class Footer:
-    """A sealed file's footer, read and understood, with what is found out of the file only once.
+    """Parsed footer of a sealed file, with values that are computed from the file only once.
 
     Attributes:
-        metadata: what pyarrow made of it, with which the file is opened again.
+        metadata: pyarrow's metadata, with which the file is opened again.
         format: version of the file's format.
         info: the array.
-        notes: whatever else a reader should know.
-        content: what the file says of its content, and
-        content_sha256: the hash of that; None of both if another program wrote it last.
-        column_names: flat names.
+        notes: other facts for readers.
+        content: description of the file's content; None if another program wrote it last.
+        content_sha256: hash of the description; None in the same case.
+        column_names: names of the flat columns.
         frame_count: rows.
         size_bytes: length of the footer.
-        is_proven: is it what was sealed, by a hash of its own?
-        is_whole: was every byte of the file held against its hash?
-        span_ns: first and last instant on the session's time axis; None: not looked for yet.
-        axis: the session's time axis; None: not looked for yet.
+        is_proven: True: the footer's own hash is right.
+        is_whole: True: the file's hash is right.
+        span_ns: first and last instant on the session's time axis; None: not computed yet.
+        axis: time axis of the session; None: not computed yet.
     """
 
     def __init__(
@@ -64,13 +64,14 @@ class Footer:
         only_slices: bool = False,
         file: BinaryIO | None = None,
     ) -> None:
-        """Read the footer of a file, and prove what is asked for.
+        """Read the footer of a file and verify it.
 
         Args:
             path: the file.
-            is_checked: nothing is held against any hash: it was already, or shall not be.
-            only_slices: as for `prove`.
-            file: the same, open, if it is not on this machine: then its footer has to prove itself.
+            is_checked: skip the hashes: the file was verified already, or shall not be.
+            only_slices: as for `verify_unless_done`.
+            file: the open file, if it is not on this machine: then the footer must have its own
+                hash.
 
         Raises:
             FileFormatError: no such file, not Parquet, not one of ours, or damaged.
@@ -81,7 +82,7 @@ class Footer:
                 check_file(path)
             footer = read_footer(path) if file is None else footer_in(file)
             length = len(footer).to_bytes(4, "little")
-            # Parsed are the very bytes that are held against the hash.
+            # The parsed bytes are the same that are verified against the hash.
             self.metadata = pq.read_metadata(
                 pa.BufferReader(b"".join((_MAGIC, footer, length, _MAGIC)))
             )
@@ -100,7 +101,7 @@ class Footer:
         self.format = self._format()
         if file is not None and not self.is_proven:
             raise FileFormatError(
-                "its footer states no hash of itself, as of an older version",
+                "its footer has no hash of its own: an older version wrote it",
                 where=where,
                 remedy="Copy the session to this machine",
             )
@@ -124,13 +125,13 @@ class Footer:
         self._extremes: dict[str, list[tuple[int, int] | None]] = {}
 
     def prove(self, path: Path, *, only_slices: bool) -> None:
-        """Hold the file against its hash, unless that was done.
+        """Verify the file against its hash, unless that was done.
 
         Args:
             path: the file.
-            only_slices: the footer's own hash will do: all that is read besides are pages, each
-                against its checksum. Where the footer has none, as of an older version, it is the
-                whole file all the same.
+            only_slices: the footer's own hash is enough, since pages are verified against their
+                checksums when they are read. Without a footer hash, as of an older version, the
+                whole file is verified.
 
         Raises:
             FileFormatError: it is damaged.
@@ -146,13 +147,13 @@ class Footer:
 
     @cached_property
     def group_rows(self) -> list[int]:
-        """Rows of every row group."""
+        """Number of rows of every row group."""
         return [self.metadata.row_group(i).num_rows for i in range(self.metadata.num_row_groups)]
 
     def extremes(self, name: str) -> list[tuple[int, int] | None]:
-        """Least and greatest value of a column of integers in every row group.
+        """Return minimum and maximum of an integer column in every row group.
 
-        None where the file does not say, and of a column that it does not have.
+        None without statistics, and for a missing column.
         """
         if name not in self._extremes:
             self._extremes[name] = [self._extreme(name, i) for i in range(len(self.group_rows))]
@@ -162,10 +163,10 @@ class Footer:
         if name not in self.column_names:
             return None
         column = self.metadata.row_group(group).column(self.schema.get_field_index(name))
-        said: Any = column.statistics if column.is_stats_set else None
-        if said is None or not said.has_min_max or not isinstance(said.min, int):
+        statistics: Any = column.statistics if column.is_stats_set else None
+        if statistics is None or not statistics.has_min_max or not isinstance(statistics.min, int):
             return None
-        return said.min, said.max
+        return statistics.min, statistics.max
 
     def _format(self) -> bytes:
         version = self.said.get(FORMAT_KEY)
@@ -179,15 +180,15 @@ class Footer:
         return version
 
     def _content(self) -> tuple[str | None, dict[str, Any] | None]:
-        """What the file says of its content; None if another program wrote it last."""
-        said = self.metadata.metadata or {}
-        content, stated = said.get(CONTENT_KEY), said.get(CONTENT_HASH_KEY)
+        """Return the content's hash and description; None if another program wrote it last."""
+        metadata = self.metadata.metadata or {}
+        content, stated = metadata.get(CONTENT_KEY), metadata.get(CONTENT_HASH_KEY)
         if content is None or stated is None:
             return None, None
         found = content_hash(self.said[ARRAY_INFO_KEY], self.said[NOTES_KEY], content)
         if found.encode() != stated:
             raise FileFormatError(
-                "its description of array and session is not the one that was sealed",
+                "its description of array and session has changed since it was sealed",
                 where=self._where,
                 expected=f"content with the hash {stated[:64]!r}, found {found}",
             )
@@ -205,7 +206,7 @@ def _notes(text: bytes | None, *, where: str) -> dict[str, Any]:
 
 
 def stamps_of(path: Path) -> Stamps:
-    """What changes if a file does; empty if there is none."""
+    """Return device, inode, size and times, which change with a file; empty if there is none."""
     try:
         found = path.stat()
     except OSError:

@@ -1,7 +1,7 @@
-"""What frames say of their own completeness: per part the numbers that are there, and their order.
+"""Check of a file's frames: numbers and order of each part.
 
-`seq` rises within a part, `t_mono_ns` with it, and `t_ns` is `t_mono_ns` plus one offset. Whoever
-filters over time relies on that; a file from elsewhere, or an edited one, need not keep to it.
+`seq` and `t_mono_ns` rise within a part, and `t_ns` is `t_mono_ns` plus one offset. Every filter
+over time relies on that; a file of another program, or an edited one, need not keep to it.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ _SAID_MAX = 3
 
 @dataclass
 class PartFrames:
-    """What was seen of one part.
+    """Frames of one part: range, count, and disorder.
 
     Attributes:
         part: its number, from 0.
         seq_first: number of its first frame.
         seq_last: number of its last frame.
-        frames: how many there were.
+        frames: number of frames.
         offset_ns: `t_ns - t_mono_ns` of its first frame.
         t_mono_ns_first: instant of its first frame.
         t_mono_ns_last: instant of its last frame.
-        held: numbers that were there.
-        disorder: what is wrong with their order, in words; the first few.
-        disorders: how often something was.
+        held: frame numbers present.
+        disorder: messages about their order; the first few.
+        disorders: how many there would be.
     """
 
     part: int
@@ -51,32 +51,32 @@ class PartFrames:
 
     @property
     def gaps(self) -> Intervals:
-        """Numbers between the first and the last that were not there."""
+        """Numbers between the first and the last without a frame."""
         first, last = sorted((self.seq_first, self.seq_last))
         return self.held.missing(first, last)
 
 
 class FrameOrder:
-    """Looks at frames as they come, in any cut; what it found is in `parts` and `disorder`."""
+    """Check of frame order, piece by piece; results are in `parts` and `disorder`."""
 
     def __init__(self) -> None:
         self.parts: list[PartFrames] = []
         self.disorder: list[str] = []
-        """What is wrong with the order of the parts."""
+        """Messages about the order of the parts."""
 
     @property
     def problems(self) -> list[str]:
-        """All that is out of order, in words."""
+        """Messages about all disorder."""
         found = list(self.disorder)
         for part in self.parts:
-            found += [f"part {part.part}: {said}" for said in part.disorder]
+            found += [f"part {part.part}: {message}" for message in part.disorder]
             if part.disorders > len(part.disorder):
                 more = part.disorders - len(part.disorder)
                 found.append(f"part {part.part}: and {more} more of the kind")
         return found
 
     def feed(self, columns: Mapping[str, Array]) -> None:
-        """Take the next frames.
+        """Check the next frames.
 
         Args:
             columns: `seq`, `t_mono_ns`, `t_ns` and, if the file has it, `part`; n rows each.
@@ -120,13 +120,13 @@ class FrameOrder:
             _say(part, f"time runs back by {late_ns} ns before frame {seq[at + 1]}")
         beyond = out_of_range(t_mono_ns, t_ns)
         shifted = (t_ns - t_mono_ns != part.offset_ns) & ~beyond  # beyond, a difference may wrap
-        for wrong, said in (
-            (beyond, "is of no year that a clock says"),
+        for wrong, problem in (
+            (beyond, "is in no possible year"),
             (shifted, "is not t_mono_ns plus the part's offset"),
         ):
             if wrong.any():
                 first = int(seq[len(seq) - len(t_ns) + int(np.argmax(wrong))])
-                _say(part, f"t_ns of frame {first} {said}")
+                _say(part, f"t_ns of frame {first} {problem}")
         breaks = np.flatnonzero((seq[1:] - seq[:-1] != 1) | falls) + 1
         cuts = [0, *breaks.tolist(), len(seq)]
         for begin, end in pairwise(cuts):
@@ -138,7 +138,7 @@ class FrameOrder:
 def in_order(
     pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]], *, where: str
 ) -> Iterator[tuple[FrameBatch, Mapping[str, Array]]]:
-    """The same frames, for readers that rely on their order.
+    """Yield the same frames, for readers that rely on their order.
 
     Raises:
         FileFormatError: the first frame out of order is reached.

@@ -1,6 +1,6 @@
-"""The ledger: every number of a session counted once, as recorded, lost for a reason, or pending.
+"""Ledger of a session: every number counted once, as recorded, lost for a reason, or pending.
 
-Pure: it is made from intervals, wherever they come from: a running server, or files alone.
+Pure functions of intervals, which a running server or files alone may give.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ def ledger_of(
 ) -> Ledger:
     """Count every number of these parts once.
 
-    What is neither held, nor lost for a known reason, nor still with the node, is lost because the
-    node came back without it: `node_restarted`.
+    A number that is neither stored, nor lost for a known reason, nor obtainable, is lost because
+    the node came back without it: `node_restarted`.
 
     Args:
-        parts: a part without an end reaches to what is held.
-        streams: by boot_id; nothing is known of a stream that is not there.
-        finished: no more parts will be added.
+        parts: a part without an end reaches to the last stored number.
+        streams: states by stream_id; a missing one counts as empty.
+        finished: True: no more parts will be added.
     """
     counted = []
     for part in parts:
@@ -56,7 +56,7 @@ def ledger_of(
 def lost_numbers(
     parts: tuple[Part, ...], streams: Mapping[str, StreamState]
 ) -> dict[str, dict[str, list[tuple[int, int]]]]:
-    """Which numbers the ledger counts as lost, by boot_id and reason; for the sealed file."""
+    """Return the numbers that the ledger counts as lost, by stream_id and reason."""
     found: dict[str, Losses] = {}
     for part in parts:
         _, lost = _gaps_and_losses(part, streams.get(part.boot_id, StreamState()))
@@ -78,7 +78,7 @@ def _last_of(part: Part, stream: StreamState) -> int:
 
 
 def _gaps_and_losses(part: Part, stream: StreamState) -> tuple[Intervals, Losses]:
-    """Numbers of a part that are not held, and those of them that never will be, by reason."""
+    """Return a part's numbers that are not stored, and the lost ones of these by reason."""
     last = _last_of(part, stream)
     gaps = Intervals()
     if last >= part.seq_first:
@@ -90,15 +90,15 @@ def _gaps_and_losses(part: Part, stream: StreamState) -> tuple[Intervals, Losses
 
 @dataclass(frozen=True)
 class StreamState:
-    """What is known of one stream where its frames are wanted.
+    """State of one stream for a session that needs its frames.
 
     Attributes:
-        held: numbers that are here, or in the sealed file.
-        lost: numbers that are known not to come, by reason. What is held is not lost.
-        damaged: numbers that were here and cannot be read any more.
-        may_come: numbers that the node may still have; until it says so nothing is given up.
-        next_seq: the number after its last frame; None while it runs, or if that is not known.
-        unsynced_tail_max: how many more frames there may have been behind the last one.
+        held: numbers that are stored here, or in the sealed file.
+        lost: numbers that will not come, by reason; none of them is stored.
+        damaged: numbers that were stored here and cannot be read any more.
+        may_come: numbers that the node may still have; unknown ones count as obtainable.
+        next_seq: number after its last frame; None while it runs, or if unknown.
+        unsynced_tail_max: upper limit of further frames behind the last one.
         missed_slots: slots without a frame.
     """
 
@@ -115,15 +115,15 @@ Stream = TypeVar("Stream", bound=StreamState)
 
 
 def states_of(session: Session, streams: Mapping[str, Stream]) -> dict[str, Stream]:
-    """The streams as the session's ledger counts them.
+    """Return the streams' states as the session's ledger counts them.
 
-    What is damaged here is lost unless the node may give it once more, and what may come is lost
-    once the session was given up. Slots count only from the start to the stop, and a tail counts
-    only if a part reaches the end of its stream.
+    A damaged number is lost unless it is obtainable, and an obtainable one is lost once the session
+    was given up. Slots count only from start to stop, and a tail counts only if a part reaches the
+    end of its stream.
 
     Args:
-        session: whose ledger it is.
-        streams: by boot_id, of all of its parts.
+        session: the session.
+        streams: states of all of its streams, by stream_id.
     """
     found = {}
     for part in session.parts:
@@ -152,7 +152,7 @@ def states_of(session: Session, streams: Mapping[str, Stream]) -> dict[str, Stre
 
 
 def numbers_of(parts: Iterable[Part]) -> dict[str, Intervals]:
-    """Numbers of these parts by boot_id; a part without an end goes on with every frame to come."""
+    """Return the numbers of parts by stream_id; a part without an end has no upper limit."""
     numbers: dict[str, Intervals] = {}
     for part in parts:
         last = NO_END if part.seq_last is None else part.seq_last

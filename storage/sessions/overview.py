@@ -1,9 +1,9 @@
-"""`overview.arrow` beside a session's frames: the session at every zoom, read piece by piece.
+"""`overview.arrow` beside a session's frames: a pyramid of bins, read piece by piece.
 
 An Arrow file of bins (`storage.sessions.pyramid`), level after level from the finest, in pieces of
 some thousand bins. The file's metadata has an index of the pieces with a checksum of each and of
-itself, so that what is read is proven without reading the rest. Nothing is lost with it: whoever
-lacks it, or finds it damaged or of other frames, makes it again (`service.sessions.overview`).
+itself, so that each piece is verified without the others. The file can always be made again from
+the frames (`service.sessions.overview`): if it is missing, damaged or of other frames.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ _KEY, _CHECK_KEY = b"foottile.overview", b"foottile.overview_sha256"
 _VERSION = 2
 Types = Mapping[str, np.dtype[Any]]
 _PIECE = 4096
-"""Bins that are read, and proven, at a time."""
+"""Bins that are read and verified at a time."""
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some bins of a level.
+    """Index entry of some bins of a level.
 
     Attributes:
         level: 0 is the finest.
-        bins: how many.
+        bins: number of bins.
         begin_ns: least `t_first_ns`.
         end_ns: greatest `t_last_ns`.
-        crc: of their values.
+        crc: CRC-32 of their values.
     """
 
     level: int
@@ -54,12 +54,12 @@ class Piece:
 
 @dataclass(frozen=True)
 class Index:
-    """What the file says of itself.
+    """Index in the file's metadata.
 
     Attributes:
-        frames_sha256: file hash of the frames that it was made from.
-        tiles: of the array.
-        estimated: do its bins have forces, or raw counts?
+        frames_sha256: file hash of the frames it was made from.
+        tiles: number of the array's tiles.
+        estimated: True: its bins have forces; False: raw counts.
         begin_ns: `t_ns` of the first frame.
         pieces: in the order of the file.
     """
@@ -72,11 +72,11 @@ class Index:
 
     @property
     def levels(self) -> int:
-        """How many there are."""
+        """Number of levels."""
         return 1 + max((piece.level for piece in self.pieces), default=-1)
 
     def to_json(self) -> bytes:
-        """For the file's metadata."""
+        """Return the index as JSON for the file's metadata."""
         content = {
             "version": _VERSION,
             "rows": ROWS,
@@ -91,7 +91,7 @@ class Index:
 
     @classmethod
     def from_json(cls, text: bytes) -> Self:
-        """The same, read.
+        """Parse an index.
 
         Raises:
             ValueError: it is none.
@@ -102,7 +102,7 @@ class Index:
             raise OtherVersionError(
                 f"another version of foottile wrote it: {content['version']}",
                 expected=f"version {_VERSION}",
-                remedy="Nothing: it is made again from the frames",
+                remedy="None needed: it is made again from the frames",
             )
         pieces = tuple(Piece(*row) for row in content["pieces"])
         return cls(
@@ -115,12 +115,12 @@ class Index:
 
 
 def overview_content(levels: Sequence[Bins], *, tiles: int, frames_sha256: str) -> pa.Buffer:
-    """The bytes of an `overview.arrow`.
+    """Return the bytes of an `overview.arrow`.
 
     Args:
-        levels: the finest first; none of them is empty.
-        tiles: of the array.
-        frames_sha256: hash of the frames that it is of.
+        levels: bins of each level, the finest first, none of them empty.
+        tiles: number of the array's tiles.
+        frames_sha256: file hash of the frames.
     """
     sink = pa.BufferOutputStream()
     _write(sink, levels, tiles, frames_sha256)
@@ -128,16 +128,16 @@ def overview_content(levels: Sequence[Bins], *, tiles: int, frames_sha256: str) 
 
 
 def write_overview(path: Path, levels: Sequence[Bins], *, tiles: int, frames_sha256: str) -> None:
-    """Write `overview.arrow`, in place of the one that is there; it is never whole in memory.
+    """Write `overview.arrow` without building it in memory; an existing one is replaced.
 
     Args:
-        path: of the file.
-        levels: as for `overview_content`.
+        path: the file.
+        levels: as for `encode_overview`.
         tiles: likewise.
         frames_sha256: likewise.
 
     Raises:
-        StorageError: the disk is full or not writable; the old one is still there then.
+        StorageError: the disk is full or not writable; the old file is unchanged.
     """
     with whole_file(path) as out:
         _write(out, levels, tiles, frames_sha256)
@@ -174,7 +174,7 @@ def _index_over(levels: Sequence[Bins], types: Types, tiles: int, frames_sha256:
 
 
 def _pieces_of(levels: Sequence[Bins], types: Types) -> Iterator[tuple[int, Bins]]:
-    """Each level and its bins, some at a time, in the columns' order."""
+    """Yield each level's number and its bins, some at a time, in the columns' order."""
     for level, bins in enumerate(levels):
         for at in range(0, len(bins["part"]), _PIECE):
             yield (
@@ -190,8 +190,8 @@ def open_overview(path: Path) -> Overview:
     """Open an `overview.arrow`.
 
     Raises:
-        FileNotFoundError: there is none.
-        DamagedFileError: it is not what was written.
+        FileNotFoundError: there is no such file.
+        DamagedFileError: its index is damaged.
         OtherVersionError: another version wrote it.
         StorageError: it cannot be read now.
     """
@@ -203,14 +203,14 @@ def open_overview(path: Path) -> Overview:
 
 
 class Overview:
-    """An `overview.arrow`, open for reading.
+    """Reader of an `overview.arrow`.
 
     Args:
-        source: its bytes; closed with it.
+        source: its bytes; closed with the reader.
         where: for errors.
 
     Raises:
-        DamagedFileError: it is not what was written.
+        DamagedFileError: its index is damaged.
         OtherVersionError: another version wrote it.
     """
 
@@ -243,7 +243,7 @@ class Overview:
         end_ns: int | None,
         axis: TimeAxis = NODE_AXIS,
     ) -> int:
-        """About how many bins of a level lie in some time: all of the pieces that do."""
+        """Return about how many bins of a level are in a time range: those of its pieces."""
         return sum(self.index.pieces[i].bins for i in self._within(level, begin_ns, end_ns, axis))
 
     def bins(
@@ -253,7 +253,7 @@ class Overview:
         end_ns: int | None,
         axis: TimeAxis = NODE_AXIS,
     ) -> Bins:
-        """Return the bins of a level that have frames of some time, instants on the time axis.
+        """Read the bins of a level with frames in a time range, instants on the time axis.
 
         Args:
             level: 0 is the finest.
@@ -292,9 +292,9 @@ class Overview:
             bins = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in names}
         except Exception as error:  # damaged bytes may cause any error
             raise self._damaged(f"piece {i}: {error}") from error
-        said = self.index.pieces[i]
-        if len(batch) != said.bins or _crc(bins) != said.crc:
-            raise self._damaged(f"piece {i} is not what its checksum is of")
+        entry = self.index.pieces[i]
+        if len(batch) != entry.bins or _crc(bins) != entry.crc:
+            raise self._damaged(f"the checksum of piece {i} is wrong")
         return bins
 
     def _damaged(self, why: object) -> DamagedFileError:
@@ -306,19 +306,19 @@ class Overview:
 
 
 def _index_of(file: pa.ipc.RecordBatchFileReader) -> Index:
-    """What a file's metadata says.
+    """Read and verify the index in a file's metadata.
 
     Raises:
-        ValueError: it is not what its hash is of, or of another file.
-        KeyError: it says nothing.
+        ValueError: its hash is wrong, or it is of another file.
+        KeyError: there is none.
     """
-    said = file.schema.metadata or {}
-    text = said[_KEY]
-    if hashlib.sha256(text).hexdigest().encode() != said[_CHECK_KEY]:
-        raise ValueError("its index is not what its hash is of")
+    metadata = file.schema.metadata or {}
+    text = metadata[_KEY]
+    if hashlib.sha256(text).hexdigest().encode() != metadata[_CHECK_KEY]:
+        raise ValueError("its index does not match its hash")
     index = Index.from_json(text)
     if file.num_record_batches != len(index.pieces):
-        raise ValueError("it has not the pieces it says")
+        raise ValueError("its index is of another number of pieces")
     return index
 
 

@@ -1,8 +1,8 @@
-"""Frames at every zoom: bins with the least and greatest of each column, so that no peak hides.
+"""Frames at every zoom: bins with minimum and maximum of each column, so that no peak is lost.
 
-A bin stands for some consecutive frames of one part of a session: single frames are bins as well,
-and bins are merged to coarser ones, 64 frames at first and then four bins at a time. Least and
-greatest of a merged bin are exactly those of its frames, however it came about.
+A bin covers consecutive frames of one part of a session: single frames are bins as well. Bins are
+merged to coarser ones, 64 frames at first and then four bins at a time. Minimum and maximum of a
+merged bin are exactly those of its frames, in whatever order they were merged.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from storage.schema import CONTACT_UNKNOWN, Array
 from storage.sessions.time_axis import TimeAxis
 
 ROWS = 64
-"""Frames of a bin of the finest level that is kept."""
+"""Frames of a bin of the finest stored level."""
 FACTOR = 4
-"""Bins of one level that make one of the next."""
+"""Bins of one level that are merged to one of the next."""
 TOP = 512
-"""Levels are added until one has no more bins."""
+"""Most bins of the coarsest level."""
 INTERVAL_95 = 1.96
 
 WITHOUT, WITH, UNKNOWN = 1, 2, 4
-"""Bits of `contact`: frames of the bin without contact, with it, and in which it is not known."""
+"""Bits of `contact`: some frames without contact, with contact, with unknown contact."""
 
 Bins = dict[str, Array]
+"""Columns of bins by name, n rows each."""
 
 _SAME = (
     *("t_first_ns", "t_last_ns", "part", "frames", "missing", "frame_status"),
@@ -37,7 +38,7 @@ _SAME = (
     *("cop_x_low_m_min", "cop_x_high_m_max", "cop_y_low_m_min", "cop_y_high_m_max"),
     *("angle_rad_min", "angle_rad_max", "contact", "estimate_status"),
 )
-"""What is said of a bin, whatever the array; and of each tile what follows."""
+"""Columns of every array; those of each tile follow."""
 _ESTIMATED = ("force_n_{i}_min", "force_n_{i}_max")
 _RAW = ("padc_{i}_min", "padc_{i}_max")
 _BY_TILE = "status_{i}"
@@ -57,12 +58,12 @@ _INTEGERS: Mapping[str, npt.DTypeLike] = {
 
 
 def bin_columns(tiles: int, *, estimated: bool) -> dict[str, np.dtype[Any]]:
-    """Names and types of what is said of a bin.
+    """Return names and types of a bin's columns.
 
-    `missing` are numbers of frames that are not there, in the bin or just before it.
-    `grf_low_n_min` and `grf_high_n_max` bound the 95 % intervals of all its frames, those of
-    `cop_x` and `cop_y` likewise; `grf_unknown` counts frames without a GRF. Without estimates there
-    are raw counts in place of forces, and of the rest what is known of frames.
+    `missing` counts frame numbers without a frame, in the bin or just before it. `grf_low_n_min`
+    and `grf_high_n_max` bound the 95 % intervals of all its frames, those of `cop_x` and `cop_y` as
+    well; `grf_unknown` counts frames without a GRF. Without estimates there are raw counts in place
+    of forces, and otherwise only columns of frames.
     """
     names = [name for name in _SAME if estimated or not _is_estimate(name)]
     for i in range(tiles):
@@ -79,7 +80,7 @@ def _type_of(name: str) -> npt.DTypeLike:
 
 
 def frame_columns(*, estimated: bool) -> tuple[str, ...]:
-    """Columns of frames that bins are made of, by their logical names; `part` may be absent."""
+    """Return the columns of frames that bins are made of, by logical name; `part` is optional."""
     same = ("seq", "t_ns", "status", "frame_status")
     if not estimated:
         return (*same, "padc")
@@ -92,11 +93,11 @@ def frame_columns(*, estimated: bool) -> tuple[str, ...]:
 
 
 def bins_of_frames(frames: Mapping[str, Array], before: int | None = None) -> Bins:
-    """A bin for each frame.
+    """Make a bin for each frame.
 
     Args:
-        frames: `frame_columns`, (n,) or (n, tiles); `part` if there are several.
-        before: number of the frame before the first, if it is of the same part.
+        frames: `required_frame_columns`, (n,) or (n, tiles); `part` if there are several.
+        before: number of the frame before the first one, if it is of the same part.
     """
     seq, n = frames["seq"], len(frames["seq"])
     part = frames["part"] if "part" in frames else np.zeros(n, np.uint16)
@@ -145,21 +146,21 @@ def _extremes(name: str, values: Array) -> Bins:
 
 
 def _interval(name: str, values: Array, sigmas: Array) -> Bins:
-    """Return the ends of 95 % intervals: `name` has a place for `low` and `high`."""
+    """Return the ends of 95 % intervals; `{}` in `name` becomes `low` and `high`."""
     middle = values.astype(np.float32)
     half = np.float32(INTERVAL_95) * sigmas.astype(np.float32)
     return {f"{name.format('low')}_min": middle - half, f"{name.format('high')}_max": middle + half}
 
 
 def merged(bins: Bins, count: int) -> Bins:
-    """Bins of which each is `count` of these, or fewer at the end of a part."""
+    """Merge `count` bins at a time, or fewer at the end of a part."""
     if not len(bins["part"]):
         return bins
     return _joined_at(bins, starts_of(bins["part"], count))
 
 
 def starts_of(part: Array, count: int) -> npt.NDArray[np.intp]:
-    """Where groups of `count` begin, none of which reaches over into another part."""
+    """Return the first index of each group of `count`; no group extends over two parts."""
     n = len(part)
     begins = np.flatnonzero(np.r_[True, part[1:] != part[:-1]])
     since = np.arange(n) - np.repeat(begins, np.diff(np.r_[begins, n]))
@@ -186,7 +187,7 @@ def _joined_at(bins: Bins, starts: npt.NDArray[np.intp]) -> Bins:
 
 
 def joined(pieces: list[Bins]) -> Bins:
-    """One after the other."""
+    """Concatenate bins."""
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
@@ -197,9 +198,9 @@ def on_axis(bins: Bins, axis: TimeAxis) -> Bins:
 
 
 class Pyramid:
-    """Gathers the finest level from consecutive frames; the others are made of it.
+    """Builder of a pyramid of bins from consecutive frames.
 
-    However frames are cut into pieces, the bins are the same.
+    The bins do not depend on how frames are cut into pieces.
     """
 
     def __init__(self) -> None:
@@ -210,7 +211,7 @@ class Pyramid:
         """Part and number of the last frame."""
 
     def feed(self, frames: Mapping[str, Array]) -> None:
-        """Take the next frames: `frame_columns`, and `part` if there are several."""
+        """Add the next frames: `required_frame_columns`, and `part` if there are several."""
         if not len(frames["seq"]):
             return
         part = int(frames["part"][0]) if "part" in frames else 0
@@ -223,13 +224,13 @@ class Pyramid:
             self._close_full()
 
     def finest(self) -> Bins | None:
-        """All bins there are by now, the last one perhaps not full; None: no frame came."""
+        """Return all bins until now, the last one perhaps not full; None before the first frame."""
         rest = [merged(joined(self._begun), ROWS)] if self._begun else []
         pieces = [*self._whole, *rest]
         return joined(pieces) if pieces else None
 
     def levels(self) -> list[Bins]:
-        """The finest level, and the coarser ones over it; no more frames will come."""
+        """End the pyramid and return its levels, the finest first; the builder is empty then."""
         if self._begun:
             self._whole.append(merged(joined(self._begun), ROWS))
         pieces, self._whole, self._begun = self._whole, [], []
@@ -248,12 +249,12 @@ class Pyramid:
 
 
 def _drained(pieces: list[Bins]) -> Bins:
-    """One after the other; the pieces lose column by column what has gone over."""
+    """Concatenate bins; their columns are released one by one, to save memory."""
     return {name: np.concatenate([piece.pop(name) for piece in pieces]) for name in list(pieces[0])}
 
 
 def levels_over(finest: Bins) -> list[Bins]:
-    """A level, and the coarser ones over it until one has at most `TOP` bins."""
+    """Return a level and its coarser ones, until one has at most `MAX_COARSEST_BINS` bins."""
     levels = [finest]
     while len(levels[-1]["part"]) > TOP:
         levels.append(merged(levels[-1], FACTOR))

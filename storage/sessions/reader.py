@@ -1,8 +1,8 @@
-"""Reading a sealed session: all of it, or the row groups and columns that a slice needs.
+"""Reader of a sealed session: all of it, or the row groups and columns of a slice.
 
-What is read is proven first: the whole file by its hash, or for slices the footer by its own, and
-every page by its checksum. A footer's statistics, where they are proven, say which row groups may
-hold frames of some time.
+Data is verified before it is read: the whole file by its hash, or for slices the footer by its own,
+and every page by its checksum. The statistics of a verified footer give the row groups that may
+have frames of a time range.
 """
 
 from __future__ import annotations
@@ -26,16 +26,19 @@ from storage.sessions.time_axis import NODE_AXIS, TIME_AXIS_NOTE, PartSpan, Time
 
 _PIECE_VALUES = 1 << 20
 _PIECE_ROWS_MIN = 1024
-"""A piece of a row group that is read at once has so many numbers: 8 MiB, however many tiles."""
+"""Fewest rows of a piece of a row group.
+
+A piece otherwise has so many rows that it has `_PIECE_VALUES` numbers: 8 MiB, however many tiles.
+"""
 
 
 class SessionReader:
-    """Reads what `SessionWriter` wrote, some thousand rows at a time.
+    """Reader of a sealed file, some thousand rows at a time.
 
     Attributes:
         path: the file.
-        footer: what its footer says; `info`, `notes`, `format`, `content`, `content_sha256`,
-            `column_names` and `frame_count` are those of `storage.sessions.footer.Footer`.
+        footer: its footer; `info`, `notes`, `format`, `content`, `content_sha256`, `column_names`
+            and `frame_count` are those of `storage.sessions.footer.SealedFileFooter`.
     """
 
     def __init__(
@@ -46,17 +49,17 @@ class SessionReader:
         only_slices: bool = False,
         footer: Footer | None = None,
     ) -> None:
-        """Open a sealed session.
+        """Open a sealed session and verify it.
 
-        Its every byte is held against the file's hash, unless only slices are read: then the footer
-        is, against its own, and what is read of pages, always, against their checksums. A file of
-        an older version, whose footer has no hash, is held against the file's all the same.
+        The whole file is verified against its hash. If only slices are read, the footer alone is
+        verified against its own hash; pages are always verified against their checksums. A file of
+        an older version, whose footer has no hash, is verified completely in any case.
 
         Args:
             path: the file.
-            is_checked: nothing is held against any hash: it was already, or shall not be.
-            only_slices: what is read are some columns, or some time.
-            footer: of this very file, if it was read before.
+            is_checked: skip the hashes: the file was verified already, or shall not be.
+            only_slices: only some columns or a time range will be read.
+            footer: footer of this file, if it was read before.
 
         Raises:
             FileFormatError: no such file, not Parquet, not one of ours, or damaged.
@@ -71,7 +74,7 @@ class SessionReader:
         self.frame_count = self.footer.frame_count
 
     def tables(self) -> Iterator[pa.Table]:
-        """All columns as they are in the file, a piece of a row group at a time.
+        """Yield all columns as in the file, a piece of a row group at a time.
 
         Raises:
             FileFormatError: a row group is damaged.
@@ -81,13 +84,13 @@ class SessionReader:
 
     @property
     def identity(self) -> dict[str, object]:
-        """Which session it is, for what is made from it: id, content hash, stated file hash."""
-        said = self.footer.metadata.metadata or {}
+        """Source reference for derived files: session id, content hash, stated file hash."""
+        metadata = self.footer.metadata.metadata or {}
         session = self.notes.get("session")
         return {
             "session": session.get("id") if isinstance(session, dict) else None,
             "content_sha256": self.content_sha256,
-            "file_sha256": said.get(FILE_HASH_KEY, b"").decode("ascii", "replace") or None,
+            "file_sha256": metadata.get(FILE_HASH_KEY, b"").decode("ascii", "replace") or None,
         }
 
     def close(self) -> None:
@@ -101,18 +104,18 @@ class SessionReader:
         self.close()
 
     def has(self, *names: str) -> bool:
-        """Does the file have these columns (of `storage.schema.KNOWN`)?"""
+        """Return whether the file has these quantities (of `storage.schema.COLUMNS_BY_NAME`)."""
         tiles = len(self.info.tiles)
         return all(self.column_names.issuperset(KNOWN[name].flat_names(tiles)) for name in names)
 
     def batches(
         self, *extra: str, groups: Sequence[int] | None = None
     ) -> Iterator[tuple[FrameBatch, dict[str, Array]]]:
-        """Frames in the order they were written, with the extra columns asked for.
+        """Yield frames in the order they were written, with extra columns.
 
         Args:
-            extra: their names.
-            groups: the row groups to read; None: all.
+            extra: names of the extra columns.
+            groups: row groups to read; None: all.
 
         Raises:
             FileFormatError: a column is missing, of another type, or damaged.
@@ -127,15 +130,15 @@ class SessionReader:
         groups: Sequence[int] | None = None,
         values_max: int | None = None,
     ) -> Iterator[dict[str, Array]]:
-        """Some columns only, of `storage.schema.KNOWN`, some thousand rows at a time.
+        """Yield some quantities (of `COLUMNS_BY_NAME`), some thousand rows at a time.
 
         Args:
-            wanted: their names.
-            groups: the row groups to read; None: all.
-            values_max: numbers that are read at once, for who has room for fewer than others.
+            wanted: names of the quantities.
+            groups: row groups to read; None: all.
+            values_max: most numbers of a piece; None: the default.
 
         Raises:
-            FileFormatError: as for `batches`.
+            FileFormatError: as for `read_batches`.
         """
         tiles = len(self.info.tiles)
         names = [flat for name in wanted for flat in KNOWN[name].flat_names(tiles)]
@@ -147,57 +150,57 @@ class SessionReader:
 
     @property
     def axis(self) -> TimeAxis:
-        """The session's time axis.
+        """Time axis of the session.
 
         Raises:
-            FileFormatError: as for `batches`.
+            FileFormatError: as for `read_batches`.
         """
         if self.footer.axis is None:
             self.footer.axis = self._time_axis()
         return self.footer.axis
 
     def span_ns(self) -> tuple[int, int]:
-        """`t_ns` of the first frame, and the last instant, both on the session's time axis.
+        """Return `t_ns` of the first and of the last frame, both on the session's time axis.
 
         Raises:
-            FileFormatError: as for `batches`.
+            FileFormatError: as for `read_batches`.
         """
         if self.footer.span_ns is not None:
             return self.footer.span_ns
         if self.axis.is_shifted:
-            on_axis = [
+            shifted = [
                 [t_ns + self.axis.shift_ns(span.number) for t_ns in span.t_ns]
                 for span in self._part_spans()
             ]
-            self.footer.span_ns = on_axis[0][0], max(last for _, last in on_axis)
+            self.footer.span_ns = shifted[0][0], max(last for _, last in shifted)
             return self.footer.span_ns
-        first, *_ = self._tables(0, ["t_ns"])  # all: Arrow leaves out a page it does not know
+        first, *_ = self._tables(0, ["t_ns"])  # all: their row count shows a skipped page
         with self._damage(0):
             begin = int(flat_values(KNOWN["t_ns"], "t_ns", first)[0])
         latest = self.extremes("t_ns")
-        unsaid = [group for group, said in enumerate(latest) if said is None]
-        ends = [int(piece["t_ns"].max()) for piece in self.columns("t_ns", groups=unsaid)]
-        end = max([*ends, *(said[1] for said in latest if said is not None)])
+        unknown_groups = [group for group, min_max in enumerate(latest) if min_max is None]
+        ends = [int(piece["t_ns"].max()) for piece in self.columns("t_ns", groups=unknown_groups)]
+        end = max([*ends, *(min_max[1] for min_max in latest if min_max is not None)])
         self.footer.span_ns = begin, end
         return begin, end
 
     def flat(
         self, names: Sequence[str], begin_t_ns: int | None, end_t_ns: int | None
     ) -> Iterator[dict[str, Array]]:
-        """Flat columns of the row groups that may hold frames of some time.
+        """Yield flat columns of the row groups that may have frames of a time range.
 
-        Which these are the footer says; where it does not, or nothing proves it, all are read.
+        Without a verified footer, or without its statistics, all row groups are read.
 
         Args:
-            names: of the columns, each n rows.
-            begin_t_ns: of the first instant on the time axis; None: from the beginning.
-            end_t_ns: of the instant behind the last; None: to the end.
+            names: names of the columns, each n rows.
+            begin_t_ns: first instant on the time axis; None: from the beginning.
+            end_t_ns: instant behind the last; None: to the end.
 
         Yields:
-            One piece at least, of no rows if there is nothing.
+            At least one piece, which may have no rows.
 
         Raises:
-            FileFormatError: as for `batches`.
+            FileFormatError: as for `read_batches`.
         """
         logical = flat_of(len(self.info.tiles))
         is_empty = True
@@ -213,28 +216,31 @@ class SessionReader:
                 yield {name: flat_values(logical[name], name, table) for name in names}
 
     def groups_within(self, begin_t_ns: int | None, end_t_ns: int | None) -> list[int]:
-        """Row groups that may hold frames of some time; bounds as for `flat`."""
+        """Return the row groups that may have frames of a time range.
+
+        Bounds as for `read_flat_columns`.
+        """
         if begin_t_ns is None and end_t_ns is None:
             return list(range(len(self.footer.group_rows)))
         return [
             group
-            for group, said in enumerate(self.extremes("t_ns"))
-            if said is None or self.axis.may_overlap(*said, begin_t_ns, end_t_ns)
+            for group, min_max in enumerate(self.extremes("t_ns"))
+            if min_max is None or self.axis.may_overlap(*min_max, begin_t_ns, end_t_ns)
         ]
 
     def frames(self) -> FrameBatch:
-        """All frames at once.
+        """Read all frames at once.
 
         Raises:
-            FileFormatError: as for `batches`.
+            FileFormatError: as for `read_batches`.
         """
         return FrameBatch.concatenate([frames for frames, _ in self.batches()])
 
     def extremes(self, name: str) -> list[tuple[int, int] | None]:
-        """Least and greatest value of a column in every row group; None: not known for sure."""
+        """Return minimum and maximum of a column in every row group; None: not certain."""
         if self._has_true_statistics:
             return self.footer.extremes(name)
-        return [None] * len(self.footer.group_rows)  # nothing proves what an older version wrote
+        return [None] * len(self.footer.group_rows)  # an older version wrote no proof
 
     def _time_axis(self) -> TimeAxis:
         if stated := self.notes.get(TIME_AXIS_NOTE):
@@ -247,23 +253,23 @@ class SessionReader:
             return NODE_AXIS
         try:
             clock = clock_beside(self)
-        except (UsageError, FileFormatError):  # the frames are worth more than the clock
+        except (UsageError, FileFormatError):  # the frames are readable without a clock table
             clock = None
         period_ns = round(1e9 / self.info.nominal_rate_hz)
         return time_axis(self._part_spans(), clock, period_ns=period_ns)
 
     def _part_spans(self) -> list[PartSpan]:
-        """First and last frame of every part that has some; of most row groups the footer says."""
+        """Return first and last frame of every part with frames, by the footer where possible."""
         names, ids = ("part", "t_mono_ns", "t_ns"), stream_ids(self)
         found: dict[int, list[tuple[int, int]]] = {}
-        unsaid: list[int] = []
-        for group, said in enumerate(zip(*(self.extremes(name) for name in names), strict=True)):
-            part, t_mono_ns, t_ns = said
+        unknown_groups: list[int] = []
+        for group, min_max in enumerate(zip(*(self.extremes(name) for name in names), strict=True)):
+            part, t_mono_ns, t_ns = min_max
             if part is None or t_mono_ns is None or t_ns is None or part[0] != part[1]:
-                unsaid.append(group)
+                unknown_groups.append(group)
             else:
                 found.setdefault(part[0], []).extend(zip(t_mono_ns, t_ns, strict=True))
-        for piece in self.columns(*names, groups=unsaid):
+        for piece in self.columns(*names, groups=unknown_groups):
             for number in np.unique(piece["part"]).tolist():
                 here = piece["part"] == number
                 ends = [[int(v.min()), int(v.max())] for v in (piece[n][here] for n in names[1:])]
@@ -278,7 +284,7 @@ class SessionReader:
     def _tables(
         self, group: int, names: Sequence[str] | None, values_max: int | None = None
     ) -> Iterator[pa.Table]:
-        """Columns of a row group, or all, in pieces."""
+        """Yield some or all columns of a row group in pieces."""
         width = len(self.column_names if names is None else names)
         size = max(_PIECE_ROWS_MIN, (values_max or _PIECE_VALUES) // max(1, width))
         left = self.footer.group_rows[group]
@@ -291,7 +297,7 @@ class SessionReader:
             with self._damage(group):
                 piece = next(pieces, None)
                 if piece is None or len(piece) > left:
-                    raise ValueError(f"it has not the {self.footer.group_rows[group]} rows it says")
+                    raise ValueError(f"it has other than its {self.footer.group_rows[group]} rows")
             left -= len(piece)
             yield pa.Table.from_batches([piece])
 
@@ -308,7 +314,7 @@ class SessionReader:
 def _opened(
     path: Path, footer: Footer | None, is_checked: bool, only_slices: bool
 ) -> tuple[Footer, pq.ParquetFile]:
-    """A file and its footer; that of another one, which was there a moment ago, is none of it."""
+    """Open a file and its footer; retry if the file is replaced in between."""
     while True:
         stamps = stamps_of(path)
         own = footer or Footer(path, is_checked=is_checked, only_slices=only_slices)

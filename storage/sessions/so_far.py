@@ -1,4 +1,4 @@
-"""Bins of a session that goes on: never more than so many, and the coarser the longer it is."""
+"""Preview bins of an unsealed session: at most a fixed number, coarser the longer it is."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from storage.schema import Array
 from storage.sessions.pyramid import FACTOR, Bins, bins_of_frames, joined, merged, starts_of
 
 MOST = 16_384
-"""Bins that are kept: of eight tiles 154 bytes each, of 64 tiles 658."""
+"""Most stored bins: with eight tiles 154 bytes each, with 64 tiles 658."""
 _PENDING = 1024
 """Frames that are merged at a time."""
 
@@ -19,11 +19,11 @@ _NONE = np.empty(0, np.int64)
 
 
 class BinsSoFar:
-    """Gathers consecutive frames into at most `most` bins, which stand for ever more frames.
+    """Bins of consecutive frames, at most `most`; each covers more frames as the session grows.
 
     Attributes:
-        frames_in_bin: how many frames a bin stands for: 1, these are the frames themselves.
-        frames: that were taken.
+        frames_in_bin: frames per bin; 1: the bins are single frames.
+        frames: number of added frames.
     """
 
     def __init__(self, most: int = MOST) -> None:
@@ -36,11 +36,11 @@ class BinsSoFar:
         """Part and number of the last frame."""
 
     def feed(self, frames: Mapping[str, Array], *, there: int = 0) -> int:
-        """Take the next frames.
+        """Add the next frames.
 
         Args:
-            frames: `storage.sessions.pyramid.frame_columns`, and `part`.
-            there: so many of the first are there already.
+            frames: `storage.sessions.pyramid.required_frame_columns`, and `part`.
+            there: number of leading frames that were added before.
 
         Returns:
             How many of these frames were.
@@ -61,10 +61,10 @@ class BinsSoFar:
         return there
 
     def cut(self, most: int) -> int:
-        """Forget all but the first frames: as many as full bins have, `most` of them at most.
+        """Drop all but the first frames: those of full bins, at most `most`.
 
         Returns:
-            How many are left. The frame before the next one has to be fed again.
+            The number of frames left. The last of them has to be added again before the next one.
         """
         bins = joined(self._bins) if self._bins else None
         ends = np.cumsum(bins["frames"], dtype=np.int64) if bins is not None else _NONE
@@ -75,7 +75,7 @@ class BinsSoFar:
         return self.frames
 
     def bins(self) -> Bins | None:
-        """All there are by now, the last one perhaps not full; None: no frame came."""
+        """Return all bins until now, the last one perhaps not full; None before the first frame."""
         rest = [self._merged(joined(self._pending))] if self._pending else []
         pieces = [*self._bins, *rest]
         return joined(pieces) if pieces else None
@@ -84,7 +84,7 @@ class BinsSoFar:
         return frames if self.frames_in_bin == 1 else merged(frames, self.frames_in_bin)
 
     def _close_full(self) -> None:
-        """Merge the frames that are waiting, but for those of a bin that is not full yet."""
+        """Merge pending frames, except those of a bin that is not full yet."""
         frames = joined(self._pending)
         last = int(starts_of(frames["part"], self.frames_in_bin)[-1])
         end = len(frames["part"])
@@ -98,7 +98,7 @@ class BinsSoFar:
 
 
 def thinned(bins: Bins, begin_ns: int | None, end_ns: int | None, most: int) -> tuple[Bins, int]:
-    """Bins of some time, merged until they are no more than `most`; of each how many were."""
+    """Return the bins of a time range, merged to at most `most`, and how many make one."""
     rows = np.ones(_length(bins), dtype=np.bool_)
     if begin_ns is not None:
         rows &= bins["t_last_ns"] >= begin_ns

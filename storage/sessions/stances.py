@@ -1,7 +1,7 @@
-"""The table of stances beside a session's frames: a row for each, made from the frames alone.
+"""`stances.parquet` beside a session's frames: a row for each stance.
 
-Nothing is lost with it: whoever lacks it, or finds it damaged or of other frames, makes it again
-(`service.sessions.stances`), to the byte.
+The file can always be made again from the frames, byte for byte (`service.sessions.stances`): if it
+is missing, damaged or of other frames.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from storage.schema import Column
 
 STANCES_NAME = "stances.parquet"
 FRAMES_HASH_KEY = b"foottile.frames_sha256"
-"""The file hash of the frames that it was made from."""
+"""Key of the file hash of the frames it was made from."""
 
 _F64 = pa.float64()
 
@@ -47,7 +47,7 @@ STANCES = (
     Column("ended", pa.bool_(), "1", "the frame behind it is there, and without contact"),
     Column("is_whole", pa.bool_(), "1", "begun, ended, no frame missing, and a GRF in each"),
 )
-"""What is said of a stance: `service.estimation.stances.Stance`."""
+"""Columns of a stance: `service.estimation.stances.Stance`."""
 
 _MAY_MISS = frozenset({"peak_t_ns", *(column.name for column in STANCES if column.type == _F64)})
 SCHEMA = pa.schema(
@@ -59,10 +59,10 @@ SCHEMA = pa.schema(
 
 
 def stances_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
-    """Stances as a table; what is NaN or None is null.
+    """Convert stances to a table; NaN and None become null.
 
     Args:
-        rows: by the names of `STANCES`.
+        rows: values by the names of `STORED_STANCE_COLUMNS`.
     """
     content = list(rows)
     arrays = [
@@ -74,27 +74,27 @@ def stances_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
 
 
 def write_stances(path: Path, table: pa.Table, *, frames_sha256: str) -> None:
-    """Write `stances.parquet`, in place of the one that is there.
+    """Write `stances.parquet`; an existing one is replaced.
 
     Args:
-        path: of the file.
-        table: of `stances_table`.
-        frames_sha256: hash of the frames that the stances are of.
+        path: the file.
+        table: of `make_stance_table`.
+        frames_sha256: file hash of the stances' frames.
 
     Raises:
-        StorageError: the disk is full or not writable; the old one is still there then.
+        StorageError: the disk is full or not writable; the old file is unchanged.
     """
-    said = {FRAMES_HASH_KEY: frames_sha256.encode()}
-    write_table(path, table.replace_schema_metadata(said), is_plain=True)
+    metadata = {FRAMES_HASH_KEY: frames_sha256.encode()}
+    write_table(path, table.replace_schema_metadata(metadata), is_plain=True)
 
 
 @dataclass(frozen=True)
 class StoredStances:
-    """What `stances.parquet` holds.
+    """Content of `stances.parquet`.
 
     Attributes:
-        table: with the columns of `STANCES`.
-        frames_sha256: hash of the frames that it was made from.
+        table: table with the columns of `STORED_STANCE_COLUMNS`.
+        frames_sha256: file hash of the frames it was made from.
     """
 
     table: pa.Table
@@ -102,17 +102,17 @@ class StoredStances:
 
 
 def read_stances(path: Path) -> StoredStances:
-    """Read `stances.parquet`.
+    """Read `stances.parquet` and verify its hash.
 
     Raises:
-        FileNotFoundError: there is none.
-        DamagedFileError: it is not what was written, or no table of stances.
+        FileNotFoundError: there is no such file.
+        DamagedFileError: its hash is wrong, or it is no table of stances.
         OtherVersionError: its columns are those of another version.
         StorageError: it cannot be read now.
     """
     read = read_table(path)
-    said = read.table.schema.metadata or {}
-    if not read.is_proven or FRAMES_HASH_KEY not in said:
+    metadata = read.table.schema.metadata or {}
+    if not read.is_proven or FRAMES_HASH_KEY not in metadata:
         raise DamagedFileError(
             "is no table of stances",
             where=str(path),
@@ -124,6 +124,6 @@ def read_stances(path: Path) -> StoredStances:
             "another version of foottile wrote it, with other columns",
             where=str(path),
             expected="columns " + ", ".join(SCHEMA.names),
-            remedy="Nothing: it is made again from the frames",
+            remedy="None needed: it is made again from the frames",
         )
-    return StoredStances(read.table, said[FRAMES_HASH_KEY].decode("ascii", "replace"))
+    return StoredStances(read.table, metadata[FRAMES_HASH_KEY].decode("ascii", "replace"))

@@ -1,16 +1,16 @@
-"""One time axis for a session, although its node's date may have been set between two parts.
+"""Time axis of a session, also if its node's date was set between two parts.
 
 A Raspberry Pi without a battery clock begins in 1970 and gets its date from the network; a node
-that is switched on again during a recording begins another stream, with another anchor to its date.
-Frames keep their `t_ns` (decision 12); here is what has to be added to it, part by part.
+that reboots during a recording begins another stream, with another anchor to its date. Frames keep
+their `t_ns` (decision 12); this module computes the shift of each part.
 
-Of two parts that follow upon each other the time between them is taken
+The time between two successive parts is taken
 
 - by the node's own date, unless the server's clock contradicts it by more than its bound;
 - else by the server's clock, where both parts were compared with it;
 - else not at all: the second part begins one frame after the first one ended.
 
-Without a comparison a step back, or one of more than `GAP_MAX_NS`, cannot be true of a recording.
+Without a comparison a step back, or one of more than `MAX_GAP_NS`, cannot be true of a recording.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from storage.clock.table import ClockTable
 from storage.schema import NO_INSTANT, Array
 
 TIME_AXIS_NOTE = "time_axis"
-"""In the notes of a file that was made from a session: the session's axis, if it is shifted."""
+"""Key of a shifted session's time axis in the notes of an export."""
 GAP_MAX_NS = 86_400_000_000_000
-"""A day; what is longer is believed only if the server's clock says so, too."""
+"""Longest gap between parts, a day, unless the server's clock confirms a longer one."""
 
 Basis = Literal["node", "server", "joined"]
-"""How it is known when a part began: by its node's date, by the server's clock, or not."""
+"""Source of a part's begin: its node's date, the server's clock, or neither."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class PartSpan:
     """First and last frame of a part.
 
     Attributes:
-        number: of the part.
-        stream_id: of the stream that it is of.
+        number: number of the part.
+        stream_id: id of its stream.
         t_mono_ns: of the two frames.
         t_ns: of the two frames.
     """
@@ -55,11 +55,11 @@ class PartSpan:
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """What has to be added to `t_ns` of each part, so that the session has one time axis.
+    """Shifts of `t_ns` by part, which give the session one time axis.
 
     Attributes:
-        shifts_ns: by number of part; that of the first one is 0.
-        bases: how each is known.
+        shifts_ns: shift by number of part; 0 for the first one.
+        bases: source of each shift.
     """
 
     shifts_ns: tuple[int, ...] = (0,)
@@ -67,11 +67,11 @@ class TimeAxis:
 
     @property
     def is_shifted(self) -> bool:
-        """Was the node's date set between two parts?"""
+        """True if the node's date was set between two parts."""
         return any(self.shifts_ns)
 
     def shift_ns(self, part: int) -> int:
-        """Return the shift of a part; of one behind the last that has frames, the last one's."""
+        """Return the shift of a part; behind the last part with frames, that one's."""
         return self.shifts_ns[min(part, len(self.shifts_ns) - 1)]
 
     def at(self, t_ns: Times, part: Array | None) -> Times:
@@ -90,7 +90,7 @@ class TimeAxis:
     def may_overlap(
         self, earliest_ns: int, latest_ns: int, begin_ns: int | None, end_ns: int | None
     ) -> bool:
-        """Whether frames of any parts may be in a time of the axis.
+        """Return whether frames of any parts may be in a range of the axis.
 
         Args:
             earliest_ns: least `t_ns` of the frames.
@@ -114,7 +114,7 @@ class TimeAxis:
 
     @classmethod
     def from_dicts(cls, stated: object, *, where: str) -> TimeAxis:
-        """Return the axis that `as_dicts` stated in a file's notes.
+        """Return the axis from a file's notes, as `to_json_list` made them.
 
         Raises:
             FileFormatError: it is none.
@@ -130,7 +130,7 @@ class TimeAxis:
             raise FileFormatError("its notes state no time axis", where=where) from error
 
     def remark(self) -> str:
-        """Return what a person should know of the axis; empty: the node's date was right."""
+        """Return a message about a shifted axis; empty: the node's date was right."""
         if not self.is_shifted:
             return ""
         if "joined" in self.bases:
@@ -143,11 +143,11 @@ class TimeAxis:
 
 
 NODE_AXIS = TimeAxis()
-"""The node's own date, as of every session of one part."""
+"""Axis of the node's own date, as of every session of one part."""
 
 
 def time_axis(spans: Sequence[PartSpan], clock: ClockTable | None, *, period_ns: int) -> TimeAxis:
-    """Find the time axis of a session.
+    """Compute the time axis of a session.
 
     Args:
         spans: of its parts, in their order; those without frames may be left out.
@@ -172,7 +172,7 @@ def time_axis(spans: Sequence[PartSpan], clock: ClockTable | None, *, period_ns:
 def _placed(
     before: PartSpan, shift_ns: int, span: PartSpan, clock: ClockTable | None, period_ns: int
 ) -> tuple[int, Basis]:
-    """Return shift and basis of a part that follows another one, whose shift is known."""
+    """Return shift and basis of a part that follows another part with a known shift."""
     by_node_ns = span.t_ns[0] - before.t_ns[1]
     change = _clock_change(before, span, clock)
     if change is None:
@@ -195,7 +195,7 @@ def _placed(
 def _clock_change(
     before: PartSpan, span: PartSpan, clock: ClockTable | None
 ) -> tuple[int, int] | None:
-    """Return by how much the node's date fell behind the server's, and the bound of that.
+    """Return the node date's change against the server's clock, and the bound of that.
 
     None: one of the two parts was not compared with the server.
     """

@@ -1,6 +1,6 @@
-"""Verifies whatever a path names, up to a whole data folder, and gives one verdict.
+"""Verification of any path, up to a whole data folder, with one verdict.
 
-Nothing is written, no lock is taken; a server or node may run beside it.
+Nothing is written, no lock is taken; a server or node may run meanwhile.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ _STREAM_NAME = re.compile(r"[0-9a-f]{32}")
 
 @dataclass
 class FolderReport:
-    """What the data folder of a server or node proves.
+    """Result of the verification of a server's or node's data folder.
 
     Attributes:
         path: the folder.
-        sessions: of its sessions, including those in the trash.
-        streams: of its journals.
-        problems: what is wrong beside these.
-        unproven: what else states no hash of itself.
-        set_aside: what was found damaged before: it counts no more, and waits for a person.
+        sessions: reports of its sessions, including those in the trash.
+        streams: reports of its journals.
+        problems: messages of other damage.
+        unproven: other files without a hash.
+        set_aside: files that were found damaged before, and wait for a person.
     """
 
     path: Path
@@ -53,17 +53,33 @@ class FolderReport:
     set_aside: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON has it (docs/formats.md)."""
+        """Return the report for JSON (docs/formats.md)."""
         sessions, streams = self.sessions, self.streams
         everything = [
             *self.problems,
-            *(f"session {s.id or s.path.name}: {said}" for s in sessions for said in s.problems),
-            *(f"journal {j.node}/{j.boot_id}: {said}" for j in streams for said in j.problems),
+            *(
+                f"session {s.id or s.path.name}: {message}"
+                for s in sessions
+                for message in s.problems
+            ),
+            *(
+                f"journal {j.node}/{j.boot_id}: {message}"
+                for j in streams
+                for message in j.problems
+            ),
         ]
         unproven = [
             *self.unproven,
-            *(f"session {s.id or s.path.name}: {said}" for s in sessions for said in s.unproven),
-            *(f"journal {j.node}/{j.boot_id}: {said}" for j in streams for said in j.unproven),
+            *(
+                f"session {s.id or s.path.name}: {message}"
+                for s in sessions
+                for message in s.unproven
+            ),
+            *(
+                f"journal {j.node}/{j.boot_id}: {message}"
+                for j in streams
+                for message in j.unproven
+            ),
         ]
         return {
             "sessions": [session.as_dict() for session in sessions],
@@ -78,14 +94,14 @@ Report = FolderReport | SessionReport | StreamReport | SegmentReport | ExportRep
 
 
 def verify(path: Path, *, data: Path | None = None) -> Report:
-    """Prove what is there: session, sealed file, journal, segment, data folder, JSON of ours.
+    """Verify a session, sealed file, journal, segment, data folder, or JSON file of ours.
 
     Args:
         path: a folder or a file.
-        data: data folder with the journals of a session that is not sealed; default: around it.
+        data: data folder with the journals of an unsealed session; default: the one around it.
 
     Raises:
-        FileFormatError: nothing is there, or nothing that FootTile wrote.
+        FileFormatError: the path does not exist, or has no file of FootTile.
     """
     if path.is_file():
         if path.suffix in (SUFFIX, INDEX_SUFFIX):
@@ -110,33 +126,33 @@ def verify(path: Path, *, data: Path | None = None) -> Report:
     if any(path.glob("*.json")):
         return verify_folder(path)
     raise FileFormatError(
-        "nothing that foottile wrote is in it",
+        "foottile wrote none of its files",
         where=str(path),
         expected="a data folder, a session's or a stream's folder, or one of their files",
     )
 
 
 def verify_folder(path: Path) -> FolderReport:
-    """Prove a data folder: every session and every journal in it.
+    """Verify a data folder: every session and every journal in it.
 
     Raises:
         FileFormatError: it cannot be read.
     """
     data = path.absolute()
     report = FolderReport(path)
-    known = cache(verify_stream)
+    verify_once = cache(verify_stream)
     proven: set[Path] = set()
     for folder in _folders(data, "journal/*", _STREAM_NAME, report):
         proven.add(folder)
         with _told(report, folder, data):
-            report.streams.append(known(folder))
+            report.streams.append(verify_once(folder))
     for place in ("sessions", "trash"):
         for folder in _folders(data, place, SESSION_ID, report):
             proven.add(folder)
             with _told(report, folder, data):
-                # The folder of a session that was never written down is empty.
+                # The folder of a session that was never saved is empty.
                 if any(not inside.name.startswith(".") for inside in folder.iterdir()):
-                    session = verify_session(folder, data=data, streams=known)
+                    session = verify_session(folder, data=data, streams=verify_once)
                     if session.id not in (None, folder.name):
                         session.problems.append(f"it lies in the folder of {folder.name}")
                     report.sessions.append(session)
@@ -144,7 +160,7 @@ def verify_folder(path: Path) -> FolderReport:
             folder = data / place / stray.name
             proven.add(folder)
             with _told(report, folder, data):
-                session = verify_session(folder, data=data, streams=known)
+                session = verify_session(folder, data=data, streams=verify_once)
                 session.problems.append(f"{place}/{stray.name}: {stray.error.what}")
                 report.sessions.append(session)
     others = verify_others(data, proven)
@@ -156,16 +172,16 @@ def verify_folder(path: Path) -> FolderReport:
 def _folders(
     data: Path, places: str, form: re.Pattern[str], report: FolderReport
 ) -> Iterator[Path]:
-    """Folders with a name of this form; what has such a name and is none is a problem.
+    """Yield folders with a name of this form; report other files with such a name as problems.
 
-    A link that a person put in the place of all sessions, or all journals, is followed.
+    A link in place of the folder of all sessions, or all journals, is followed.
     """
     for path in sorted(data.glob(f"{places}/*")):
         if ASIDE in path.name or not form.fullmatch(path.name):
             continue
         with _told(report, path, data):
             if path.is_symlink() or (path.parent.is_symlink() and path.parent.parent != data):
-                what = "it is a link, or in one, which is not followed"
+                what = "it is a link, or in one: links are not followed"
                 report.problems.append(f"{path.relative_to(data)}: {what}")
             elif path.is_dir():
                 yield path
@@ -175,9 +191,9 @@ def _folders(
 
 @contextmanager
 def _told(report: FolderReport, path: Path, data: Path) -> Iterator[None]:
-    """Note what cannot be read, and go on with the rest; what was deleted meanwhile is no damage.
+    """Context manager: report any error as a problem and go on; a deleted path is none.
 
-    Damaged bytes may cause any error, and none may hide what is wrong elsewhere.
+    Damaged bytes may cause any error, and none may hide other damage.
     """
     try:
         yield
@@ -188,7 +204,7 @@ def _told(report: FolderReport, path: Path, data: Path) -> Iterator[None]:
 
 
 def verdict_of(report: Report) -> Verdict:
-    """Return the worst of what was found.
+    """Return the worst finding.
 
     Frames of a journal that no session needs may be deleted: that is no loss.
     """

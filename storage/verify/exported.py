@@ -1,4 +1,4 @@
-"""An export, recognised: it says which session it was made from, and proves nothing itself."""
+"""Recognition of exports: files made from a session, which prove nothing themselves."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from storage.sessions.content_hash import CONTENT_KEY
 from storage.sessions.file import EXPORT_COLUMN, EXPORT_KEY
 
 FORMATS = frozenset({"parquet", "arrow", "csv"})
-"""Formats whose exports it recognises."""
+"""Export formats that are recognised."""
 _ARROW_BEGIN = b"ARROW1\0\0"
 _HEADER_MAX = 1 << 20
 _SEMICOLONS = re.compile(r'"[^";,]*";')
 _OF_A_TILE = re.compile("|".join(f"{c.name}_." for c in KNOWN.values() if c.per_tile))
-"""Number or serial is behind the quantity."""
+"""Column of one tile: the quantity, then number or serial."""
 
 
 @dataclass
 class ExportReport:
-    """What an export says of itself.
+    """Facts about an export.
 
     Attributes:
         path: the file.
-        format: of the file.
-        source: session, hashes of its file, and what was chosen of it; empty if it does not say.
-        problems: what is wrong with it; none: it can be read to its end.
+        format: format of the file.
+        source: session, hashes of its file, and selection; empty if the export has none of it.
+        problems: messages of damage; empty: it can be read to its end.
     """
 
     path: Path
@@ -43,7 +43,7 @@ class ExportReport:
     problems: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON has it (docs/formats.md)."""
+        """Return the report for JSON (docs/formats.md)."""
         return {
             "export": self.format,
             "source": self.source,
@@ -56,7 +56,7 @@ def verify_export(path: Path) -> ExportReport | None:
     """Read an export to its end.
 
     Returns:
-        None if it is none: a sealed session, something else, or too damaged to tell.
+        None if it is no export: a sealed session, another file, or too damaged to tell.
     """
     with path.open("rb") as file:
         begin = file.read(4)
@@ -70,15 +70,17 @@ def verify_export(path: Path) -> ExportReport | None:
 def _parquet(path: Path) -> ExportReport | None:
     try:
         file = pq.ParquetFile(path, page_checksum_verification=True)
-        said, footer = file.schema_arrow.metadata or {}, file.metadata.metadata or {}
+        metadata, footer = file.schema_arrow.metadata or {}, file.metadata.metadata or {}
     except Exception:  # damaged bytes may cause any error
         return None
     with file:
-        # Those of older versions say so by what they lack: they are not sealed.
-        is_older = ARRAY_INFO_KEY in said and FORMAT_KEY not in said and CONTENT_KEY not in footer
-        if EXPORT_KEY not in said and not is_older:
+        # Exports of older versions have no key; they lack the entries of a sealed file.
+        is_older = (
+            ARRAY_INFO_KEY in metadata and FORMAT_KEY not in metadata and CONTENT_KEY not in footer
+        )
+        if EXPORT_KEY not in metadata and not is_older:
             return None
-        report = ExportReport(path, "parquet", _source(said))
+        report = ExportReport(path, "parquet", _source(metadata))
         try:
             for group in range(file.num_row_groups):
                 file.read_row_group(group)
@@ -90,19 +92,19 @@ def _parquet(path: Path) -> ExportReport | None:
 def _arrow(path: Path) -> ExportReport | None:
     try:
         with pa.OSFile(str(path), "r") as file:
-            file.seek(len(_ARROW_BEGIN))  # a stream is there, which is read although its end lacks
+            file.seek(len(_ARROW_BEGIN))  # a stream begins there, which needs no footer
             with pa.ipc.open_stream(file) as stream:
-                said = stream.schema.metadata or {}
-            if EXPORT_KEY not in said and ARRAY_INFO_KEY not in said:
+                metadata = stream.schema.metadata or {}
+            if EXPORT_KEY not in metadata and ARRAY_INFO_KEY not in metadata:
                 return None
-            report = ExportReport(path, "arrow", _source(said))
+            report = ExportReport(path, "arrow", _source(metadata))
             try:
                 with pa.ipc.open_file(file) as whole:
                     for i in range(whole.num_record_batches):
                         whole.get_batch(i).validate()
             except Exception as error:  # damaged bytes may cause any error
                 report.problems.append(f"it cannot be read: {error}")
-    except Exception:  # the same
+    except Exception:  # damaged bytes may cause any error
         return None
     return report
 
@@ -116,15 +118,15 @@ def _csv(path: Path) -> ExportReport | None:
         names, *cells = csv.reader([header, row] if row else [header], delimiter=between)
     except (UnicodeDecodeError, ValueError, csv.Error):
         return None
-    known = {*KNOWN, EXPORT_COLUMN}
-    if not names or not all(name in known or _OF_A_TILE.match(name) for name in names):
+    known_names = {*KNOWN, EXPORT_COLUMN}
+    if not names or not all(name in known_names or _OF_A_TILE.match(name) for name in names):
         return None
     first = dict(zip(names, *cells, strict=False)) if cells else {}
     return ExportReport(path, "csv", _json(first.get(EXPORT_COLUMN, "")))
 
 
-def _source(said: dict[bytes, bytes]) -> dict[str, Any]:
-    return _json(said.get(EXPORT_KEY, b""))
+def _source(metadata: dict[bytes, bytes]) -> dict[str, Any]:
+    return _json(metadata.get(EXPORT_KEY, b""))
 
 
 def _json(text: str | bytes) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""Proves a sealed file from itself alone: its bytes, its content, its frames' order and counts.
+"""Verification of a sealed file by itself: its bytes, content, frame order and counts.
 
-What only `session.json` beside it could prove is said as well, in `unproven`.
+Facts that only `session.json` beside it could prove are listed in `unproven`.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _ONE_MORE = 2
 
 @dataclass
 class FileReport:
-    """What a sealed file proves.
+    """Result of the verification of a sealed file.
 
     Attributes:
         path: the file.
-        problems: what is wrong with it; none: it is whole.
-        unproven: what it cannot show by itself.
-        notes: what it says of its session; empty if that cannot be read.
-        ledger: of its session, as the file states it, else as counted from its frames.
+        problems: messages of damage; empty: it is undamaged.
+        unproven: facts that the file itself cannot prove.
+        notes: notes about its session; empty if they cannot be read.
+        ledger: the file's ledger; counted from the frames if it has none.
         parts: its frames, by part.
-        frames: how many there are.
-        content_sha256: hash of what it says; None of an older or rewritten file.
+        frames: number of frames.
+        content_sha256: hash of the content; None of an older or rewritten file.
     """
 
     path: Path
@@ -51,16 +51,16 @@ class FileReport:
 
     @property
     def session(self) -> dict[str, Any]:
-        """What it says of the session it is of."""
-        said = self.notes.get("session")
-        return said if isinstance(said, dict) else {}
+        """Facts about the session in the file's notes."""
+        content = self.notes.get("session")
+        return content if isinstance(content, dict) else {}
 
 
 def verify_file(path: Path) -> FileReport:
-    """Read all of a sealed file, and hold it against what it says of itself.
+    """Read a complete sealed file and verify it against its hashes and its ledger.
 
     Args:
-        path: the file; it is read, never written.
+        path: the file; it is never written.
 
     Raises:
         FileFormatError: there is no such file, or it is no sealed session.
@@ -69,7 +69,7 @@ def verify_file(path: Path) -> FileReport:
     hashes = _file_hashes(path)
     if hashes is not None and hashes[0] != hashes[1]:
         report.problems.append(
-            "its bytes are not those that were sealed, by the hash in its footer"
+            "its bytes have changed since it was sealed, by the hash in its footer"
         )
     elif hashes is not None:
         own = footer_hashes(read_footer(path))
@@ -90,48 +90,48 @@ def verify_file(path: Path) -> FileReport:
 
 
 def part_problems(parts: list[PartFrames], ledger: Ledger, lost: dict[str, Losses]) -> list[str]:
-    """Reasons why a ledger cannot be that of these frames.
+    """Return messages where a ledger does not fit the frames.
 
     Args:
         parts: the frames.
-        ledger: what is said of them.
-        lost: by boot_id the numbers that are said to be lost; a stream that is not in it names
-            none, and then only their count is held against the gaps.
+        ledger: the ledger.
+        lost: lost numbers by stream_id; of a stream without an entry only the count is checked
+            against the gaps.
     """
     problems = ledger_problems(ledger)
     by_number = {part.part: part for part in parts}
     for strange in sorted(set(by_number) - set(range(len(ledger.parts)))):
-        problems.append(f"there are frames of part {strange}, of which the ledger says nothing")
-    for number, said in enumerate(ledger.parts):
+        problems.append(f"there are frames of part {strange}, which is not in the ledger")
+    for number, stated in enumerate(ledger.parts):
         found = by_number.get(number)
         frames = found.frames if found is not None else 0
         name = f"part {number}"
-        if frames != said.recorded:
-            problems.append(f"{name}: {frames} frames, and the ledger has {said.recorded}")
+        if frames != stated.recorded:
+            problems.append(f"{name}: {frames} frames, and the ledger has {stated.recorded}")
         held = found.held if found is not None else Intervals()
-        beyond = held - Intervals([(said.seq_first, said.seq_last)] if _length(said) else [])
+        beyond = held - Intervals([(stated.seq_first, stated.seq_last)] if _length(stated) else [])
         if beyond:
             first, last = next(iter(beyond))
             problems.append(
-                f"{name}: frames {first} to {last} are outside of {said.seq_first} to "
-                f"{said.seq_last}, which it consists of"
+                f"{name}: frames {first} to {last} are outside of its range {stated.seq_first} to "
+                f"{stated.seq_last}"
             )
-        gaps = held.missing(said.seq_first, said.seq_last) if _length(said) else Intervals()
-        accounted = sum(said.lost.values()) + said.pending
+        gaps = held.missing(stated.seq_first, stated.seq_last) if _length(stated) else Intervals()
+        accounted = sum(stated.lost.values()) + stated.pending
         if gaps.count != accounted:
             problems.append(
                 f"{name}: {gaps.count} frames are missing ({_named(gaps)}), and the ledger "
                 f"accounts for {accounted}"
             )
-        if said.boot_id in lost:
-            unnamed = gaps - lost[said.boot_id].all
-            if unnamed and not said.pending:
+        if stated.boot_id in lost:
+            unnamed = gaps - lost[stated.boot_id].all
+            if unnamed and not stated.pending:
                 problems.append(f"{name}: frames {_named(unnamed)} are missing and not named lost")
     return problems
 
 
 def ledger_problems(ledger: Ledger) -> list[str]:
-    """What is wrong with a ledger in itself."""
+    """Return messages where a ledger contradicts itself."""
     problems = []
     for number, part in enumerate(ledger.parts):
         counted = part.recorded + sum(part.lost.values()) + part.pending
@@ -149,10 +149,10 @@ def ledger_problems(ledger: Ledger) -> list[str]:
 
 
 def named_losses(notes: dict[str, Any]) -> dict[str, Losses]:
-    """The numbers that a file's notes name as lost, by boot_id; older files name none.
+    """Parse the lost numbers in a file's notes, by stream_id; older files have none.
 
     Raises:
-        FileFormatError: they are not readable.
+        FileFormatError: they cannot be parsed.
     """
     try:
         return {
@@ -197,11 +197,11 @@ def _read_through(reader: SessionReader, report: FileReport, *, has_file_hash: b
 
 
 def _is_ours(path: Path) -> bool:
-    """Was it once a sealed session? A damaged one is reported as damaged, not as foreign."""
+    """Return whether it was a sealed session; if so it is reported as damaged, not as foreign."""
     try:
         with pq.ParquetFile(path) as file:
             metadata = file.schema_arrow.metadata or {}
-    except Exception:  # unreadable: not recognisable as ours
+    except Exception:  # unreadable: only the name is left to recognise it
         return path.name == "frames.parquet"
     return any(key.startswith(b"foottile.") for key in metadata)
 
@@ -209,25 +209,30 @@ def _is_ours(path: Path) -> bool:
 def _content_problems(stated: dict[str, Any], found: dict[str, Any]) -> list[str]:
     problems = []
     if stated.get("frames") != found["frames"]:
-        problems.append(f"{found['frames']} frames, where {stated.get('frames')} were sealed")
+        problems.append(f"{found['frames']} frames, and {stated.get('frames')} were sealed")
     if stated.get("parts") != found["parts"]:
-        problems.append("its parts do not begin and end where they did when it was sealed")
-    said, has = stated.get("columns", {}), found["columns"]
-    if list(said) != list(has):
-        added, gone = sorted(set(has) - set(said)), sorted(set(said) - set(has))
+        problems.append("the ranges of its parts have changed since it was sealed")
+    stated_columns, found_columns = stated.get("columns", {}), found["columns"]
+    if list(stated_columns) != list(found_columns):
+        added = sorted(set(found_columns) - set(stated_columns))
+        gone = sorted(set(stated_columns) - set(found_columns))
         changes = [f"added: {', '.join(added)}"] * bool(added) + [
             f"gone: {', '.join(gone)}"
         ] * bool(gone)
-        problems.append(f"its columns are not those that were sealed ({'; '.join(changes)})")
-    changed = [name for name in has if name in said and has[name] != said[name]]
+        problems.append(f"its columns have changed since it was sealed ({'; '.join(changes)})")
+    changed = [
+        name
+        for name in found_columns
+        if name in stated_columns and found_columns[name] != stated_columns[name]
+    ]
     if changed:
         shown = ", ".join(changed[:6]) + (" ..." if len(changed) > 6 else "")
-        problems.append(f"the values of {shown} are not those that were sealed")
+        problems.append(f"the values of {shown} have changed since it was sealed")
     return problems
 
 
 def _check_offset(report: FileReport, utc_offset_ns: int) -> None:
-    """Check part 0, the stream that the file describes; later parts have their own anchors."""
+    """Check part 0, whose stream the file describes; later parts have their own anchors."""
     first = next((part for part in report.parts if part.part == 0), None)
     if first is not None and first.offset_ns != utc_offset_ns:
         report.problems.append(
@@ -236,9 +241,9 @@ def _check_offset(report: FileReport, utc_offset_ns: int) -> None:
 
 
 def _check_ledger(report: FileReport) -> None:
-    """Hold the frames against the ledger in the notes, or make one from the frames."""
-    said = report.notes.get("ledger")
-    if said is None:
+    """Check the frames against the ledger in the notes, or count a ledger from the frames."""
+    stated = report.notes.get("ledger")
+    if stated is None:
         gaps = union(part.gaps for part in report.parts)
         if gaps:
             report.problems.append(
@@ -260,10 +265,10 @@ def _check_ledger(report: FileReport) -> None:
             ),
             missed_slots=0,
         )
-        report.unproven.append("where its recording began and ended: it is of no recorded session")
+        report.unproven.append("begin and end of its recording: it is of no recorded session")
         return
     try:
-        report.ledger = Ledger.model_validate(said)
+        report.ledger = Ledger.model_validate(stated)
         lost = named_losses(report.notes)
         parts = _PARTS.validate_python(report.session.get("parts", ()))
     except (ValidationError, FileFormatError) as error:

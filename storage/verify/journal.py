@@ -1,4 +1,4 @@
-"""Proves a stream's journal as it lies on the disk: its segments, their order, and its notes."""
+"""Verification of a stream's journal: its segments, their order, and its notes."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from storage.verify.segment import SegmentReport, verify_segment
 
 @dataclass
 class StreamReport:
-    """What one stream's journal proves.
+    """Result of the verification of one stream's journal.
 
     Attributes:
-        node: whose stream it is, by its folder's name.
-        boot_id: which stream it is, by its folder's name.
-        held: numbers of frames that are whole.
-        lost: numbers that are known to be lost, by reason; damaged ones among them.
+        node: its node, by the folder's name.
+        boot_id: its id, by the folder's name.
+        held: numbers of undamaged frames.
+        lost: lost numbers by reason; damaged ones among them.
         unsynced: see `SegmentReport`.
         notes: its `stream.json`; None if there is none.
         info: the array.
-        segments: how many there are.
-        problems: what is wrong.
-        remarks: what a person should know, and is no damage.
-        unproven: what these files cannot show.
+        segments: number of segments.
+        problems: messages of damage.
+        remarks: other messages for people.
+        unproven: facts that these files cannot prove.
     """
 
     node: str
@@ -53,18 +53,18 @@ class StreamReport:
     unproven: list[str] = field(default_factory=list)
 
     def state(self, may_come: Intervals) -> StreamState:
-        """The stream as sessions know it.
+        """Return the stream's state for ledgers.
 
         Args:
-            may_come: what its node may still give, if it is not known to be lost.
+            may_come: numbers that its node may still send, unless they are lost.
         """
         notes = self.notes
-        told = Losses(notes.lost if notes is not None else None)
+        recorded_losses = Losses(notes.lost if notes is not None else None)
         return StreamState(
             held=self.held,
-            lost=told,
-            damaged=self.lost.all - told.all,
-            may_come=may_come - told.all,
+            lost=recorded_losses,
+            damaged=self.lost.all - recorded_losses.all,
+            may_come=may_come - recorded_losses.all,
             next_seq=notes.next_seq if notes is not None else None,
             unsynced_tail_max=notes.unsynced_tail_max if notes is not None else 0,
             missed_slots=notes.missed_slots if notes is not None else 0,
@@ -72,7 +72,7 @@ class StreamReport:
 
     @property
     def missing(self) -> Intervals:
-        """Numbers up to the stream's end that are neither here nor known to be lost.
+        """Numbers up to the stream's end that are neither stored nor lost.
 
         They were deleted when no session needed them any more, or are still to come.
         """
@@ -85,7 +85,7 @@ class StreamReport:
         return self.held.missing(first, last) - self.lost.all
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON has it (docs/formats.md)."""
+        """Return the report for JSON (docs/formats.md)."""
         lost = self.lost.by_reason.items()
         return {
             "node": self.node,
@@ -104,10 +104,10 @@ class StreamReport:
 
 
 def verify_stream(folder: Path) -> StreamReport:
-    """Check a stream's journal: every segment, and what its notes say of them.
+    """Verify a stream's journal: every segment, and its notes.
 
     Args:
-        folder: `DIR/journal/<node>/<boot_id>`.
+        folder: `DIR/journal/<node>/<stream_id>`.
 
     Raises:
         FileFormatError: the folder cannot be read.
@@ -116,7 +116,7 @@ def verify_stream(folder: Path) -> StreamReport:
     try:
         report.notes, is_proven = StreamNotes.load_checked(folder)
         if not is_proven:
-            report.unproven.append(f"{NOTES_FILE}: it states no hash of itself")
+            report.unproven.append(f"{NOTES_FILE}: it has no hash")
     except (FileFormatError, StorageError) as error:
         report.problems.append(f"{NOTES_FILE}: {error.what}")
     if report.notes is not None:
@@ -160,7 +160,7 @@ def _check_stream(report: StreamReport, segments: list[SegmentReport], *, is_ser
         )
     index = np.concatenate([np.zeros(0, RECORD), *(segment.index for segment in segments)])
     index = index[np.argsort(index["seq_first"], kind="stable")]
-    # What a disk refused once was written again: a second copy is neither damage nor out of order.
+    # A batch that a disk refused was written again: a second copy is neither damage nor disorder.
     ends = np.maximum.accumulate(index["seq_first"] + index["count"])
     index = index[np.concatenate([[True] * min(1, len(index)), ends[1:] > ends[:-1]]).astype(bool)]
     back = runs_back(index["t_ns_first"], index["t_ns_last"])
@@ -171,11 +171,11 @@ def _check_stream(report: StreamReport, segments: list[SegmentReport], *, is_ser
     last = report.held.last
     if last is not None and last >= notes.next_seq:
         report.problems.append(
-            f"it holds frame {last}, and {NOTES_FILE} says that it ended with {notes.next_seq - 1}"
+            f"it has frame {last}, and by {NOTES_FILE} it ended with {notes.next_seq - 1}"
         )
     open_ones = [segment for segment in segments if not segment.is_closed]
     if not is_servers and open_ones:
-        # Its node closes a stream's segments before it writes down where the stream ended.
+        # A node closes a stream's segments before it records where the stream ended.
         report.problems += [
             f"{segment.path.name}: it was cut behind frame {segment.held.last}: the stream has "
             "ended, and it was not closed"
@@ -191,27 +191,25 @@ def _check_clock(report: StreamReport, folder: Path) -> None:
         return
     if lines.damaged:
         report.problems.append(
-            f"{CLOCK_LOG}: {lines.damaged} lines are not what was written: they are left out, and "
-            "the bounds of the server's time are wider"
+            f"{CLOCK_LOG}: {lines.damaged} lines are damaged: they are skipped, and the bounds of "
+            "the server's time are wider"
         )
     if lines.is_torn:
-        report.remarks.append(
-            f"{CLOCK_LOG}: it ends with what is no whole line, as after a power cut"
-        )
+        report.remarks.append(f"{CLOCK_LOG}: its last line is incomplete, as after a power cut")
 
 
 def _segments(folder: Path) -> list[SegmentReport]:
-    """Every segment's report; damage is checked again, as the file may just have been deleted."""
+    """Verify every segment; damaged ones twice, since the file may just have been deleted."""
     first_look = [_if_there(path) for path in _names(folder, SUFFIX)]
-    looked = [
+    second_look = [
         _if_there(report.path) if report is not None and report.problems else report
         for report in first_look
     ]
-    return [report for report in looked if report is not None]
+    return [report for report in second_look if report is not None]
 
 
 def _if_there(path: Path) -> SegmentReport | None:
-    """The segment's report; None if it was deleted meanwhile because no session needs it."""
+    """Verify a segment; None if it was deleted meanwhile because no session needs it."""
     try:
         report = verify_segment(path)
     except FileFormatError:

@@ -1,7 +1,7 @@
-"""Proves what lies in a data folder beside sessions and journals, file by file.
+"""Verification of other files in a data folder, beside sessions and journals.
 
-Whatever it is called, a JSON file of ours has its own hash (`storage.checked_json`), `server_id` a
-CRC-32. What has `.damaged-N` behind its name was set aside and counts no more.
+Every JSON file of ours has its own hash (`storage.checksummed_json`), `server_id` a CRC-32. A name
+with `.damaged-N` was set aside and is not verified.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from storage.server_id import SERVER_ID_NAME, ServerId, read_server_id
 
 @dataclass
 class Others:
-    """What was found, each by its path in the data folder.
+    """Findings, each with its path in the data folder.
 
     Attributes:
-        problems: what is damaged.
-        unproven: files that state no hash of themselves.
-        set_aside: what was found damaged before, and waits for a person.
+        problems: messages of damage.
+        unproven: files without a hash.
+        set_aside: files that were found damaged before, and wait for a person.
     """
 
     problems: list[str] = field(default_factory=list)
@@ -33,13 +33,13 @@ class Others:
 
 
 def verify_others(data: Path, proven: set[Path]) -> Others:
-    """Prove every JSON file of a data folder but those in folders that are proven elsewhere.
+    """Verify `server_id` and every JSON file of a data folder, except in folders done elsewhere.
 
-    And `server_id`. Token, locks and whatever else lies there have nothing that proves them.
+    Token, locks and other files have no checksum.
 
     Args:
         data: the data folder.
-        proven: folders of streams and sessions; only what was set aside in them is named.
+        proven: folders of streams and sessions; of them only set-aside files are listed.
     """
     found = Others()
 
@@ -58,7 +58,7 @@ def verify_others(data: Path, proven: set[Path]) -> Others:
                 _check(path, name, read_server_id, found)
             elif name.endswith(".json") and not name.startswith(".") and not is_proven:
                 check_json(path, _name(path, data), found)
-        # A folder that was set aside, or that has the name of a file, is not looked into.
+        # A folder that was set aside, or that has the name of a file, is skipped.
         folders[:] = [name for name in folders if ASIDE not in name and not name.endswith(".json")]
         if is_proven:
             folders.clear()
@@ -66,7 +66,7 @@ def verify_others(data: Path, proven: set[Path]) -> Others:
 
 
 def check_json(path: Path, name: str, found: Others) -> None:
-    """Prove one JSON file, and note under this name what is wrong with it."""
+    """Verify one JSON file, and add any finding under `name`."""
     _check(path, name, read_checked, found)
 
 
@@ -75,7 +75,7 @@ def _check(
 ) -> None:
     try:
         if not read(path).is_proven:
-            found.unproven.append(f"{name}: it states no hash of itself")
+            found.unproven.append(f"{name}: it has no hash")
     except FileNotFoundError:
         return  # replaced or deleted meanwhile
     except (DamagedFileError, StorageError) as error:

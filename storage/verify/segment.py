@@ -1,8 +1,8 @@
-"""Proves one segment of a journal as it lies on the disk; nothing is mended.
+"""Verification of one segment of a journal; nothing is repaired.
 
-It may be written meanwhile, or have been until the power failed: behind the last batch of a segment
-that was not closed there may be half a batch, and its index may name some that never came to the
-disk. Those were never promised. Everything else has to agree with its checksum.
+A writer may be appending, or a power cut may have stopped it: then an unclosed segment may end with
+half a batch, and its index may have records of batches that never came to the disk. Those were
+never promised. Everything else has to match its checksum.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ from storage.schema import array_info, older_wire_schema, wire_schema
 from storage.wire import decode
 
 _RUN_BATCHES = 256
-"""Batches that are looked at together: some thousand frames."""
+"""Batches that are checked together: some thousand frames."""
 
 
 @dataclass
 class SegmentReport:
-    """What one segment proves.
+    """Result of the verification of a segment.
 
     Attributes:
         path: the segment.
-        held: numbers of frames whose bytes agree with their checksum.
+        held: numbers of frames whose bytes match their checksum.
         damaged: numbers of frames whose bytes do not.
-        unsynced: numbers that the index names at the end of a segment that was not closed, and that
-            are not on the disk: they were never promised.
-        is_closed: was it closed in order?
-        info: the array it is of; None if that cannot be read.
-        index: records of the batches that are held.
-        problems: what is wrong with it.
-        remarks: what a person should know, and is no damage.
+        unsynced: numbers in the index at the end of an unclosed segment that are not on the disk:
+            they were never promised.
+        is_closed: True: it was closed in order.
+        info: its array; None if that cannot be read.
+        index: records of the undamaged batches.
+        problems: messages of damage.
+        remarks: other messages for people.
     """
 
     path: Path
@@ -71,7 +71,7 @@ class SegmentReport:
     remarks: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON has it (docs/formats.md)."""
+        """Return the report for JSON (docs/formats.md)."""
         return {
             "node": self.info.node if self.info is not None else None,
             "boot_id": self.info.boot_id if self.info is not None else None,
@@ -85,7 +85,7 @@ class SegmentReport:
 
 
 def verify_segment(path: Path) -> SegmentReport:
-    """Check every batch of a segment.
+    """Verify every batch of a segment.
 
     Raises:
         FileFormatError: there is no such file.
@@ -106,8 +106,8 @@ def verify_segment(path: Path) -> SegmentReport:
 
 def _verify(path: Path, report: SegmentReport) -> None:
     try:
-        # In this order, for a writer appends to the segment first: what was there before the
-        # index was read, and is not in the index, is one batch at most.
+        # In this order, since a writer appends to the segment first: at most one batch of this
+        # size has no record in the index that is read after it.
         size = path.stat().st_size
         index: Records | None = read_index(path)
     except FileNotFoundError:
@@ -117,7 +117,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
     report.is_closed = index is not None and is_closed(index)
     schema, header_bytes = _schema_of(path, report)
     if schema is None:
-        # A segment just begun when the power failed may be empty; one with frames may not.
+        # A segment that was created just before a power cut may be empty; one with frames may not.
         if report.is_closed or (index is not None and _holds_any(path, index)):
             report.problems.append("it does not begin with the description of an array")
         return
@@ -145,12 +145,12 @@ def _verify(path: Path, report: SegmentReport) -> None:
 
 
 class _Batches:
-    """Looks at the batches of one segment, in the order of its index.
+    """Verifier of the batches of one segment, in the order of its index.
 
     Args:
-        report: told what is found.
-        schema: of the segment.
-        header_bytes: where its first batch begins.
+        report: findings are added here.
+        schema: schema of the segment.
+        header_bytes: offset of its first batch.
     """
 
     def __init__(self, report: SegmentReport, schema: pa.Schema, header_bytes: int) -> None:
@@ -160,23 +160,23 @@ class _Batches:
         self._end = header_bytes
         self._doubtful = Intervals()
         self._said: list[str] = []
-        """Since the last batch that is whole."""
+        """Messages since the last undamaged batch."""
 
     def check(self, index: Records) -> None:
-        """Check all batches that the index has."""
-        report, good = self._report, [np.zeros(0, RECORD)]
+        """Verify all batches of the index."""
+        report, undamaged = self._report, [np.zeros(0, RECORD)]
         if report.is_closed:
             index = index[:-1]
         with report.path.open("rb") as file:
             for begin in range(0, len(index), _RUN_BATCHES):
                 records = index[begin : begin + _RUN_BATCHES]
                 if self._is_right(file.fileno(), records):
-                    good.append(records)
+                    undamaged.append(records)
                     continue
                 for at, record in enumerate(records):
                     if self._is_good(file.fileno(), record, begin + at):
-                        good.append(records[at : at + 1])
-        report.index = np.concatenate(good)
+                        undamaged.append(records[at : at + 1])
+        report.index = np.concatenate(undamaged)
         if report.is_closed:
             report.damaged = report.damaged | self._doubtful
             report.problems += self._said
@@ -188,7 +188,7 @@ class _Batches:
             )
 
     def _is_right(self, descriptor: int, records: Records) -> bool:
-        """Is all right with these batches, looked at together? If not, nothing is noted of them."""
+        """Return whether a group of batches is undamaged; otherwise nothing is recorded."""
         offset, length = records["offset"], records["length"].astype(np.uint64)
         is_joined = bool((offset[1:] == (offset + length)[:-1]).all())
         first, last = numbers(records[0])[0], numbers(records[-1])[1]
@@ -210,7 +210,7 @@ class _Batches:
         return True
 
     def _is_good(self, descriptor: int, record: np.void, at: int) -> bool:
-        """Is one batch whole, with frames that belong there?"""
+        """Verify one batch; return whether it is undamaged and its frames belong there."""
         report = self._report
         if not is_whole(record):
             self._said.append(f"record {at} of its index is damaged")
@@ -226,7 +226,7 @@ class _Batches:
         self._found_whole()
         wrong = _wrong_in(payload, record, self._runs.schema, self._info)
         if int(record["offset"]) < self._end:
-            wrong = "they stand where other frames stand as well"
+            wrong = "they overlap other frames"
         self._end = int(record["offset"]) + int(record["length"])
         if not wrong and report.held.within(first, last):
             wrong = "they are in it twice"
@@ -237,14 +237,14 @@ class _Batches:
         return True
 
     def _found_whole(self) -> None:
-        """Damage followed by a good batch happened after writing."""
+        """Report pending damage: a good batch behind it shows that it happened after writing."""
         self._report.damaged = self._report.damaged | self._doubtful
         self._report.problems += self._said
         self._doubtful, self._said = Intervals(), []
 
 
 def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, info: ArrayInfo) -> str:
-    """Why the bytes are not what the index says; empty if they are."""
+    """Return a message where the bytes contradict the index; empty if they do not."""
     try:
         batch = decode(payload, schema)
     except FileFormatError as error:
@@ -252,19 +252,19 @@ def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, info: ArrayInf
     if (int(batch.seq[0]), len(batch)) != (int(record["seq_first"]), int(record["count"])):
         return f"the batch holds {len(batch)} frames from {int(batch.seq[0])} on"
     if (int(batch.t_ns[0]), int(batch.t_ns[-1])) != (record["t_ns_first"], record["t_ns_last"]):
-        return "the index says other instants than the batch"
+        return "the index has other instants than the batch"
     return broken_rule(batch, info)
 
 
 def _holds_any(path: Path, index: Records) -> bool:
-    """Does any batch in the segment agree with the index?"""
+    """Return whether any batch in the segment matches the index."""
     with path.open("rb") as file:
         batches = batches_in(index)
         return any(payload_of(file.fileno(), record) is not None for record in batches)
 
 
 def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:
-    """Schema that a segment should begin with, and how many bytes it takes; None: it has none."""
+    """Return a segment's expected schema and the length of its header; None: it has none."""
     schema, length = read_header(path)
     if schema is None:
         return None, 0

@@ -1,7 +1,7 @@
-"""Proves a session's folder from its files alone: description, frames, events, clock and ledger.
+"""Verification of a session's folder by its files: description, frames, markers, clock, ledger.
 
-Nothing is written and no lock is needed: a server may run beside it. What looks wrong while the
-session changes is looked at again.
+Nothing is written and no lock is needed: a server may run meanwhile. If the session changes during
+a check that finds problems, the check is repeated.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ _Stored = TypeVar("_Stored", StoredEvents, StoredClock)
 
 @dataclass
 class SessionReport:
-    """What a session's folder, or a sealed file, proves.
+    """Result of the verification of a session's folder, or of a sealed file.
 
     Attributes:
         path: the folder or file.
-        id: of the session; None if it cannot be read, or if the file belongs to no session.
-        name: as people call it.
-        node: whose frames they are.
-        state: as it says; `file` of a lone one.
-        ledger: what became of every frame; None if that cannot be read.
+        id: id of the session; None if it cannot be read, or if the file is of no session.
+        name: name of the session.
+        node: name of its node.
+        state: state in its metadata; `file` for a lone file.
+        ledger: its ledger; None if that cannot be read.
         sha256: hash of the sealed file; None if it is not sealed.
-        problems: what is wrong; none: it is whole.
-        unproven: what these files cannot show.
-        in_trash: was it deleted?
+        problems: messages of damage; empty: it is undamaged.
+        unproven: facts that these files cannot prove.
+        in_trash: True: it is in the trash.
     """
 
     path: Path
@@ -61,11 +61,11 @@ class SessionReport:
 
     @property
     def frames(self) -> int:
-        """How many frames are recorded."""
+        """Number of recorded frames."""
         return sum(part.recorded for part in self.ledger.parts) if self.ledger else 0
 
     def as_dict(self) -> dict[str, Any]:
-        """The ledger, and what was found (docs/formats.md)."""
+        """Return ledger and findings for JSON (docs/formats.md)."""
         empty = Ledger(complete=False, lossy=False, parts=(), missed_slots=0)
         ledger = self.ledger or empty
         if self.problems:
@@ -81,7 +81,7 @@ class SessionReport:
 
 
 def verify_lone_file(path: Path) -> SessionReport:
-    """Prove a sealed file without `session.json` beside it.
+    """Verify a sealed file without `session.json` beside it.
 
     Raises:
         FileFormatError: there is no such file, or it is no sealed session.
@@ -93,7 +93,7 @@ def verify_lone_file(path: Path) -> SessionReport:
     report.problems, report.unproven = file.problems, file.unproven
     if report.id is not None:
         report.unproven.append(
-            f"that it is the file that {SESSION_NAME} of its session names, nor events and clock"
+            f"that it is the file in {SESSION_NAME} of its session, nor events and clock"
         )
     return report
 
@@ -105,13 +105,13 @@ def verify_session(
     session: Session | None = None,
     streams: Streams = verify_stream,
 ) -> SessionReport:
-    """Prove a session's folder.
+    """Verify a session's folder.
 
     Args:
-        folder: with `session.json`, and `frames.parquet` if it is sealed.
-        data: where its journals are if it is not sealed; default: where a server has them.
-        session: what to hold the files against, in place of `session.json`.
-        streams: checks a stream's journal.
+        folder: folder with `session.json`, and `frames.parquet` if it is sealed.
+        data: data folder with its journals if it is not sealed; default: a server's layout.
+        session: model to verify the files against, in place of `session.json`.
+        streams: verifies a stream's journal.
 
     Raises:
         FileFormatError: there is no such folder.
@@ -131,36 +131,39 @@ def _once(
     folder: Path, data: Path, session: Session | None, text: bytes | None, streams: Streams
 ) -> SessionReport:
     report = SessionReport(folder, in_trash=folder.absolute().parent.name == "trash")
-    said = (
+    metadata = (
         claims_of(session)
         if session is not None
         else claims_in(folder, text, report.problems, report.unproven)
     )
-    if said is None:
+    if metadata is None:
         if (folder / FRAMES_NAME).is_file():
             _add_file(report, folder)
         return report
-    report.id, report.name = str(said.content["id"]), str(said.content.get("name", ""))
-    report.node, report.state = str(said.content.get("node", "")), str(said.content.get("state"))
-    report.ledger = said.ledger
+    report.id, report.name = str(metadata.content["id"]), str(metadata.content.get("name", ""))
+    report.node, report.state = (
+        str(metadata.content.get("node", "")),
+        str(metadata.content.get("state")),
+    )
+    report.ledger = metadata.ledger
     if report.state == "sealed":
-        _check_sealed(report, folder, said)
-    elif said.whole is not None:
-        _count(report, data, said.whole, streams)
+        _check_sealed(report, folder, metadata)
+    elif metadata.whole is not None:
+        _count(report, data, metadata.whole, streams)
     return report
 
 
-def _check_sealed(report: SessionReport, folder: Path, said: Claims) -> None:
-    problems, content = report.problems, said.content
-    if said.ledger is None:
-        problems.append("it is sealed, and its ledger is missing")
-    elif any(part.pending for part in said.ledger.parts):
-        problems.append("it is sealed, and frames of it are still to come")
+def _check_sealed(report: SessionReport, folder: Path, metadata: Claims) -> None:
+    problems, content = report.problems, metadata.content
+    if metadata.ledger is None:
+        problems.append("it is sealed, but its ledger is missing")
+    elif any(part.pending for part in metadata.ledger.parts):
+        problems.append("it is sealed, but frames are still to come")
     path = folder / FRAMES_NAME
-    if said.ledger is not None and not any(part.recorded for part in said.ledger.parts):
+    if metadata.ledger is not None and not any(part.recorded for part in metadata.ledger.parts):
         if path.is_file():
-            problems.append(f"{FRAMES_NAME} is there, and the ledger has no frame recorded")
-        problems += ledger_problems(said.ledger)
+            problems.append(f"{FRAMES_NAME} exists, but the ledger has no frame recorded")
+        problems += ledger_problems(metadata.ledger)
         return
     if not path.is_file():
         problems.append(f"{FRAMES_NAME} is missing")
@@ -172,21 +175,21 @@ def _check_sealed(report: SessionReport, folder: Path, said: Claims) -> None:
             f"{report.sha256}, not {content.get('sha256')}"
         )
     _compare(problems, content, file, path.stat().st_size)
-    if said.ledger is not None:
-        report.ledger = said.ledger
-        if file.ledger is not None and file.ledger != said.ledger:
+    if metadata.ledger is not None:
+        report.ledger = metadata.ledger
+        if file.ledger is not None and file.ledger != metadata.ledger:
             problems.append(f"the ledgers of {SESSION_NAME} and {FRAMES_NAME} are not the same")
-    if file.session and file.session.get("parts") != [p.model_dump() for p in said.parts]:
+    if file.session and file.session.get("parts") != [p.model_dump() for p in metadata.parts]:
         problems.append(f"{SESSION_NAME} and {FRAMES_NAME} are not of the same parts")
-    whole = said.whole
-    _check_events(report, folder / EVENTS_NAME, whole.events if whole is not None else None)
-    _check_clock(report, folder / CLOCK_NAME, whole)
+    session = metadata.whole
+    _check_events(report, folder / EVENTS_NAME, session.events if session is not None else None)
+    _check_clock(report, folder / CLOCK_NAME, session)
     _check_stances(report, folder / STANCES_NAME)
     _check_overview(report, folder / OVERVIEW_NAME)
 
 
 def _compare(problems: list[str], content: dict[str, Any], file: FileReport, size: int) -> None:
-    """What `session.json` says of the file against what the file says."""
+    """Compare the file's facts in `session.json` with the file."""
     first_last = [(part.t_mono_ns_first, part.t_mono_ns_last) for part in file.parts]
     duration_s = sum(last - first for first, last in first_last) * 1e-9
     found: dict[str, Any] = {"frames": file.frames, "bytes": size}
@@ -211,7 +214,7 @@ def _compare(problems: list[str], content: dict[str, Any], file: FileReport, siz
 
 
 def _add_file(report: SessionReport, folder: Path) -> FileReport:
-    """Prove the frames, and take over what was found."""
+    """Verify the frames, and add the findings to the report."""
     path = folder / FRAMES_NAME
     try:
         file = verify_file(path)
@@ -228,12 +231,12 @@ def _add_file(report: SessionReport, folder: Path) -> FileReport:
 
 
 def _check_events(report: SessionReport, path: Path, events: tuple[Event, ...] | None) -> None:
-    """Prove the table of events.
+    """Verify the table of markers.
 
     Args:
-        report: takes what is found.
-        path: of the table.
-        events: that it should have; None: that is not known, and it may be missing.
+        report: findings are added here.
+        path: the table.
+        events: expected markers; None: unknown, and the table may be missing.
     """
     stored = _stored(report, path, read_events, may_lack=events is None)
     if stored is not None and events is not None and stored.events != events:
@@ -241,7 +244,7 @@ def _check_events(report: SessionReport, path: Path, events: tuple[Event, ...] |
 
 
 def _check_clock(report: SessionReport, path: Path, session: Session | None) -> None:
-    """Prove the clock table in the same way."""
+    """Verify the clock table."""
     stored = _stored(report, path, read_clock, may_lack=session is None)
     if stored is None or session is None:
         return
@@ -251,7 +254,7 @@ def _check_clock(report: SessionReport, path: Path, session: Session | None) -> 
 
 
 def _check_stances(report: SessionReport, path: Path) -> None:
-    """Prove the table of stances, which may be missing: it is made again from the frames."""
+    """Verify the table of stances; a missing one is made again from the frames."""
     try:
         stored = read_stances(path)
     except FileNotFoundError:
@@ -267,7 +270,7 @@ def _check_stances(report: SessionReport, path: Path) -> None:
 
 
 def _check_overview(report: SessionReport, path: Path) -> None:
-    """Prove every piece of the overview, which may be missing, too."""
+    """Verify every piece of the overview; a missing one is made again from the frames."""
     try:
         with open_overview(path) as overview:
             for level in range(overview.index.levels):
@@ -303,9 +306,9 @@ def _stored(
 
 
 def _count(report: SessionReport, data: Path, session: Session, streams: Streams) -> None:
-    """The ledger of a session that is not sealed, from the journals."""
+    """Count the ledger of an unsealed session from the journals."""
     if not (data / "journal").is_dir():
-        report.unproven.append("what of it is there: its journals are not here")
+        report.unproven.append("which of its frames are stored: its journals are not here")
         return
     reports: dict[str, StreamReport] = {}
     for part in session.parts:
@@ -314,7 +317,7 @@ def _count(report: SessionReport, data: Path, session: Session, streams: Streams
             reports[part.boot_id] = found = streams(folder)
             report.problems += [f"journal {part.boot_id}: {problem}" for problem in found.problems]
         reports.setdefault(part.boot_id, StreamReport(session.node, part.boot_id))
-    # In a server's folder a node may still deliver frames; a node's own folder has all there are.
+    # For a server's folder a node may still send frames; a node's own folder has all of them.
     may_come = Intervals([(0, NO_END)] if (data / "nodes").is_dir() else ())
     states = states_of(session, {b: found.state(may_come) for b, found in reports.items()})
     ledger = ledger_of(session.parts, states, finished=session.stopped_t_ns is not None)

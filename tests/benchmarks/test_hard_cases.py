@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+from collections import Counter
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from devices.frames import FrameBatch, FrameStatus, zero_columns
 
@@ -51,13 +53,34 @@ def test_frames_are_lost_a_tenth_of_a_second_at_a_time_and_never_of_the_lead(
     columns = zero_columns(n, 1)
     columns["seq"][:] = np.arange(n)
     columns["frame_status"][: n // 2] = FrameStatus.LEAD
-    (left,) = hard.without([FrameBatch(**columns)], 0.1, seed=1)
+    left = hard.without(FrameBatch(**columns), 0.1, np.random.default_rng(1))
     gaps = np.diff(left.seq.astype(int)) - 1
     assert (left.seq[: n // 2] == np.arange(n // 2)).all()
     assert 0.05 < 1.0 - (len(left) - n // 2) / (n // 2) < 0.15
     assert gaps[gaps > 0].min() >= 50
 
 
-def test_alarms_are_counted_as_onsets_and_added_up(hard: ModuleType) -> None:
-    lines = list(hard.alarm_lines({"a": [0.5, 1.0, 0.0, 2.0], "b": [0.25, 0.0, 1.0, 0.0]}))
-    assert lines[-1] == "| all | 0.75 | 1 | 1 | 2 |"
+def test_alarms_are_added_up_with_the_bound_that_their_hours_allow(hard: ModuleType) -> None:
+    stuck, clipped, lost = hard.JUDGED
+    a = hard.Alarms(2.0, Counter({stuck: 1, clipped: 2}), 7.5)
+    b = hard.Alarms(1.0, Counter({lost: 3}), 8.25)
+    lines = list(hard.alarm_lines({("a", 0.0): a, ("b", 0.1): b}))
+    assert lines[1] == "| b | 10 % | 1.00 | 0 | 0 | 3 | < 2.97 | 8.2 |"
+    assert lines[2] == "| all | - | 3.00 | 1 | 2 | 3 | < 2.09 | 8.2 |"
+
+
+@pytest.mark.parametrize("alarms", [0, 1, 5, 50])
+def test_a_rate_is_bounded_as_that_of_a_poisson_process(hard: ModuleType, alarms: int) -> None:
+    exact = 0.5 * chi2.ppf(0.95, 2 * (alarms + 1))
+    assert hard.most_per_hour(alarms, 4.0) == pytest.approx(exact / 4.0, rel=0.02)
+
+
+def test_a_healthy_foot_has_a_line_for_each_share_of_lost_frames(
+    hard: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hard, "NOISES", ({},))
+    monkeypatch.setattr(hard, "LADDERS", {"static": hard.LADDERS["static"]})
+    lines = list(hard.healthy(Path(), 0.006, [0.0, 0.1], ["rolling"]))
+    assert [line.split("|")[1:7] for line in lines[:2]] == [
+        [" rolling ", f" {lost} % ", " 0.01 ", " 0 ", " 0 ", " 0 "] for lost in (0, 10)
+    ]

@@ -7,20 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from service.estimation.records import Records
+from service.estimation.records import RecordArray
 
 
 def through(
-    kernel: Callable[..., Any], laws: Records | None, state: Records, *columns: Any
+    kernel: Callable[..., Any],
+    params: RecordArray[Any] | None,
+    state: RecordArray[Any],
+    *columns: Any,
 ) -> np.ndarray:
-    """What a model makes of readings; its state moves on.
+    """Apply a model's kernel to readings, one after the other; its state is updated.
 
     Args:
         kernel: of the model.
-        laws: (1,), constants of the tile; None for a model that has none.
+        params: (1,), of the tile; None for a model without any.
         state: (1,), of the tile.
-        columns: (n,), what the kernel takes of each reading, or one value for all.
+        columns: further arguments of the kernel, each (n,) or one value for all.
     """
-    tile = (state[0],) if laws is None else (laws[0], state[0])
+    tile = (state[0],) if params is None else (params[0], state[0])
     rows = zip(*np.broadcast_arrays(*columns), strict=True)
     return np.array([kernel(*tile, *row) for row in rows])

@@ -41,8 +41,8 @@ def test_ordinary_frames_and_the_ends_of_every_range_keep_to_the_rules() -> None
     [
         ("padc", 1024, "10 bits"),
         ("tadc", 65534, "10 bits"),
-        ("status", 64, "status has bits"),
-        ("frame_status", 64, "frame_status has bits"),
+        ("status", 64, "status has undefined bits"),
+        ("frame_status", 64, "frame_status has undefined bits"),
         ("sample_offset_us", 60_000_001, "a minute"),
         ("sample_offset_us", -(2**31), "a minute"),
         ("servo_age_us", -2, "negative"),

@@ -224,7 +224,7 @@ def test_whatever_a_header_says_of_lengths_little_memory_is_taken(data: st.DataO
 def test_a_message_with_bytes_behind_it_is_refused() -> None:
     """In a journal they would stand where the next message has to begin."""
     schema = schema_of(2)
-    with pytest.raises(FileFormatError, match="another length"):
+    with pytest.raises(FileFormatError, match="not those its header states"):
         decode(encode(frames(5), schema) + bytes(8), schema)
 
 

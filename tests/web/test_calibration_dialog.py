@@ -56,6 +56,8 @@ def test_another_calibration_is_chosen_and_the_nodes_own_again(
         page.click("#calibration")
         expect(page.locator("#calibration-used")).to_contain_text("from the node")
         expect(page.locator("#calibrations li")).to_have_count(2)
+        guided = page.locator("#calibration-guided")
+        expect(guided).to_have_attribute("href", "/calibrate?node=bench")
         expect(page.locator(row(page, lacks))).to_contain_text("Does not fit: no curve for T02")
         expect(page.locator(f"{row(page, lacks)} button")).to_have_count(0)
         expect(page.locator(row(page, fits))).to_contain_text(f"{fits.date}, T01, T02, scale")

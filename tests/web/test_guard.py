@@ -19,7 +19,7 @@ pytestmark = pytest.mark.real_time
 
 OpenFaulty = Callable[..., Page]
 Answer = Callable[[Route], object]
-PAGES = ("/", "/nodes", "/docs", "/sessions", "/sessions/none")
+PAGES = ("/", "/nodes", "/calibrate", "/docs", "/sessions", "/sessions/none")
 
 
 @pytest.fixture

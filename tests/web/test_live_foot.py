@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -150,6 +151,47 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         assert bottom_of(page, "#foot") < top_of(page, "#actions")
         assert page.evaluate("document.documentElement.scrollWidth") == 390
         assert complaints(page) == []
+    node.close()
+
+
+@pytest.mark.parametrize(
+    ("places_m", "text"),
+    [
+        # A reference tile beside the row: drawn from above.
+        (
+            [(0.0, 0.012), (0.014, 0.012), (0.0, 0.04)],
+            "COP x .+ ± .+ mm, y not measured",
+        ),
+        (
+            [(0.02, -0.01), (0.02, 0.01), (0.05, 0.0)],
+            "COP x not measured, y .+ ± .+ mm",
+        ),
+    ],
+)
+def test_a_row_of_tiles_draws_the_cop_on_the_row_and_gives_no_number_across_it(
+    scripted: Scripted, open_page: OpenPage, places_m: list[tuple[float, float]], text: str
+) -> None:
+    tiles = [
+        make_tile(i, x_m=x_m, y_m=y_m, reference=i == 2) for i, (x_m, y_m) in enumerate(places_m)
+    ]
+
+    class Row(FakeNode):
+        @property
+        def info(self) -> Any:
+            facts = {"node": self.name, "boot_id": self.boot_id}
+            return make_array(tiles, **facts, utc_offset_ns=self.utc_offset_ns)
+
+    scripted.node.close()
+    node = Row(scripted.running, "row", tiles=3)
+    node.connect()
+    node.tared()
+    with Play(node, 15.0):
+        page = open_page(scripted.url)
+        page.select_option("#node-select", "row")
+        expect(page.locator("#cop")).to_have_text(re.compile(rf"^{text} \(95 %\)$"))
+        expect(page.locator("#foot .cop-symbol")).to_be_visible()
+        page.goto(f"{scripted.url}/nodes")
+        expect(page.locator('.node[data-node="row"][data-live="true"]')).to_have_count(1)
     node.close()
 
 

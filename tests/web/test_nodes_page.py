@@ -112,7 +112,7 @@ def test_a_node_that_sends_nothing_is_not_recorded_and_its_card_says_why(
             page.keyboard.press("r")
             expect(page.locator(f"{card('bench')}[data-recording=true]")).to_have_count(1)
             refused = page.locator(f"{card('silent')} .refused")
-            expect(refused).to_contain_text("Not recorded: node 'silent' is not sending")
+            expect(refused).to_contain_text("Not recorded: node 'silent' sends no frames")
             expect(page.locator("#notices")).to_contain_text("silent not recorded")
             expect(page.locator("#stop-all")).to_be_enabled()
             assert complaints(page) == []

@@ -119,7 +119,7 @@ def test_what_people_say_is_changed_and_the_second_of_two_is_told(
     assert session.now()["tags"] == ["wet", "mud"]
     other.fill("#edit-notes", "all went well")
     other.click("#edit-dialog [value=ok]")
-    expect(other.locator("#notices")).to_contain_text("changed by somebody else")
+    expect(other.locator("#notices")).to_contain_text("changed by another client")
     expect(other.locator("#about")).to_contain_text("slipped twice")
     assert session.now()["notes"] == "slipped twice"
 
@@ -129,7 +129,7 @@ def test_what_people_say_is_changed_and_the_second_of_two_is_told(
     assert session.running.http.patch(url, json={"label": "water"}).status_code == 200
     one.fill("#marker-label", "sand")
     one.press("#marker-label", "Enter")
-    expect(one.locator("#notices")).to_contain_text("changed by somebody else")
+    expect(one.locator("#notices")).to_contain_text("changed by another client")
     expect(one.locator("#markers-list")).to_contain_text("water")
     assert markers(session)[0]["label"] == "water"
 

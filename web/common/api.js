@@ -49,6 +49,14 @@ export const unassignCalibration = (node, said) => call("DELETE", `/nodes/${id(n
 export const listCalibrations = () => call("GET", "/calibrations");
 /** Upload a file unchanged: its hash covers every byte. @type {(file: Blob) => Promise<Calibration>} */
 export const uploadCalibration = (file) => call("POST", "/calibrations", { body: file });
+export const deleteCalibration = (calibration) => call("DELETE", `/calibrations/${id(calibration)}`);
+/** @type {(node: string) => Promise<{weighing: Weighing | null}>} */
+export const weighingOf = (node) => call("GET", `/nodes/${id(node)}/weighing`);
+/** @type {(node: string, plan: WeighingPlan) => Promise<Weighing>} */
+export const startWeighing = (node, plan) => call("POST", `/nodes/${id(node)}/weighing`, { body: plan });
+/** @type {(node: string, said: string) => Promise<Weighing>} */
+export const repeatWeight = (node, said) => call("POST", `/nodes/${id(node)}/weighing/repeat`, { said });
+export const endWeighing = (node, said) => call("DELETE", `/nodes/${id(node)}/weighing`, { said });
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
 /** @type {(node: string, name: string) => Promise<Session>} */
 export const startSession = (node, name) => call("POST", "/sessions", { body: { node, name } });

@@ -25,15 +25,16 @@ class CalibrationDialog {
     this.back = el("button", { type: "button", cls: "small presses", id: "calibration-back", text: "Use the node’s calibration" });
     this.back.hidden = true;
     this.list = el("ul", { id: "calibrations", "aria-label": "Calibrations on the server, newest first" });
-    this.none = el("p", { text: "None on the server yet. Upload a file from “foottile calibrate”." });
+    this.none = el("p", { text: "None on the server yet. Calibrate with weights, or upload a file from “foottile calibrate”." });
     this.none.hidden = true;
     this.message = el("p", { id: "calibration-said", role: "alert" });
     this.file = el("input", { type: "file", id: "calibration-file", accept: ".json,application/json" });
+    const guided = el("a", { id: "calibration-guided", href: `/calibrate?node=${encodeURIComponent(node)}`, text: "Calibrate with weights …" });
     const upload = el("label", { cls: "presses", text: "Upload calibration file " }, this.file);
     this.element = el("dialog", { id: "calibration-dialog", "aria-labelledby": "calibration-title" },
       el("h2", { id: "calibration-title", text: `Calibration of ${node}` }), this.inUse, this.back,
       el("p", { cls: "soft", text: "Applies from the next frame. A running recording keeps its calibration." }),
-      this.none, this.list, upload, this.message,
+      this.none, this.list, guided, upload, this.message,
       el("form", { method: "dialog" }, el("p", { cls: "row" }, el("button", { type: "submit", value: "", autofocus: "", text: "Close" }))));
     this.back.addEventListener("click", () => this.run(() => this.unassign()));
     this.file.addEventListener("change", () => this.run(() => this.upload()));

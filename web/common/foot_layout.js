@@ -1,6 +1,7 @@
 // Positions of tiles in a picture: from the side (line of tiles) or from above (plan). Pure.
 
 const GRID_FROM_M = 0.005; // tiles spread wider than this in y are a grid
+const SAME_PLACE_M = 1e-6; // tiles that differ by less are in one row
 
 /** @typedef {{x: number, y: number}} Point in pixels */
 
@@ -27,6 +28,12 @@ export function isGrid(tiles) {
   const pitch = spacing(tiles, (tile) => tile.y_m);
   const beside = (a, b) => Math.max(Math.abs(a.x_m - b.x_m), Math.abs(a.y_m - b.y_m)) > 0.98 * pitch;
   return isPlan(tiles) && tiles.every((a, i) => tiles.slice(0, i).every((b) => beside(a, b)));
+}
+
+/** Return the coordinate that all places share, or null. @param {number[]} placesM @returns {number | null} */
+function commonPlace(placesM) {
+  const [least, most] = range(placesM);
+  return most - least <= SAME_PLACE_M ? least : null;
 }
 
 /** Layout of a foot in a box. */
@@ -66,6 +73,9 @@ export class FootLayout {
     this.baseline = this.plan ? heightPx / 2 : heightPx - basePx;
     this.radiusPx = Math.min(0.44 * this.pitch * this.scale, 30);
     this.points = tiles.map((tile) => this.at(tile.x_m, up(tile)));
+    const loaded = tiles.filter((tile) => !tile.reference);
+    /** Common x and y of the loaded tiles, in metres; null: tiles differ, so the centre of pressure is measured along that axis. */
+    this.row = { x: commonPlace(loaded.map((tile) => tile.x_m)), y: commonPlace(loaded.map((tile) => tile.y_m)) };
     /** Tiles from heel to toe. */
     this.order = tiles.map((_, i) => i).sort((a, b) => tiles[a].x_m - tiles[b].x_m);
   }
@@ -78,6 +88,18 @@ export class FootLayout {
     const [forward, up] = [(xM - this.middle.x) * this.scale, (upM - this.middle.up) * this.scale];
     if (this.toesUp) return { x: this.widthPx / 2 - up, y: this.baseline - forward };
     return { x: this.widthPx / 2 + forward, y: this.baseline - up };
+  }
+
+  /**
+   * Return the position in metres at which a centre of pressure is drawn: a coordinate that is not measured is that of the row.
+   * @param {number | null | undefined} xM
+   * @param {number | null | undefined} yM
+   * @returns {{x: number, y: number} | null} null: no centre of pressure
+   */
+  copPlace(xM, yM) {
+    if (!Number.isFinite(xM) && !Number.isFinite(yM)) return null;
+    const [x, y] = [xM ?? this.row.x, yM ?? this.row.y];
+    return x === null || y === null ? null : { x, y };
   }
 
   /** Return the sole and the leg above it, as an SVG path. */

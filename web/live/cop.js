@@ -16,7 +16,7 @@ const TRAIL_EVERY_S = 0.06; // costly, and its new end is next to the symbol
 export class Cop {
   /**
    * @param {import("../common/foot_layout.js").FootLayout} layout
-   * @param {{timeS: number, x: number | null, y: number}[]} past of the last seconds, oldest first, kept over a change of size
+   * @param {{timeS: number, x: number | null, y: number | null}[]} past of the last seconds, oldest first, kept over a change of size
    */
   constructor(layout, past = []) {
     this.layout = layout;
@@ -33,22 +33,22 @@ export class Cop {
 
   draw(node, frame, writesText) {
     const note = byId("cop");
-    const x = frame?.cop_x_m ?? null;
-    const shown = x !== null;
+    const at = this.layout.copPlace(frame?.cop_x_m, frame?.cop_y_m);
+    const shown = at !== null;
     this.updateTrail(frame, writesText);
     for (const part of [this.symbol, this.halo, this.span, this.area]) place(part, { visibility: shown ? "visible" : "hidden" });
     const sigma = frame?.cop_sigma_x_m ?? null;
-    setData(note, "xM", shown ? x.toFixed(6) : "");
+    setData(note, "xM", shown ? at.x.toFixed(6) : "");
     setData(note, "sigmaM", shown && sigma !== null ? sigma.toFixed(6) : "");
-    if (writesText) setText(note, shown ? this.text(frame) : `No COP: ${whyNoCop(node, frame)}${frame?.contact === false ? this.lastText() : ""}`);
+    if (writesText) setText(note, shown ? this.text(frame) : `No COP: ${whyNoCop(node, frame, this.layout)}${frame?.contact === false ? this.lastText() : ""}`);
     if (!shown) return;
-    if (this.layout.plan) this.drawPlan(frame);
-    else this.drawSide(frame);
+    if (this.layout.plan) this.drawPlan(frame, at);
+    else this.drawSide(frame, at);
   }
 
   /** Return the position as text. */
-  text({ cop_x_m: x, cop_y_m: y, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null }) {
-    const across = this.layout.plan ? `, ${coordinateText("y", y ?? 0, sigmaY)}` : "";
+  text({ cop_x_m: x = null, cop_y_m: y = null, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null }) {
+    const across = this.layout.plan ? `, ${coordinateText("y", y, sigmaY)}` : "";
     return `COP ${coordinateText("x", x, sigmaX)}${across} (95 %)`;
   }
 
@@ -56,12 +56,13 @@ export class Cop {
   lastText() {
     const last = this.past.findLast((one) => one.x !== null);
     if (!last) return "";
-    return `, last x ${number(last.x * MM)}${this.layout.plan ? `, y ${number(last.y * MM)}` : ""} mm`;
+    const { plan, row } = this.layout;
+    const measured = ["x", ...(plan ? ["y"] : [])].filter((name) => row[name] === null);
+    return `, last ${measured.map((name) => `${name} ${number(last[name] * MM)}`).join(", ")} mm`;
   }
 
-  drawPlan(frame) {
-    const { cop_x_m: x, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null } = frame;
-    const y = frame.cop_y_m ?? 0;
+  drawPlan(frame, { x, y }) {
+    const { cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null } = frame;
     const at = this.layout.at(x, y);
     const halfPx = (sigma) => Math.max(3, Z95 * (sigma ?? 0) * this.layout.scale);
     const [across, along] = this.layout.toesUp ? [sigmaY, sigmaX] : [sigmaX, sigmaY];
@@ -73,9 +74,9 @@ export class Cop {
     place(this.symbol, { d });
   }
 
-  drawSide(frame) {
+  drawSide(frame, { x }) {
     const { layout } = this;
-    const { cop_x_m: x, cop_sigma_x_m: sigma = null } = frame;
+    const { cop_sigma_x_m: sigma = null } = frame;
     const px = layout.at(x, 0).x;
     const halfPx = Z95 * (sigma ?? 0) * layout.scale;
     const [a, b] = [px - halfPx, px + halfPx];
@@ -97,7 +98,7 @@ export class Cop {
     if (nowS === null) past.length = 0;
     else if (past.at(-1)?.timeS !== nowS) {
       if (past.length && nowS < past.at(-1).timeS) past.length = 0;
-      past.push({ timeS: nowS, x: frame.cop_x_m ?? null, y: frame.cop_y_m ?? 0 });
+      past.push({ timeS: nowS, x: null, y: null, ...layout.copPlace(frame.cop_x_m, frame.cop_y_m) });
       while (past[0].timeS < nowS - TRAIL_S) past.shift();
     }
     setData(layout.plan ? this.area : this.span, "trail", String(past.length));
@@ -123,13 +124,13 @@ export class Cop {
 
 const timeOf = (frame) => (!frame ? null : Number.isFinite(frame.t_ns) ? frame.t_ns / 1e9 : frame.timeS ?? null);
 
-const coordinateText = (name, value, sigma) => `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
+const coordinateText = (name, value, sigma) => value === null ? `${name} not measured` : `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
 
 /** Return a dot and four strokes around an ellipse. */
 const hairs = (x, y, rx, ry) => `M${x} ${y}h.1M${x - rx - 14} ${y}h10M${x + rx + 4} ${y}h10M${x} ${y - ry - 14}v10M${x} ${y + ry + 4}v10`;
 
 /** Return the reason for no COP. */
-function whyNoCop(node, frame) {
+function whyNoCop(node, frame, { row }) {
   if (!frame) return "no data";
   const bits = frame.estimate_status ?? 0;
   if (!node.tare || node.tare.undone) return "not tared";
@@ -137,5 +138,6 @@ function whyNoCop(node, frame) {
   if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);
   if (frame.contact === false) return "no contact";
   if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
+  if (row.x !== null && row.y !== null) return "not measured: all tiles at one point";
   return "not determined";
 }

@@ -138,15 +138,16 @@ export class SmallFoot {
 
   /** Draw the COP: from the side an arrow with its 95 % bar, from above a dot in its ellipse. */
   drawCop(frame) {
-    if (!Number.isFinite(frame?.cop_x_m)) return;
     const { context, colours, layout } = this;
+    const place = layout.copPlace(frame?.cop_x_m, frame?.cop_y_m);
+    if (!place) return;
     context.strokeStyle = colours.cop;
     context.fillStyle = colours.cop;
     context.lineWidth = 2;
     const half = (sigma_m) => Z95 * (Number.isFinite(sigma_m) ? sigma_m : 0) * layout.scale;
     context.beginPath();
     if (layout.plan) {
-      const { x, y } = layout.at(frame.cop_x_m, frame.cop_y_m ?? 0);
+      const { x, y } = layout.at(place.x, place.y);
       const [across, along] = [frame.cop_sigma_y_m, frame.cop_sigma_x_m].map((sigma_m) => Math.max(4, half(sigma_m)));
       context.ellipse(x, y, across, along, 0, 0, 2 * Math.PI); // toes up
       context.stroke();
@@ -155,7 +156,7 @@ export class SmallFoot {
       context.fill();
       return;
     }
-    const { x } = layout.at(frame.cop_x_m, 0);
+    const { x } = layout.at(place.x, 0);
     const y = layout.lineAt(x) + layout.radiusPx + 4;
     context.moveTo(x, y);
     const long = Math.min(11, 0.09 * this.heightPx);

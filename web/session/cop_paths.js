@@ -32,7 +32,7 @@ export class CopPaths {
   show(tiles, answer) {
     this.tiles = tiles;
     this.answer = answer;
-    this.known = answer.curves.some((curve) => curve.cop_x_m.some((value) => value !== null));
+    this.known = answer.curves.some((curve) => [...curve.cop_x_m, ...curve.cop_y_m].some((value) => value !== null));
     byId("cop-figure").hidden = !this.known;
   }
 
@@ -98,7 +98,11 @@ export class CopPaths {
     if (layout.plan) {
       this.drawTiles(layout.points, layout.radiusPx, colours);
       this.drawScale(layout, width, height, colours);
-      return { plan: true, place: (_, xM, yM) => (yM === null ? null : layout.at(xM, yM)) };
+      const place = (_, xM, yM) => {
+        const found = layout.copPlace(xM, yM);
+        return found && layout.at(found.x, found.y);
+      };
+      return { plan: true, place };
     }
     // A line of tiles measures one axis: the other is time.
     const radius = Math.min(11, 0.42 * layout.pitch * ((width - 60) / (layout.span + 2 * layout.pitch)));
@@ -114,7 +118,7 @@ export class CopPaths {
     context.fillStyle = colours.soft;
     context.textAlign = "right";
     context.fillText("forward →", box.right, box.bottom + 62);
-    return { plan: false, place: (percent, xM) => ({ x: x(1e3 * xM), y: y(percent) }) };
+    return { plan: false, place: (percent, xM) => (xM === null ? null : { x: x(1e3 * xM), y: y(percent) }) };
   }
 
   drawTiles(points, radius, colours) {
@@ -227,7 +231,7 @@ const meanOf = ({ overlaid, spread }) =>
 function placesOf(along, xsM, ysM, place) {
   const [xs, ys] = [[], []];
   for (let i = 0; i < along.length; i++) {
-    const at = xsM[i] === null ? null : place(along[i], xsM[i], ysM[i]);
+    const at = place(along[i], xsM[i], ysM[i]);
     xs.push(at?.x ?? null);
     ys.push(at?.y ?? null);
   }

@@ -75,7 +75,7 @@ export function panelsOf(bins, asHeat, beside = null) {
     panels.push({
       key: `cop-${axis}`, title, unit: "mm", factor: 1e3, kind: "series",
       columns: [`cop_${axis}_m_min`, `cop_${axis}_m_max`], band: [`cop_${axis}_low_m_min`, `cop_${axis}_high_m_max`],
-      height: PLACE_PX, head: TITLE_PX, ...(axis === "x" && !measuresY(bins) ? { note: Y_UNMEASURED } : {}),
+      height: PLACE_PX, head: TITLE_PX, ...unmeasured(bins, axis === "x" ? "y" : "x"),
     });
   }
   if (bins.estimated && bins.has("angle_rad_min")) {
@@ -87,10 +87,8 @@ export function panelsOf(bins, asHeat, beside = null) {
   return panels;
 }
 
-export const Y_UNMEASURED = "COP y not measured: tiles in one row";
-
-/** Return true if y is measured: not with a single row of tiles. */
-export const measuresY = (bins) => bins.has("cop_y_m_max");
+/** Return a note if a coordinate of the COP is not measured: across a single row of tiles. */
+const unmeasured = (bins, axis) => (bins.has(`cop_${axis}_m_max`) ? {} : { note: `COP ${axis} not measured: tiles in one row` });
 
 /** Return true if a coordinate changes: on a line of tiles one is constant. */
 function isVariable(bins, stem) {

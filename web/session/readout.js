@@ -50,7 +50,9 @@ export function readingsOf(bins, i, panels) {
       const place = span(bins, i, [`cop_${axis}_m_min`, `cop_${axis}_m_max`], 1e3);
       if (shown.has(`cop-${axis}`)) found.push([`cop-${axis}`, name, place === null ? "–" : `${place} mm${copHalf(bins, i, axis)}`]);
     }
-    if (panels.some((panel) => panel.note)) found.push(["cop-y", "COP y", "not measured: tiles in one row"]);
+    const noted = panels.find((panel) => panel.note);
+    const across = noted?.key === "cop-y" ? "x" : "y";
+    if (noted) found.push([`cop-${across}`, `COP ${across}`, "not measured: tiles in one row"]);
     if (shown.has("angle")) {
       const angle = span(bins, i, ["angle_rad_min", "angle_rad_max"], 180 / Math.PI);
       found.push(["angle", "Angle", angle === null ? "–" : `${angle}°`]);

@@ -1,1 +1,1 @@
-"""Dynamixel MX servos, read only: packets of both protocols, models, and the newest position."""
+"""Read-only driver of Dynamixel MX servos: packets of both protocols, firmwares, positions."""

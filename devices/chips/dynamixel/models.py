@@ -1,6 +1,6 @@
-"""What the firmwares of an MX servo differ in: protocol, model number, and where the position is.
+"""Differences of the two firmwares of MX servos: protocol, model numbers, registers.
 
-The factory's firmware speaks Protocol 1.0. "MX(2.0)" firmware speaks 2.0, has another control table
+The factory's firmware uses Protocol 1.0. "MX(2.0)" firmware uses 2.0 and has another control table
 and another model number. Sources: hardware.md 5, e-manual mx-28.md, mx-64.md and their `-2` pages.
 """
 
@@ -15,48 +15,48 @@ from devices.chips.dynamixel.protocol1 import PROTOCOL_1
 from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 
 COUNTS_PER_TURN = 4096
-"""Of every MX servo (hardware.md 5)."""
+"""Encoder counts per turn of every MX servo (hardware.md 5)."""
 
 
 class CountRange(Enum):
-    """How far a servo's count goes, which its mode of operation decides."""
+    """Range of a servo's count, which depends on its operating mode."""
 
     ONE_TURN = "one turn"
     """Position control (joint mode): the joint stays within the turn that the encoder measures."""
     MANY_TURNS = "many turns"
-    """The count goes on beyond a turn, from where the servo was switched on."""
+    """Multi-turn: the count continues beyond a turn, from its value at power-up."""
     WRAPPED = "wrapped"
-    """Wheel mode of Protocol 1.0: the joint goes on, the count stays within a turn."""
+    """Wheel mode of Protocol 1.0: the joint turns on, the count stays within a turn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """A place in a control table."""
+    """Register of a control table."""
 
     address: int
     size: int
-    """Bytes to ask for: not two in 1.0, see `devices.chips.dynamixel.protocol1`."""
+    """Bytes to read: never two in 1.0, see `devices.chips.dynamixel.protocol1`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Firmware:
-    """One of the two firmwares."""
+    """Protocol and registers of a firmware."""
 
     protocol: DynamixelProtocol
     model_numbers: Mapping[str, int]
-    """At address 0, by the model's name."""
+    """Model number at address 0, by the model's name."""
     position_address: int
     position_bytes: int
     """Bytes of the present position: little-endian, signed, beyond one turn in multi-turn mode."""
     asked_bytes: int
-    """How many are read from there: in 1.0 one more, see `devices.chips.dynamixel.protocol1`."""
+    """Bytes to read from there: in 1.0 one more, see `devices.chips.dynamixel.protocol1`."""
     tick: Register
-    """Realtime Tick: its first two bytes are milliseconds since it was switched on."""
+    """Realtime Tick: its first two bytes are milliseconds since power-up."""
     mode: Register
     """Operating Mode; in 1.0 the limits of the angle, CW and CCW, which decide the mode."""
 
     def count_range(self, mode: bytes) -> CountRange:
-        """Return how far the count goes in the mode that the register says."""
+        """Return the range of the count for the content of the register `mode`."""
         if self.protocol.version == 2:
             return CountRange.ONE_TURN if mode[0] == _POSITION_CONTROL else CountRange.MANY_TURNS
         limits = mode[:4]
@@ -89,11 +89,11 @@ FIRMWARES = {
         mode=Register(11, 1),
     ),
 }
-"""By the protocol that they speak."""
+"""Firmwares by protocol version."""
 
 
 def known_model(number: int) -> tuple[str, int] | None:
-    """A model's name and the protocol of its firmware; None if it is no MX-28 or MX-64."""
+    """Look up a model's name and protocol by its number; None if it is no MX-28 or MX-64."""
     for version, firmware in FIRMWARES.items():
         for name, its_number in firmware.model_numbers.items():
             if its_number == number:

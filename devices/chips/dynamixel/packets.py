@@ -1,4 +1,4 @@
-"""What both Dynamixel protocols share: packets, the search for them, and what a protocol is.
+"""Common part of both Dynamixel protocols: packets, their decoder, and the protocol's interface.
 
 Sources: e-manual protocol1.md and protocol2.md, hardware.md 5.1 and 5.2.
 """
@@ -22,77 +22,77 @@ class Instruction(IntEnum):
 
 
 def wire_time_ns(n_bytes: int, baudrate: int) -> int:
-    """Nanoseconds that `n_bytes` take at 8N1: ten bits per byte (hardware.md 5.2)."""
+    """Compute the time of `n_bytes` on the wire at 8N1: ten bits per byte (hardware.md 5.2)."""
     return n_bytes * 10 * 1_000_000_000 // baudrate
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet off the wire, unstuffed.
+    """Packet from the wire, unstuffed.
 
-    Whether it asks or answers is written in it in 2.0 only. In 1.0 the byte of the `instruction` is
-    the error byte of an answer, and the listener has to know which of the two it is.
+    Only 2.0 marks requests and answers. In 1.0 the byte of the `instruction` is the error byte of
+    an answer, and the receiver has to know the direction.
     """
 
     servo_id: int
     instruction: int
     parameters: bytes
     intact: bool
-    """Its CRC or checksum fits."""
+    """True if the CRC or checksum is correct."""
     wire: bytes
-    """As it came, stuffing and checksum included."""
+    """Raw bytes, with stuffing and checksum."""
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What a servo answered."""
+    """Decoded answer of a servo."""
 
     packet: Packet
     data: bytes
     alert: bool
-    """The hardware complains; the data are valid all the same."""
+    """True if the servo reports a hardware error; the data are still valid."""
     refusal: str
-    """Why the servo did not do what it was asked; empty if it did."""
+    """Reason why the servo refused the request; empty if it did not."""
 
 
 class DynamixelProtocol(ABC):
-    """One version of the protocol: pure functions of bytes, no state."""
+    """Version of the protocol: pure functions of bytes, no state."""
 
     version: int
     highest_id: int
     header: bytes
     preamble_bytes: int
-    """From the header to the end of the length."""
+    """Length from the header to the end of the length field."""
     shortest_bytes: int
-    """A packet without parameters."""
+    """Length of a packet without parameters."""
 
     @abstractmethod
     def size(self, preamble: bytes) -> int:
-        """Bytes of the packet with this beginning; 0 if it is noise."""
+        """Return the length of the packet with this preamble; 0 if it is noise."""
 
     @abstractmethod
     def pack(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-        """One packet, ready for the wire."""
+        """Encode a packet for the wire."""
 
     @abstractmethod
     def unpack(self, wire: bytes) -> Packet:
-        """The packet in bytes whose length is the one they say."""
+        """Decode a packet from bytes of its full length."""
 
     @abstractmethod
     def read_request(self, servo_id: int, address: int, length: int) -> bytes:
-        """The packet that asks for `length` bytes of the control table from `address` on."""
+        """Encode a request for `length` bytes of the control table from `address` on."""
 
     @abstractmethod
     def identity_request(self, servo_id: int) -> bytes:
-        """The packet that asks for model number (2 bytes, little-endian) and firmware version."""
+        """Encode a request for model number (2 bytes, little-endian) and firmware version."""
 
     @abstractmethod
     def status(self, packet: Packet) -> Status | None:
-        """`packet` as an answer; None if it cannot be one."""
+        """Decode `packet` as an answer; None if it is not an answer."""
 
 
 class PacketDecoder:
-    """Finds packets in a stream of bytes, however it is cut and whatever lies between them."""
+    """Decoder of packets in a byte stream with any split and with noise between packets."""
 
     def __init__(self, protocol: DynamixelProtocol) -> None:
         self._protocol = protocol
@@ -100,13 +100,13 @@ class PacketDecoder:
 
     @property
     def missing(self) -> int:
-        """The fewest bytes that must still come: asking for no more never waits in vain."""
+        """Fewest bytes until a packet can be complete: a read of so many never waits in vain."""
         known = len(self._buffer) >= self._protocol.preamble_bytes
         size = self._size() if known else self._protocol.shortest_bytes
         return size - len(self._buffer)
 
     def feed(self, data: bytes) -> list[Packet]:
-        """Add `data`; return the packets it completes, in order, whether they are intact or not."""
+        """Add `data`; return the completed packets, in order, intact or not."""
         self._buffer += data
         packets = []
         while self._seek_packet():
@@ -117,11 +117,11 @@ class PacketDecoder:
         return self._protocol.size(bytes(self._buffer[: self._protocol.preamble_bytes]))
 
     def _seek_packet(self) -> bool:
-        """Drop what comes before a packet's beginning; is all of the packet there?"""
+        """Drop bytes before a header; return whether a complete packet is in the buffer."""
         buffer, header = self._buffer, self._protocol.header
         while True:
             start = buffer.find(header)
-            if start < 0:  # but the last bytes may be the beginning of one
+            if start < 0:  # the last bytes may be the beginning of a header
                 kept = (n for n in range(len(header) - 1, 0, -1) if buffer.endswith(header[:n]))
                 start = len(buffer) - next(kept, 0)
             del buffer[:start]
@@ -133,6 +133,6 @@ class PacketDecoder:
 
     def _take_packet(self) -> Packet:
         packet = self._protocol.unpack(bytes(self._buffer[: self._size()]))
-        # A header that noise made may have swallowed a true one: go on right behind it.
+        # A false header in noise may have swallowed a true one: go on right behind it.
         del self._buffer[: len(packet.wire) if packet.intact else 1]
         return packet

@@ -1,4 +1,4 @@
-"""Finds servos on a serial line whose protocol and baud rate are not known."""
+"""Search for servos of unknown protocol and baud rate on a serial line."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from devices.clock import Clock
 from devices.errors import ServoPacketError, ServoStatusError, ServoTimeoutError
 
 BAUDRATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000)
-"""The factory's first, then by how usual they are."""
+"""Baud rates to try: the factory's first, then the more usual ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundServo:
-    """One servo, as it answered."""
+    """Servo found by the search."""
 
     servo_id: int
     baudrate: int
     protocol: int
-    """Which protocol it answers in."""
+    """Protocol version of its answer, 1 or 2."""
     model: str | None
-    """Name, if it is an MX-28 or MX-64."""
+    """Model name; None if it is no MX-28 or MX-64."""
     model_number: int
     firmware_version: int
 
@@ -38,7 +38,7 @@ def probe(
     baudrates: Iterable[int] = BAUDRATES,
     timeout_s: float = 0.05,
 ) -> list[FoundServo]:
-    """Ask for every id at every baud rate in both protocols; what answers, in that order.
+    """Try every id at every baud rate in both protocols; return the servos that answer, in order.
 
     Every silence costs `timeout_s` seconds: half a second for one id and all rates, two minutes
     for all ids. The default is ample for an answer at 57600 baud (4 ms) through an FTDI adapter
@@ -63,7 +63,7 @@ def probe(
                         timeout_s=timeout_s,
                         protocol=protocol,
                     )
-                    # At a wrong rate an answer is noise, if anything comes at all.
+                    # At a wrong rate an answer is noise, or absent.
                     with contextlib.suppress(ServoTimeoutError, ServoPacketError, ServoStatusError):
                         identity = servo.identify()
                         known = known_model(identity.model_number)

@@ -1,8 +1,8 @@
 """Dynamixel Protocol 1.0, as pure functions of bytes.
 
-Requests and answers have the same form here, and a one-wire adapter hands one's own request back.
-An answer can be byte for byte its request: that to a ping, with the voltage bit set, is a ping. So
-nothing is asked for whose answer would have that length: no ping, no two bytes.
+Requests and answers have the same form, and a one-wire adapter echoes requests. An answer may equal
+its request: the answer to a ping, with the voltage bit set, is a ping. So the driver sends no
+request whose answer would have the same length: no ping, no read of two bytes.
 
 Sources: e-manual protocol1.md, hardware.md 5.1.
 """
@@ -20,7 +20,7 @@ from devices.chips.dynamixel.packets import (
 )
 
 # Instruction or error to checksum. Longer than the whole control table of an MX, which ends at
-# address 73, is noise: this header is short, and a wrong length would be waited for.
+# address 73, is noise: the header is short, and a wrong length would cause a timeout.
 _MIN_LENGTH, _MAX_LENGTH = 2, 2 + 74
 
 
@@ -29,7 +29,7 @@ class Error(IntFlag):
 
     VOLTAGE = 0x01
     ANGLE = 0x02
-    """The goal position is outside the limits; it says nothing of the present one."""
+    """The goal position, not the present one, is outside the limits."""
     OVERHEAT = 0x04
     RANGE = 0x08
     CHECKSUM = 0x10
@@ -38,7 +38,7 @@ class Error(IntFlag):
     UNDEFINED = 0x80
 
     ALERT = VOLTAGE | ANGLE | OVERHEAT | OVERLOAD
-    """The servo complains of its state; it did what it was asked, and its data are valid."""
+    """Mask of the bits that report a bad state; the request succeeded and the data are valid."""
 
 
 _REFUSALS = {
@@ -50,7 +50,7 @@ _REFUSALS = {
 
 
 def checksum(data: bytes) -> int:
-    """Inverted sum of `data`, which is everything from the id on (e-manual protocol1.md)."""
+    """Compute the inverted sum of `data`, all bytes from the id on (e-manual protocol1.md)."""
     return ~sum(data) & 0xFF
 
 

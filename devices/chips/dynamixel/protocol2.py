@@ -10,7 +10,7 @@ import struct
 from devices.chips.dynamixel.packets import DynamixelProtocol, Instruction, Packet, Status
 
 ALERT = 0x80
-"""Bit of the error byte: the hardware complains (address 70 says of what); the answer is valid."""
+"""Bit of the error byte: a hardware error (register at address 70); the answer is valid."""
 ERRORS = (
     "none",
     "result fail",
@@ -42,7 +42,7 @@ _CRC_TABLE = _crc_table()
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16 of Protocol 2.0: polynomial 0x8005, initially 0, not reflected (e-manual crc.md)."""
+    """Compute the CRC-16 of Protocol 2.0: polynomial 0x8005, initially 0 (e-manual crc.md)."""
     crc = 0
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ _CRC_TABLE[crc >> 8 ^ byte]
@@ -63,7 +63,7 @@ class _Protocol2(DynamixelProtocol):
         return self.preamble_bytes + length if _MIN_LENGTH <= length <= _MAX_LENGTH else 0
 
     def pack(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-        # Stuffed first, then length and CRC over what was stuffed.
+        # Length and CRC are of the stuffed bytes.
         body = (bytes([instruction]) + parameters).replace(_PATTERN, _STUFFED)
         packet = self.header + struct.pack("<BH", servo_id, len(body) + _CRC) + body
         return packet + struct.pack("<H", crc16(packet))

@@ -1,7 +1,7 @@
-"""Dynamixel MX servos over Protocol 1.0 or 2.0, read only: identity and position.
+"""Read-only driver of Dynamixel MX servos over Protocol 1.0 or 2.0: identity and position.
 
-Sources: e-manual of the MX series and hardware.md 5. A servo can neither be moved nor set up from
-here, so that no mistake in a measurement can move a robot.
+Sources: e-manual of the MX series and hardware.md 5. The driver has no write commands, so that no
+mistake in a measurement can move a robot.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from devices.errors import (
     ServoTimeoutError,
 )
 
-# Far more than a status (15 bytes at most here): it bounds a line that never stops chattering.
+# Far more than a status (15 bytes at most here): a bound for a line with endless noise.
 _MAX_BYTES_PER_ANSWER = 256
 
 REOPEN_NS = 1_000_000_000
-"""From one attempt to open a port that is away to the next."""
+"""Interval of attempts to reopen a missing port."""
 _UNANSWERED_MAX = 3
 UPTIME_NS = 1_000_000_000
-"""Between two looks at the servo's uptime while it answers."""
+"""Interval of uptime checks while the servo answers."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServoIdentity:
-    """What a servo says of itself."""
+    """Model number and firmware version of a servo."""
 
     model_number: int
     firmware_version: int
@@ -56,22 +56,22 @@ class _Answer:
     status: Status
     asked_ns: int
     done_ns: int
-    """Its last byte."""
+    """Instant of the last byte."""
 
 
 class Dynamixel:
-    """One servo. Not thread-safe: one thread owns a port.
+    """Driver of one servo. Not thread-safe: one thread owns a port.
 
     Args:
-        port: its serial port; None: `reopen` has to open it first.
-        clock: virtual or real.
-        servo_id: its id.
-        baudrate: of its line.
-        timeout_s: in seconds, should be the port's own: the longest that one read of it waits.
+        port: serial port; None: `reopen` has to open it first.
+        clock: virtual or real clock.
+        servo_id: id of the servo.
+        baudrate: baud rate of the line.
+        timeout_s: timeout of an answer, in seconds; should be the port's own read timeout.
         protocol: 1 or 2.
-        model: "MX-28" or "MX-64", to check when the port was opened again.
-        reopen: opens the port again after it failed, once a second. A servo that can be reopened is
-            also watched for restarts; None: neither.
+        model: "MX-28" or "MX-64", to check after reopening the port.
+        reopen: reopens the port after a failure, at most once a second, and enables the detection
+            of restarts; None: neither.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Dynamixel:
         reopen: Callable[[], SerialPort] | None = None,
     ) -> None:
         self.remarks: tuple[str, ...] = ()
-        """What is wrong with this servo, but does not stop the frames."""
+        """Warnings from opening the servo, which do not stop acquisition."""
         self._port = port
         self._model = model
         self._reopen = reopen
@@ -113,12 +113,11 @@ class Dynamixel:
         )
 
     def identify(self) -> ServoIdentity:
-        """Model number and firmware version.
+        """Read model number and firmware version.
 
         Raises:
-            ServoTimeoutError: no answer within the time-out.
-            ServoPacketError: an answer that is damaged, another servo's, or of another length, or
-                nothing but noise.
+            ServoTimeoutError: no answer within the timeout.
+            ServoPacketError: the answer is damaged, another servo's, of another length, or noise.
             ServoStatusError: the servo refused.
             ServoSetupError: the port itself failed, as when its plug is pulled.
         """
@@ -126,10 +125,10 @@ class Dynamixel:
         return ServoIdentity(int.from_bytes(data[:2], "little"), data[2])
 
     def check_model(self, model: str) -> None:
-        """Ask the servo whether it is the `model` with the firmware that the scene says.
+        """Check that the servo is a `model` with firmware for the scene's protocol.
 
         Raises:
-            ServoSetupError: it is another; the text names the keys to set.
+            ServoSetupError: another model or firmware; the text names the keys to set.
             ServoError: as for `identify`.
         """
         number = self.identify().model_number
@@ -156,10 +155,13 @@ class Dynamixel:
         )
 
     def read_position(self) -> PositionReading:
-        """The present position. Raises what `identify` raises.
+        """Read the present position; reopen the port and check the uptime if due.
 
-        The servo samples it somewhere between the last bit of the request and the first of the
-        answer (hardware.md 5.2); a slow adapter delays the answer and so widens the interval.
+        The servo samples between the last bit of the request and the first of the answer
+        (hardware.md 5.2); a slow adapter delays the answer and so widens the interval.
+
+        Raises:
+            ServoError: as for `identify`.
         """
         try:
             self._ensure_port()
@@ -185,7 +187,7 @@ class Dynamixel:
         )
 
     def look_at_uptime(self) -> None:
-        """Note whether the servo restarted since the last look; after a silence its mode, too.
+        """Read the uptime and detect a restart; after a silence read the operating mode, too.
 
         Raises:
             ServoError: as for `identify`.
@@ -204,7 +206,7 @@ class Dynamixel:
         self._was_silent = False
 
     def _read_register(self, register: Register) -> bytes | None:
-        """Read a register; None if the servo refuses, or never answers what it is asked there."""
+        """Read a register; None if the servo refuses, or has never answered there."""
         if self._unanswered >= _UNANSWERED_MAX:
             return None
         request = self._protocol.read_request(self._id, register.address, register.size)
@@ -224,10 +226,10 @@ class Dynamixel:
             self._port.close()
 
     def _ensure_port(self) -> None:
-        """Open a port that is away, at most once a second, and check which servo is there.
+        """Reopen a missing port, at most once a second, and check the servo's model.
 
         Raises:
-            ServoSetupError: it is still away, or another servo answers.
+            ServoSetupError: the port is still missing, or another servo answers.
         """
         if self._port is not None or self._reopen is None:
             return
@@ -246,19 +248,19 @@ class Dynamixel:
         self._lost = None
 
     def _let_go(self) -> None:
-        """Close a port that failed; while it is open it keeps its number occupied."""
+        """Close a failed port, so that its device number becomes free."""
         if self._port is not None and self._reopen is not None:
             with contextlib.suppress(*PORT_ERRORS):
                 self._port.close()
             self._port = None
 
     def _exchange(self, request: bytes, n_data: int) -> _Answer:
-        """The answer to `request` with `n_data` bytes."""
+        """Send `request` and return its answer with `n_data` bytes."""
         port = self._port
         if port is None:
             raise self._port_failed("it is not open")
         try:
-            # Packets carry no number: a late answer to an older request would pass for this one's.
+            # Packets have no number: discard a late answer to an older request.
             port.reset_input_buffer()
             asked_ns = self._clock.now_ns()
             sent = port.write(request)
@@ -292,12 +294,12 @@ class Dynamixel:
             data = port.read(min(decoder.missing, _MAX_BYTES_PER_ANSWER - n_bytes))
             done_ns = self._clock.now_ns()
             if not data or done_ns > deadline_ns:
-                # The port has waited in real time; a virtual clock has yet to.
+                # The port has waited in real time; advance a virtual clock, too.
                 self._clock.sleep_until_ns(deadline_ns)
                 raise self._timed_out(n_bytes)
             n_bytes += len(data)
             for packet in reversed(decoder.feed(data)):
-                # A one-wire adapter hands back what it was given.
+                # A one-wire adapter echoes the request.
                 echo = packet.wire == request
                 if not echo and (status := self._protocol.status(packet)) is not None:
                     return status, done_ns
@@ -339,30 +341,30 @@ def open_servo(
     protocol: int = 2,
     waits: bool = False,
 ) -> Dynamixel:
-    """Open the servo at `port`: /dev/ttyUSB0 and the like.
+    """Open the servo at `port` (such as /dev/ttyUSB0) and check its model.
 
-    It is asked who it is. One that does not answer is opened all the same, for it may yet come to
-    life: that, and a slow adapter, are among the `remarks` of what is returned. A port that fails
-    later is opened again by its path, or by udev's link to the adapter that it led to.
+    A silent servo is opened as well, since it may start later: silence and a slow adapter are
+    `remarks` of the result. A port that fails later is reopened by its path, or by udev's link to
+    its adapter.
 
     The default `timeout_s`, in seconds, is ample for the slowest case: 9600 baud (30 ms), the
     longest return delay (0.5 ms) and an FTDI's default latency timer (16 ms).
 
     Args:
-        port: its path, or what gives it at each attempt: an emulated servo's.
-        baudrate: of its line.
-        clock: virtual or real.
-        servo_id: its id.
-        timeout_s: how long an answer is waited for, by the clock.
-        patience_s: how long the port waits for bytes, in real time: more than `timeout_s` on a
-            virtual clock, where a machine that is busy must not look like silence. None: as long.
+        port: path, or a function that returns it at each attempt (an emulated servo's).
+        baudrate: baud rate of the line.
+        clock: virtual or real clock.
+        servo_id: id of the servo.
+        timeout_s: timeout of an answer, by the clock.
+        patience_s: read timeout of the port, in real time: more than `timeout_s` on a virtual
+            clock, where a busy machine must not look like silence. None: `timeout_s`.
         model: "MX-28" or "MX-64".
         protocol: 1 or 2.
-        waits: a port that is not there yet is a remark, and is opened as soon as it is there.
+        waits: a missing port is a remark, and is opened as soon as it exists.
 
     Raises:
-        ServoLostError: there is no such port, it may not be used, or another program uses it.
-        ServoSetupError: another model or firmware answers than `model` and `protocol`.
+        ServoLostError: the port is missing, not permitted, or used by another program.
+        ServoSetupError: another model or firmware than `model` and `protocol` answers.
     """
     path = port if isinstance(port, str) else port()
 

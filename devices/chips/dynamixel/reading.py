@@ -1,4 +1,4 @@
-"""One reading of a servo's position."""
+"""Reading of a servo's position."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from devices.chips.dynamixel.models import CountRange
 
 @dataclass(frozen=True, slots=True)
 class PositionReading:
-    """A position and when it was true: at `t_mono_ns`, give or take `half_width_ns`."""
+    """Position with its sample instant, `t_mono_ns` within `half_width_ns`."""
 
     counts: int
     """Signed; 4096 to the turn, beyond one turn in multi-turn mode."""
     t_mono_ns: int
-    """Nanoseconds of the clock, midway between end of request and first byte of the answer."""
+    """Sample instant: midway between end of request and first byte of the answer."""
     half_width_ns: int
     done_ns: int
-    """When the answer was complete, nanoseconds of the clock."""
+    """Instant at which the answer was complete."""
     alert: bool = False
-    """The servo reports a hardware error; the position is valid all the same."""
+    """True if the servo reports a hardware error; the position is still valid."""
     restarted: bool = False
-    """The servo restarted since the reading before, or may have."""
+    """True if the servo restarted, or may have, since the previous reading."""
     count_range: CountRange = CountRange.MANY_TURNS
     is_turn_known: bool = True
-    """Are its whole turns known? `TurnCounter` tells."""
+    """True if the number of whole turns is known; set by `TurnCounter`."""

@@ -1,9 +1,9 @@
-"""The newest position of a servo, for frames to carry along.
+"""Sources of a servo's newest position, to be stored with each frame.
 
-On a real clock a thread of its own reads the servo, so that its silence costs the tiles nothing. In
-a session on virtual time nothing runs beside the tile loop, so the servo is read in lock-step:
-at every instant a reading was due, on a clock of the servo's own line, and its value is known to
-the frames only from the instant at which its answer was complete.
+On a real clock a separate thread reads the servo, so that its silence does not delay the tiles. On
+virtual time no thread may run beside the tile loop, so the servo is read in lock-step: at every
+instant at which a reading was due, on a separate clock of the servo's line. A frame gets a value
+only if its answer was complete by then.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from devices.clock import Clock
 from devices.errors import ServoError, ServoSetupError
 
 _RECENT = 16
-"""Readings kept for a frame that takes long: 64 tiles take 16 ms, a quick servo 1 ms."""
+"""Recent readings, for long frames: 64 tiles take 16 ms, a fast servo 1 ms."""
 
 
 class _PacedServo:
-    """A servo that is read at fixed intervals."""
+    """Base class of servos that are read at fixed intervals."""
 
     def __init__(self, servo: Dynamixel, clock: Clock, *, rate_hz: float) -> None:
         self.failures = 0
-        """Readings that failed: silence, garbage, or an error status."""
+        """Number of failed readings: silence, garbage, or an error status."""
         self.is_turn_known = True
-        """Are the whole turns known of the position that `latest` gave last?"""
+        """True if the number of whole turns in the last returned position is known."""
         self._servo = servo
         self._clock = clock
         self._period_ns = round(1e9 / rate_hz)
@@ -40,7 +40,7 @@ class _PacedServo:
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the servo now, in words; empty if nothing is."""
+        """Present warning about the servo; empty if it works."""
         if self._failure:
             return self._failure
         if self._newest_is_turn_known:
@@ -65,19 +65,19 @@ class _PacedServo:
         return reading
 
     def _forget(self) -> None:
-        """Drop what was read before the servo went away: its age tells nothing of it."""
+        """Discard readings from before the servo went away."""
         raise NotImplementedError
 
     @property
     def stale_after_ns(self) -> int:
-        """Three intervals: one late answer is no fault."""
+        """Age in ns above which a position is stale: three intervals, to tolerate a late answer."""
         return 3 * self._period_ns
 
 
 class PolledServo(_PacedServo):
-    """A `ServoSource` for virtual time: readings at fixed intervals on the servo line's clock.
+    """Servo source for virtual time: readings at fixed intervals on the servo line's clock.
 
-    It blocks while a servo is silent, so it is not for a real loop.
+    A silent servo blocks it, so do not use it in a real loop.
     """
 
     def __init__(self, servo: Dynamixel, line_clock: Clock, *, rate_hz: float) -> None:
@@ -87,7 +87,10 @@ class PolledServo(_PacedServo):
         self._on_the_way: deque[PositionReading] = deque()
 
     def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
-        """Newest position known at `t_mono_ns` with its sample instant; None before the first."""
+        """Return the newest position known at `t_mono_ns`, and its instant; None before the first.
+
+        Performs all readings that were due by then.
+        """
         while self._due_ns <= t_mono_ns:
             self._clock.sleep_until_ns(self._due_ns)
             reading = self._read_position()
@@ -107,9 +110,9 @@ class PolledServo(_PacedServo):
 
 
 class ServoReader(_PacedServo):
-    """A `ServoSource` for a real clock: a thread reads the servo at a fixed rate.
+    """Servo source for a real clock: a thread reads the servo at a fixed rate.
 
-    Use as a context manager: the thread runs while the block does.
+    Context manager: the thread runs within the block.
     """
 
     def __init__(self, servo: Dynamixel, clock: Clock, *, rate_hz: float) -> None:
@@ -119,10 +122,10 @@ class ServoReader(_PacedServo):
         self._thread = threading.Thread(target=self._read, name="servo", daemon=True)
 
     def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
-        """Newest position sampled by `t_mono_ns`, with its sample instant; None before the first.
+        """Return the newest position sampled by `t_mono_ns`, and its instant; None if none exists.
 
-        The thread goes on while a frame is taken, so there are newer ones: they are for the next
-        frame. Only if there is no older one is the oldest given, with age 0.
+        The thread continues during a frame, so newer readings may exist: they belong to the next
+        frame. If all are newer, return the oldest, with age 0.
         """
         recent = self._recent
         if not recent:
@@ -152,10 +155,10 @@ class ServoReader(_PacedServo):
         while not self._stop.is_set():
             reading = self._read_position()
             if reading is not None:
-                # Replaced as a whole, newest first: a reader sees the old or the new ones.
+                # Replaced atomically, newest first.
                 self._recent = (reading, *self._recent[: _RECENT - 1])
             else:
-                # A port that has gone fails at once: do not spin on it.
+                # A missing port fails at once: do not spin.
                 self._stop.wait(self._period_ns * 1e-9)
             due_ns = max(due_ns + self._period_ns, self._clock.now_ns())
             self._clock.sleep_until_ns(due_ns)

@@ -1,12 +1,12 @@
-"""Whole turns of a servo's count: continued where the next reading tells them, else not known.
+"""Unwrapping of whole turns in a servo's count.
 
-A servo counts turns in memory. When it is switched on or rebooted, and when its torque is switched
-on in position control, the count begins anew within one turn (e-manual, Present Position). In
-1.0's wheel mode the count always stays within one turn. So a count may leap by whole turns while
-the joint stands still, and each turn is 2 pi of angle.
+A servo counts turns in volatile memory. After power-up or reboot, and when its torque is switched
+on in position control, the count restarts within one turn (e-manual, Present Position). In 1.0's
+wheel mode the count always stays within one turn. So a count may jump by whole turns while the
+joint stands still, and each turn is 2 pi of angle.
 
-Between two readings a joint moves no farther than its greatest speed allows. If that is less than
-half a turn, the turn follows from it; if it is more, it is not known.
+The joint's maximum speed bounds its travel between two readings. If the bound is less than half a
+turn, the number of turns follows; otherwise it is unknown.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from devices.chips.dynamixel.reading import PositionReading
 from devices.frames import NO_SERVO_COUNTS
 
 SPEED_MAX_COUNTS_PER_S = 3 * COUNTS_PER_TURN
-"""Twice the no-load speed of an MX-64 at its highest voltage, 78 rev/min: a load may drive it."""
+"""Maximum speed: twice the no-load speed of an MX-64 at its highest voltage, 78 rev/min, because a
+load may drive the joint."""
 SLACK_COUNTS = 64
-"""Noise of the encoder, and of the instants."""
-_COUNTS_END = 2**31  # the column of a frame holds no more
+"""Allowance for noise of the encoder and of the instants."""
+_COUNTS_END = 2**31  # the limit of a frame's column, int32
 
 
 class TurnCounter:
-    """Follows the readings of one servo."""
+    """Unwrapper of the readings of one servo."""
 
     def __init__(self) -> None:
         self._last: PositionReading | None = None
@@ -33,7 +34,7 @@ class TurnCounter:
         self._has_left_turn = False
 
     def follow(self, reading: PositionReading) -> PositionReading:
-        """Return the next reading with its count continued, or with `is_turn_known` false."""
+        """Return the next reading with its count unwrapped, or with `is_turn_known` false."""
         last, self._last = self._last, reading
         if last is not None:
             self._turns = self._turns_after(last, reading)
@@ -67,6 +68,6 @@ class TurnCounter:
 
 
 def _stays_in_turn(reading: PositionReading) -> bool:
-    """Return whether the joint is held within the turn that its encoder measures."""
+    """Return whether the joint's mode limits it to the turn that its encoder measures."""
     is_in_turn = 0 <= reading.counts < COUNTS_PER_TURN
     return reading.count_range is CountRange.ONE_TURN and is_in_turn

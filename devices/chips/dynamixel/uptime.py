@@ -1,8 +1,8 @@
-"""Detects that a servo restarted, from its Realtime Tick: milliseconds since it was switched on.
+"""Detection of servo restarts by the Realtime Tick: milliseconds since power-up.
 
-The register counts 0 to 32767 and begins again (e-manual, Realtime Tick), so after a silence of
-half a minute it tells nothing. Firmware of Protocol 1.0 before version 40 has no such register;
-then a servo that was silent may have restarted.
+The register counts 0 to 32767 and wraps (e-manual, Realtime Tick), so after a silence of half a
+minute it is ambiguous. Firmware of Protocol 1.0 before version 40 has no such register; then any
+silence may have been a restart.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ _SILENCE_MAX_MS = 25_000.0  # beyond it the tolerance and the wrap leave no answ
 
 
 class UptimeWatch:
-    """Compares each tick with the one before."""
+    """Detector that compares each tick with the previous one."""
 
     def __init__(self) -> None:
         self._tick: int | None = None
@@ -21,19 +21,19 @@ class UptimeWatch:
         self._is_supported = True
 
     def has_restarted(self, tick: int | None, t_ns: int, *, silent_ns: int) -> bool:
-        """Return whether the servo restarted since the tick before, or may have.
+        """Update with a tick; return whether the servo restarted, or may have, since the last one.
 
         Args:
-            tick: as read now; None: the servo has no such register.
+            tick: present tick; None: the servo has no such register.
             t_ns: instant of the clock.
-            silent_ns: how long the servo has not answered before that; 0: it answered all along.
+            silent_ns: time without an answer before `t_ns`; 0: the servo answered all along.
         """
         before, elapsed_ms = self._tick, (t_ns - self._t_ns) * 1e-6
         self._tick, self._t_ns = tick, t_ns
         if before is None and tick is not None:
             return False
         if tick is None or (tick == before and elapsed_ms > _TOLERANCE_MS):
-            self._is_supported = False  # it stands still: firmware without this register
+            self._is_supported = False  # a constant tick: firmware without this register
         if not self._is_supported or tick is None or before is None:
             return silent_ns > 0
         if elapsed_ms > _SILENCE_MAX_MS:
@@ -41,5 +41,5 @@ class UptimeWatch:
         off_ms = (tick - before - elapsed_ms + TICKS / 2) % TICKS - TICKS / 2
         if abs(off_ms) > _TOLERANCE_MS + _TOLERANCE_PART * elapsed_ms:
             return True
-        # It fits, but so would by chance the tick of a servo that was switched on in the silence.
+        # The tick fits, but a servo powered up during the silence could match by chance.
         return silent_ns > 0 and tick <= silent_ns * 1e-6 + _TOLERANCE_MS

@@ -1,1 +1,1 @@
-"""The wires of the emulated bus at the level of bits, and what can be wrong with them."""
+"""Emulated bus at bit level, with its faults."""

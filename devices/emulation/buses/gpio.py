@@ -1,4 +1,4 @@
-"""The wires of an emulated bus as GPIO lines: what `devices.recovery.recovery` moves by hand."""
+"""Wires of an emulated bus as GPIO lines, for `devices.recovery.recovery`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.faults import Fault
 
 _CLOCKS_LEFT = 6
-"""Bits of its byte, and the acknowledge, that a hanging slave still has to send."""
+"""Clocks until a hanging slave has sent the rest of its byte and the acknowledge."""
 
 
 class EmulatedWire:
-    """SCL or SDA by hand; low while we pull it, or while the fault that holds it is there."""
+    """SCL or SDA as a GPIO line; low while driven low, or while a fault holds it."""
 
     def __init__(self, adapter: EmulatedI2cAdapter, clock: Clock, held: Fault) -> None:
         self._adapter = adapter
@@ -23,23 +23,23 @@ class EmulatedWire:
         self._low = False
 
     def drive(self, *, low: bool) -> None:
-        """Pull low, or let go."""
+        """Pull the line low, or release it."""
         self._low = low
 
     def high(self) -> bool:
-        """Is it high, that is, does no device pull it low?"""
+        """Return whether the line is high: no device pulls it low."""
         return not self._low and not self._held(self._clock.now_ns())
 
 
 class EmulatedScl(EmulatedWire):
-    """SCL by hand. A slave that holds SDA lets go after the clocks that its byte still needs."""
+    """SCL as a GPIO line. A slave that holds SDA releases it after the rest of its byte."""
 
     def __init__(self, adapter: EmulatedI2cAdapter, clock: Clock) -> None:
         super().__init__(adapter, clock, adapter.line.scl_low)
         self._clocks = 0
 
     def drive(self, *, low: bool) -> None:
-        """Pull low, or let go; a rising edge is a clock."""
+        """Pull the line low, or release it; a rising edge is a clock."""
         if self._low and not low and not self._held(self._clock.now_ns()):
             self._clocks += 1
             if self._clocks >= _CLOCKS_LEFT:
@@ -48,23 +48,23 @@ class EmulatedScl(EmulatedWire):
 
 
 class EmulatedReset:
-    """RESET of all multiplexers. A slave that holds SDA needs clocks: it is not freed for good."""
+    """RESET of all multiplexers. It does not free a slave that holds SDA, which needs clocks."""
 
     def __init__(self, adapter: EmulatedI2cAdapter) -> None:
         self._adapter = adapter
 
     def drive(self, *, low: bool) -> None:
-        """Low deselects all channels."""
+        """Drive RESET; low deselects all channels."""
         if low:
             self._adapter.reset_muxes()
 
     def high(self) -> bool:
-        """Nothing else pulls it."""
+        """Return True: no other device pulls the line."""
         return True
 
 
 class EmulatedLines:
-    """All lines of one emulated bus."""
+    """GPIO lines of one emulated bus."""
 
     def __init__(self, adapter: EmulatedI2cAdapter, clock: Clock) -> None:
         self._adapter = adapter
@@ -72,11 +72,11 @@ class EmulatedLines:
 
     @contextmanager
     def bus(self) -> Iterator[tuple[EmulatedScl, EmulatedWire]]:
-        """SCL and SDA while the block runs."""
+        """Request SCL and SDA while the block runs."""
         sda = EmulatedWire(self._adapter, self._clock, self._adapter.line.sda_low)
         yield EmulatedScl(self._adapter, self._clock), sda
 
     @contextmanager
     def reset(self) -> Iterator[EmulatedReset]:
-        """RESET while the block runs."""
+        """Request RESET while the block runs."""
         yield EmulatedReset(self._adapter)

@@ -1,10 +1,10 @@
-"""An I2C adapter and its wires, at the level of bits: what a driver sees of emulated silicon.
+"""Emulated I2C adapter and its wires, at bit level.
 
-The adapter takes the very `i2c_msg` objects that `smbus2.SMBus.i2c_rdwr` takes, raises bare
-`OSError` with the Raspberry Pi's errno, and refuses what the Pi's bcm2835 adapter refuses
-(hardware.md 3.2). The wires are open-drain: an acknowledge or a data bit is low if
-*any* device pulls it low. Time on the bus is counted in SCL periods as bus_budget.py
-does: START, repeated START and STOP one each, nine per byte.
+The adapter accepts the same `i2c_msg` objects as `smbus2.SMBus.i2c_rdwr`, raises bare `OSError`
+with the Raspberry Pi's errno, and refuses the same transfers as the Pi's bcm2835 adapter
+(hardware.md 3.2). The wires are open-drain: an acknowledge or a data bit is low if *any* device
+pulls it low. Time on the bus is counted in SCL periods as in `devices.array.budget`: START,
+repeated START and STOP one each, nine per byte.
 """
 
 from __future__ import annotations
@@ -26,57 +26,57 @@ I2C_RDWR_IOCTL_MAX_MSGS = 42  # include/uapi/linux/i2c-dev.h
 MESSAGE_BYTES_MAX = 8192  # the kernel's limit of one message
 _FLAG_READ = 0x0001  # I2C_M_RD, include/uapi/linux/i2c.h
 _TIMEOUT_UNIT_NS = 10_000_000  # of the ioctl I2C_TIMEOUT
-_TIMEOUT_DEFAULT = 100  # the i2c core's second
+_TIMEOUT_DEFAULT = 100  # the i2c core's default, 1 s
 _FAILING_TRANSFERS = 3
 _UDEV_NS = 300_000_000  # assumed
 _NOT_ACKNOWLEDGED_BITS = 11  # START, address with direction and missing acknowledge, STOP
 
 
 class I2cDevice(Protocol):
-    """A chip on the wires. Times are the clock's, at the end of the bits in question."""
+    """Chip on the bus. Times are of the clock, at the end of the respective bits."""
 
     @property
     def address(self) -> int:
-        """Its 7-bit address."""
+        """7-bit address."""
 
     def start(self, reading: bool, t_ns: int) -> bool:
-        """Its address was called: True to acknowledge and expect bytes."""
+        """Handle the chip's address; return True to acknowledge and expect bytes."""
 
     def write(self, value: int) -> bool:
-        """Take one byte; True to acknowledge."""
+        """Receive one byte; return True to acknowledge."""
 
     def read(self, count: int) -> bytes:
-        """Give `count` bytes."""
+        """Send `count` bytes."""
 
     def stop(self, t_ns: int) -> None:
-        """STOP of a transaction that it acknowledged; called once for each acknowledge."""
+        """Handle the STOP of an acknowledged transaction; called once for each acknowledge."""
 
     def lose_supply(self) -> None:
-        """Its supply was gone for a moment."""
+        """Interrupt the supply for a moment."""
 
 
 class MuxDevice(I2cDevice, Protocol):
-    """A device that connects further segments of wire."""
+    """Device that connects further segments of the bus."""
 
     @property
     def mask(self) -> int:
-        """Channels that are in force now, one bit each."""
+        """Connected channels, one bit each."""
 
     def connected(self) -> Iterable[I2cDevice]:
-        """Devices on the channels that are in force now."""
+        """Return the devices on the connected channels."""
 
     def suffer(self, t_ns: int) -> None:
-        """Apply what has happened to it since it was last asked."""
+        """Apply faults since the last call."""
 
     def reset(self) -> None:
-        """Its RESET line was low."""
+        """Reset as by the RESET line."""
 
 
 _NO_DEVICE: Sequence[I2cDevice] = ()
 
 
 class EmulatedI2cAdapter:
-    """The bus of an emulated Raspberry Pi: multiplexers on the trunk, chips behind them."""
+    """Bus of an emulated Raspberry Pi: multiplexers on the trunk, chips behind them."""
 
     def __init__(
         self, muxes: Sequence[MuxDevice], clock: Clock, scl_hz: float, line: Line | None = None
@@ -94,11 +94,10 @@ class EmulatedI2cAdapter:
         self._wire = self._devices_by_address()
 
     def set_timeout(self, units_10ms: int) -> None:
-        """How long a wedged transfer lasts, as by the ioctl I2C_TIMEOUT.
+        """Set the timeout of a wedged transfer, as by the ioctl I2C_TIMEOUT, and open the adapter.
 
-        An adapter is opened by this: its file is not there while it is unplugged, and belongs to
-        root for a moment when it is back, until udev gives it to its group. With the adapter the
-        chips on its wires lose their supply.
+        Its device file is absent while unplugged, and belongs to root for a moment after plugging,
+        until udev changes its group. The chips on its wires lose their supply with the adapter.
 
         Raises:
             OSError: ENOENT, EACCES.
@@ -119,31 +118,31 @@ class EmulatedI2cAdapter:
         self._timeout_ns = units_10ms * _TIMEOUT_UNIT_NS
 
     def _has_died(self, now_ns: int) -> bool:
-        """Was the adapter unplugged since it was opened? Then its open file is of no use."""
+        """Return whether the adapter was unplugged since it was opened: its open file fails."""
         unplugged = self.line.adapter_unplugged
         if unplugged.possible and unplugged.struck(self._opened_ns, now_ns):
             self._is_dead = True
         return self._is_dead
 
     def reset_muxes(self) -> None:
-        """The RESET line of all multiplexers, pulsed."""
+        """Pulse the RESET line of all multiplexers."""
         for mux in self._muxes:
             mux.reset()
         self._wire = self._devices_by_address()
 
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
-        """One transaction, as the ioctl I2C_RDWR on a Pi would carry it out.
+        """Run one transaction, like the ioctl I2C_RDWR on a Pi.
 
         Raises:
-            OSError: EINVAL and EOPNOTSUPP for what the kernel or the adapter refuses before it
-                touches the bus, EREMOTEIO for a missing acknowledge, ETIMEDOUT if SCL is stuck.
+            OSError: EINVAL and EOPNOTSUPP for transfers that the kernel or the adapter refuses,
+                EREMOTEIO for a missing acknowledge, ETIMEDOUT if SCL is stuck.
         """
         begin_ns = self._clock.now_ns()
         _refuse_unsupported(i2c_msgs)
         disturbed = None if self.line.sound else self.line
         if disturbed is not None:
             if self._has_died(begin_ns):
-                # First the USB transfers that were under way fail, then the device is gone.
+                # First the USB transfers in flight fail, then the device is gone.
                 self._refused += 1
                 raise _refusal(errno.EIO if self._refused <= _FAILING_TRANSFERS else errno.ENODEV)
             for mux in self._muxes:
@@ -186,7 +185,7 @@ class EmulatedI2cAdapter:
             stop_ns = begin_ns + round((bits + 1) * self._ns_per_bit)
             for device in addressed:
                 device.stop(stop_ns)
-            # Routing changes at STOP and at no other time, and only if a mux was written to.
+            # Routing changes only at STOP, and only if a mux was addressed.
             if routed:
                 self._wire = self._devices_by_address()
             self._clock.sleep_until_ns(stop_ns)
@@ -194,14 +193,14 @@ class EmulatedI2cAdapter:
     def _called(
         self, address: int, reading: bool, t_ns: int, disturbed: Line
     ) -> Sequence[I2cDevice]:
-        """Devices whose address matches the address byte, which may be disturbed."""
-        heard = disturbed.disturbed(address << 1 | reading, t_ns)
-        if heard & 1 != reading:
+        """Return the devices whose address matches the address byte, which may be disturbed."""
+        received = disturbed.disturbed(address << 1 | reading, t_ns)
+        if received & 1 != reading:
             return _NO_DEVICE  # both sides would read, or both write
-        return self._wire.get(heard >> 1, _NO_DEVICE)
+        return self._wire.get(received >> 1, _NO_DEVICE)
 
     def _is_stuck(self, messages: Sequence[i2c_msg], begin_ns: int) -> bool:
-        """Go through a transaction on wires that do not move; True if that looks like success."""
+        """Run a transaction on stuck wires; return True if it looks like success."""
         if self.line.wedged(begin_ns):
             self._clock.sleep_until_ns(begin_ns + self._timeout_ns)
             raise _refusal(errno.ETIMEDOUT)
@@ -220,7 +219,7 @@ class EmulatedI2cAdapter:
         self._clock.sleep_until_ns(begin_ns + round(bits * self._ns_per_bit))
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Close the adapter; it has no resources."""
 
     def _devices_by_address(self) -> dict[int, list[I2cDevice]]:
         routing = tuple([mux.mask for mux in self._muxes])
@@ -252,7 +251,7 @@ def _refuse_unsupported(messages: Sequence[i2c_msg]) -> None:
 def _write(
     message: i2c_msg, listeners: Sequence[I2cDevice], t_ns: int, disturbed: Line | None
 ) -> int:
-    """Give the bytes of a message to the listening devices; return how many were acknowledged."""
+    """Send a message's bytes to the addressed devices; return the number of acknowledged bytes."""
     sent = ctypes.string_at(message.buf, message.len)
     if disturbed is None and len(listeners) == 1:
         write = listeners[0].write
@@ -261,8 +260,8 @@ def _write(
                 return count - 1
         return len(sent)
     for count, value in enumerate(sent, start=1):
-        heard = value if disturbed is None else disturbed.disturbed(value, t_ns)
-        acknowledged = True in [device.write(heard) for device in listeners]
+        received = value if disturbed is None else disturbed.disturbed(value, t_ns)
+        acknowledged = True in [device.write(received) for device in listeners]
         if not acknowledged or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
             return count - 1
     return len(sent)
@@ -274,8 +273,8 @@ def _read(
     if len(listeners) == 1:
         values = listeners[0].read(message.len)
     else:  # open drain: a bit is low if any device pulls it low
-        given = [device.read(message.len) for device in listeners]
-        values = bytes(map(partial(reduce, and_), zip(*given, strict=True)))
+        each = [device.read(message.len) for device in listeners]
+        values = bytes(map(partial(reduce, and_), zip(*each, strict=True)))
     if disturbed is not None:
         values = bytes([disturbed.disturbed(value, t_ns) for value in values])
     ctypes.memmove(message.buf, values, message.len)
@@ -285,7 +284,7 @@ _ADDRESS_BITS = 8
 
 
 class Line:
-    """SDA and SCL, healthy but for `faults`; chance is drawn from `label`."""
+    """SDA and SCL with their `faults`; `label` seeds random faults."""
 
     def __init__(self, faults: Faults, label: str) -> None:
         self.sda_low = faults.of("sda_low")
@@ -296,27 +295,27 @@ class Line:
         self._nack_storm = faults.of("nack_storm")
         self._bit_errors = faults.of("bit_errors")
         self._faults = faults
-        # Not numpy's: a draw for every byte has to be cheap. A label's text seeds it the same way
-        # on every machine.
+        # Not numpy's: a draw for every byte has to be cheap. A text seeds it the same way on every
+        # machine.
         self._rng = random.Random(label)  # noqa: S311  # no secret
 
     @property
     def sound(self) -> bool:
-        """Is nothing wrong on this bus, now or later?"""
+        """True if no fault of the scene is possible, now or later."""
         return not self._faults.possible
 
     def wedged(self, t_ns: int) -> bool:
-        """Does a transfer that begins now end in the adapter's time-out?"""
+        """Return whether a transfer that begins now ends in the adapter's timeout."""
         if self.scl_low(t_ns):
             return True
         return self._happens(self.adapter_timeout, t_ns)
 
     def loses_acknowledge(self, t_ns: int) -> bool:
-        """Is this acknowledge not seen?"""
+        """Draw whether an acknowledge is lost."""
         return self._happens(self._nack_storm, t_ns)
 
     def disturbed(self, value: int, t_ns: int) -> int:
-        """The byte as it arrives: with one bit turned over, by chance."""
+        """Return the received byte: sometimes with one flipped bit."""
         if self._happens(self._bit_errors, t_ns):
             return value ^ 1 << self._rng.randrange(_ADDRESS_BITS)
         return value

@@ -1,1 +1,1 @@
-"""Emulated chips at register level: what the wires show of one part."""
+"""Emulated chips at register level."""

@@ -1,10 +1,10 @@
-"""A Dynamixel MX servo behind a pseudo-terminal, for the very code that reads one.
+"""Emulated Dynamixel MX servo behind a pseudo-terminal, for the real driver.
 
-A thread answers at `port` whatever opens it: `devices.chips.dynamixel.reader`, or ROBOTIS's own
+A thread answers any program that opens `port`: `devices.chips.dynamixel.reader`, or ROBOTIS's own
 SDK. A pseudo-terminal has no wire, so the time on the wire and the return delay pass on the
 injected clock: with a `SystemClock` an answer takes as long as a servo's, with a `VirtualClock` it
-takes as long in virtual time, while the reader is blocked. What it answers is its firmware's
-matter (`devices.emulation.chips.dynamixel_firmware`). Sources: hardware.md 5.1 and 5.2.
+takes as long in virtual time, while the reader is blocked. The answers are in
+`devices.emulation.chips.dynamixel_firmware`. Sources: hardware.md 5.1 and 5.2.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from devices.clock import Clock
 from devices.emulation.chips.dynamixel_firmware import EMULATED_FIRMWARES
 from devices.emulation.faults import Fault
 
-# A rate as the pseudo-terminal keeps it.
+# Baud rates as termios constants.
 _SPEEDS = {
     9_600: termios.B9600,
     57_600: termios.B57600,
@@ -39,14 +39,14 @@ _SPEEDS = {
 
 
 class EmulatedServo:
-    """One servo alone on its line, powered from construction until `close`.
+    """Emulated servo alone on its line, powered from construction until `close`.
 
     `position` maps nanoseconds of the clock to signed counts; it is called on the servo's thread.
-    `protocol` is 1 or 2. `return_delay_us` is in microseconds, 0 to 508 in steps of 2. While
-    `unplugged`, its USB adapter is away; while `unpowered`, it is silent, and then it restarts.
+    `protocol` is 1 or 2. `return_delay_us` is in microseconds, 0 to 508 in steps of 2. During
+    `unplugged` its USB adapter is absent; during `unpowered` it is silent, and then it restarts.
 
     Raises:
-        UsageError: no MX servo runs at `baudrate`, or none (below 4.5 M) that termios can name.
+        UsageError: no MX servo runs at `baudrate`, or termios has no such rate (4.5 M).
     """
 
     def __init__(
@@ -87,9 +87,9 @@ class EmulatedServo:
 
     @property
     def port(self) -> str:
-        """What to open: a path that leads to the pseudo-terminal while the adapter is plugged in.
+        """Path of the pseudo-terminal; it exists while the adapter is plugged in.
 
-        An adapter that is back is plugged in by this: ask for it before each attempt to open it.
+        Reading this property plugs a returned adapter in, so read it before each attempt to open.
         """
         now_ns = self._clock.now_ns()
         if self._is_hung_up and not self._unplugged(now_ns):
@@ -99,11 +99,11 @@ class EmulatedServo:
         return str(self._link)
 
     def _plug_in(self) -> None:
-        # The slave's end stays open here too: else the line hangs up whenever a reader closes it.
+        # The slave's end stays open, or the line would hang up when a reader closes it.
         self._line, self._slave = pty.openpty()
         tty.setraw(self._slave)
         self._link.symlink_to(os.ttyname(self._slave))
-        # A servo does not wait for a listener; what is not read is lost.
+        # A servo does not wait for a reader; unread bytes are lost.
         os.set_blocking(self._line, False)
         self._wake, self._wake_writer = os.pipe()
         self._is_hung_up = False
@@ -112,7 +112,7 @@ class EmulatedServo:
         self._thread.start()
 
     def _hang_up(self) -> None:
-        """The adapter is pulled: its open file fails, and its path is not there."""
+        """Unplug the adapter: its open file fails, and its path vanishes."""
         self._link.unlink()
         self._is_hung_up = True
         for descriptor in (self._line, self._slave):
@@ -157,8 +157,7 @@ class EmulatedServo:
                 self._firmware.restart(received_ns)
             if self._unpowered(received_ns):
                 continue
-            # The one thing of a wire that a pseudo-terminal keeps is the rate it was opened with.
-            # At any other than its own a servo hears noise.
+            # A pseudo-terminal has a baud rate, but no wire. At another rate a servo gets noise.
             if termios.tcgetattr(self._slave)[5] != self._speed:
                 continue
             for packet in decoder.feed(data):

@@ -1,12 +1,11 @@
-"""What an MX servo answers to a packet, in either of its two firmwares, and its control table.
+"""Emulated firmware of an MX servo: its answers and control table, for both protocols.
 
-Sources: hardware.md 5 and 5.1, e-manual protocol1.md, protocol2.md and the MX control tables. Where
-they are silent: gaps in the control table read as zero, and a read may begin and end anywhere in it
-(so does an XM540, DynamixelSDK #175); there is one servo on the line, so it takes the first slot
-after a broadcast; in 1.0 a read of nothing, or of more than the table, is out of range. Where it
-knows less than silicon: it cannot be written to, and answers that, like a bulk read, as it answers
-an undefined instruction; fast sync read is not known to it; in 1.0 it knows neither the multi-turn
-offset nor the resolution divider.
+Sources: hardware.md 5 and 5.1, e-manual protocol1.md, protocol2.md and the MX control tables. Not
+documented, so assumed: gaps in the control table read as zero, and a read may begin and end
+anywhere (as in an XM540, DynamixelSDK #175); as the only servo on the line it uses the first slot
+after a broadcast; in 1.0 a read of no bytes, or beyond the table, is out of range. Not implemented:
+writes and bulk reads, which are undefined instructions; fast sync read; in 1.0 the multi-turn
+offset and the resolution divider.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from devices.errors import UsageError
 
 FIRMWARE_VERSION = 42
 MULTI_TURN_COUNTS = 28_672
-"""Seven turns: in Protocol 1.0 a servo goes no further either way (hardware.md 5)."""
+"""Limit of the count in Protocol 1.0, either way: seven turns (hardware.md 5)."""
 
 _ON_BEFORE_NS = 5_000_000_000
-"""How long before its first answer it was switched on."""
+"""Uptime at the first answer."""
 
 _ANSWERED_FROM: dict[int, int] = {Instruction.PING: 0, Instruction.READ: 1}
 _INSTRUCTION_ERROR, _CRC_ERROR, _DATA_RANGE_ERROR, _DATA_LENGTH_ERROR = 2, 3, 4, 5
@@ -50,16 +49,16 @@ class _Layout:
 
 
 class EmulatedFirmware(ABC):
-    """One servo's firmware and control table.
+    """Emulated firmware and control table of a servo.
 
     Args:
         position: maps nanoseconds of the clock to signed counts.
-        servo_id: as in its table.
+        servo_id: id of the servo.
         model: "MX-28" or "MX-64".
-        baudrate: of its line.
+        baudrate: baud rate of the line.
         return_delay_us: 0 to 508 in steps of 2.
         status_return_level: 0 ping only, 1 ping and reads, 2 all.
-        many_turns: its joint goes beyond one turn (extended position control).
+        many_turns: True for multi-turn mode (extended position control).
 
     Raises:
         UsageError: no MX servo with this firmware runs at `baudrate`.
@@ -69,9 +68,9 @@ class EmulatedFirmware(ABC):
     _layout: ClassVar[_Layout]
     _baud_codes: ClassVar[Mapping[int, int]]
     _modes: ClassVar[Mapping[bool, bytes]]
-    """Mode of operation: within one turn, as at the factory, and over many."""
+    """Operating mode: False: within one turn, the factory's; True: multi-turn."""
     _answered_from: ClassVar[Mapping[int, int]] = _ANSWERED_FROM
-    """Status return level from which an instruction is answered; every other needs level 2."""
+    """Status return level from which an instruction is answered; others need level 2."""
 
     def __init__(
         self,
@@ -92,7 +91,7 @@ class EmulatedFirmware(ABC):
         firmware = FIRMWARES[self.version]
         self.protocol = firmware.protocol
         self.alerts = Error(0)
-        """Error bits of every answer in 1.0; in 2.0 they are in its table."""
+        """Error bits of every answer in 1.0; in 2.0 they are in the control table."""
         self._position = position
         self._register = firmware
         self._uncounted = 0
@@ -112,11 +111,11 @@ class EmulatedFirmware(ABC):
 
     @property
     def return_delay_ns(self) -> int:
-        """Between the end of a request and the beginning of its answer."""
+        """Delay between the end of a request and the beginning of its answer."""
         return self.table[self._layout.return_delay] * 2000
 
     def is_answered(self, packet: Packet) -> bool:
-        """Does this servo answer `packet`?"""
+        """Return whether this servo answers `packet`."""
         level = self.table[self._layout.status_return_level]
         if level < self._answered_from.get(packet.instruction, 2):
             return False
@@ -126,20 +125,20 @@ class EmulatedFirmware(ABC):
         return packet.servo_id == self._id and not self._is_an_answer(packet)
 
     def restart(self, t_ns: int) -> None:
-        """Count milliseconds from `t_ns` on, and the turns anew: its supply came back."""
+        """Restart at `t_ns` after a loss of power: reset uptime and turns."""
         self._powered_ns = t_ns
         self._uncounted = self._position(t_ns) // COUNTS_PER_TURN * COUNTS_PER_TURN
 
     @abstractmethod
     def answer(self, packet: Packet, t_ns: int) -> bytes:
-        """The status packet to `packet`, executed at `t_ns`."""
+        """Execute `packet` at `t_ns` and return the status packet."""
 
     def _is_called_by(self, packet: Packet) -> bool:
-        """Is this servo one of those that a broadcast names?"""
+        """Return whether a broadcast addresses this servo."""
         return False
 
     def _is_an_answer(self, packet: Packet) -> bool:
-        """Another servo's answer, or the echo of an own one, is no request."""
+        """Return whether a packet is an answer (another servo's, or an echo), not a request."""
         return False
 
     @property
@@ -160,7 +159,7 @@ class EmulatedFirmware(ABC):
 
 
 class _Firmware1(EmulatedFirmware):
-    """The factory's, Protocol 1.0. Its table ends behind Goal Acceleration."""
+    """Factory firmware, Protocol 1.0. Its table ends behind Goal Acceleration."""
 
     version = 1
     _modes: ClassVar = {False: b"\x00\x00\xff\x0f", True: b"\xff\x0f\xff\x0f"}
@@ -200,7 +199,7 @@ class _Firmware1(EmulatedFirmware):
 
 
 class _Firmware2(EmulatedFirmware):
-    """Protocol 2.0, called MX(2.0). Its table ends behind Indirect Data 56 (SDK mx_64.model)."""
+    """Firmware MX(2.0), Protocol 2.0. Its table ends behind Indirect Data 56 (SDK mx_64.model)."""
 
     version = 2
     _modes: ClassVar = {False: b"\x03", True: b"\x04"}
@@ -236,7 +235,7 @@ class _Firmware2(EmulatedFirmware):
         return packet.instruction == Instruction.STATUS
 
     def _execute(self, packet: Packet, t_ns: int) -> tuple[int, bytes]:
-        """Error number and data."""
+        """Execute a packet; return error number and data."""
         broadcast = packet.servo_id == BROADCAST_ID
         if not packet.intact:
             return _CRC_ERROR, b""
@@ -261,4 +260,4 @@ class _Firmware2(EmulatedFirmware):
 
 
 EMULATED_FIRMWARES: dict[int, type[EmulatedFirmware]] = {1: _Firmware1, 2: _Firmware2}
-"""By the protocol that they speak."""
+"""Emulated firmwares by protocol version."""

@@ -1,7 +1,7 @@
-"""From gas pressure to the two words of a conversion: the analogue side of one MPL115A2.
+"""Analogue front end of an MPL115A2: from gas pressure to the two words of a conversion.
 
-Noise is that of a real part (hardware.md 1.3): 0.165 kPa in all, rounding included, with 1.2 % of
-readings more than 0.5 kPa off, most of them low. Counts past either end wrap, as real parts do.
+Noise as in a real part (hardware.md 1.3): 0.165 kPa in all, rounding included, with 1.2 % of
+readings more than 0.5 kPa off, mostly low. Counts past either end wrap, as in real parts.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ _TADC_NOISE = 0.5  # in counts
 
 _MEASURED_NOISE_KPA = 0.165
 _OUTLIER_RATE = 0.012
-_OUTLIER_KPA = (0.5, 1.2)  # their size, at the noise that was measured
+_OUTLIER_KPA = (0.5, 1.2)  # range of their size, at the measured noise
 _OUTLIERS_LOW = 0.85  # most are low (hardware.md 1.3)
-_DRAWN_AT_ONCE = 1024  # a call of numpy for each reading would be dear
+_DRAWN_AT_ONCE = 1024  # a call of numpy for each reading would be slow
 _FAR_OVER_RANGE_KPA = 45.0
 
 
 class FrontEnd:
-    """Samples one dome, or what is around a bare chip: a `Sense` for the emulated chip.
+    """Sampler of one dome, or of the surroundings of a bare chip: a `Sense` of the emulated chip.
 
-    Before `begin` its dome is at rest at the scene's first instant. Fault `over_range`: it is
-    pressed 45 kPa harder, past its range; most wrap. `frozen`: the word of its pressure stands
-    still, that of its temperature does not.
+    Before `begin` the dome is at the scene's first instant. Fault `over_range`: pressure is 45 kPa
+    higher, past the range; most parts wrap. `frozen`: the pressure word stays constant, the
+    temperature word does not.
     """
 
     def __init__(
@@ -69,12 +69,12 @@ class FrontEnd:
         self._steady_tadc = self._true_tadc(0.0)
 
     def begin(self, epoch_ns: int) -> None:
-        """The scene's time begins at this instant of the clock."""
+        """Begin the scene's time at this instant of the clock."""
         self._epoch_ns = epoch_ns
 
     def __call__(self, t_ns: int) -> tuple[int, int]:
-        """Words `padc`, `tadc` of a conversion that samples at `t_ns`."""
-        # A conversion that was under way when the scene began saw its first instant.
+        """Compute the words `padc`, `tadc` of a conversion that samples at `t_ns`."""
+        # A conversion begun before the scene samples its first instant.
         t_s = 0.0 if self._epoch_ns is None else max(0.0, (t_ns - self._epoch_ns) * 1e-9)
         core_kpa, outlier_kpa, tadc_noise = next(self._noise)
         kpa = self._pressure_kpa(t_s)
@@ -84,7 +84,7 @@ class FrontEnd:
         if self._over_range(t_ns):
             kpa += _FAR_OVER_RANGE_KPA
         kpa += self._correlate(core_kpa, t_ns * 1e-9) + outlier_kpa
-        # The transducer feels the true temperature; the word reported for it is a noisy one.
+        # The true temperature affects the pressure word; the temperature word itself is noisy.
         tadc = self._steady_tadc if self._steady else self._true_tadc(t_s)
         c = self._c
         pcomp = (kpa - PRESSURE_MIN_KPA) / _KPA_PER_PCOMP
@@ -101,7 +101,7 @@ class FrontEnd:
         return abs(self._c.b1 + self._c.c12 * self._tadc_at_25) * _KPA_PER_PCOMP
 
     def _correlate(self, white_kpa: float, t_s: float) -> float:
-        """Core noise with a correlation time: the same variance, less of it new in each sample."""
+        """Correlate the core noise in time (AR(1)), with unchanged variance."""
         if self._correlated_s == 0.0:
             return white_kpa
         keep = math.exp(-(t_s - self._last_s) / self._correlated_s)
@@ -113,7 +113,7 @@ class FrontEnd:
 def _noise(
     scene: EmulationScene, lsb_kpa: float, rng: np.random.Generator
 ) -> Iterator[tuple[float, float, float]]:
-    """Core and outlier in kPa and temperature noise in counts, for one conversion after another."""
+    """Yield core noise and outlier in kPa, and temperature noise in counts, per conversion."""
     scale = scene.noise_kpa / _MEASURED_NOISE_KPA
     low, high = (scale * limit for limit in _OUTLIER_KPA)
     outlier_variance = _OUTLIER_RATE * (low * low + low * high + high * high) / 3

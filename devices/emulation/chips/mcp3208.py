@@ -1,7 +1,7 @@
-"""An MCP3208 at bit level, and the amplifier in front of it.
+"""Emulated MCP3208 at bit level, with its input amplifier.
 
-Source: data sheet DS21298E section 5 (figures 5-1 and 5-2, table 5-2). The chip knows no bytes: it
-waits for the first bit that is high, wherever in a transfer that is, and counts clocks from there.
+Source: data sheet DS21298E section 5 (figures 5-1 and 5-2, table 5-2). The chip ignores byte
+boundaries: it waits for the first high bit of a transfer, and counts clocks from there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from devices.clock import Clock
 from devices.scene.hardware import ReferenceScene
 
 Volts = Callable[[int, int], float]
-"""Input and instant in ns -> voltage there; noise and non-linearity are its business."""
+"""Function of input and instant in ns that returns the voltage, with noise and non-linearity."""
 
 # Clocks after the start bit: SGL/DIFF, D2, D1, D0, then the clock that ends sampling.
 _CONFIGURATION = 4
@@ -23,18 +23,18 @@ _SAMPLING = 5
 
 
 class EmulatedMcp3208:
-    """One converter alone on its chip select: an `SpiDevice`.
+    """Emulated converter alone on its chip select: an `SpiDevice`.
 
-    The sample is taken at the end of the sampling clock, and the time on the wire passes on the
-    clock. A code begins half a count below its voltage.
+    It samples at the end of the sampling clock; transfers take their time on the clock. A code
+    begins half a count below its voltage.
 
     Args:
-        volts: what is connected to the inputs.
-        clock: virtual or real.
+        volts: voltages at the inputs.
+        clock: virtual or real clock.
         vref_v: reference, in volts.
         max_speed_hz: SPI clock.
-        floats_high: what is read while the chip leaves DOUT floating, which it does up to the null
-            bit. On a real board that is anything; high by default, since that helps no driver.
+        floats_high: level of DOUT while the chip leaves it floating, up to the null bit. It is
+            undefined on a real board; high by default, the worse case for a driver.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class EmulatedMcp3208:
         return data
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Close the device; it has no resources."""
 
     def _answer(self, sent: list[int], begin_ns: int) -> list[int]:
         start = sent.index(1) if 1 in sent else len(sent)
@@ -95,12 +95,12 @@ def amplifier_volts(
     *,
     noise_n: Callable[[], float] | None = None,
 ) -> Volts:
-    """The amplifier of a load cell at the scene's input; the other inputs are grounded.
+    """Create the voltages of a load cell's amplifier at the scene's input; others are grounded.
 
     Args:
         force_n: force on the cell in newtons at an instant in ns.
-        scene: its scale, which is inverted here.
-        noise_n: draws the amplifier's noise of one reading, as a force in newtons; absent: none.
+        scene: section with the scale, which is inverted here.
+        noise_n: draws the amplifier's noise of one reading, as a force in newtons; None: no noise.
     """
 
     def volts(channel: int, t_ns: int) -> float:

@@ -1,7 +1,7 @@
-"""MPL115A2 at register level: what the two wires show of one part.
+"""Emulated MPL115A2 at register level.
 
-Source: MPL115A2 data sheet Rev. 10 and hardware.md 1. What is not documented there is either left
-undefined to the driver (the pointer after a read) or offered as a mode (a read in a conversion).
+Source: MPL115A2 data sheet Rev. 10 and hardware.md 1. Undocumented behaviour is either undefined
+for the driver (the pointer after a read) or a choice of modes (a read in a conversion).
 """
 
 from __future__ import annotations
@@ -19,22 +19,21 @@ _SAMPLE_QUARTER = 4  # as the driver assumes (hardware.md 1.4)
 _SLOW_NS = 2_900_000  # slower than any healthy part, within the data sheet's 3 ms
 
 Sense = Callable[[int], tuple[int, int]]
-"""Sample instant in ns -> the 10-bit words `padc`, `tadc` of a conversion that samples then."""
+"""Function of a conversion's sample instant in ns that returns the 10-bit words `padc`, `tadc`."""
 
 OnConversion = Callable[[int, tuple[int, int], tuple[int, int, int, int]], None]
-"""Told of every conversion: the instant of its CONVERT's STOP, its words, and the coefficients of
-the part that made it. Only to judge a driver by; no driver has it."""
+"""Callback for every conversion: instant of its CONVERT's STOP, its words, and the part's
+coefficients. Only for judging drivers."""
 
 
 @dataclass
 class PartFaults:
-    """What may be wrong with one part.
+    """Faults of one part.
 
-    `no_answer`: it does not acknowledge, as with RST low; its registers and conversion go on.
-    `unplugged`: it has no supply; plugged in again its registers are zero. `replaced`: the same,
-    and what is plugged in again is another part. `stale`: a conversion never ends. `slow`: it takes
-    2.9 ms, still within the data sheet. `all_ones`: it is lost between address and data, so that
-    the line floats high.
+    `no_answer`: no acknowledge, as with RST low; registers and conversion go on. `unplugged`: no
+    supply; afterwards its registers are zero. `replaced`: unplugged, then another part in its
+    place. `stale`: conversions never end. `slow`: they take 2.9 ms, still within the data sheet.
+    `all_ones`: the part is lost between address and data, so that the line floats high.
     """
 
     no_answer: Fault = field(default_factory=Fault)
@@ -44,18 +43,18 @@ class PartFaults:
     slow: Fault = field(default_factory=Fault)
     all_ones: Fault = field(default_factory=Fault)
     scene: Faults | None = None
-    """All faults of the scene; while none of them is possible, none of these is asked."""
+    """All faults of the scene; while none is possible, the others are not evaluated."""
 
 
 @dataclass(frozen=True)
 class Silicon:
-    """What is soldered in: fixed for one part."""
+    """Fixed properties of one part."""
 
     coefficient_words: tuple[int, int, int, int]
     conversion_ns: int
     sense: Sense
     late_ns: int = 0
-    """How much later than after a quarter of a conversion it samples, below zero earlier."""
+    """Delay of the sample instant after a quarter of the conversion; negative: earlier."""
 
 
 @dataclass
@@ -66,14 +65,14 @@ class _Conversion:
 
 
 class EmulatedMpl115a2:
-    """One part: sixteen bytes of registers, a command, and a conversion that takes its time.
+    """Emulated part: registers, CONVERT command, and conversions that take time.
 
-    Registers are zero after power-up and keep the previous result until a conversion ends, a
-    conversion being started by the STOP of a CONVERT. A CONVERT during a conversion restarts it.
+    Registers are zero after power-up and hold the previous result until a conversion ends. The STOP
+    of a CONVERT starts a conversion; a CONVERT during a conversion restarts it.
     """
 
     address = 0x60
-    """The same for every part; the general call is not acknowledged (DS 2)."""
+    """I2C address of every part; the general call is not acknowledged (DS 2)."""
 
     def __init__(
         self,
@@ -93,7 +92,7 @@ class EmulatedMpl115a2:
         self.lose_supply()
 
     def lose_supply(self) -> None:
-        """Begin anew: all registers but the coefficients are zero, nothing converts."""
+        """Reset: all registers but the coefficients are zero, no conversion runs."""
         self._registers = bytearray(_REGISTERS)
         self._registers[0x04:0x0C] = struct.pack(">4H", *self._silicon.coefficient_words)
         self._pointer = 0
@@ -102,7 +101,7 @@ class EmulatedMpl115a2:
         self._conversion: _Conversion | None = None
 
     def start(self, reading: bool, t_ns: int) -> bool:
-        """Acknowledge, unless the part is silent."""
+        """Handle the part's address; return the acknowledge, False if the part is silent."""
         if (self._scene_faults is None or self._scene_faults.possible) and not self._lives(t_ns):
             return False
         self._t_ns = t_ns
@@ -114,7 +113,7 @@ class EmulatedMpl115a2:
         return True
 
     def _lives(self, t_ns: int) -> bool:
-        """Does it acknowledge? What happened to it since it was last called is applied first."""
+        """Apply faults since the last call; return whether the part acknowledges."""
         since_ns, self._seen_ns = self._seen_ns, t_ns
         faults = self._faults
         if faults.replaced.possible and faults.replaced.struck(since_ns, t_ns):
@@ -126,7 +125,7 @@ class EmulatedMpl115a2:
         return not (faults.no_answer(t_ns) or faults.unplugged(t_ns) or faults.replaced(t_ns))
 
     def write(self, value: int) -> bool:
-        """Take the register address, then data; only CONVERT heeds its data, whatever it is."""
+        """Receive the register address, then data, which matter for CONVERT only, in any value."""
         if self._expects_register:
             self._pointer = value & 0x7F  # the top bit is "don't care" (DS 8.4)
             self._expects_register = False
@@ -136,7 +135,7 @@ class EmulatedMpl115a2:
         return True
 
     def read(self, count: int) -> bytes:
-        """Give the bytes from the pointer on, which moves with them."""
+        """Send bytes from the pointer on, and advance it."""
         begin = self._pointer
         self._pointer = (begin + count) % _REGISTERS
         if self._faults.all_ones.possible and self._faults.all_ones(self._t_ns):
@@ -146,7 +145,7 @@ class EmulatedMpl115a2:
         return bytes(self._registers[(begin + i) % _REGISTERS] for i in range(count))
 
     def stop(self, t_ns: int) -> None:
-        """Start the conversion that the transaction asked for."""
+        """Start a conversion if the transaction contained CONVERT."""
         if self._convert_at_stop:
             self._convert_at_stop = False
             self._settle(t_ns)
@@ -170,7 +169,7 @@ class EmulatedMpl115a2:
             self._conversion = None
 
     def _disturb(self, t_ns: int) -> None:
-        """A read while converting: undocumented, so three behaviours are on offer."""
+        """Apply the effect of a read during a conversion: undocumented, so one of three modes."""
         conversion = self._conversion
         if conversion is None or self._mode == "stale":
             return

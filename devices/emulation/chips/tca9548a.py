@@ -1,4 +1,4 @@
-"""TCA9548A at register level (data sheet SCPS207G, 8.5)."""
+"""Emulated TCA9548A at register level (data sheet SCPS207G, 8.5)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from devices.emulation.faults import Fault
 
 
 class EmulatedTca9548a:
-    """One control register without a register address; bit n connects channel n.
+    """Emulated multiplexer: one control register without an address; bit n connects channel n.
 
-    A written value is latched with its acknowledge and comes into force at STOP (8.5.4). Of several
-    data bytes the last one counts. Power-up value 0: nothing is connected.
+    A written value is latched with its acknowledge and takes effect at STOP (8.5.4). Of several
+    data bytes the last one counts. Power-up value 0: no channel is connected.
 
-    Faults: `brown_out`, its supply is gone, so it is silent and connects nothing; `mux_reset`, its
-    RESET line or a dip of the supply has deselected everything and it goes on as if new.
+    Faults: `brown_out`: no supply, so it is silent and connects no channel; `mux_reset`: its RESET
+    line or a dip of the supply deselects all channels.
     """
 
     def __init__(
@@ -32,26 +32,26 @@ class EmulatedTca9548a:
         self._seen_ns = 0
         self._latched = 0
         self.mask = 0
-        """Channels in force."""
+        """Connected channels."""
 
     def suffer(self, t_ns: int) -> None:
-        """Apply what has happened to it since it was last asked."""
+        """Apply faults since the last call."""
         since_ns, self._seen_ns = self._seen_ns, t_ns
         if self._brown_out.struck(since_ns, t_ns) or self._mux_reset.set_in(since_ns, t_ns):
             self.reset()
 
     def reset(self) -> None:
-        """As by its RESET line: nothing is connected any more."""
+        """Reset as by the RESET line: no channel is connected."""
         self._latched = self.mask = 0
 
     def lose_supply(self) -> None:
-        """Its supply and that of all chips behind it was gone for a moment."""
+        """Interrupt the supply of the mux and of all chips behind it for a moment."""
         self.reset()
         for device in self._channels.values():
             device.lose_supply()
 
     def start(self, reading: bool, t_ns: int) -> bool:
-        """Acknowledge, in both directions, if it has a supply."""
+        """Return the acknowledge, in both directions: True with a supply."""
         return not self._brown_out(t_ns)
 
     def write(self, value: int) -> bool:
@@ -60,13 +60,13 @@ class EmulatedTca9548a:
         return True
 
     def read(self, count: int) -> bytes:
-        """Give the control register; every byte of a longer read is the same one."""
+        """Send the control register, repeated in a longer read."""
         return bytes([self._latched]) * count
 
     def stop(self, t_ns: int) -> None:
-        """Bring the latched channels into force."""
+        """Connect the latched channels."""
         self.mask = self._latched
 
     def connected(self) -> Iterable[I2cDevice]:
-        """Devices on the channels in force."""
+        """Return the devices on the connected channels."""
         return [device for channel, device in self._channels.items() if self.mask >> channel & 1]

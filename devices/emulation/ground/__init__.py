@@ -1,1 +1,1 @@
-"""What the foot stands on: forces and angle over time, notes, and the mill with its converter."""
+"""Grounds of an emulated foot: forces and angle over time, and the indenter with its converter."""

@@ -1,7 +1,6 @@
-"""What every ground is: forces on the domes as a function of time.
+"""Base class of grounds: forces on the domes as a function of time, the ground truth of a scene.
 
-Forces are along each dome's axis, times in seconds since power-up. They are the ground truth of a
-scene.
+Forces are along each dome's axis, times in seconds since power-up.
 """
 
 from __future__ import annotations
@@ -15,30 +14,30 @@ from devices.arrays import Floats
 
 
 class Ground(ABC):
-    """A load on all domes of a foot; by default it never ends and the foot does not turn."""
+    """Load on all domes of a foot; by default endless, and with a fixed segment."""
 
     arc_rad: Floats | None = None
-    """Angle of each dome's axis in the foot; None: all are upright, whatever the segment does."""
+    """Angle of each dome's axis in the foot; None: all stay upright at any segment angle."""
 
     @property
     def duration_s(self) -> float | None:
-        """When its programme is over; None for one that goes on."""
+        """End of the load; None for an endless one."""
         return None
 
     @abstractmethod
     def forces_n(self, t_s: Floats) -> Floats:
-        """Force on each dome along its axis, (len(t_s), tiles)."""
+        """Compute the force on each dome along its axis, (len(t_s), tiles)."""
 
     def rest_n(self, t_s: Floats) -> Floats:
-        """Vertical force on the foot that no dome bears."""
+        """Compute the vertical force on the foot beside the domes."""
         return np.zeros(len(t_s))
 
     def angle_rad(self, t_s: Floats) -> Floats | None:
-        """Angle of the foot segment; None for a foot without a moving segment."""
+        """Compute the angle of the foot segment; None for a foot without a moving segment."""
         return None
 
     def tilt_rad(self, t_s: Floats) -> Floats:
-        """Angle of each dome's axis ahead of the vertical, (n, tiles); (n, 1) if all stand."""
+        """Compute the angle of each dome's axis ahead of the vertical, (n, tiles) or (n, 1)."""
         angle_rad = self.angle_rad(t_s)
         if self.arc_rad is None or angle_rad is None:
             return np.zeros((len(t_s), 1))
@@ -46,7 +45,7 @@ class Ground(ABC):
 
 
 def in_round(t_s: Floats, lead_s: float, round_s: float) -> Floats:
-    """Times within the first of many rounds of `round_s` after the lead; infinite: there is one."""
+    """Map times to the first round after the lead; `round_s` infinite: a single round."""
     t_s = np.asarray(t_s)
     if not math.isfinite(round_s):
         return t_s

@@ -1,6 +1,6 @@
-"""The ground of a scene: a foot in the air, on a plate, rolling, or under a recorded load.
+"""Grounds of scenes: a foot in the air, standing, rolling, or under a recorded load.
 
-Every ground is preceded by `lead_s` seconds without load.
+Every load begins after `lead_s` seconds without load.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from devices.scene.hardware import TileScene
 
 
 class NoLoad(Ground):
-    """A foot in the air."""
+    """Foot in the air."""
 
     def __init__(self, tiles: int) -> None:
         self._tiles = tiles
 
     def forces_n(self, t_s: Floats) -> Floats:
-        """Zero."""
+        """Return zeros."""
         return np.zeros((len(t_s), self._tiles))
 
 
 class Standing(Ground):
-    """A constant load whose centre of pressure sways slowly, as in quiet standing."""
+    """Constant load with a slow sway of the centre of pressure, as in quiet standing."""
 
     _LOWERING_S = 0.3
-    _SWAY_HZ = (0.23, 0.61)  # incommensurate, so that it does not repeat soon
+    _SWAY_HZ = (0.23, 0.61)  # incommensurate, for a long period
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class Standing(Ground):
         self._sway_m = ground.sway_m
 
     def forces_n(self, t_s: Floats) -> Floats:
-        """The tile forces with the least squares for this load and centre of pressure."""
+        """Compute the tile forces with the least squares for the load and centre of pressure."""
         since = np.asarray(t_s) - self._lead_s
         load_n = self._load_n * np.clip(since / self._LOWERING_S, 0.0, 1.0)
         sway_m = sum(
@@ -81,10 +81,10 @@ class Standing(Ground):
 
 
 class Rolling(Ground):
-    """The foot's arc rolls over a rigid plate at constant speed, is lifted, and rolls again.
+    """Rolling of the foot's arc over a rigid plate at constant speed, lifted and repeated.
 
-    Axes as in the design: rolling forward turns the segment by a positive angle, and the contact
-    moves forward on the foot to the place whose arc angle is the segment's.
+    Rolling forward turns the segment by a positive angle, and the contact moves forward on the foot
+    to the place whose arc angle equals the segment's.
     """
 
     arc_rad: Floats
@@ -110,7 +110,10 @@ class Rolling(Ground):
         self._cycle_s = 2 * self._LOWERING_S + self._roll_s + self._BACK_S
 
     def forces_n(self, t_s: Floats) -> Floats:
-        """An elastic foundation under the contact patch; the load is its vertical sum."""
+        """Compute the forces of an elastic foundation under the contact patch.
+
+        The load is their vertical sum.
+        """
         since = np.asarray(t_s) - self._lead_s
         phase_s = np.mod(since, self._cycle_s)
         lifting_s = phase_s - self._LOWERING_S - self._roll_s
@@ -122,11 +125,11 @@ class Rolling(Ground):
         reach = self._ground.patch_m / self._ground.radius_m
         pressed = np.where(self._bears, np.maximum(0.0, 1.0 - (off_rad / reach) ** 2), 0.0)
         vertical = (pressed * np.cos(off_rad)).sum(axis=1)
-        vertical[vertical == 0.0] = np.inf  # nothing is touched
+        vertical[vertical == 0.0] = np.inf  # no contact
         return np.asarray(pressed * (load_n / vertical)[:, None])
 
     def angle_rad(self, t_s: Floats) -> Floats:
-        """Angle of the segment."""
+        """Compute the angle of the segment."""
         return self._angle(np.asarray(t_s) - self._lead_s)
 
     def _angle(self, since_s: Floats) -> Floats:
@@ -137,10 +140,10 @@ class Rolling(Ground):
 
 
 class TraceLoad(Ground):
-    """A recorded load, linear between its samples; over and over again if it is `looped`."""
+    """Recorded load, linear between its samples, repeated endlessly if `looped`."""
 
     _PAUSE_S = 1.0
-    """In the air between two rounds, long enough for a tare."""
+    """Pause in the air between two rounds, long enough for a tare."""
 
     def __init__(self, pressed: PressedTrace, lead_s: float = 0.0, *, looped: bool = False) -> None:
         self._pressed = pressed
@@ -149,11 +152,11 @@ class TraceLoad(Ground):
 
     @property
     def duration_s(self) -> float | None:
-        """End of the trace, after the foot has been lifted; None for one that is looped."""
+        """End of the trace, after lifting the foot; None if looped."""
         return None if np.isfinite(self._round_s) else float(self._pressed.time_s[-1])
 
     def forces_n(self, t_s: Floats) -> Floats:
-        """The trace's forces; zero before and after it."""
+        """Interpolate the trace's forces; zero before and after it."""
         time_s, forces_n = self._pressed.time_s, self._pressed.forces_n
         at_s = in_round(t_s, self._lead_s, self._round_s)
         return np.stack(
@@ -161,7 +164,7 @@ class TraceLoad(Ground):
         )
 
     def angle_rad(self, t_s: Floats) -> Floats | None:
-        """The trace's angle, if it has one."""
+        """Interpolate the trace's angle; None without one."""
         if self._pressed.angle_rad is None:
             return None
         at_s = in_round(t_s, self._lead_s, self._round_s)
@@ -176,13 +179,13 @@ def make_ground(
     pressed: PressedTrace | None,
     looped: bool = False,
 ) -> Ground:
-    """The ground of a scene, or a recorded load in its place.
+    """Create the ground of a scene, or of a recorded load in its place.
 
-    `looped`: what would have an end, a recorded load or three hops, begins again and again.
+    With `looped` a finite load (a recorded one, or three hops) repeats endlessly.
 
     Raises:
-        UsageError: the scene wants a load trace and there is none.
-        SceneError: the ground's keys ask for the impossible.
+        UsageError: the scene needs a load trace and none was given.
+        SceneError: the ground's keys are physically impossible.
     """
     positions_m = tile_positions_m(scene.tile)
     bears = np.array([not tile.reference for tile in scene.tile])
@@ -209,10 +212,10 @@ def make_ground(
 def press_on(
     scene: Scene, load: LoadTrace, *, load_scale: float, cop: CopTransform, lead_s: float
 ) -> PressedTrace:
-    """A recorded load as forces on the scene's tiles; see `ground.load_trace.press`.
+    """Convert a recorded load to forces on the scene's tiles (`load_trace.press`).
 
     Raises:
-        LoadTraceError: it cannot be pressed on them.
+        LoadTraceError: the load does not fit the tiles.
     """
     return press(
         load,
@@ -225,5 +228,5 @@ def press_on(
 
 
 def tile_positions_m(tiles: tuple[TileScene, ...]) -> Floats:
-    """Positions of tiles in the foot frame, (tiles, 3)."""
+    """Return the positions of tiles in the foot frame, (tiles, 3)."""
     return np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in tiles])

@@ -1,11 +1,11 @@
 """Three hops of a leg on poppy seeds or in mud, as forces on domes over time.
 
-The motion is integrated once and interpolated: the truth does not depend on who asks, or when.
-Every hop lands on a fresh place, which is a little firmer or softer than the scene says; the leg
-hops a little higher or lower, and is caught at the top of the last hop. The seed draws that.
+The motion is integrated once and interpolated: the truth does not depend on the times of queries.
+Every hop lands on a fresh place, a little firmer or softer than the scene's value; the leg hops a
+little higher or lower, and is caught at the top of the last hop. The seed draws these variations.
 
-The sole is strips, one under each place of the tiles, all of the same area. Of each, the tile's
-dome bears the stated share, along its own axis; the rim of the sole bears the rest.
+The sole consists of strips, one under each position of tiles, with equal areas per tile. The tile's
+dome bears the stated share of its area's load, along its axis; the rim of the sole bears the rest.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from devices.scene.emulated import MudGround, PoppyGround
 HOPS = 3
 
 _AIR_S = 2.0
-"""In the air after the last hop, and before the first again: long enough for a tare."""
+"""Time in the air after the last hop, and before the first again: long enough for a tare."""
 _STANCE_S = 0.25
-"""About as long landing and push-off take; the segment turns that much longer than it stands."""
-_SWING_S = 0.12  # the segment turns back in this time for the next touch-down
-_FIRMNESS = 0.05  # how much places differ, relative
-_HEIGHT = 0.03  # how much hops differ in height, relative
-_PITCH = 0.1  # how much they differ in pitch, relative
-_STEEPEST_RAD = 0.7  # a dome further round the foot would not press on the ground
+"""Approximate duration of landing and push-off; the segment turns during these and the stand."""
+_SWING_S = 0.12  # time in which the segment turns back for the next touch-down
+_FIRMNESS = 0.05  # relative variation of the ground's strength between places
+_HEIGHT = 0.03  # relative variation of the hops' height
+_PITCH = 0.1  # relative variation of the pitch
+_STEEPEST_RAD = 0.7  # largest arc angle of a dome that still presses on the ground
 
 
 class Hopping(Ground):
-    """A leg's three hops on soft ground.
+    """Three hops of a leg on soft ground.
 
     Args:
-        ground: what it hops on.
-        positions_m: (tiles, 3), in the foot frame.
+        ground: section of the scene.
+        positions_m: (tiles, 3), positions in the foot frame.
         bears: (tiles,), False for bare reference tiles, which are in no strip.
-        seed: draws what differs from hop to hop.
-        lead_s: when it is dropped.
-        looped: is it dropped over and over again?
+        seed: seed of the variation between hops.
+        lead_s: time of the drop.
+        looped: repeat endlessly.
 
     Raises:
         SceneError: the tiles are not on an arc below the ankle, or the leg gets stuck.
@@ -84,15 +84,15 @@ class Hopping(Ground):
         )
         leg = Leg(ground.mass_kg, ground.leg_n_per_m, strips)
         self._head_kpa_m = ground.head_kpa_per_m if isinstance(ground, MudGround) else 0.0
-        # Turns of the segment: when each begins, how long it takes, from where and to where.
+        # Turns of the segment: begin; duration, first and last angle.
         self._begins_s: list[float] = [0.0]
         self._turns: list[tuple[float, float, float]] = []
         self.touch_s: list[float] = []
-        """When the sole touches the ground, for each hop."""
+        """Touch-down time of each hop."""
         self.leave_s: list[float] = []
-        """When the sole has left the ground, for each hop."""
+        """Lift-off time of each hop."""
         self.strokes_m: list[float] = []
-        """By how much each push-off lengthens the leg."""
+        """Stroke of each push-off."""
         self._hop(ground, leg, random_of(f"hop/{seed}"))
         self._round_s = self._end_s - lead_s if looped else math.inf
 
@@ -105,7 +105,7 @@ class Hopping(Ground):
         for hop in range(HOPS):
             place = SoftGround.of(ground, float(firmness[hop]))
             hopping.fall(place, self._angle)
-            # Its force has acted for a step, and rises from nothing during the one before.
+            # The force has acted for a step, and rises from zero during the previous one.
             self.touch_s.append(hopping.motion.t_s - 2.0 * STEP_S)
             self._turn(hopping.motion.t_s, ground.stand_s + _STANCE_S, pitches_rad[hop])
             hopping.stand(place, self._angle, hopping.motion.t_s + ground.stand_s)
@@ -135,15 +135,15 @@ class Hopping(Ground):
 
     @property
     def duration_s(self) -> float | None:
-        """End of the time in the air after the last hop; None for a leg dropped again and again."""
+        """End of the time in the air after the last hop; None if looped."""
         return None if math.isfinite(self._round_s) else self._end_s
 
     def forces_n(self, t_s: Floats) -> Floats:
-        """Force on each dome along its axis, (len(t_s), tiles)."""
+        """Compute the force on each dome along its axis, (len(t_s), tiles)."""
         return self._stresses_pa(self._in_round(t_s)) * self._dome_m2
 
     def angle_rad(self, t_s: Floats) -> Floats:
-        """Angle of the segment."""
+        """Compute the angle of the segment."""
         at_s = self._in_round(t_s)
         turn = np.maximum(np.searchsorted(self._begins_s, at_s, side="right") - 1, 0)
         duration_s, from_rad, to_rad = np.array(self._turns)[turn].T
@@ -151,25 +151,25 @@ class Hopping(Ground):
         return np.asarray(from_rad + (to_rad - from_rad) * done * done * (3.0 - 2.0 * done))
 
     def rest_n(self, t_s: Floats) -> Floats:
-        """Vertical force on the foot that no dome bears: rim, drag, suction and buoyancy."""
+        """Compute the vertical force on the foot beside the domes: rim, drag, suction, buoyancy."""
         at_s = self._in_round(t_s)
         upright = np.cos(self.arc_rad - self.angle_rad(t_s)[:, None])
         rim_n = (self._stresses_pa(at_s) * self._rim_m2 * upright).sum(axis=1)
         return np.asarray(rim_n + np.interp(at_s, self._time_s, self._rest_n, left=0.0, right=0.0))
 
     def depth_m(self, t_s: Floats) -> Floats:
-        """Depth of each tile below the surface, (len(t_s), tiles); negative above it."""
+        """Compute the depth of each tile below the surface, (len(t_s), tiles); negative above."""
         ankle_m = np.interp(self._in_round(t_s), self._time_s, self._ankle_m)[:, None]
         angle_rad = self.angle_rad(t_s)[:, None]
         x_m, z_m = self._positions_m[:, 0], self._positions_m[:, 2]
         return np.asarray(np.sin(angle_rad) * x_m - np.cos(angle_rad) * z_m - ankle_m)
 
     def head_kpa(self, t_s: Floats) -> Floats:
-        """Hydrostatic pressure on each tile, (len(t_s), tiles)."""
+        """Compute the hydrostatic pressure on each tile, (len(t_s), tiles)."""
         return self._head_kpa_m * np.maximum(self.depth_m(t_s), 0.0)
 
     def _stresses_pa(self, at_s: Floats) -> Floats:
-        """Stress under each tile."""
+        """Interpolate the stress under each tile."""
         pa = [
             np.interp(at_s, self._time_s, strip, left=0.0, right=0.0) for strip in self._stress_pa.T
         ]

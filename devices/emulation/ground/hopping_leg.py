@@ -1,8 +1,8 @@
-"""A leg that is dropped on soft ground and hops: masses, spring, push-off, and the ground's forces.
+"""Dynamics of a leg that is dropped on soft ground and hops: masses, spring, push-off, ground.
 
-Vertical motion of two masses, what is above the leg's spring and what is below it, with fixed small
-steps; the segment's angle is given as a function of time. The push-off lengthens the leg, and takes
-what it needs to take: its stroke is found by trying, as who tunes a robot would.
+Vertical motion of two masses, above and below the leg's spring, with fixed small steps; the
+segment's angle is a given function of time. The push-off lengthens the leg by a stroke that root
+finding adjusts to the height of the hop.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from devices.emulation.ground.soft_ground import GRAVITY_M_S2, SoftGround
 from devices.errors import SceneError
 
 STEP_S = 0.00025
-"""The stiffest thing, a foot of 0.12 kg in poppy seeds unloading, has a period of 14 ms. The bounds
-of the scene's keys keep it stable."""
+"""Time step. The shortest period, of a foot of 0.12 kg in poppy seeds on unloading, is 14 ms. The
+bounds of the scene's keys keep the integration stable."""
 
 LEG_M = 0.30
 _FOOT_SHARE = 0.13
@@ -25,26 +25,26 @@ _FOOT_SHARE = 0.13
 _STANDING_DAMPING, _PUSHING_DAMPING = 0.4, 0.1
 """Damping of the leg's spring, relative to critical (assumed: geared servos hold or drive it)."""
 _STOP = 40.0
-"""How many times stiffer than the spring the leg's end stop is; it is damped critically."""
-_FOLDED = 0.95  # of its length: a spring that is pressed further has no more travel
+"""Ratio of the stiffness of the leg's end stop, critically damped, to that of the spring."""
+_FOLDED = 0.95  # limit of the spring's compression, as a part of the leg's length
 _PUSH_S = 0.10
 _RETRACT_S = 0.12
 _STROKE_MAX_M = 0.20
-_LEFT_WITHIN_S = 0.6  # a push-off that takes longer is stuck
-_HEIGHT_TOLERANCE_M = 0.001  # of the hop, good enough for a drawn height
-_TRIES = 12  # of the regula falsi
+_LEFT_WITHIN_S = 0.6  # timeout of a push-off, after which the foot counts as stuck
+_HEIGHT_TOLERANCE_M = 0.001  # tolerance of the hop's height
+_TRIES = 12  # iterations of the regula falsi
 
 Angle = Callable[[float], float]
 
 
 @dataclass(frozen=True)
 class Strip:
-    """A strip of the sole, from side to side, at one place of its length.
+    """Transverse strip of the sole.
 
     Attributes:
-        x_m: forward of the ankle.
-        z_m: up the segment, so negative.
-        area_m2: of the strip; its normal points away from the ankle.
+        x_m: position forward of the ankle.
+        z_m: position up the segment from the ankle, so negative.
+        area_m2: area of the strip; its normal points away from the ankle.
     """
 
     x_m: float
@@ -59,12 +59,12 @@ class Strip:
 
 @dataclass(frozen=True)
 class Leg:
-    """What hops.
+    """Properties of a leg.
 
     Attributes:
-        mass_kg: of all of it.
-        stiffness_n_m: of its spring.
-        strips: of its sole.
+        mass_kg: total mass.
+        stiffness_n_m: stiffness of the spring.
+        strips: strips of the sole.
     """
 
     mass_kg: float
@@ -78,12 +78,12 @@ class Leg:
 
     @property
     def body_kg(self) -> float:
-        """Mass above it."""
+        """Mass above the spring."""
         return self.mass_kg - self.foot_kg
 
     @property
     def sole_m(self) -> float:
-        """From the ankle to the lowest of the sole, upright."""
+        """Distance from the ankle to the lowest point of the upright sole."""
         return max(-strip.z_m for strip in self.strips)
 
 
@@ -95,8 +95,8 @@ class Motion:
         t_s: time.
         ankle_m: height of the ankle above the ground's surface.
         body_m: height of the body.
-        stroke_m: by how much the leg is longer than at rest.
-        set_m: of each strip, see `SoftGround.stress_pa`.
+        stroke_m: extension of the leg beyond its rest length.
+        set_m: plastic set under each strip, see `SoftGround.stress_pa`.
     """
 
     t_s: float
@@ -108,12 +108,12 @@ class Motion:
     set_m: list[float] = field(default_factory=list)
 
     def copy(self) -> Motion:
-        """Another one, to try things with."""
+        """Return a deep copy, for trial motions."""
         return Motion(**(vars(self) | {"set_m": list(self.set_m)}))
 
 
 class Step(NamedTuple):
-    """What happened in one step.
+    """Recorded state and forces of one time step.
 
     Attributes:
         t_s: time.
@@ -122,7 +122,7 @@ class Step(NamedTuple):
         ankle_m_s: speed of the ankle upwards.
         body_m_s: speed of the body upwards.
         stress_pa: stress on each strip.
-        rest_n: vertical force of the ground that presses no strip.
+        rest_n: vertical force of the ground beside the strips.
     """
 
     t_s: float
@@ -135,12 +135,12 @@ class Step(NamedTuple):
 
 
 class HoppingLeg:
-    """A leg on its way.
+    """Simulation of a hopping leg.
 
     Args:
-        leg: what hops.
-        drop_m: height of the sole above the ground when it is let go.
-        t_s: when that is.
+        leg: properties of the leg.
+        drop_m: drop height of the sole above the ground.
+        t_s: time of the drop.
     """
 
     def __init__(self, leg: Leg, drop_m: float, t_s: float) -> None:
@@ -155,20 +155,20 @@ class HoppingLeg:
         self._touches = False
         self._damping = _STANDING_DAMPING
         self.release_m = self.centre_m(self.motion)
-        """Height of the centre of mass when it was let go."""
+        """Height of the centre of mass at the drop."""
 
     def centre_m(self, motion: Motion) -> float:
-        """Height of the centre of mass."""
+        """Compute the height of the centre of mass."""
         leg = self.leg
         return (leg.foot_kg * motion.ankle_m + leg.body_kg * motion.body_m) / leg.mass_kg
 
     def rising_m_s(self, motion: Motion) -> float:
-        """Speed of the centre of mass, upwards."""
+        """Compute the speed of the centre of mass, upwards."""
         leg = self.leg
         return (leg.foot_kg * motion.ankle_m_s + leg.body_kg * motion.body_m_s) / leg.mass_kg
 
     def fall(self, ground: SoftGround, angle: Angle) -> None:
-        """Fall until the sole touches the ground, which is untouched here."""
+        """Simulate the fall until the sole touches fresh ground."""
         self.motion.set_m = [0.0] * len(self.leg.strips)
         self._touches = False
         while not self._touches:
@@ -176,19 +176,19 @@ class HoppingLeg:
             self._step(self.motion, ground, angle, self.recorded)
 
     def stand(self, ground: SoftGround, angle: Angle, until_s: float) -> None:
-        """Land and stand."""
+        """Simulate landing and standing until `until_s`."""
         self._damping = _STANDING_DAMPING
         while self.motion.t_s < until_s:
             self._step(self.motion, ground, angle, self.recorded)
 
     def push_off(self, ground: SoftGround, angle: Angle, height_m: float) -> float:
-        """Leave the ground so that the centre of mass rises to `height_m`.
+        """Simulate a push-off whose stroke lets the centre of mass rise to `height_m`.
 
         Returns:
-            The stroke that this takes.
+            The stroke.
 
         Raises:
-            SceneError: there is none.
+            SceneError: no stroke is sufficient.
         """
         begin = self.motion
         self._damping = _PUSHING_DAMPING
@@ -197,7 +197,7 @@ class HoppingLeg:
         def missing_m(stroke_m: float) -> float:
             self.motion = begin.copy()
             self._push(ground, angle, stroke_m, None)
-            if self._touches:  # it stands stretched in the ground, which has not let go
+            if self._touches:  # the leg is fully extended and still in the ground
                 return stuck_m
             v = max(self.rising_m_s(self.motion), 0.0)
             return height_m - self.centre_m(self.motion) - v * v / (2 * GRAVITY_M_S2)
@@ -212,8 +212,8 @@ class HoppingLeg:
             )
         stroke_m = high_m
         for _ in range(_TRIES):
-            # Regula falsi with Illinois' halving. Sticky ground lets go at some stroke or not at
-            # all, so there may be none that fits; then it is the least that gets high enough.
+            # Regula falsi, Illinois algorithm. In sticky ground the height jumps at some stroke, so
+            # there may be no root; then use the smallest stroke that is high enough.
             stroke_m = (low_m * high - high_m * low) / (high - low)
             miss = missing_m(stroke_m)
             if abs(miss) < _HEIGHT_TOLERANCE_M:
@@ -229,7 +229,7 @@ class HoppingLeg:
         return stroke_m
 
     def rise(self, ground: SoftGround, angle: Angle) -> None:
-        """Fly until the highest point."""
+        """Simulate the flight to its highest point."""
         while self.rising_m_s(self.motion) > 0.0:
             self._retract()
             self._step(self.motion, ground, angle, self.recorded)
@@ -253,7 +253,7 @@ class HoppingLeg:
     def _step(
         self, motion: Motion, ground: SoftGround, angle: Angle, record: list[Step] | None
     ) -> None:
-        """One step: forces of the present, then speeds, then places (semi-implicit Euler)."""
+        """Integrate one step: forces, then speeds, then positions (semi-implicit Euler)."""
         known_s, angle_rad = self._angle
         if known_s != motion.t_s:
             angle_rad = angle(motion.t_s)
@@ -276,7 +276,7 @@ class HoppingLeg:
     def _ground_n(
         self, motion: Motion, ground: SoftGround, angle_rad: float, turn_rad: float
     ) -> tuple[list[float], float, float]:
-        """Stress on each strip, their vertical force, and that on the rest of the foot."""
+        """Compute the stress on each strip, their vertical force, and the rest of the foot's."""
         if motion.ankle_m >= self._reach_m:
             self._touches = False
             return [0.0] * len(self._strips), 0.0, 0.0
@@ -291,7 +291,7 @@ class HoppingLeg:
             sinking = turn_rad * (c * x_m + s * z_m) - ankle_m_s
             pa, set_m[i] = ground.stress_pa(depth_m, sinking, set_m[i])
             stress_pa.append(pa)
-            # The vertical part of its normal, cos(arc - angle), is below_m over its radius.
+            # The vertical component of the normal, cos(arc - angle), is below_m over the radius.
             press_n += pa * area_per_radius_m * below_m
             mean_depth_m += depth_m * area_m2
             gap_m = min(gap_m, set_m[i] - depth_m)
@@ -303,10 +303,10 @@ class HoppingLeg:
         return stress_pa, press_n, rest_n
 
     def _leg_n(self, motion: Motion) -> float:
-        """Push of the leg: a damped spring, and an end stop that pulls.
+        """Compute the leg's force: a damped spring, and in extension an end stop that pulls.
 
         Raises:
-            SceneError: it is pressed together all the way.
+            SceneError: the spring is compressed beyond its limit.
         """
         leg = self.leg
         k = leg.stiffness_n_m

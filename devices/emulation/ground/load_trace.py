@@ -1,9 +1,9 @@
-"""A recorded load, and how it is pressed on an array of tiles.
+"""Conversion of a recorded load to forces on an array of tiles.
 
-A trace gives either a force per tile, or a total force with its centre of pressure. In the second
-case, among the non-negative tile forces with this sum and moment the one with the least sum of
-squares is pressed. Ground truth is what was pressed, so moved and limited samples are counted;
-negative forces, which plates show as noise, press nothing.
+A trace has either a force per tile, or a total force with its centre of pressure. The latter is
+split into non-negative tile forces with this sum and moment and the least squares. The converted
+forces are the ground truth, so moved and limited samples are counted; negative forces, which are
+noise of plates, become zero.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from devices.arrays import Bools, Floats
 from devices.errors import LoadTraceError, UsageError
 
 FORCE_LIMIT_N = 120.0
-"""Four times what a tile is made for (paper III-A: 25 to 35 N); more is not pressed on it. Below it
-lie saturation of all parts and, for one in eight, the count that wraps."""
+"""Largest force on a tile, four times its rated load (paper III-A: 25 to 35 N). All parts saturate
+below it and, of one in eight, the count wraps."""
 
 TOUCH_S = 0.010
 """Ramp time for a trace that begins or ends under load."""
 
-_COP_NEEDED_FROM = 0.01  # of the greatest force: below it a centre of pressure may be missing
+_COP_NEEDED_FROM = 0.01  # part of the largest force below which the COP may be missing
 _NO_LOAD_N = 1e-12
-_EXACT = 1e4  # weight of sum and moment against the squares: they hold to 1e-8
+_EXACT = 1e4  # weight of sum and moment against the squares: exact to 1e-8
 _MOVED_M = 1e-6
 
 
 @dataclass(frozen=True)
 class LoadTrace:
-    """A recorded load; all arrays have time as the first axis.
+    """Recorded load; all arrays have time as the first axis.
 
     Attributes:
         where: name of the file, for messages.
         time_s: strictly increasing.
         cells_n: (n, cells), force per tile; None if the trace has a total force.
         fz_n: (n,), total force; None if the trace has cells for the array.
-        cop_m: (n, 2), its centre of pressure in the trace's own axes; NaN where undefined.
+        cop_m: (n, 2), centre of pressure in the trace's axes; NaN where undefined.
         angle_rad: (n,), segment angle; None if not recorded.
     """
 
@@ -52,9 +52,10 @@ class LoadTrace:
 
 @dataclass(frozen=True)
 class CopTransform:
-    """COP used = `scale` * (cop - c0) + `offset_m`, c0 being the trace's force-weighted mean COP.
+    """Transform of a trace's COP: `scale` * (cop - c0) + `offset_m`.
 
-    `axes` says which axis of the trace becomes x and which y of the foot, with sign: "xy", "-yx".
+    c0 is the trace's force-weighted mean COP. `axes` names the trace's axes that become x and y of
+    the foot, with signs: "xy", "-yx".
     """
 
     scale: float = 1.0
@@ -62,7 +63,7 @@ class CopTransform:
     axes: str = "xy"
 
     def matrix(self) -> Floats:
-        """Rows: foot x and y; columns: trace x and y.
+        """Return the matrix of the axes (rows: foot x and y; columns: trace x and y).
 
         Raises:
             UsageError: `axes` is not two different axes with optional signs.
@@ -70,7 +71,7 @@ class CopTransform:
         match = re.fullmatch(r"([+-]?)([xy])([+-]?)([xy])", self.axes)
         if match is None or match[2] == match[4]:
             raise UsageError(
-                f"--cop-axes {self.axes!r} names no two axes",
+                f"--cop-axes {self.axes!r} does not name two different axes",
                 expected="xy, yx, or one of these with signs such as -yx",
             )
         rows = np.zeros((2, 2))
@@ -81,15 +82,15 @@ class CopTransform:
 
 @dataclass(frozen=True)
 class PressedTrace:
-    """Tile forces over time as they are pressed, and what had to be changed to press them."""
+    """Tile forces over time, converted from a trace, with counts of changed samples."""
 
     time_s: Floats
     forces_n: Floats
     angle_rad: Floats | None
     moved_to_edge: int
-    """Samples whose centre of pressure lay outside the tiles' hull and was moved to its edge."""
+    """Number of samples whose COP lay outside the tiles' hull and was moved to its edge."""
     limited: int
-    """Samples where a tile would have borne more than `FORCE_LIMIT_N`."""
+    """Number of samples with a tile force above `FORCE_LIMIT_N`, which was limited."""
 
 
 def press(
@@ -101,14 +102,14 @@ def press(
     cop: CopTransform,
     lead_s: float,
 ) -> PressedTrace:
-    """Turn a trace into forces on tiles, beginning at `lead_s`.
+    """Convert a trace to forces on tiles, beginning at `lead_s`.
 
     Args:
-        trace: the recorded load.
-        positions_m: (tiles, 2), where the tiles are.
+        trace: recorded load.
+        positions_m: (tiles, 2), positions of the tiles.
         bears: (tiles,), False for bare reference tiles, which get no force.
         load_scale: factor on every force.
-        cop: how the trace's centre of pressure becomes the foot's.
+        cop: transform of the trace's centre of pressure to the foot's.
         lead_s: seconds without load before it.
 
     Raises:
@@ -173,7 +174,7 @@ def _share(
     cop_m = np.where(defined[:, None], trace.cop_m - centre_m, 0.0)
     wanted_m = cop.scale * cop_m @ cop.matrix().T + np.array(cop.offset_m)
 
-    # A line array knows one axis only; the other one is dropped.
+    # A line array has one axis only; the other one is dropped.
     axes = np.ptp(positions_m, axis=0) > 1e-9
     shares = np.zeros((len(fz_n), len(positions_m)))
     moved = 0
@@ -184,7 +185,11 @@ def _share(
 
 
 def _least_squares_shares(positions_m: Floats, cop_m: Floats) -> tuple[Floats, bool]:
-    """Non-negative shares of sum one with their centroid at `cop_m` or nearest to it."""
+    """Compute non-negative shares of sum one with their centroid nearest to `cop_m`.
+
+    Returns:
+        The shares, and whether the centroid had to be moved.
+    """
     from scipy.optimize import nnls
 
     tiles, axes = positions_m.shape

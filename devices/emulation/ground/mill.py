@@ -1,7 +1,7 @@
-"""The mill: a spindle presses one tile after another against a reference force sensor.
+"""Indenter: a spindle presses one tile after another against a reference force sensor.
 
-`Indentation` is its programme, a ground like any other; `Mill` is what stands beside the tiles: the
-reference sensor, and the operator who notes what is being done.
+`Indentation` is its programme, a ground like any other; `Mill` is the reference sensor, with the
+operator's notes.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ _MILL_NOISE_N = 0.02
 
 
 class Indentation(Ground):
-    """The mill: slow repeats, held loads released at once, taps, and a soak at two temperatures.
+    """Programme of the indenter: slow strokes, holds with quick release, taps, and a thermal soak.
 
-    One tile after another is pressed by the spindle; `phases` says what the spindle does.
+    The spindle presses one tile after another; `PHASES` names the actions. The soak is at two
+    temperatures.
     """
 
     _HOLDS = 5
@@ -86,7 +87,7 @@ class Indentation(Ground):
         return np.minimum(np.searchsorted(self._ends, t_s, side="right"), len(self._ends) - 1)
 
     def forces_n(self, t_s: Floats) -> Floats:
-        """The spindle's force on the tile under it, zero on all others."""
+        """Compute the spindle's force on the tile under it, zero on all others."""
         forces_n = np.zeros((len(t_s), len(self.serials)))
         tile = self.pressed_tile(t_s)
         rows = np.flatnonzero(tile >= 0)
@@ -94,7 +95,7 @@ class Indentation(Ground):
         return forces_n
 
     def spindle_n(self, t_s: float) -> float | None:
-        """Force of the spindle; None where it stands over no tile."""
+        """Compute the force of the spindle; None between tiles."""
         segment = bisect_right(self._time_s, t_s) - 1
         if segment >= len(self._tile) or self._tile[segment] < 0:
             return None
@@ -103,21 +104,21 @@ class Indentation(Ground):
         return begin_n + (t_s - begin_s) / (end_s - begin_s) * (end_n - begin_n)
 
     def pressed_tile(self, t_s: Floats) -> npt.NDArray[np.intp]:
-        """Index of the tile under the spindle; -1 for none."""
+        """Return the index of the tile under the spindle; -1 for none."""
         return np.asarray(self._tiles_of[self._segment(t_s)])
 
     def phase(self, t_s: Floats) -> npt.NDArray[np.intp]:
-        """Index into `PHASES`."""
+        """Return the index into `PHASES`."""
         return np.asarray(self._phases_of[self._segment(t_s)])
 
 
 class Mill:
-    """The reference force sensor of the indentation rig, with its own noise, and the operator.
+    """Reference force sensor of the indenter, with its noise, and the operator's notes.
 
     Args:
-        ground: the programme.
-        seconds: time of the scene at instants of the clock in ns.
-        rng: draws the amplifier's noise.
+        ground: programme of the indenter.
+        seconds: converts instants of the clock in ns to seconds of the scene.
+        rng: random generator of the amplifier's noise.
     """
 
     def __init__(
@@ -131,9 +132,9 @@ class Mill:
         self._rng = rng
 
     def adc(self, reference: ReferenceScene, clock: Clock) -> EmulatedMcp3208:
-        """A converter with the sensor's amplifier at the input that `reference` names.
+        """Create a converter with the sensor's amplifier at the input that `reference` names.
 
-        Where the spindle presses no tile the sensor bears nothing, and reads about zero.
+        Between tiles the sensor is unloaded, and reads about zero.
         """
         volts = amplifier_volts(self._borne_n, reference, noise_n=self._noise_n)
         return EmulatedMcp3208(volts, clock, vref_v=reference.vref_v)
@@ -145,7 +146,7 @@ class Mill:
         return _MILL_NOISE_N * float(self._rng.standard_normal())
 
     def notes(self, t_mono_ns: Times) -> dict[str, npt.NDArray[np.object_]]:
-        """What the mill's operator notes at each instant.
+        """Return the operator's notes at each instant.
 
         Returns:
             `pressed_tile`, serial of the tile under the spindle or None, and `phase`.

@@ -1,18 +1,18 @@
-"""How ground that gives way resists the strips of a sole: granular matter, and mud.
+"""Resistance of soft ground (granular matter, mud) to the strips of a sole.
 
-Vertical motion only. What a strip feels is a stress, in Pa, normal to it:
+Vertical motion only. The stress on a strip, in Pa, normal to it, consists of:
 
-* **Strength**, proportional to depth, as resistive force theory has it for a flat plate: Li, Zhang
-  and Goldman, "A terradynamics of legged locomotion on granular media", Science 339, 1408 (2013);
-  poppy seeds are of the order of 0.3 N/cm^3. It is plastic: a strip that rises by a little has no
-  load any more, and one that sinks again finds the strength where it left it.
-* **Inertia** of what is pushed aside, proportional to the square of the speed, added to the
+* **Strength**, proportional to depth, as in resistive force theory for a flat plate: Li, Zhang and
+  Goldman, "A terradynamics of legged locomotion on granular media", Science 339, 1408 (2013); poppy
+  seeds are of the order of 0.3 N/cm^3. It is plastic: a strip that rises a little is unloaded, and
+  on sinking again meets the strength at its former depth.
+* **Inertia** of the displaced matter, proportional to the square of the speed, added to the
   strength: Katsuragi and Durian, "Unified force law for granular impact cratering", Nature Physics
   3, 420 (2007).
-* In mud also **viscosity** under the sole, and forces on the whole foot that reach no strip:
-  viscous drag on its sides, suction while it is pulled out, buoyancy. That mud has all of these:
-  Chen et al., "A foot resistive force model for legged locomotion on muddy terrains",
-  arXiv:2604.12006 (2026); how large they are differs by orders of magnitude with its water.
+* In mud also **viscosity** under the sole, and forces on the whole foot beside the strips: viscous
+  drag on its sides, suction while it is pulled out, buoyancy. Source for all of these: Chen et al.,
+  "A foot resistive force model for legged locomotion on muddy terrains", arXiv:2604.12006 (2026);
+  their size differs by orders of magnitude with the mud's water.
 
 Assumed, without a source of their own: the unloading stiffness, the depth over which a touching
 strip is wetted, and every number of the mud but its density (hardware.md 9: 1.5 to 1.8 kPa per
@@ -31,27 +31,27 @@ from devices.scene.emulated import MudGround, PoppyGround
 GRAVITY_M_S2 = 9.81
 _PA_M_PER_N_CM3 = 1e6
 _WETTED_M = 0.002
-"""A strip is flat neither in itself nor against grains of a millimetre: it is in full touch when it
-is this deep. At 1.4 m/s that is 1.4 ms."""
+"""Depth of full contact: neither the strip nor the grains, a millimetre large, are flat. It takes
+1.4 ms at 1.4 m/s."""
 _FOOT_M = 0.02
-"""Thickness of the foot: buoyancy grows no deeper than that."""
+"""Thickness of the foot, the depth of full buoyancy."""
 _SUCKS_M = 0.004
 _SUCKS_M_S = 0.05
-"""Pulled more slowly than this, mud flows in as the gap opens."""
+"""Speed of pulling below which mud mostly fills the gap as it opens."""
 
 
 @dataclass(frozen=True)
 class SoftGround:
-    """What one place of the ground is like. `SoftGround.of` makes it from a scene.
+    """Properties of the ground at one place. `SoftGround.of` derives them from a scene.
 
     Attributes:
         strength_pa_m: strength per metre of depth.
-        unloading: how many times stiffer it is in unloading than in sinking in.
-        inertia_kg_m3: density of what is pushed aside, times its drag coefficient.
+        unloading: ratio of the stiffness in unloading to that in penetration.
+        inertia_kg_m3: density of the displaced matter, times its drag coefficient.
         viscous_pa_s_m: stress under the sole per speed of sinking.
         side_n_s_m2: viscous drag on the sides of foot and leg per speed and depth.
-        suction_pa: the most that sucks at the sole while it is pulled out.
-        head_pa_m: hydrostatic pressure per metre of depth; 0: none, it is no liquid.
+        suction_pa: largest suction at the sole while it is pulled out.
+        head_pa_m: hydrostatic pressure per metre of depth; 0: no liquid.
     """
 
     strength_pa_m: float
@@ -64,7 +64,7 @@ class SoftGround:
 
     @classmethod
     def of(cls, ground: PoppyGround | MudGround, firmness: float = 1.0) -> SoftGround:
-        """A place of a scene's ground, `firmness` times as strong as its scene says."""
+        """Derive a place of a scene's ground, `firmness` times as strong as in the scene."""
         strength_pa_m = firmness * ground.strength_n_per_cm3 * _PA_M_PER_N_CM3
         if isinstance(ground, PoppyGround):
             # Grains of 1.0 g/cm^3, 58 % of the volume when loosely packed; drag coefficient 1.5.
@@ -75,21 +75,21 @@ class SoftGround:
             strength_pa_m,
             unloading=10.0,
             inertia_kg_m3=1.0 * head_pa_m / GRAVITY_M_S2,
-            # Of a disc in creeping flow 16 eta r v over pi r^2, half of it in front of the disc.
+            # Drag of a disc in creeping flow: 16 eta r v over pi r^2, half of it in front.
             viscous_pa_s_m=8.0 / math.pi * ground.viscosity_pa_s / half_width_m,
-            # Sheared in a gap of 2 cm along the sole's edge, four sides long.
+            # Shear in a gap of 2 cm along the sole's four edges.
             side_n_s_m2=ground.viscosity_pa_s * 8.0 * half_width_m / 0.02,
             suction_pa=ground.suction_kpa * 1e3,
             head_pa_m=head_pa_m,
         )
 
     def stress_pa(self, depth_m: float, sinking_m_s: float, set_m: float) -> tuple[float, float]:
-        """Stress on a strip, never negative, and its set.
+        """Compute the stress on a strip, never negative, and its new plastic set.
 
         Args:
-            depth_m: of the strip below the surface.
-            sinking_m_s: how fast it sinks.
-            set_m: depth at which the strip would bear nothing, from what it did before; 0 in
+            depth_m: depth of the strip below the surface.
+            sinking_m_s: its speed of sinking.
+            set_m: plastic set: depth at which the strip is unloaded, from its earlier motion; 0 in
                 untouched ground.
         """
         if depth_m <= 0.0:
@@ -97,7 +97,7 @@ class SoftGround:
         strength_pa = self.strength_pa_m * depth_m
         stiffness_pa_m = self.unloading * self.strength_pa_m
         stress_pa = stiffness_pa_m * (depth_m - set_m)
-        if stress_pa < strength_pa:  # unloaded, or loaded again: the grains hold still
+        if stress_pa < strength_pa:  # elastic: unloading or reloading
             return max(stress_pa, 0.0), set_m
         if sinking_m_s > 0.0:
             wetted = min(depth_m / _WETTED_M, 1.0)
@@ -111,12 +111,12 @@ class SoftGround:
     def on_the_foot_n(
         self, depth_m: float, sinking_m_s: float, gap_m: float, sole_m2: float
     ) -> float:
-        """Vertical force on the whole foot that presses no strip; negative pulls it down.
+        """Compute the vertical force on the whole foot beside the strips; negative: downwards.
 
         Args:
-            depth_m: of the middle of the sole.
-            sinking_m_s: how fast it sinks; negative while it is pulled out.
-            gap_m: between the sole and its bed; 0 while any strip bears.
+            depth_m: depth of the middle of the sole.
+            sinking_m_s: its speed of sinking; negative while it is pulled out.
+            gap_m: gap between the sole and its bed; 0 while any strip bears load.
             sole_m2: area of the sole.
         """
         if depth_m <= 0.0 or self.head_pa_m == 0.0:
@@ -128,7 +128,7 @@ class SoftGround:
         return force_n
 
     def suction_at_pa(self, gap_m: float, rising_m_s: float) -> float:
-        """Suction on a rising sole: greatest at `_SUCKS_M`, gone when the gap has filled."""
+        """Compute the suction on a rising sole: largest at `_SUCKS_M`, zero in a filled gap."""
         part = gap_m / _SUCKS_M
         flow = rising_m_s / (rising_m_s + _SUCKS_M_S)
         return self.suction_pa * part * math.exp(1.0 - part) * flow

@@ -1,1 +1,1 @@
-"""Instruments under the foot: a force plate and a pressure plate, with clocks of their own."""
+"""Emulated instruments under the foot: force plate and pressure plate, with separate clocks."""

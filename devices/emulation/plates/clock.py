@@ -1,4 +1,4 @@
-"""The clock of an instrument that is started by hand: it begins when it likes, and drifts."""
+"""Clock of an instrument that is started by hand, with an unknown start and a drift."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from devices.arrays import Floats
 
 @dataclass(frozen=True)
 class PlateClock:
-    """Samples of an instrument.
+    """Sample clock of an instrument.
 
     Attributes:
-        rate_hz: as it states.
-        start_s: when its first sample is, in seconds of the scene.
-        drift_ppm: by how much it goes too fast.
+        rate_hz: nominal sample rate.
+        start_s: instant of the first sample, in seconds of the scene.
+        drift_ppm: excess of the real rate.
     """
 
     rate_hz: float
@@ -24,10 +24,11 @@ class PlateClock:
     drift_ppm: float
 
     def samples(self, end_s: float) -> tuple[Floats, Floats]:
-        """Samples until the scene's `end_s`: their times by the instrument, and by the scene.
+        """Compute the sample times until the scene's `end_s`.
 
         Returns:
-            Both (n,), from zero and from `start_s` on; empty if it ends before it starts.
+            Times by the instrument, from zero, and by the scene, from `start_s`, both (n,); empty
+            if `end_s` is before the start.
         """
         goes = 1.0 + 1e-6 * self.drift_ppm
         n = max(0, int((end_s - self.start_s) * goes * self.rate_hz))

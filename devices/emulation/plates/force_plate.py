@@ -1,8 +1,8 @@
-"""A small force plate with six channels, as it is on paper and a little beside that.
+"""Emulated small force plate with six channels and realistic errors.
 
-A plate is a spring with a mass on it; its amplifier has a low-pass filter. Channels mix, have a
-gain of their own, an offset that creeps, noise, and steps of a converter. Where the numbers are
-from, and how sure they are, is in hardware.md 11.
+The plate is a mass on a spring; its amplifier has a low-pass filter. Channels have crosstalk, gain
+errors, a drifting offset, noise, and quantization. Sources and confidence of the numbers are in
+hardware.md 11.
 """
 
 from __future__ import annotations
@@ -21,45 +21,46 @@ from devices.emulation.plates.underfoot import FORCES, MOMENTS, VERTICAL
 CHANNELS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
 RATE_HZ = 1000.0
 RANGE = np.array([125.0, 125.0, 250.0, 12.0, 12.0, 6.0])
-"""Of the channels, either way, in N and N m."""
+"""Range of the channels, either way, in N and N m."""
 BITS = 16
 NATURAL_HZ, DAMPING = 400.0, 0.05
 FILTER_HZ = 300.0
-"""Butterworth, second order."""
+"""Corner frequency of the low-pass filter: Butterworth, second order."""
 GAIN = 0.005
-"""Of a channel's own gain, at the most."""
+"""Largest gain error of a channel, relative."""
 CROSSTALK, CROSSTALK_OF_VERTICAL = 0.02, 0.005
-"""Part of a load that another force, or another moment, shows of it, at the most."""
+"""Largest crosstalk from a force to another, or from a moment to another; from the vertical force.
+"""
 LEVER_M = 0.0005
-"""Moment that a newton shows, at the most."""
+"""Largest moment shown per newton."""
 WHITE, SLOW = 4e-4, 2e-4
 """Standard deviations of the noise, in parts of the range."""
 SLOW_S = 3.0
 OFFSET = 4e-3
-"""After it was set to zero by hand, in parts of the range."""
+"""Largest offset after zeroing by hand, in parts of the range."""
 CREEP_PER_S = 4e-5
-"""Of that offset, in parts of the range."""
+"""Largest drift of that offset, in parts of the range per second."""
 STATED_SIGMA_N = 0.25
-"""Standard uncertainty of a vertical force of some 20 N once the zero is off, as a user would put
-together from the above: noise, a uniform gain within half a per cent, crosstalk of 2 N."""
+"""Standard uncertainty of a vertical force of some 20 N after subtraction of the zero, as a user
+would combine it: noise, a uniform gain within half a per cent, crosstalk of 2 N."""
 DRIFT_PPM = 50.0
 LATEST_S = 0.4
 
 Complexes = npt.NDArray[np.complex128]
 
-_FINER = 4  # the filters are computed on samples so much closer
-_PAD_S = 0.1  # in which what they remember from before has died away
+_FINER = 4  # oversampling of the filters
+_PAD_S = 0.1  # lead-in for the filters' transients
 
 
 @dataclass(frozen=True)
 class ForcePlate:
-    """One plate in one trial.
+    """Force plate in one trial.
 
     Attributes:
-        clock: its own.
-        mixing: (6, 6), what each channel shows of each load.
-        offset: (6,), at the first sample.
-        creep_per_s: (6,), of the offset.
+        clock: clock of the plate.
+        mixing: (6, 6), sensitivity of each channel to each load.
+        offset: (6,), offset at the first sample.
+        creep_per_s: (6,), drift of the offset.
     """
 
     clock: PlateClock
@@ -69,7 +70,7 @@ class ForcePlate:
 
     @classmethod
     def drawn(cls, plate: np.random.Generator, trial: np.random.Generator) -> ForcePlate:
-        """A plate, and how it was set up for a trial; each is drawn by its own generator."""
+        """Draw a plate's properties and the set-up of a trial, each by its own generator."""
         mixing = np.eye(6) * (1.0 + GAIN * plate.uniform(-1.0, 1.0, 6))
         part = CROSSTALK * plate.uniform(-1.0, 1.0, (6, 6))
         part[:, VERTICAL] *= CROSSTALK_OF_VERTICAL / CROSSTALK
@@ -90,21 +91,21 @@ class ForcePlate:
 
     @property
     def delay_s(self) -> float:
-        """How late slow loads are shown: the spring's delay and the filter's."""
+        """Delay of slow loads: the spring's and the filter's."""
         return DAMPING / (math.pi * NATURAL_HZ) + math.sqrt(0.5) / (math.pi * FILTER_HZ)
 
     def record(
         self, wrench: Callable[[Floats], Floats], end_s: float, noise: np.random.Generator
     ) -> tuple[Floats, Floats]:
-        """What it writes down of a load until `end_s` of the scene.
+        """Simulate a recording of a load until `end_s` of the scene.
 
         Args:
             wrench: forces and moments at instants of the scene, (n, 6).
-            end_s: when it is stopped.
-            noise: draws it.
+            end_s: end of the recording.
+            noise: random generator of the noise.
 
         Returns:
-            Times by its own clock (n,), and its channels (n, 6).
+            Times by the plate's clock (n,), and its channels (n, 6).
         """
         time_s, t_s = self.clock.samples(end_s)
         shown = self._filtered(wrench, t_s) @ self.mixing.T
@@ -115,7 +116,7 @@ class ForcePlate:
         return time_s, np.asarray(np.clip(np.rint(shown / step) * step, -RANGE, RANGE - step))
 
     def _filtered(self, wrench: Callable[[Floats], Floats], t_s: Floats) -> Floats:
-        """The load through spring and filter, exactly, as both are linear."""
+        """Apply spring and filter to the load, exactly, as both are linear."""
         if not len(t_s):
             return np.zeros((0, 6))
         step_s = 1.0 / (_FINER * self.clock.rate_hz * (1.0 + 1e-6 * self.clock.drift_ppm))
@@ -129,7 +130,7 @@ class ForcePlate:
         return np.asarray(np.fft.irfft(spectrum, len(fine_s), axis=0)[before::_FINER])
 
     def _slow(self, n: int, noise: np.random.Generator) -> Floats:
-        """Noise of unit variance that lasts `SLOW_S`: straight lines between knots."""
+        """Draw noise of unit variance with correlation time `SLOW_S`, linear between knots."""
         decay = math.exp(-0.1)
         knot_s = 0.1 * SLOW_S
         knots = noise.standard_normal((2 + int(n / (self.clock.rate_hz * knot_s)), 6))

@@ -1,8 +1,8 @@
-"""A pressure plate: a matrix of cells, each with a gain of its own, a threshold and an end.
+"""Emulated pressure plate: a matrix of cells with individual gains, a threshold and a limit.
 
-The foot touches it through its domes. Each makes a round patch whose pressure is that of an elastic
-sphere on a plane (Hertz); its middle stays where the dome comes down, and its radius is no larger
-than the dome's. Where the numbers are from, and how sure they are, is in hardware.md 11.
+The domes touch it. Each makes a round patch with the pressure of an elastic sphere on a plane
+(Hertz), whose middle is the dome's place on the plate and whose radius is at most the dome's.
+Sources and confidence of the numbers are in hardware.md 11.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from devices.emulation.plates.underfoot import Underfoot
 RATE_HZ = 100.0
 PITCH_M = 0.005
 THRESHOLD_KPA, END_KPA, STEP_KPA = 10.0, 1270.0, 2.5
-"""Less is shown as nothing, more as this; and steps between."""
+"""Threshold below which a cell shows zero, largest value, and resolution."""
 NOISE_KPA = 1.0
 CELL_GAIN, GAIN = 0.03, 0.01
 """Standard deviations of a cell's gain, and of the whole plate's, relative."""
 PLACED_M, TURNED_RAD = 0.0005, math.radians(1.0)
-"""Standard deviations of where the foot is put on its mark, by axis, and how it is turned."""
+"""Standard deviations of the foot's placement on its mark, by axis, and of its rotation."""
 STATED_SIGMA_N = 0.25
 """Standard uncertainty of a sum of some 9 N: noise and steps of 30 cells, thresholds, gains."""
 STATED_COP_SIGMA_M = 0.001
-"""Of each coordinate of the COP: placement, a degree at the foot's ends, cells and their gains."""
+"""Standard uncertainty of a COP coordinate: placement, rotation, cells and their gains."""
 DRIFT_PPM = 50.0
 LATEST_S = 0.4
 
@@ -36,21 +36,21 @@ _MARGIN_M = 0.02
 _DOME_RADIUS_M = 0.0055
 _MODULUS_PA = 2.17e6 / (
     1.0 - 0.5**2
-)  # of the paper's Vytaflex 60, incompressible, on a rigid plate
+)  # modulus of the paper's Vytaflex 60, incompressible, on a rigid plate
 _POINTS = 61
 _GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True)
 class PressurePlate:
-    """One plate in one trial.
+    """Pressure plate in one trial.
 
     Attributes:
-        clock: its own.
-        origin_m: (2,), the middle of the first cell, by the mark on which the foot is put.
-        gains: (cells along x, cells along y), of force shown for force.
-        placed_m: (2,), where on the mark the foot is.
-        turned_rad: how it is turned, to the left.
+        clock: clock of the plate.
+        origin_m: (2,), middle of the first cell, relative to the mark for the foot.
+        gains: (cells along x, cells along y), gains of force.
+        placed_m: (2,), position of the foot relative to the mark.
+        turned_rad: rotation of the foot, to the left.
     """
 
     clock: PlateClock
@@ -63,7 +63,7 @@ class PressurePlate:
     def drawn(
         cls, places_m: Floats, plate: np.random.Generator, trial: np.random.Generator
     ) -> PressurePlate:
-        """A plate around places (tiles, 2), and how the foot was put on it in a trial."""
+        """Draw a plate around places (tiles, 2), and the placement of the foot in a trial."""
         cells = np.ceil((np.abs(places_m).max(axis=0) + _MARGIN_M) / PITCH_M).astype(int)
         whole = 1.0 + GAIN * plate.standard_normal()
         return cls(
@@ -81,10 +81,10 @@ class PressurePlate:
     def record(
         self, foot: Underfoot, end_s: float, noise: np.random.Generator
     ) -> tuple[Floats, Floats]:
-        """What it writes down of a foot until `end_s` of the scene.
+        """Simulate a recording of a foot until `end_s` of the scene.
 
         Returns:
-            Times by its own clock (n,), and forces (n, cells along x, cells along y).
+            Times by the plate's clock (n,), and forces (n, cells along x, cells along y).
         """
         time_s, t_s = self.clock.samples(end_s)
         cosine, sine = math.cos(self.turned_rad), math.sin(self.turned_rad)
@@ -98,7 +98,7 @@ class PressurePlate:
         return time_s, np.where(kpa < THRESHOLD_KPA, 0.0, kpa) * n_per_kpa
 
     def _pressed_n(self, vertical_n: Floats, places_m: Floats) -> Floats:
-        """What each cell bears, (n, cells along x, cells along y); beside the plate is nothing."""
+        """Compute the load of each cell, (n, cells along x, cells along y); none off the plate."""
         shape = (len(vertical_n), *self.gains.shape)
         total = np.zeros(math.prod(shape))
         radius_m = patch_radius_m(vertical_n)
@@ -114,15 +114,15 @@ class PressurePlate:
 
 
 def patch_radius_m(force_n: Floats) -> Floats:
-    """Radius of the patch that a dome makes on a plane under a force."""
+    """Compute the radius of a dome's contact patch on a plane under a force."""
     cubed = 0.75 * np.maximum(force_n, 0.0) * _DOME_RADIUS_M / _MODULUS_PA
     return np.asarray(np.minimum(np.cbrt(cubed), _DOME_RADIUS_M))
 
 
 def _spread() -> Floats:
-    """Points of a patch of radius 1 that bear the same force each, (points, 2).
+    """Compute points of a patch of radius 1 with equal forces, (points, 2).
 
-    Within a radius r is the part 1 - (1 - r^2)^(3/2) of the force (Hertz).
+    The part 1 - (1 - r^2)^(3/2) of the force is within a radius r (Hertz).
     """
     part = (np.arange(_POINTS) + 0.5) / _POINTS
     radius = np.sqrt(1.0 - (1.0 - part) ** (2.0 / 3.0))

@@ -1,7 +1,7 @@
-"""What a foot does to a plate under it, as a function of time.
+"""Load of a foot on a plate under it, as a function of time.
 
-Axes are the laboratory's: x forward, y left, z up; forces are those of the ground on the foot, in
-newtons, moments about the plate's middle, in its surface. The foot's middle stands over it.
+Laboratory axes: x forward, y left, z up; forces of the ground on the foot, in newtons; moments
+about the middle of the plate's surface. The foot's middle is over it.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ VERTICAL = 2
 
 _SEEN_AS = {"force plate": {"none", "plate", "rolling", "trace", "poppy", "mud"}}
 _SEEN_AS["pressure plate"] = _SEEN_AS["force plate"] - {"poppy", "mud"}
-"""Grounds under which an instrument can lie: no footprint comes through seeds or mud."""
+"""Grounds with which an instrument can be used: no footprint passes through seeds or mud."""
 
 
 class Underfoot:
-    """A foot on a plate.
+    """Load of a foot on a plate.
 
-    An arc rolls without slipping, so each dome comes down on one place of the plate: as far from
-    the middle as its arc is long. What no dome bears comes down in the middle.
+    An arc rolls without slipping, so each dome touches the plate at one place, whose distance from
+    the middle is the dome's arc length. Load beside the domes acts in the middle.
 
     Args:
-        ground: of the scene.
-        positions_m: (tiles, 3), in the foot frame.
+        ground: ground of the scene.
+        positions_m: (tiles, 3), positions in the foot frame.
     """
 
     def __init__(self, ground: Ground, positions_m: Floats) -> None:
@@ -39,14 +39,14 @@ class Underfoot:
         if ground.arc_rad is not None:
             x_m = np.hypot(x_m, z_m) * ground.arc_rad
         self.places_m = np.stack([x_m, y_m], axis=1)
-        """(tiles, 2), where on the plate each dome comes down."""
+        """Position on the plate at which each dome touches it, (tiles, 2)."""
 
     def vertical_n(self, t_s: Floats) -> Floats:
-        """Vertical force under each dome, (n, tiles)."""
+        """Compute the vertical force under each dome, (n, tiles)."""
         return np.asarray(self._ground.forces_n(t_s) * np.cos(self._ground.tilt_rad(t_s)))
 
     def wrench(self, t_s: Floats) -> Floats:
-        """Forces and moments of the whole foot, (n, 6): x, y, z of each."""
+        """Compute forces and moments of the whole foot, (n, 6): x, y, z of each."""
         forces_n, tilt_rad = self._ground.forces_n(t_s), self._ground.tilt_rad(t_s)
         up_n, back_n = forces_n * np.cos(tilt_rad), forces_n * np.sin(tilt_rad)
         x_m, y_m = self.places_m.T
@@ -62,14 +62,14 @@ class Underfoot:
 
 
 def check_seen(instrument: str, scene: Scene) -> None:
-    """Refuse a plate that would see nothing of a scene.
+    """Check that a plate can measure the load of a scene.
 
     Args:
         instrument: "force plate" or "pressure plate".
-        scene: which.
+        scene: the scene file.
 
     Raises:
-        UsageError: its ground lies on no such plate.
+        UsageError: the plate cannot be used with its ground.
     """
     kinds = _SEEN_AS[instrument]
     if scene.ground.kind not in kinds:

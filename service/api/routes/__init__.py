@@ -1,1 +1,1 @@
-"""The HTTP API, a module for each kind of thing. No rule of a session is here."""
+"""HTTP API, one module per resource. Rules of sessions are elsewhere."""

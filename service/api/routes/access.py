@@ -1,4 +1,4 @@
-"""What routes share: the server they serve, its files, and the problems they document."""
+"""Shared parts of routes: server state, files, entity tags, documented problems."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
 
 
 def problems(**meanings: str) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries of the problems a route may answer with: `problems(_404="no such node")`."""
+    """Return OpenAPI entries of a route's problems: `problem_responses(_404="No such node.")`."""
     return {
         int(status.removeprefix("_")): {"description": meaning, **_SCHEMA}
         for status, meaning in meanings.items()
@@ -31,18 +31,18 @@ def problems(**meanings: str) -> dict[int | str, dict[str, Any]]:
 
 
 def present(path: Path) -> Path:
-    """A file of a sealed session, which may have been taken away.
+    """Return the path of a sealed session's file if the file exists.
 
     Raises:
-        UnknownError: it is not there.
+        UnknownError: it does not exist.
     """
     if not path.is_file():
-        raise UnknownError(f"the file {path.name} has been taken away", where=str(path))
+        raise UnknownError(f"the file {path.name} is missing", where=str(path))
     return path
 
 
 _DATED_S = (-62_135_596_800, 253_402_300_799)
-"""The first second of the year 1 and the last one of 9999: `Last-Modified` can state no others."""
+"""First second of the year 1 and last one of 9999: `Last-Modified` can state no others."""
 
 
 def file_answer(path: Path, **about: Any) -> FileResponse:
@@ -54,11 +54,11 @@ def file_answer(path: Path, **about: Any) -> FileResponse:
 
 
 def stored_table(session: Session, path: Path) -> FileResponse:
-    """A table that lies beside a session's frames, as it is.
+    """Answer with a session's stored table as it is.
 
     Raises:
         StateError: it is written when the session is sealed.
-        UnknownError: it has been taken away.
+        UnknownError: the file does not exist.
     """
     if session.sha256 is None:
         raise StateError(
@@ -76,7 +76,7 @@ def _server(request: Request) -> Server:
 
 
 class SecondsQuery(BaseModel):
-    """Which time of a session."""
+    """Time interval of a session."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -84,30 +84,31 @@ class SecondsQuery(BaseModel):
         default=None, description="Seconds after the first frame."
     )
     end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
-        default=None, description="Up to, not including, so many seconds after the first frame."
+        default=None, description="End, not included, in seconds after the first frame."
     )
 
 
 def has_it(request: Request, tag: str) -> bool:
-    """Does If-None-Match name this entity tag, without its quotes?"""
-    given = request.headers.get("if-none-match", "")
-    return any(t.strip().removeprefix("W/") in (f'"{tag}"', "*") for t in given.split(","))
+    """Return whether If-None-Match names this entity tag, given without quotes."""
+    header = request.headers.get("if-none-match", "")
+    return any(t.strip().removeprefix("W/") in (f'"{tag}"', "*") for t in header.split(","))
 
 
 ServerState = Annotated[Server, Depends(_server)]
 
-CHANGED = problems(_412="Somebody else has changed it: it is not what If-Match names.")
+CHANGED = problems(_412="It was changed meanwhile: its revision is not that in If-Match.")
 FULL = problems(_507="The data folder cannot be written.")
 
 IfMatch = Annotated[
-    str | None, Header(description="`said` of what is changed, as it was when you looked at it.")
+    str | None,
+    Header(description="Revision that you have seen (`said`); else the change is refused."),
 ]
 IdempotencyKey = Annotated[
     str | None,
     Header(
-        description="Yours, new for each recording: the same request with the same key, sent "
-        "again, is answered with what the first one has begun, and begins nothing. It is kept with "
-        "what it began, for as long as that is.",
+        description="Key of your choice, new for each recording: a repeated request with the same"
+        " key is answered with the result of the first one, and creates nothing. The "
+        "key is stored with its session.",
         pattern=r"^[!-~]{1,200}$",
         examples=["8e03978e-40d5-43dd-bc93-6894a57f9324"],
     ),
@@ -115,18 +116,18 @@ IdempotencyKey = Annotated[
 
 
 def tag_of(if_match: str | None) -> str | None:
-    """What is expected, of an `If-Match` with or without quotes; any is none."""
-    said = (if_match or "").strip().removeprefix("W/").strip('"')
-    return None if said in ("", "*") else said
+    """Return the revision in an `If-Match`, with or without quotes; None for `*` or no header."""
+    revision = (if_match or "").strip().removeprefix("W/").strip('"')
+    return None if revision in ("", "*") else revision
 
 
 def asked_with(key: str | None, what: str, body: BaseModel) -> Asked | None:
-    """A request as it is told from others; None: it came without a key.
+    """Return the record of a request with its key; None without a key.
 
     Args:
         key: its `Idempotency-Key`, with or without quotes.
-        what: it asks for.
-        body: as it was understood, so that how it is written does not matter.
+        kind: kind of the request.
+        body: parsed body, so that its spelling does not matter.
     """
     if key is None:
         return None

@@ -1,4 +1,4 @@
-"""Calibrations that the server keeps: uploaded, fitted here, downloaded, and used for a node."""
+"""Routes of calibrations: upload, fit, download, assign."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from service.sessions.pipeline import EstimateOptions, EstimateStream
 router = APIRouter(tags=["calibrations"])
 
 _NONE = "none"
-"""Names, as an id, that no calibration is in use."""
+"""Id for the absence of a calibration."""
 _UNKNOWN = problems(_404="No such calibration.", _409="Its file is damaged.")
 _NO_NODE = problems(_404="No such node.")
 
@@ -46,20 +46,22 @@ SessionId = Annotated[str, StringConstraints(max_length=100)]
 
 
 class KeptView(View):
-    """One calibration in short."""
+    """Summary of a calibration."""
 
     id: str = Field(description="Hash of its content.", examples=["983bbbe1624bad0b"])
     name: str
-    reference: str = Field(description="The force sensor that its scale comes from.")
-    date: str = Field(description="Of the recordings, ISO 8601.")
-    serials: list[str] = Field(description="Tiles that it has a curve of; `*`: any.")
-    refused: list[str] = Field(description="Tiles whose recordings gave none; its file says why.")
+    reference: str = Field(description="Force sensor of its scale.")
+    date: str = Field(description="Date of the recordings, ISO 8601.")
+    serials: list[str] = Field(description="Tiles with a curve; `*`: any tile.")
+    refused: list[str] = Field(
+        description="Tiles without a curve, although recorded; the file has the reasons."
+    )
     absolute_scale: Literal["measured", "assumed"]
-    mounted: bool = Field(description="Whether a plate has shown how its tiles are mounted.")
+    mounted: bool = Field(description="True: a force plate has shown how its tiles are mounted.")
 
     @classmethod
     def of(cls, kept: Kept) -> KeptView:
-        """As it is kept."""
+        """Return the view of a summary."""
         return cls(
             id=kept.id,
             name=kept.name,
@@ -73,7 +75,7 @@ class KeptView(View):
 
 
 class StartFit(BaseModel):
-    """What to fit."""
+    """Request to fit a calibration."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -81,18 +83,18 @@ class StartFit(BaseModel):
         Field(description="Bench recordings; repeats of a tile may be spread over several.")
     )
     name: Line = Field(examples=["left leg, November"])
-    reference: Line = Field(default="not stated", description="The force sensor.")
+    reference: Line = Field(default="not stated", description="Force sensor.")
     reference_delay_ms: Annotated[float, Field(ge=-1000, le=1000, strict=True)] | None = Field(
         default=None,
-        description="How late its readings are; not known if left out, which costs certainty.",
+        description="Delay of its readings; unknown if left out, which increases the uncertainty.",
     )
     reference_delay_sigma_ms: Annotated[float, Field(ge=0, le=1000, strict=True)] = Field(
-        default=0.1, description="Standard uncertainty of that."
+        default=0.1, description="Standard uncertainty of the delay."
     )
 
 
 class FitView(View):
-    """A fit, under way or ended."""
+    """Calibration job, running or ended."""
 
     id: str
     name: str
@@ -100,13 +102,13 @@ class FitView(View):
     state: Literal["running", "done", "failed", "cancelled"]
     started_t_ns: int = Field(description="Server's UTC.")
     ended_t_ns: int | None
-    said: list[ShownText] = Field(description="What was found so far, a line a tile.")
-    calibration_id: str | None = Field(description="What came of it, once it is done.")
-    problem: ShownText | None = Field(description="Why it failed.")
+    said: list[ShownText] = Field(description="Log of the job, a line per tile.")
+    calibration_id: str | None = Field(description="Id of the calibration, once it is done.")
+    problem: ShownText | None = Field(description="Reason of a failure.")
 
     @classmethod
     def of(cls, fit: Fit) -> FitView:
-        """As it is now."""
+        """Return the present state of a job."""
         return cls(
             id=fit.id,
             name=fit.name,
@@ -121,31 +123,31 @@ class FitView(View):
 
 
 class Assign(BaseModel):
-    """Which calibration a node's tiles are to be estimated with."""
+    """Request to assign a calibration to a node."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: Annotated[str, StringConstraints(max_length=100)] = Field(
-        description="Of one that the server keeps."
+        description="Id of a calibration on the server."
     )
 
 
 class NodeCalibrationView(View):
-    """Which calibration a node's tiles are estimated with."""
+    """Calibration of a node."""
 
     node: str
     source: CalibrationSource = Field(
-        description="Who says which: the node itself, or the server, where one was assigned."
+        description="Origin: the node itself, or the server, where one was assigned."
     )
-    assigned_t_ns: int | None = Field(description="When that was, server's UTC.")
-    calibration: CalibrationView | None = Field(description="What is in use; null: none.")
-    problem: ShownText | None = Field(description="Why none is.")
-    own_id: str | None = Field(description="Of the one that the node says itself.")
+    assigned_t_ns: int | None = Field(description="Time of the assignment, server's UTC.")
+    calibration: CalibrationView | None = Field(description="Calibration in use; null: none.")
+    problem: ShownText | None = Field(description="Reason why none is in use.")
+    own_id: str | None = Field(description="Id of the node's own calibration.")
 
     @classmethod
     def of(cls, node: ServerNode) -> NodeCalibrationView:
-        """As it is now."""
-        estimates, own = node.estimates, node.hello.calibration
+        """Return the present calibration of a node."""
+        estimates, own_calibration = node.estimates, node.hello.calibration
         live, assigned = estimates.live, estimates.assignment.present
         used = None
         if live.calibration is not None and live.calibration_id and live.ranges is not None:
@@ -160,22 +162,23 @@ class NodeCalibrationView(View):
             assigned_t_ns=None if assigned is None else assigned.t_ns,
             calibration=used,
             problem=estimates.calibration_problem,
-            own_id=None if own is None else own.id,
+            own_id=None if own_calibration is None else own_calibration.id,
         )
 
 
 InUse = Annotated[
     str | None,
     Header(
-        description="Id of the calibration in use when you looked, or `none`: only if it still is."
+        description="Id of the calibration in use that you have seen, or `none`; else the change "
+        "is refused."
     ),
 ]
 
 
 @router.get("/calibrations", operation_id="listCalibrations", summary="Calibrations")
 async def list_calibrations(server: ServerState) -> Page[KeptView]:
-    """All that the server keeps, the newest recordings first."""
-    return Page(items=[KeptView.of(kept) for kept in server.calibrations.all()])
+    """Return the calibrations on the server, the newest recordings first."""
+    return Page(items=[KeptView.of(summary) for summary in server.calibrations.all()])
 
 
 @router.post(
@@ -185,9 +188,9 @@ async def list_calibrations(server: ServerState) -> Page[KeptView]:
     status_code=HTTPStatus.CREATED,
     responses={
         **problems(
-            _409="There are too many.",
+            _409="The limit of calibrations is reached.",
             _413="It is longer than 1 MiB.",
-            _422="It is no calibration, has an unknown field, or its hash is of another content.",
+            _422="No calibration, an unknown field, or a wrong hash.",
         ),
         **FULL,
     },
@@ -200,19 +203,19 @@ async def list_calibrations(server: ServerState) -> Page[KeptView]:
     },
 )
 async def upload(request: Request, server: ServerState, response: Response) -> KeptView:
-    """Keep a calibration file, checked as wherever one is read; the same file twice is one.
+    """Store a calibration file, checked as on every read; the same file twice is one calibration.
 
-    One without `id` and `check` was written by hand, and is called unproven.
+    A file without `id` and `check` was written by hand, and is marked as unproven.
     """
     calibration = await run_in_threadpool(_understood, await request.body())
-    kept = server.calibrations.keep(calibration)
-    response.headers["Location"] = f"/api/v1/calibrations/{kept.id}"
-    return KeptView.of(kept)
+    summary = server.calibrations.keep(calibration)
+    response.headers["Location"] = f"/api/v1/calibrations/{summary.id}"
+    return KeptView.of(summary)
 
 
 @router.get("/calibrations/fits", operation_id="listFits", summary="Fits")
 async def list_fits(server: ServerState) -> Page[FitView]:
-    """The last of them since the server was started, newest first."""
+    """Return the last jobs since the server was started, newest first."""
     return Page(items=[FitView.of(fit) for fit in server.fits.all()])
 
 
@@ -223,14 +226,14 @@ async def list_fits(server: ServerState) -> Page[FitView]:
     status_code=HTTPStatus.ACCEPTED,
     responses=problems(
         _404="No such session.",
-        _409="Another one is being fitted, or a session is not sealed.",
-        _422="Not as described, or the sessions are too long.",
+        _409="Another job is running, or a session is not sealed.",
+        _422="Invalid body, or the sessions are too long.",
     ),
 )
 async def start_fit(body: StartFit, server: ServerState, response: Response) -> FitView:
-    """Fit every tile that was pressed in sessions of a bench, as `foottile calibrate` does.
+    """Fit every tile in bench recordings, as `foottile calibrate` does.
 
-    It goes on beside the server; what is asked for again and again is how far it is.
+    The job runs beside the server; poll it for its progress.
     """
     options = {"reference": body.reference}
     if body.reference_delay_ms is not None:
@@ -244,11 +247,11 @@ async def start_fit(body: StartFit, server: ServerState, response: Response) -> 
 @router.get(
     "/calibrations/fits/{fit_id}",
     operation_id="getFit",
-    summary="How far a fit is",
+    summary="Fit progress",
     responses=problems(_404="No such fit."),
 )
 async def get_fit(fit_id: str, server: ServerState) -> FitView:
-    """What it has found so far, and the id of the calibration once it is done."""
+    """Return a job's progress, and the id of the calibration once it is done."""
     return FitView.of(server.fits.get(fit_id))
 
 
@@ -259,23 +262,23 @@ async def get_fit(fit_id: str, server: ServerState) -> FitView:
     responses=problems(_404="No such fit."),
 )
 async def cancel_fit(fit_id: str, server: ServerState) -> FitView:
-    """Nothing of it is kept; one that has ended stays as it is."""
+    """Cancel a running job without a result; an ended one is unchanged."""
     return FitView.of(await server.fits.cancel(fit_id))
 
 
 @router.get(
     "/calibrations/{calibration_id}",
     operation_id="getCalibration",
-    summary="A calibration file",
+    summary="Download a calibration",
     response_class=Response,
     responses={
         200: {"description": "The file.", "content": {"application/json": {}}},
-        304: {"description": "You have it."},
+        304: {"description": "Unchanged."},
         **_UNKNOWN,
     },
 )
 async def get_calibration(calibration_id: str, request: Request, server: ServerState) -> Response:
-    """Whole, as every command of `foottile` takes it; its id is its entity tag."""
+    """Return the file as every command of `foottile` reads it; its id is its entity tag."""
     calibration = await run_in_threadpool(server.calibrations.get, calibration_id)
     return _file(calibration, request)
 
@@ -289,7 +292,7 @@ async def get_calibration(calibration_id: str, request: Request, server: ServerS
     responses={**problems(_404="No such calibration."), **FULL},
 )
 async def delete_calibration(calibration_id: str, server: ServerState) -> None:
-    """Sessions that were recorded with it, and nodes that it was assigned to, have it still."""
+    """Delete a calibration; sessions and nodes that use it have a copy."""
     server.calibrations.delete(calibration_id)
 
 
@@ -300,7 +303,7 @@ async def delete_calibration(calibration_id: str, server: ServerState) -> None:
     responses=_NO_NODE,
 )
 async def node_calibration(node: str, server: ServerState) -> NodeCalibrationView:
-    """Which one is in use, and who says so."""
+    """Return the calibration in use, and its origin."""
     return NodeCalibrationView.of(server.nodes.get(node))
 
 
@@ -313,7 +316,7 @@ async def node_calibration(node: str, server: ServerState) -> NodeCalibrationVie
             _404="No such node or calibration.",
             _409="The calibration's file is damaged.",
             _412="Another calibration is in use than If-Match names.",
-            _422="Not as described, or it does not fit the node's tiles.",
+            _422="Invalid body, or it does not fit the node's tiles.",
         ),
         **FULL,
     },
@@ -321,15 +324,15 @@ async def node_calibration(node: str, server: ServerState) -> NodeCalibrationVie
 async def assign(
     node: str, body: Assign, server: ServerState, if_match: InUse = None
 ) -> NodeCalibrationView:
-    """Estimate a node's tiles with this one, in place of its own, until that is taken back.
+    """Estimate a node's tiles with this calibration, until it is unassigned.
 
-    From the next frame on, and for sessions that begin then; what is being recorded keeps what it
-    began with. The choice outlives a restart of either side.
+    From the next frame on, and for sessions that begin then; sessions that are being recorded keep
+    theirs. The assignment outlives a restart of either side.
     """
     the_node = server.nodes.get(node)
     calibration = await run_in_threadpool(server.calibrations.get, body.id)
     _expect_in_use(the_node, if_match)
-    _check_fits(the_node, calibration)
+    check_fits(the_node, calibration)
     the_node.estimates.use_calibration(calibration, utc_ns())
     server.tell_node(the_node)
     return NodeCalibrationView.of(the_node)
@@ -338,7 +341,7 @@ async def assign(
 @router.delete(
     "/nodes/{node}/calibration",
     operation_id="takeBackCalibration",
-    summary="Take an assignment back",
+    summary="Unassign a calibration",
     responses={
         **_NO_NODE,
         **problems(_412="Another calibration is in use than If-Match names."),
@@ -346,7 +349,7 @@ async def assign(
     },
 )
 async def take_back(node: str, server: ServerState, if_match: InUse = None) -> NodeCalibrationView:
-    """The node's own calibration is in use again, if it has one."""
+    """Use the node's own calibration again, if it has one."""
     the_node = server.nodes.get(node)
     _expect_in_use(the_node, if_match)
     if the_node.estimates.calibration_source == "server":
@@ -374,11 +377,11 @@ def _expect_in_use(node: ServerNode, if_match: str | None) -> None:
     expect(tag_of(if_match), present, f"the calibration of {node.name!r}")
 
 
-def _check_fits(node: ServerNode, calibration: Calibration) -> None:
-    """Refuse what the tiles that the node said last cannot be estimated with.
+def check_fits(node: ServerNode, calibration: Calibration) -> None:
+    """Refuse a calibration with which the present tiles cannot be estimated.
 
     Raises:
-        UsageError: a tile is not in it, has another chip, or a model lacks what it needs.
+        UsageError: a tile is not in it, has another chip, or a model lacks parameters.
     """
     try:
         EstimateStream(node.info, EstimateOptions(calibration, node.info.models, LIVE_LAG_MS))

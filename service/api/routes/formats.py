@@ -1,4 +1,4 @@
-"""The formats that sessions are given away in."""
+"""Formats of downloads."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ router = APIRouter(prefix="/formats", tags=["data"])
 
 
 class FormatView(BaseModel):
-    """A format, as `GET .../data?format=` takes it."""
+    """Format, as in `GET .../data?format=`."""
 
     name: str
-    title: str = Field(description="For people.")
-    opened_by: str = Field(description="Some programs that open it.")
-    ending: str = Field(description="Of its files' names, without the dot.")
+    title: str = Field(description="Title for people.")
+    opened_by: str = Field(description="Programs that open it.")
+    ending: str = Field(description="File extension, without the dot.")
     media_type: str
-    options: list[str] = Field(description="Parameters of the download that are for this format.")
-    takes_columns: bool = Field(description="Can columns be chosen?")
-    needs_forces: bool = Field(description="Not of a session without estimates.")
-    needs_sealed: bool = Field(description="Not of a session that is not sealed.")
-    holds_several: bool = Field(description="Can all sessions of a take be in one file?")
-    frames_max: int | None = Field(description="Ask for a slice of more; null: any number.")
-    missing: str | None = Field(description="What this server lacks for it; null: nothing.")
+    options: list[str] = Field(description="Download parameters of this format.")
+    takes_columns: bool = Field(description="True: columns can be selected.")
+    needs_forces: bool = Field(description="True: the session needs estimates.")
+    needs_sealed: bool = Field(description="True: the session has to be sealed.")
+    holds_several: bool = Field(description="True: one file can have all sessions of a take.")
+    frames_max: int | None = Field(description="Frame limit of a download; null: no limit.")
+    missing: str | None = Field(description="Missing extra of this server; null: none.")
 
 
 class FormatsView(BaseModel):
@@ -35,6 +35,6 @@ class FormatsView(BaseModel):
 
 @router.get("", operation_id="listFormats", summary="Formats of downloads")
 def formats() -> FormatsView:
-    """In the order in which menus have them."""
-    known = FORMATS.values()
-    return FormatsView(items=[FormatView.model_validate(f, from_attributes=True) for f in known])
+    """Return the formats in the order of menus."""
+    formats_ = FORMATS.values()
+    return FormatsView(items=[FormatView.model_validate(f, from_attributes=True) for f in formats_])

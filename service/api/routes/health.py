@@ -1,4 +1,4 @@
-"""Is it alive, is it able, and what is it?"""
+"""Health, readiness and version of the server."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ router = APIRouter(tags=["server"])
 
 
 class Health(View):
-    """The process answers."""
+    """State of the process."""
 
     status: str = Field(examples=["ok"])
     problems: list[ShownText] = Field(
-        description="What was found damaged in the data folder when the server was started, and "
-        "what became of it, in words. The rest is served."
+        description="Damage found in the data folder at the start, and the consequence, as text. "
+        "Everything else is served."
     )
 
 
 class Ready(View):
-    """It can do its work."""
+    """Readiness of the server."""
 
     ready: bool
     nodes_connected: int
@@ -33,27 +33,27 @@ class Ready(View):
 
 
 class Version(View):
-    """Which software and protocols."""
+    """Versions of software and protocols."""
 
     software: str = Field(examples=["foottile 0.1.0"])
     api: str = "v1"
     protocol: str = SUBPROTOCOL
 
 
-@router.get("/health", operation_id="getHealth", summary="Is the process alive?")
+@router.get("/health", operation_id="getHealth", summary="Liveness")
 async def health(server: ServerState) -> Health:
-    """Answers while the process runs; says what it found damaged."""
+    """Return the state of the process, with the damage found at its start."""
     return Health(status="ok", problems=server.problems)
 
 
 @router.get(
     "/ready",
     operation_id="getReady",
-    summary="Can it record?",
+    summary="Readiness",
     responses=problems(_507="The data folder cannot be written."),
 )
 def ready(server: ServerState) -> Ready:
-    """Writes some bytes to the data folder and counts who is there."""
+    """Write a test file to the data folder, and count nodes and subscribers."""
     server.check_storage()
     return Ready(
         ready=True,
@@ -62,7 +62,7 @@ def ready(server: ServerState) -> Ready:
     )
 
 
-@router.get("/version", operation_id="getVersion", summary="Which version is it?")
+@router.get("/version", operation_id="getVersion", summary="Version")
 async def version() -> Version:
-    """Software, API and link protocol."""
+    """Return the versions of software, API and link protocol."""
     return Version(software=SOFTWARE)

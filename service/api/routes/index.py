@@ -1,4 +1,4 @@
-"""What there is: every route of the API with its address."""
+"""Index of the API: every route with its address."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from service.version import SOFTWARE
 
 
 class RouteView(View):
-    """One thing that can be asked."""
+    """Route of the API."""
 
     method: str = Field(examples=["GET"])
     href: str = Field(
-        description="Its path; names in braces are to be filled in.",
+        description="Path; replace the names in braces.",
         examples=["/api/v1/sessions/{session_id}"],
     )
     operation: str = Field(
-        description="Its `operationId` in the description.", examples=["getSession"]
+        description="Its `operationId` in the OpenAPI document.", examples=["getSession"]
     )
     summary: str
 
 
 class IndexView(View):
-    """Where to begin."""
+    """Index of the API."""
 
     software: str = Field(examples=["foottile 0.1.0"])
-    docs: str = Field(description="The description for people.", examples=["/docs"])
-    openapi: str = Field(description="The same for machines, OpenAPI 3.1.")
-    live: str = Field(description="The websocket of screens.")
-    ingest: str = Field(description="The websocket of nodes.")
+    docs: str = Field(description="Description for people.", examples=["/docs"])
+    openapi: str = Field(description="Description for programs, OpenAPI 3.1.")
+    live: str = Field(description="Websocket of live data.")
+    ingest: str = Field(description="Websocket of nodes.")
     routes: list[RouteView]
 
 
 async def index(request: Request) -> IndexView:
-    """Every route with its address, and where it is described."""
+    """Return every route with its address and summary."""
     app = request.app
     return IndexView(
         software=SOFTWARE,
@@ -49,9 +49,9 @@ async def index(request: Request) -> IndexView:
             RouteView(
                 method=method,
                 href=path,
-                operation=said["operationId"],
-                summary=said["summary"],
+                operation=operation["operationId"],
+                summary=operation["summary"],
             )
-            for path, method, said in operations(app.openapi())
+            for path, method, operation in operations(app.openapi())
         ],
     )

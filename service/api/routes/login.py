@@ -1,4 +1,4 @@
-"""Getting in: a ticket, or the token, becomes a cookie that the browser keeps."""
+"""Login: a ticket, or the token, is exchanged for a cookie of the browser."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.server_clock import utc_ns
 router = APIRouter(tags=["login"])
 
 _NOT_TAKEN = (
-    "This ticket is not taken: each is good once and for five minutes, until the server ends. Get "
+    "Invalid ticket: each is valid once and for five minutes, until the server ends. Get "
     "a new one with `foottile invite` on the computer on which `foottile serve` runs"
 )
 _NOTHING_SHOWN = "A login needs a ticket, or the token as Authorization: Bearer TOKEN"
@@ -26,19 +26,19 @@ _RIGHTS: dict[str, Right] = {"look": Right.LOOK, "press": Right.PRESS}
 
 
 class LoginView(View):
-    """What the one who asks may do."""
+    """Present permissions of the client."""
 
-    private: bool = Field(description="Is a login asked for to look, too?")
+    private: bool = Field(description="True: reading needs a login, too.")
     may: May | None = Field(
-        description="By the login that was shown; null: none was. Then one may look unless the "
-        "server is private."
+        description="Role by the credentials of the request; null: none. Without any, reading is "
+        "allowed unless the server is private."
     )
-    ended: bool = Field(description="Was a login shown that has ended?")
-    ends_t_ns: int | None = Field(description="When the login ends, server's UTC.")
+    ended: bool = Field(description="True: the login has expired.")
+    ends_t_ns: int | None = Field(description="End of the login, server's UTC.")
 
 
 class LogIn(BaseModel):
-    """With what to get in; the token comes as `Authorization` instead."""
+    """Ticket of a login; the token is sent as `Authorization` instead."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -46,21 +46,22 @@ class LogIn(BaseModel):
 
 
 class NewTicket(BaseModel):
-    """What a ticket is for."""
+    """Role of a new ticket."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    may: May = Field(default="press", description="`look`: a viewer's.")
+    may: May = Field(default="press", description="`look`: viewer; `press`: operator.")
 
 
 class TicketView(View):
-    """A ticket."""
+    """Ticket, a one-time login."""
 
     ticket: str
     may: May
-    ends_t_ns: int = Field(description="When it ends, server's UTC.")
+    ends_t_ns: int = Field(description="End of its validity, server's UTC.")
     urls: list[str] = Field(
-        description="Addresses of the live page, with the ticket; whoever opens one first is in.",
+        description="URLs of the live page with the ticket; the first browser that opens one is "
+        "logged in.",
         examples=[["http://192.168.4.1:8000/#ticket=..."]],
     )
 
@@ -73,25 +74,27 @@ def _logins(request: Request) -> Logins:
 LoginsState = Annotated[Logins, Depends(_logins)]
 
 
-@router.get("/login", operation_id="getLogin", summary="What may I do?")
+@router.get("/login", operation_id="getLogin", summary="Current permissions")
 async def get_login(request: Request, logins: LoginsState) -> LoginView:
-    """By the cookie or the token of this request."""
-    shown = logins.shown_by(request)
-    return _view(logins, shown.right, shown.left_s, has_ended=shown.has_ended)
+    """Return the permissions by the cookie or the token of this request."""
+    credentials = logins.shown_by(request)
+    return _view(logins, credentials.right, credentials.left_s, has_ended=credentials.has_ended)
 
 
-@router.post("/login", operation_id="logIn", summary="Change a ticket, or the token, for a cookie")
+@router.post(
+    "/login", operation_id="logIn", summary="Exchange a ticket, or the token, for a cookie"
+)
 async def log_in(
     body: LogIn, request: Request, response: Response, logins: LoginsState
 ) -> LoginView:
-    """The cookie is HttpOnly and SameSite=Strict, and ends after 12 hours or with the server."""
+    """Set a cookie, HttpOnly and SameSite=Strict, valid for 12 hours or until the server ends."""
     if body.ticket is not None:
-        given = logins.tickets.take(body.ticket)
-        right = None if given is None else given.right
+        grant = logins.tickets.take(body.ticket)
+        right = None if grant is None else grant.right
     else:
-        shown = logins.shown_by(request)
-        # A cookie is not renewed by itself: then it would never end.
-        right = Right.PRESS if shown.right is Right.OWN else None
+        credentials = logins.shown_by(request)
+        # A cookie cannot renew itself: it would never expire.
+        right = Right.PRESS if credentials.right is Right.OWN else None
     if right is None:
         detail = _NOT_TAKEN if body.ticket is not None else _NOTHING_SHOWN
         headers = {"www-authenticate": "Bearer"}
@@ -115,7 +118,7 @@ async def log_in(
     response_model=None,
 )
 async def log_out(request: Request, response: Response, logins: LoginsState) -> None:
-    """The cookie of this request is good for nothing from now on."""
+    """Invalidate the cookie of this request."""
     cookie = logins.cookie_of(request)
     if cookie is not None:
         logins.cookies.take(cookie)
@@ -125,11 +128,11 @@ async def log_out(request: Request, response: Response, logins: LoginsState) -> 
 @router.post(
     "/tickets",
     operation_id="giveTicket",
-    summary="A ticket for somebody else",
+    summary="Create a one-time login",
     status_code=HTTPStatus.CREATED,
 )
 async def give_ticket(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
-    """Good once, for five minutes. It takes the token itself; a login is not enough."""
+    """Create a ticket, valid once and for five minutes. Needs the token; a login is not enough."""
     ticket = logins.tickets.new(_RIGHTS[body.may])
     urls = request.app.state.find_urls() or (str(request.base_url).rstrip("/"),)
     return TicketView(
@@ -141,7 +144,7 @@ async def give_ticket(body: NewTicket, request: Request, logins: LoginsState) ->
 
 
 def with_ticket(url: str, ticket: str) -> str:
-    """The page's address with a ticket, in the part that no browser sends to a server."""
+    """Return the page's URL with a ticket in the fragment, which no browser sends to a server."""
     return f"{url}/#ticket={ticket}"
 
 

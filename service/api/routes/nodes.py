@@ -1,4 +1,4 @@
-"""Nodes and their tares."""
+"""Routes of nodes and their tares."""
 
 from __future__ import annotations
 
@@ -24,41 +24,43 @@ router = APIRouter(prefix="/nodes", tags=["nodes"])
 
 
 class TareRequest(BaseModel):
-    """What may be said with a tare."""
+    """Options of a tare."""
 
     model_config = ConfigDict(extra="forbid")
 
     reason: Annotated[str, AfterValidator(check_new_name)] = Field(
-        default="", max_length=REASON_LENGTH_MAX, description='For the history; else "by hand".'
+        default="",
+        max_length=REASON_LENGTH_MAX,
+        description='Reason for the history; default "by hand".',
     )
 
 
 class AcceptReplacementRequest(BaseModel):
-    """Which machine is accepted."""
+    """Fingerprint of the accepted machine."""
 
     model_config = ConfigDict(extra="forbid")
 
     fingerprint: str = Field(
         pattern=r"^[0-9a-f]{4}(-[0-9a-f]{4}){3}$",
-        description="Of `replacement`, as it was shown and as the machine itself prints it.",
+        description="Fingerprint of `replacement`, as the machine itself prints it.",
     )
 
 
 class RecentQuery(BaseModel):
-    """How far back, and up to where."""
+    """Time interval of the history."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     seconds: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] = Field(
-        default=10.0, description="Back from the newest frame."
+        default=10.0, description="Length of the interval, back from the newest frame."
     )
     before_seq: Annotated[int, Field(ge=0, lt=2**53)] | None = Field(
         default=None,
-        description="Only what ends before this number: `seq_first` of a live message of the last "
-        "second, which then goes on without a seam.",
+        description="Only spans that end before this number: `seq_first` of a live message of the"
+        " last second continues them without a seam.",
     )
     tiles: Literal["force_n", "gauge_kpa"] | None = Field(
-        default=None, description="Adds `tiles`: this of each of them."
+        default=None, description="Adds `tiles`: this quantity of each tile."
     )
 
 
@@ -74,31 +76,34 @@ class RecentTilesView(View):
 
 
 class RecentView(View):
-    """Spans of consecutive frames, oldest first; one value a span in each list."""
+    """Spans of consecutive frames, oldest first; one value per span in each list."""
 
     node: str
-    boot_id: str = Field(description="The stream that all of it is of: the present one.")
-    age_ms: float | None = Field(
-        description="How old the newest frame is that screens were told; null while unknown."
-    )
+    boot_id: str = Field(description="Id of the present stream, of which all spans are.")
+    age_ms: float | None = Field(description="Age of the newest published frame; null if unknown.")
     seq_first: list[int]
     seq: list[int]
-    n: list[int] = Field(description="Frames in it; fewer than its numbers if some are missing.")
-    t_ns: list[int] = Field(description="Of its newest frame, node's UTC.")
-    grf_n: list[float | None] = Field(description="Of its newest frame.")
-    grf_min_n: list[float | None] = Field(description="Least of its frames.")
-    grf_max_n: list[float | None] = Field(description="Greatest of its frames.")
-    grf_at_least_max_n: list[float | None] = Field(
-        description="Greatest lower bound of its frames whose GRF is not known."
+    n: list[int] = Field(
+        description="Number of frames; fewer than the range of numbers if some are missing."
     )
-    tiles: RecentTilesView | None = Field(description="Only where it was asked for.")
+    t_ns: list[int] = Field(description="Time of its newest frame, node's UTC.")
+    grf_n: list[float | None] = Field(description="GRF of its newest frame.")
+    grf_min_n: list[float | None] = Field(description="Minimum over its frames.")
+    grf_max_n: list[float | None] = Field(description="Maximum over its frames.")
+    grf_at_least_max_n: list[float | None] = Field(
+        description="Greatest lower bound among its frames without a GRF."
+    )
+    tiles: RecentTilesView | None = Field(description="Null unless requested.")
 
 
 _UNKNOWN = problems(_404="No such node.")
 
 InForce = Annotated[
     str | None,
-    Header(description="Id of the tare in force when you looked, or `none`: only if it still is."),
+    Header(
+        description="Id of the tare in force that you have seen, or `none`; else the change is "
+        "refused."
+    ),
 ]
 
 
@@ -108,15 +113,15 @@ def _expect_in_force(node: ServerNode, if_match: str | None) -> None:
     expect(tag_of(if_match), in_force, f"the tare of {node.name!r}")
 
 
-@router.get("", operation_id="listNodes", summary="All nodes the server knows")
+@router.get("", operation_id="listNodes", summary="All nodes")
 async def list_nodes(server: ServerState) -> Page[NodeView]:
-    """Connected ones and those it remembers."""
+    """Return connected and remembered nodes."""
     return Page(items=[server.view_node(node) for node in server.nodes])
 
 
 @router.get("/{node}", operation_id="getNode", summary="One node", responses=_UNKNOWN)
 async def get_node(node: str, server: ServerState) -> NodeView:
-    """Its array, calibration, tare, clock and counts."""
+    """Return array, calibration, tare, clock and counts of a node."""
     return server.view_node(server.nodes.get(node))
 
 
@@ -124,23 +129,23 @@ async def get_node(node: str, server: ServerState) -> NodeView:
     "/{node}/scene", operation_id="getScene", summary="The node's scene", responses=_UNKNOWN
 )
 async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
-    """The content of its scene file, defaults filled in."""
+    """Return the content of the node's scene file, with defaults."""
     return server.nodes.get(node).hello.scene
 
 
 @router.get(
     "/{node}/recent",
     operation_id="getRecent",
-    summary="What screens were told lately",
+    summary="History of the last minute",
     responses=_UNKNOWN,
 )
 async def get_recent(
     node: str, query: Annotated[RecentQuery, Query()], server: ServerState
 ) -> RecentView:
-    """The GRF of the last seconds, up to a minute, from the server's memory.
+    """Return the GRF of the last seconds, up to a minute, from the server's memory.
 
-    No peak hides: each span has least and greatest. Only of the present stream, and of what came
-    since the server was started; where frames are missing, numbers are.
+    Each span has minimum and maximum, so that no peak hides. Only frames of the present stream that
+    came since the server was started; where frames are missing, numbers are missing.
     """
     the_node = server.nodes.get(node)
     rows = server.hub.recent(the_node).rows(query.seconds, query.before_seq)
@@ -178,7 +183,7 @@ def _four_digits(values: list[float]) -> list[float | None]:
     responses={
         **_UNKNOWN,
         **problems(
-            _409="The foot is loaded or moves, or the node is away.",
+            _409="The foot is loaded or moves, or the node is not connected.",
             _412="Another tare is in force than If-Match names.",
             _507="Disk full.",
         ),
@@ -190,9 +195,10 @@ async def tare(
     request: TareRequest | None = None,
     if_match: InForce = None,
 ) -> TareView:
-    """Take the newest unloaded quarter of a second of the last ten seconds as the baseline.
+    """Use the newest unloaded quarter of a second of the last ten seconds as the baseline.
 
-    It may lie in a flight phase. The tare before is kept and comes back if this one is undone.
+    It may lie in a flight phase. The former tare stays in the history and is in force again if this
+    one is undone.
     """
     the_node = server.nodes.get(node)
     _expect_in_force(the_node, if_match)
@@ -205,7 +211,7 @@ async def tare(
     "/{node}/tares", operation_id="listTares", summary="History of tares", responses=_UNKNOWN
 )
 async def list_tares(node: str, server: ServerState) -> TaresPage:
-    """Newest first; the first one of the present tiles that is not undone is in force."""
+    """Return the tares, newest first; the first valid one of the present tiles is in force."""
     the_node = server.nodes.get(node)
     items = [TareView.of(t) for t in reversed(the_node.estimates.tares.all)]
     return TaresPage(items=items, drift=DriftView.of(the_node))
@@ -224,9 +230,9 @@ async def list_tares(node: str, server: ServerState) -> TaresPage:
     ),
 )
 async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InForce = None) -> None:
-    """The tare before it is in force again; it stays in the history, marked.
+    """Put the tare before it in force again; this one stays in the history, marked as undone.
 
-    If it was an automatic one, no other is taken until one is taken by hand.
+    After undoing an automatic tare, no other automatic one follows until a tare by hand.
     """
     the_node = server.nodes.get(node)
     _expect_in_force(the_node, if_match)
@@ -243,8 +249,8 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
     responses={
         **_UNKNOWN,
         **problems(
-            _409="No other machine asks to connect under this name.",
-            _412="Another machine than this one asked last.",
+            _409="No machine was refused under this name.",
+            _412="Another machine was refused last.",
             _507="Disk full.",
         ),
     },
@@ -252,9 +258,9 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
 async def accept_replacement(
     node: str, request: AcceptReplacementRequest, server: ServerState
 ) -> None:
-    """The machine that `replacement` describes is the node from now on.
+    """Accept the machine in `replacement` as the node from now on.
 
-    Accept it if the node's storage was replaced or its folder deleted, and its fingerprint is the
-    one that the machine prints. The machine before is disconnected, and refused from then on.
+    Accept it if the node's storage was replaced or its folder deleted, and the machine itself
+    prints this fingerprint. The former machine is disconnected, and refused from then on.
     """
     server.accept_replacement(node, request.fingerprint)

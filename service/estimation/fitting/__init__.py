@@ -1,1 +1,1 @@
-"""From a bench recording to a calibration: checks, fits and intervals. No estimate needs it."""
+"""Calibration from rig recordings: checks, fits and intervals. No estimate needs it."""

@@ -1,9 +1,9 @@
-"""95 % bands of a calibration, with Student's t, because repeats on a bench are few.
+"""Covariances and 95 % bands of a calibration, with Student's t for few repeats.
 
 The paper draws the mean of four repeats. The band of that mean is t(repeats - 1) times its standard
-uncertainty, which is the spread of repeats over the square root of their number: with four repeats
-3.18 of them instead of 1.96. A single new loading scatters about the mean more widely, by the
-spread of a repeat itself.
+uncertainty, the standard deviation of repeats over the square root of their number: with four
+repeats 3.18 times instead of 1.96 times. A single new loading scatters about the mean by the
+standard deviation of a repeat.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ _UPPER_95 = 0.975
 
 
 def fit_covariance(jacobian: Any, known: Floats) -> Floats:
-    """Covariance of the parameters of a least-squares fit whose residuals have unit variance.
+    """Compute the covariance of a least-squares fit with priors and residuals of unit variance.
 
     Args:
         jacobian: (residuals, parameters).
-        known: (parameters,), standard uncertainties before any residual: what the residuals do not
-            tell, as the time of a part that is zero, is not known better than that.
+        known: (parameters,), prior standard uncertainties, which stay for parameters that the
+            residuals do not determine, such as the time constant of a fraction of zero.
     """
     j = np.asarray(jacobian) * known
     return np.asarray(np.linalg.inv(j.T @ j + np.eye(len(known))) * np.outer(known, known))
 
 
 def beyond_bounds(jacobian: Any, residual: Floats, known: Floats, held: Bools) -> Floats:
-    """How far beyond their bounds the parameters that are held back would go, to first order.
+    """Compute the step beyond their bounds of the parameters at a bound, to first order.
 
-    What is not possible but fits better says that something else is wrong: the parameter is as
-    uncertain as that. No more than `known`; zero for parameters that are free.
+    A better fit beyond a bound shows an error of the model, and adds to the uncertainty. At most
+    `known`; zero for the other parameters.
     """
     if not held.any():
         return np.zeros(len(known))
@@ -45,7 +45,7 @@ def beyond_bounds(jacobian: Any, residual: Floats, known: Floats, held: Bools) -
 
 
 def student_t_95(repeats: int) -> float:
-    """Half width of a two-sided 95 % interval in standard uncertainties, from so many repeats.
+    """Return the half width of a two-sided 95 % interval in standard uncertainties.
 
     Raises:
         ValueError: fewer than two repeats have no spread.
@@ -56,20 +56,20 @@ def student_t_95(repeats: int) -> float:
 
 
 def curve_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    """Force of the cubic at gauge pressures (m,), zero at zero pressure."""
+    """Compute the force of the cubic at gauge pressures (m,), zero at zero pressure."""
     coefficients = np.array(tile.coefficients[1:]) * tile.f_scale_n
     return np.asarray(_basis_of(tile, gauge_kpa) @ coefficients)
 
 
 def mean_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    """Half width of the 95 % band of the mean curve, from the covariance over repeats."""
+    """Compute the half width of the mean curve's 95 % band, from the covariance over repeats."""
     return student_t_95(tile.repeats) * np.sqrt(_mean_variance(tile, gauge_kpa))
 
 
 def new_loading_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    """Half width of the band in which a single new reading lies in 95 of 100 loadings.
+    """Compute the half width of the 95 % band of a reading in a new loading.
 
-    The mean's own uncertainty, a gain of the new loading's own, and its hysteresis loop.
+    It consists of the mean's uncertainty, the gain of a new loading, and its hysteresis loop.
     """
     force_n = curve_n(tile, gauge_kpa)
     variance = (
@@ -91,7 +91,7 @@ def _basis_of(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
 
 
 def cubic_basis(gauge_kpa: Floats, offset_kpa: float, scale_kpa: float) -> Floats:
-    """Basis u^k - u0^k of a cubic, (m, 3), which is zero at zero pressure by construction."""
+    """Compute the basis u^k - u0^k of a cubic, (m, 3), zero at zero pressure by construction."""
     u = (gauge_kpa - offset_kpa) / scale_kpa
     u0 = -offset_kpa / scale_kpa
     return np.stack([u**k - u0**k for k in range(1, BASIS + 1)], axis=1)

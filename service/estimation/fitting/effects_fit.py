@@ -1,4 +1,4 @@
-"""What a bench recording determines of a tile beside its static curve."""
+"""Fit of a tile's effects beside its static curve: gas, rubber, hysteresis, temperature."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from service.estimation.fitting.soak import fit_soak
 from service.estimation.fitting.timing import UNKNOWN_DELAY
 
 _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
-"""Takes a cubic in x = gauge / range without constant term to u = 2 x - 1, as far as it varies."""
+"""Transform of a cubic without constant term from x = gauge / range to u = 2 x - 1."""
 
 
 def fit_effects(
     recordings: Sequence[Indentation], tile: TileCalibration, delay: Parameter = UNKNOWN_DELAY
 ) -> Effects:
-    """Gas, rubber, hysteresis and temperature, as far as the recordings determine them.
+    """Fit the effects that the recordings determine.
 
     Args:
-        recordings: of the tile on the bench, all on one chip.
+        recordings: of the tile in the rig, all of one chip.
         tile: its static curve, from the same recordings.
-        delay: of the reference, which is in the `late_s` of the answer: see `resolved`.
+        delay: of the reference; `late_s` of the answer contains it (see `separate_delays`).
     """
     points, baseline_kpa = loadings(recordings)
     noise_kpa = float(np.mean([unloaded(each).noise_kpa for each in pressed_in(recordings)]))
@@ -59,7 +59,7 @@ def fit_effects(
     effects = _centred(effects)
     if not isinstance(soaked, TemperatureEffect):
         return effects
-    # What the dome gives back of the presses before a soak is no warmth.
+    # Recovery from the loads before a soak is no effect of temperature.
     model = dome_model(effects, tile, baseline_kpa)
     pressed = pressed_in(recordings)
     soaks = [_recovered(each, pressed, noise_kpa, model) for each in recordings]
@@ -72,7 +72,7 @@ def fit_effects(
 def _recovered(
     recording: Indentation, pressed: Sequence[Indentation], noise_kpa: float, model: DomeModel
 ) -> Soak:
-    """A recording's soak without what is left in the dome of the presses before it."""
+    """Return a recording's soak less the dome's recovery from the loads before it."""
     soaking = soak(recording, noise_kpa)
     if not len(soaking.t_s):
         return soaking
@@ -91,14 +91,14 @@ def _recovered(
 
 
 def _last_ns(pressed: Indentation) -> int:
-    """When the tile was last under the spindle."""
+    """Return the last instant at which the tile was under the spindle."""
     return int(pressed.t_ns[pressed.under_spindle & (pressed.phase != "soak")][-1])
 
 
 def _as_doubtful(
     now: TemperatureEffect, before: TemperatureEffect, rubber: RubberEffect | None
 ) -> TemperatureEffect:
-    """As uncertain, too, as the recovery is of which it has been rid."""
+    """Add the uncertainty of the recovery that was subtracted."""
     doubt = max(MISFIT_MIN, 0.0 if rubber is None else rubber.misfit)
 
     def doubted(a: Parameter, b: Parameter) -> Parameter:
@@ -112,11 +112,11 @@ def _as_doubtful(
 
 
 def dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> DomeModel:
-    """What was found of a tile, to say what it reads.
+    """Make the forward model of a tile.
 
     Args:
-        effects: with its curve in the tile's variable.
-        tile: its static curve, which stands where there is no creep.
+        effects: with the curve in the tile's variable.
+        tile: static curve, used without creep.
         baseline_kpa: absolute pressure unloaded.
     """
     gas, rubber, loop = effects.gas, effects.rubber, effects.hysteresis
@@ -135,14 +135,14 @@ def dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> 
 
 
 def _centred(effects: Effects) -> Effects:
-    """With the curve in the variable of the tile's own."""
+    """Convert the curve of settled forces to the variable of the tile's static curve."""
     rubber = effects.rubber
     if rubber is None:
         return effects
     curve = _U_OF_X @ np.array(rubber.coefficients[1:])
     polynomial = (0.0, float(curve[0]), float(curve[1]), float(curve[2]))
     if not is_monotonic(polynomial, (-1.0, 1.0)):
-        reason = "the curve of forces that have lasted is not monotonic"
+        reason = "the curve of settled forces is not monotonic"
         return effects.model_copy(
             update={"rubber": None, "refused": {**effects.refused, "rubber": reason}}
         )
@@ -157,7 +157,7 @@ def _centred(effects: Effects) -> Effects:
 
 
 def loadings(recordings: Sequence[Indentation]) -> tuple[Presses, float]:
-    """Every loading of a tile above one common baseline in kPa, and that baseline."""
+    """Return every loading of a tile above one common baseline in kPa, and that baseline."""
     recordings = pressed_in(recordings)
     zeros = [unloaded(recording) for recording in recordings]
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
@@ -169,29 +169,29 @@ def loadings(recordings: Sequence[Indentation]) -> tuple[Presses, float]:
 
 
 def curve_over_range(coefficients: Sequence[float]) -> Floats:
-    """c1, c2, c3 over x = gauge / range of a curve whose variable is centred in that range."""
+    """Convert a curve in the centred variable to c1, c2, c3 over x = gauge / range."""
     return np.asarray(np.linalg.solve(_U_OF_X, np.array(coefficients[1:])))
 
 
 def _best(soaks: Sequence[TemperatureEffect | str]) -> TemperatureEffect | str:
-    """The soak that determines the rise with temperature best, else the last soak's reason."""
+    """Return the effect with the least uncertain rise, else the last soak's reason."""
     told = [warm for warm in soaks if isinstance(warm, TemperatureEffect)]
     return min(told, key=lambda warm: warm.kpa_per_k.sigma) if told else soaks[-1]
 
 
-_BEFORE_S = 0.02  # enough to see where it came from
-_AFTER_S = 0.1  # in which the gas cools, and beyond which a hold is a hold
+_BEFORE_S = 0.02  # shown before the event
+_AFTER_S = 0.1  # the gas cools within it; a longer loading is a hold
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A short time of a bench recording; arrays of m readings.
+    """Section of a rig recording around a release or a tap; arrays of m readings.
 
     Attributes:
-        t_s: from the instant at which the force changes fastest.
+        t_s: from the event.
         measured_kpa: gauge pressure, NaN where there is none.
-        static_kpa: of the curve alone.
-        modelled_kpa: of the curve with all effects that were determined, with the loading's gain.
+        static_kpa: modelled with the static curve alone.
+        modelled_kpa: modelled with all effects, with the loading's gain.
     """
 
     t_s: Floats
@@ -201,15 +201,15 @@ class Replay:
 
 
 def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[str, Replay]:
-    """A "release" and a "tap" of the tile, as far as it was released and tapped.
+    """Extract a "release" and a "tap" of the tile, if there are any, with their models.
 
-    Of several it is the second, so that the first one's settling does not show.
+    The second of several, because the dome has settled by then.
     """
     if not any(np.isin(recording.phase, ("release", "tap")).any() for recording in recordings):
         return {}
     points, baseline_kpa = loadings(recordings)
     effects = tile.effects
-    # The slow strokes' mean curve has creep and loop in it already.
+    # The mean curve of slow strokes contains creep and loop.
     static = DomeModel(
         curve_over_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa
     )
@@ -238,7 +238,7 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
 
 
 def _moments(t_s: Floats, force_n: Floats, loading: Ints, fast: Bools) -> dict[str, int]:
-    """Where to look: the second of the loadings that were held, and of those that were not."""
+    """Return the reading of the second release, and of the second tap."""
     held: list[int] = []
     tapped: list[int] = []
     for number in np.unique(loading[fast]):

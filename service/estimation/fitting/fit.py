@@ -1,4 +1,4 @@
-"""A tile's static curve: the cubic of force over gauge pressure through slow strokes (paper eq. 2).
+"""Fit of a tile's static curve: cubic of force over gauge pressure of slow strokes (paper eq. 2).
 
 Pressure is centred and scaled before the fit: a cubic in raw 100 to 115 kPa has a condition number
 beyond 1e12. The curve has no constant term, because the tare makes zero pressure zero force.
@@ -70,7 +70,7 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
     """Fit the static curve of one tile to all its slow strokes, in one file or several.
 
     Raises:
-        CalibrationError: there is no curve that could be believed (see `bench_checks`).
+        CalibrationError: the recordings give no valid curve (see `rig.checks`).
     """
     where = ", ".join(place(recording) for recording in recordings)
     zeros = [unloaded(recording) for recording in recordings]
@@ -80,7 +80,7 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
     blocks, by_chip = before_saturation(recordings, blocks, noise_kpa)
     refuse_unloaded(blocks, where)
     drift_kpa = baseline_drift_kpa(recordings)
-    # Every repeat reaches the end of the range on average: beyond it there is nothing to go by.
+    # The mean end of the repeats: beyond it there is little data.
     high_kpa = float(np.mean(_tops(blocks, blocks.gauge_kpa)))
     cubic = _Cubic(high_kpa)
     coefficients = cubic.solve(blocks)
@@ -145,16 +145,16 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
 
 @dataclass(frozen=True)
 class _LeftOut:
-    """Every repeat against the curve of the others."""
+    """Each repeat against the curve of the others."""
 
     force_n: Floats
     residual_n: Floats
     covariance: Floats
-    """Of the coefficients of all."""
+    """Covariance of the coefficients of all repeats, by jackknife."""
 
 
 def _left_out(cubic: _Cubic, blocks: Strokes) -> _LeftOut:
-    # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
+    # Errors within a repeat are correlated, so whole repeats are left out.
     repeats = np.unique(blocks.repeat)
     without = np.stack([cubic.solve(blocks.select(blocks.repeat != r)) for r in repeats])
     parts = blocks.by_repeat()
@@ -169,12 +169,12 @@ def _left_out(cubic: _Cubic, blocks: Strokes) -> _LeftOut:
 
 
 def _tops(blocks: Strokes, values: Floats) -> list[float]:
-    """The greatest value of each repeat."""
+    """Return the largest value of each repeat."""
     return [float(values[blocks.repeat == r].max()) for r in np.unique(blocks.repeat)]
 
 
 def _gains(blocks: Strokes, fitted_n: Floats) -> Floats:
-    """Force of each repeat over that of the curve."""
+    """Return the force of each repeat over the curve's."""
     parts = [blocks.repeat == r for r in np.unique(blocks.repeat)]
     return np.array(
         [float((blocks.force_n * fitted_n)[r].sum() / (fitted_n**2)[r].sum()) for r in parts]
@@ -196,7 +196,7 @@ def _band(tile: TileCalibration) -> tuple[BandPoint, ...]:
 
 
 def _r2_of_mean(cubic: _Cubic, residual_n: Floats, blocks: Strokes) -> float:
-    """R2 of the cubic to the mean over repeats and branches, in equal steps of pressure."""
+    """Compute R2 of the cubic to the mean over repeats and branches, in equal pressure steps."""
     place_of = blocks.gauge_kpa / (2 * cubic.scale_kpa) * MEAN_STEPS
     step = np.clip(place_of.astype(np.int64), 0, MEAN_STEPS - 1)
     count = np.bincount(step, minlength=MEAN_STEPS)
@@ -207,7 +207,7 @@ def _r2_of_mean(cubic: _Cubic, residual_n: Floats, blocks: Strokes) -> float:
 
 
 def _misfit(force_n: Floats, residual_n: Floats) -> tuple[float, float]:
-    """Gain and loop part of the scatter of left-out residuals (see `TileCalibration`).
+    """Compute gain and loop part of the left-out residuals' scatter (see `TileCalibration`).
 
     Non-negative least squares of the squared residuals, each relative to the size of its force,
     so that small loads count as much as large ones.

@@ -1,4 +1,4 @@
-"""What a bench recording determines of a tile's gas, rubber and hysteresis."""
+"""Selection and fit of a tile's gas, rubber and hysteresis effects."""
 
 from __future__ import annotations
 
@@ -28,12 +28,11 @@ from service.estimation.fitting.unknowns import LATE_S, TERMS_MAX, Parts
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _SURE = 5.0
-"""An effect that differs from zero by so many standard uncertainties is there. Of others it is
-asked ..."""
+"""Distance from zero, in standard uncertainties, from which an effect needs no test."""
 _CHANCE = 0.0027
-"""... how often chance explains as much as it does: three standard uncertainties of one unknown."""
+"""Significance level of the likelihood-ratio test for the others: three standard uncertainties."""
 _LITTLE_N = 0.1
-"""An effect that never exceeds this on the bench is not worth a model."""
+"""Least largest force of an effect in the rig for which it is kept."""
 _FAST_MIN = 50
 """Least number of readings of holds, releases and taps that determine fast effects."""
 
@@ -47,15 +46,15 @@ def identify(
     soaked: TemperatureEffect | str,
     delay: Parameter,
 ) -> Effects:
-    """What of gas, rubber and hysteresis the recording determines.
+    """Fit the effects among gas, rubber and hysteresis that the recording determines.
 
     Args:
         points: all loadings.
         scale_kpa: end of the calibrated range.
         baseline_kpa: absolute pressure unloaded.
-        first_curve: c1, c2, c3 of the static curve over gauge / `scale_kpa`, to begin with.
-        soaked: from the soak, whose wall's give is used; or why it tells nothing.
-        delay: of the reference; `late_s` of the answer has it in it.
+        first_curve: start values of c1, c2, c3 of the curve over gauge / `scale_kpa`.
+        soaked: effect of the thermal soak, whose wall compliance is used; or the reason for none.
+        delay: of the reference; `late_s` of the answer contains it.
     """
     refused: dict[EffectName, str] = {}
     temperature = None
@@ -70,10 +69,10 @@ def identify(
     if int(points.fast.sum()) < _FAST_MIN:
         parts = replace(parts, late_s=None, gas=False)
         refused["gas"] = "no holds, releases or taps in the recording"
-    # Judged beside as many terms of creep as there may be, or what creeps would seem to flow.
+    # Tested beside the largest number of creep terms, or creep would look like flow.
     parts = replace(parts, terms=TERMS_MAX)
     fit = problem.fit(parts)
-    # One at a time: without the least needed, the others may be.
+    # One at a time: without the least significant one, the others may become significant.
     while (spared := _spared(problem, parts, fit)) is not None:
         name, why, fit = spared
         parts = replace(parts, **_WITHOUT[name])
@@ -121,15 +120,15 @@ def identify(
 
 
 def best_creep(problem: OutputErrorProblem, parts: Parts, many: Fit) -> Fit:
-    """With as many terms of creep as foretell best a loading that was not fitted.
+    """Return the fit with the number of creep terms that best predicts a left-out loading.
 
-    A further term has to lower the squares of all loadings by more than chance would, and of the
-    loadings held out, in sum, by more than they differ from one to the other.
+    A further term has to lower the sum of squares significantly, and the sums of squares of
+    left-out loadings, in total, by more than their scatter.
 
     Args:
         problem: of the tile.
-        parts: what is fitted beside.
-        many: with `TERMS_MAX` terms.
+        parts: effects to fit.
+        many: fit with `TERMS_MAX` terms.
     """
     fits = [problem.fit(replace(parts, terms=n), many.scatter) for n in range(1, TERMS_MAX)]
     best, *others = [*fits, many]
@@ -142,10 +141,10 @@ def best_creep(problem: OutputErrorProblem, parts: Parts, many: Fit) -> Fit:
 
 
 def _chance(problem: OutputErrorProblem, more: Fit, less: Fit) -> float:
-    """How often chance explains as much as `more` does beyond `less`, which has fewer unknowns.
+    """Return the p-value of the likelihood-ratio test of `more` against `less`.
 
-    Twice the logarithm of the likelihood is as chi squared of their number (Wilks 1938). How
-    uncertain parameters are does not tell: of a quick gas time and gamma make up for one another.
+    Twice the logarithm of the ratio is chi squared with the difference of their numbers of unknowns
+    (Wilks 1938). Standard uncertainties would not do: time and gamma of a fast gas compensate.
     """
     better = problem.squares(less.model, more.scatter) - problem.squares(more.model, more.scatter)
     return float(chdtrc(more.unknowns - less.unknowns, max(better, 0.0)))
@@ -156,7 +155,7 @@ _Effect = EffectName | Literal["flow"]
 
 @dataclass(frozen=True)
 class _Size:
-    """How great a fitted effect is: in words, in its uncertainties, and in newtons at most."""
+    """Size of a fitted effect: text, in standard uncertainties, and largest force."""
 
     words: str
     sigmas: float
@@ -164,9 +163,9 @@ class _Size:
 
 
 def _spared(problem: OutputErrorProblem, parts: Parts, fit: Fit) -> tuple[_Effect, str, Fit] | None:
-    """The effect that is needed least, why it may be left out, and the fit without it.
+    """Return the least significant effect, the reason to omit it, and the fit without it.
 
-    None: all are needed.
+    None: all are significant.
     """
     found, greatest = None, 0.0
     for name, without in _WITHOUT.items():
@@ -183,7 +182,7 @@ def _spared(problem: OutputErrorProblem, parts: Parts, fit: Fit) -> tuple[_Effec
 
 
 def _size(problem: OutputErrorProblem, fit: Fit, name: _Effect) -> _Size | None:
-    """Of an effect; None: it was not fitted."""
+    """Compute the size of an effect; None: it was not fitted."""
     model, full_n = fit.model, problem.most_n
     sigma = {each: float(sigmas[0]) for each, sigmas in fit.sigma.items()}
     flows = model.flow_part / sigma["flow_part"] if "flow_part" in sigma else 0.0
@@ -210,7 +209,7 @@ _WITHOUT: Mapping[_Effect, Mapping[str, Any]] = {
     "rubber": {"terms": 0},
     "gas": {"gas": False},
 }
-"""Parts without an effect."""
+"""Changes of `Parts` that omit an effect."""
 
 
 def _parameters(values: Iterable[float], sigmas: Floats) -> tuple[Parameter, ...]:

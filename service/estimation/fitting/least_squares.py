@@ -1,9 +1,9 @@
-"""Least squares of many residuals over a few bounded unknowns, by damped steps.
+"""Least squares of many residuals over a few bounded unknowns (Levenberg-Marquardt).
 
-Residuals have unit variance, so a step that lowers their sum of squares by less than a small part
-of one changes no parameter by a part of its uncertainty that matters: there it ends. Steps are
-solved from the normal equations, which are as small as the unknowns are few; an SVD of thousands of
-residuals for every step took as long as the model itself.
+Residuals have unit variance, so a step that lowers their sum of squares by much less than 1 changes
+no parameter by a relevant part of its uncertainty: the search ends there. Steps are solved from the
+normal equations, which are small; an SVD of thousands of residuals for every step took as long as
+the model itself.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from devices.arrays import Bools, Floats
 
 _STEPS = 60  # a bound; a good start needs ten
 ENOUGH = 1e-4
-"""A sum of squares that falls by less is at its end: a hundredth of a standard uncertainty."""
-_DIFFERENCE = 1e-6  # of an unknown's scale: errors of rounding and of curvature are alike small
-_DAMPING = (1e-9, 1e-3, 1e9)  # least, first, and that at which no step is left
+"""Decrease of the sum of squares at which the search ends: 0.01 standard uncertainties."""
+_DIFFERENCE = 1e-6  # of an unknown's scale: balances rounding and curvature
+_DAMPING = (1e-9, 1e-3, 1e9)  # least, first, and largest
 
 
 @dataclass(frozen=True)
 class Found:
-    """Where the residuals are least.
+    """Minimum of a least-squares problem.
 
     Attributes:
         x: (unknowns,).
         residual: (residuals,).
         jacobian: (residuals, unknowns).
-        at_bound: (unknowns,), held back by a bound.
+        at_bound: (unknowns,), True where a bound stops the search.
     """
 
     x: Floats
@@ -47,15 +47,15 @@ def least_squares(
     scale: Floats,
     enough: float = ENOUGH,
 ) -> Found:
-    """Levenberg and Marquardt's steps, none of them across a bound.
+    """Minimize a sum of squares within bounds.
 
     Args:
-        residual: (residuals,) of unknowns (unknowns,), of unit variance.
-        x: to begin with.
-        low: least values.
-        high: greatest values.
-        scale: what is much for an unknown.
-        enough: the search ends where the sum of squares falls by less.
+        residual: function from unknowns (unknowns,) to residuals (residuals,) of unit variance.
+        x: start values.
+        low: lower bounds.
+        high: upper bounds.
+        scale: typical changes of the unknowns.
+        enough: decrease of the sum of squares at which the search ends.
     """
     _, damping, most = _DAMPING
     off = residual(x)
@@ -94,7 +94,7 @@ def _jacobian(
 
 
 def _step(normal: Floats, slope: Floats, held: Bools, damping: float) -> Floats:
-    """The damped step of the unknowns that are free to take one."""
+    """Compute the damped step of the unknowns that no bound stops."""
     free = np.flatnonzero(~held)
     step = np.zeros(len(slope))
     matrix = normal[np.ix_(free, free)]

@@ -1,8 +1,8 @@
-"""What a tile would read if these were its parameters: reference force in, pressure out.
+"""Forward model of a dome: reference force in, pressure out.
 
-The models of the ladder the other way round, sample by sample: creep, loop, curve, gas. A fit in
-this direction leaves the noise where it is, in the pressure; a fit of the inverse would explain it
-away (gamma = 46).
+The models of an estimate in the opposite direction, sample by sample: creep, loop, curve, gas. A
+fit in this direction leaves the noise in the pressure; a fit of the inverse would explain it away
+(gamma = 46).
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from service.estimation.models.rubber import crept_parts
 _NEWTON_STEPS = 30  # a bound; it ends when a step is below `_CLOSE`
 _GAS_STEPS = 30  # likewise; two are the rule
 _CLOSE = 1e-10
-"""A smaller step changes nothing: behind it, the next would be as its square."""
+"""Step at which the iteration ends: the next one would be its square."""
 _FLAT = 1e-5
-"""Below it a difference of exponentials is its series: the next term is lost in rounding."""
+"""Argument below which a difference of exponentials is computed by its series."""
 _FLATTEST = 0.05
-"""Part of the slope at zero with which a trial cubic goes on where it turns over."""
+"""Least slope of a trial cubic, as a part of the slope at zero."""
 
 
 @dataclass(frozen=True)
 class DomeModel:
-    """Parameters of one tile; without the last ones it has the static curve alone.
+    """Parameters of one tile; the defaults are those of the static curve alone.
 
     Attributes:
         curve: c1, c2, c3 of force over x = gauge / `scale_kpa`.
         scale_kpa: end of the curve.
         baseline_kpa: absolute pressure unloaded.
-        wall_per_kpa: part of the volume that the wall gives way for a kPa.
+        wall_per_kpa: compliance of the wall, part of the volume for a kPa.
         gamma: ratio of heat capacities; 1 for no gas effect.
         tau_s: the gas' time constant.
-        part: (terms,) of the creep.
-        creep_s: (terms,) its times.
-        loop: (plays,) parts of the plays of half widths `WIDTHS_N`.
-        flow_part: of the branch that flows; 0 for none.
-        flow_n: what it bears in a slow stroke.
-        flow_power: of its flow over what it bears.
-        late_s: how much later than its instant says the tile is sampled; the forces given to
-            `pressed` are those of that time, from `load`.
+        part: (terms,), fractions of the creep.
+        creep_s: (terms,), its time constants.
+        loop: (plays,), weights of the plays of half widths `WIDTHS_N`.
+        flow_part: fraction of the viscous branch; 0 for none.
+        flow_n: force on it during a slow stroke.
+        flow_power: exponent of its flow over that force.
+        late_s: delay of the tile's samples behind their instants. Forces passed to
+            `compute_pressures` have to be those at the delayed instants, from `interpolate_force`.
     """
 
     curve: Floats
@@ -66,7 +66,7 @@ class DomeModel:
     late_s: float = 0.0
 
     def pressed(self, t_s: Floats, force_n: Floats) -> Floats:
-        """What `pressed` gives for these parameters."""
+        """Compute pressures with these parameters; see the function `compute_pressures`."""
         return pressed(
             t_s,
             force_n,
@@ -87,10 +87,9 @@ class DomeModel:
 
 
 def load(t_s: Floats, force_n: Floats) -> Callable[[Floats], Floats]:
-    """Force at any instant, from a reference's readings.
+    """Make a smooth, monotone interpolator of a reference's readings, constant beyond them.
 
-    Smooth, and nowhere beyond the readings: along straight lines a fit of the instant would stop at
-    every reading, where they have a corner.
+    Along straight lines a fit of the delay would stop at every reading, where they have a corner.
     """
     between = PchipInterpolator(t_s, force_n)
     first_s, last_s = t_s[0], t_s[-1]
@@ -107,9 +106,9 @@ def _heated(
     k: float,
     wall: float,
 ) -> tuple[float, float]:
-    """Pressure of a gas that would settle at `static`, and its temperature over the wall's.
+    """Solve for the pressure of a gas that would cool to `static`, and its temperature ratio.
 
-    Both follow from one another (model `gas`): Newton's steps in the logarithm of the pressure.
+    Newton's method in the logarithm of the pressure (model `gas`).
     """
     ln_static = math.log(static)
     ln_p = ln_before
@@ -121,10 +120,10 @@ def _heated(
         mean = (1.0 - decay) / x if abs(x) > _FLAT else 1.0 - 0.5 * x
         slope = (mean - decay) / x if abs(x) > _FLAT else 0.5 - x / 3.0
         now = warm * decay + h * mean
-        rise = k * (warm * decay + h * slope) / now  # of ln T with ln p
+        rise = k * (warm * decay + h * slope) / now  # d ln T / d ln p
         iso = p / now
         inner, outer = 1.0 + wall * (iso - baseline_kpa), 1.0 + wall * (p - baseline_kpa)
-        give = wall * (iso * (1.0 - rise) / inner - p / outer)  # how the wall's share rises
+        give = wall * (iso * (1.0 - rise) / inner - p / outer)  # derivative of the wall's share
         step = (ln_static + math.log(now * inner / outer) - ln_p) / (1.0 - rise - give)
         ln_p += step
         p = math.exp(ln_p)
@@ -151,28 +150,27 @@ def pressed(
     flow_n: float,
     flow_power: float,
 ) -> Floats:
-    """Pressures of one tile under forces that are linear between instants.
+    """Compute the pressures of one tile under forces that are linear between instants.
 
     Args:
         t_s: (n,) instants.
         force_n: (n,) forces on the dome.
-        curve: this and what follows as in `DomeModel`.
+        curve: this and the others as in `DomeModel`.
         scale_kpa: end of the curve.
         baseline_kpa: pressure unloaded.
         gamma: ratio of heat capacities.
         tau_s: the gas' time constant.
-        wall: the wall's give.
-        part: of the creep.
-        creep_s: its times.
-        loop: parts of the plays.
+        wall: compliance of the wall.
+        part: fractions of the creep.
+        creep_s: its time constants.
+        loop: weights of the plays.
         widths: their half widths.
-        flow_part: of the branch that flows.
-        flow_n: what it bears in a slow stroke.
-        flow_power: of its flow over what it bears.
+        flow_part: fraction of the viscous branch.
+        flow_n: force on it during a slow stroke.
+        flow_power: exponent of its flow.
 
     Returns:
-        (n, 3): pressure, pressure without the gas' heat, and the part of the force that creep and
-        loop hide: the force less what appears of it.
+        (n, 3): pressure, pressure without the gas' heat, and the force less the apparent force.
     """
     n = len(t_s)
     out = np.empty((n, 3))

@@ -1,8 +1,8 @@
-"""Gas, rubber and hysteresis of a tile as an output-error problem.
+"""Output-error fit of a tile's gas, rubber and hysteresis.
 
-All parameters at once are fitted to the pressure that the tile should read under the reference
-force. Every loading may have a gain of its own about one, because loadings do not repeat exactly
-(paper III-A: 3 %); gains are found in closed form, and how they scatter is a result.
+All parameters at once are fitted to the pressure of the tile under the reference force. Every
+loading has its own gain about one, because loadings do not repeat exactly (paper III-A: 3 %). Gains
+are found in closed form; their scatter is a result.
 """
 
 from __future__ import annotations
@@ -22,37 +22,36 @@ from service.estimation.fitting.unknowns import Parts, told_s, unknowns_of
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _SCATTER = (0.003, 0.03)
-"""Least scatter of loadings that is believed; and the paper's scatter, to begin with."""
+"""Least scatter of loadings, and the start value: the paper's."""
 _ROUGHLY = 1.0
-"""A sum of squares that tells how much loadings scatter; a second search knows that."""
+"""End of the first search, which determines the scatter for the second."""
 _MODEL = 0.01
-"""Part of a pressure that no model explains: a tenth of what is corrected, which is a tenth.
-Without it readings under great loads would have the curve err under small ones."""
-_BINS = 15  # parts of the range that systematic errors are averaged over
+"""Unmodelled part of a pressure: a tenth of the corrections, which are a tenth. Without it readings
+under large loads would distort the curve at small ones."""
+_BINS = 15  # bins of the range for averages of systematic errors
 _OF_RUBBER = ("part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power")
 _OPENS_N = 0.1
-"""A tile with less force is at rest."""
+"""Largest force on a tile at rest."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model.
+    """Fitted model of a dome.
 
     Attributes:
-        model: its parameters.
-        gains: (loadings,), of each loading.
+        model: fitted parameters.
+        gains: (loadings,), gain of each loading.
         scatter: standard deviation of the gains.
-        modelled: (m, 3), as `pressed` gives it.
+        modelled: (m, 3), answer of `compute_pressures`.
         sigma: standard uncertainties by the name of the unknown: "late_s", "gamma", "ln_tau",
-            "part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power", as far as they were
-            fitted; and of
-            what neighbouring terms trade with one another only the sum: "part_sum", "loop_n".
-        curve_covariance: (3, 3), of the curve's coefficients.
-        at_bound: unknowns that are at the end of what is possible.
-        unknowns: how many were fitted.
-        unseen: (loadings,), squares of what each would be off if the others alone were fitted.
-        unsure: how uncertain the corrections of gas and of creep are by their parameters alone,
-            relative, root mean square on the bench: "gas", "rubber".
+            "part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power", if fitted; and of
+            sums over neighbouring terms, which are correlated: "part_sum", "loop_n".
+        curve_covariance: (3, 3), covariance of the curve's coefficients.
+        at_bound: names of unknowns at a bound.
+        unknowns: number of unknowns.
+        unseen: (loadings,), leave-one-loading-out sums of squares.
+        unsure: relative uncertainty of the corrections "gas" and "rubber" by their parameters, root
+            mean square in the rig.
     """
 
     model: DomeModel
@@ -69,7 +68,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Misfits:
-    """Root mean square errors: of the gas' and the creep's corrections, and of the curve."""
+    """Root mean square errors of the gas correction, of the creep correction, and of the curve."""
 
     gas: float
     rubber: float
@@ -81,7 +80,7 @@ class OutputErrorProblem:
 
     Args:
         points: all loadings.
-        static: the model without effects, to begin with.
+        static: start model, without effects.
     """
 
     def __init__(self, points: Presses, static: DomeModel) -> None:
@@ -89,23 +88,23 @@ class OutputErrorProblem:
         self._static = static
         gauge_kpa = points.kpa - static.baseline_kpa
         self._usable = np.isfinite(points.kpa) & (points.weight > 0.0)
-        # Beyond the curve's end there is no curve to be fitted to.
+        # No curve exists beyond its end.
         self._usable &= gauge_kpa <= static.scale_kpa
         self._gauge_kpa = np.where(self._usable, gauge_kpa, 0.0)
         noise_kpa = 1.0 / np.where(self._usable, points.weight, 1.0)
         weight = 1.0 / np.hypot(noise_kpa, _MODEL * self._gauge_kpa)
         self._weight = np.where(self._usable, weight, 0.0)
         between = load(points.t_s, points.force_n)
-        # Of all unknowns one alone moves it, and interpolation costs as much as the smaller models.
+        # Depends on one unknown only, and interpolation costs as much as the smaller models.
         self._force_n = lru_cache(maxsize=2)(lambda late_s: between(points.t_s + late_s))
         self._told_s = told_s(points)
 
     def fit(self, parts: Parts, scatter: float | None = None) -> Fit:
-        """Fit the curve and these parts.
+        """Fit the curve and these effects.
 
         Args:
-            parts: what is fitted.
-            scatter: of the loadings, where it is known; else it is found.
+            parts: effects to fit.
+            scatter: of the loadings; None: determine it.
         """
         unknowns = unknowns_of(parts, self._static.curve, self._told_s)
         likely = np.concatenate([u.likely for u in unknowns])
@@ -130,8 +129,7 @@ class OutputErrorProblem:
             x = found.x
             model = self._model(x, at)
             gains, modelled = self._gains(model, scatter)
-            # Gains scatter about their mean, which the curve should have taken: not quite, and
-            # there are few of them.
+            # About 1, not about their mean: the curve absorbs most of the mean, and they are few.
             if not known:
                 scatter = max(_SCATTER[0], float(np.sqrt(np.mean((gains - 1.0) ** 2))))
         read = slice(0, len(found.residual) - len(x))
@@ -163,10 +161,10 @@ class OutputErrorProblem:
         )
 
     def _unseen(self, found: Found, within: Floats) -> Floats:
-        """What each loading is off by if only the others are fitted, squared, to first order.
+        """Return leave-one-loading-out sums of squares, to first order.
 
-        Without its residuals r and their slopes J, the unknowns would move by
-        (all J'J - J'J)^-1 J'r: that is what leaving it out and fitting again comes to.
+        Without the residuals r of a loading and their slopes J, the unknowns would move by
+        (all J'J - J'J)^-1 J'r.
         """
         free = ~found.at_bound
         slopes = found.jacobian[:, free] * within[free]
@@ -190,7 +188,7 @@ class OutputErrorProblem:
         model: DomeModel,
         at: dict[str, slice],
     ) -> dict[str, float]:
-        """See `Fit`."""
+        """Return `Fit.correction_uncertainty`."""
         x = (modelled[:, 1] - model.baseline_kpa) / model.scale_kpa
         corrected = {
             "gas": (("gamma", "ln_tau"), modelled[:, 0] - modelled[:, 1]),
@@ -206,7 +204,7 @@ class OutputErrorProblem:
         return unsure
 
     def misfits(self, fit: Fit) -> Misfits:
-        """What the fit leaves of the measured pressures, as parts of what was corrected."""
+        """Compute the fit's residual errors relative to the corrections."""
         rows, points, model = self._usable, self._points, fit.model
         gauge_kpa = fit.modelled[:, 0] - model.baseline_kpa
         residual_kpa = (fit.gains[points.loading] * gauge_kpa - self._gauge_kpa)[rows]
@@ -216,7 +214,7 @@ class OutputErrorProblem:
         residual_n = residual_kpa * n_per_kpa
         curve_n = _systematic_n(residual_n, points.force_n[rows], points.fast[rows])
         # Squares beyond those of noise and curve, over the squares of the corrections. The noise is
-        # what readings differ by from one to the next: outliers are not among them any more.
+        # that of differences of successive readings, without outliers.
         weighted = residual_kpa * self._weight[rows]
         noise = float(np.mean(np.diff(weighted) ** 2)) / 2.0
         variance = noise / self._weight[rows] ** 2 + (curve_n / n_per_kpa) ** 2
@@ -242,7 +240,7 @@ class OutputErrorProblem:
         return replace(model, loop=x[at["loop"]]) if "loop" in at else model
 
     def _gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:
-        """Gain of each loading, by least squares with a prior of one, and modelled pressures."""
+        """Compute the gain of each loading, with a prior of one, and the modelled pressures."""
         points = self._points
         modelled = model.pressed(points.t_s, self._force_n(model.late_s))
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
@@ -253,7 +251,7 @@ class OutputErrorProblem:
         return (product + prior) / (square + prior), modelled
 
     def residual(self, model: DomeModel, scatter: float) -> Floats:
-        """What is fitted: pressures and gains off, in their standard uncertainties."""
+        """Compute the residuals of pressures and gains in their standard uncertainties."""
         gains, modelled = self._gains(model, scatter)
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         off = (gains[self._points.loading] * gauge_kpa - self._gauge_kpa) * self._weight
@@ -261,34 +259,34 @@ class OutputErrorProblem:
 
     @property
     def most_n(self) -> float:
-        """The greatest force on the bench."""
+        """Largest reference force."""
         return float(self._points.force_n.max())
 
     def heat_n(self, fit: Fit) -> float:
-        """What the gas' heat makes of a force at most."""
+        """Return the largest effect of the gas' heat on a force."""
         model, rows = fit.model, self._usable
         heated_kpa, settled_kpa = fit.modelled[rows, 0], fit.modelled[rows, 1]
         slope = _n_per_kpa(model, (settled_kpa - model.baseline_kpa) / model.scale_kpa)
         return float(np.abs((heated_kpa - settled_kpa) * slope).max())
 
     def squares(self, model: DomeModel, scatter: float) -> float:
-        """Sum of squares of what is fitted."""
+        """Compute the sum of squared residuals."""
         off = self.residual(model, scatter)
         return float(off @ off)
 
 
 def _n_per_kpa(model: DomeModel, x: Floats) -> Floats:
-    """Slope of the curve at parts of its range."""
+    """Compute the slope of the curve at parts x of its range."""
     c1, c2, c3 = model.curve
     return np.asarray((c1 + x * (2.0 * c2 + x * 3.0 * c3)) / model.scale_kpa)
 
 
 def _systematic_n(residual_n: Floats, force_n: Floats, fast: Bools) -> float:
-    """How far the curve is off where slow strokes agree with one another, root mean square.
+    """Return the root mean square error of the curve where slow strokes agree with one another.
 
     Means over `_BINS` parts of the range of force, on the way in and on the way out.
     """
-    slow = fast if fast.all() else ~fast  # strokes that went on into taps are all there is
+    slow = fast if fast.all() else ~fast  # only strokes that continue into taps
     rising = np.gradient(force_n) > 0.0
     full_n = force_n[slow].max()
     squares = []

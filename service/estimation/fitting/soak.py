@@ -1,9 +1,9 @@
-"""What warmth does to an unloaded tile, from the end of a bench recording: a soak at two warmths.
+"""Temperature effect of an unloaded tile, from a thermal soak at two temperatures in the rig.
 
-A sealed bubble at rest follows p/T of its gas, less what its wall gives way. The gas is some
-seconds behind its chip or ahead of it, and `tadc` tells the chip's temperature (hardware.md 1.3,
-9). The gas is followed as the estimator will (model `temperature`), so what that does not describe
-is seen here, and goes into the uncertainty of the lag.
+A sealed bubble at rest follows p/T of its gas, less the compliance of its wall. The gas lags its
+chip by some seconds or leads it; the raw temperature is the chip's (hardware.md 1.3, 9). The gas is
+computed as in an estimate (model `temperature`), so the misfit of that model is part of the lag's
+uncertainty.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from service.estimation.models.temperature import followed
 
 STEP_MIN_K = 1.0
 LAG_S = (-10.0, 30.0)
-"""Lags that are looked for: from a chip that is that late to a gas that is."""
+"""Range of lags: negative for a lagging chip, positive for a lagging gas."""
 _LAGS_S = np.concatenate([-np.geomspace(10.0, 0.3, 8), [0.0], np.geomspace(0.3, 30.0, 10)])
-"""Where the search may begin: misfits have valleys."""
+"""Start values of the search, which has local minima."""
 _BIN_S = 0.1  # shorter than lags that matter, and long enough to average noise
-_SIGMA_MAX = 0.1  # relative: a baseline per kelvin that is known worse is not used
+_SIGMA_MAX = 0.1  # relative: a less certain baseline per kelvin is not used
 _KELVIN = 273.15
 _T_SIGMA = 5.0 / 298.0
-"""The chip's thermometer is not calibrated: it may be off by 5 K (hardware.md 1.3)."""
+"""Relative uncertainty of the uncalibrated thermometer: 5 K (hardware.md 1.3)."""
 _RECOVERS_S = 5.0
-"""How long a dome that was pressed before creeps back, and is left alone."""
+"""Time of a soak that is skipped while the dome recovers from earlier loads."""
 
 
 def fit_soak(soak: Soak) -> TemperatureEffect | str:
-    """How a tile's baseline follows temperature, or why the recording does not show it."""
+    """Fit the temperature effect; return the reason where the recording does not determine it."""
     bins = _bins(soak)
     if bins is None:
         return "the recording has no soak at two temperatures"
@@ -46,7 +46,7 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
     t_ns = np.rint(1e9 * soak.t_s).astype(np.int64)[:, None]
 
     def gas_k(lag_s: float) -> tuple[Floats, Floats]:
-        """Of the gas above the chip's at first, and its rise in kelvins a second."""
+        """Return the gas' temperature above the chip's first one, and its rise in K/s."""
         counts, rise = followed(soak.tadc[:, None], t_ns, np.array([lag_s]))
         return (
             (bins.mean(counts[:, 0]) - still_counts) / TADC_PER_KELVIN,
@@ -59,7 +59,7 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
         return np.asarray(off * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + off**2))))
 
     def straight(lag_s: float) -> Floats:
-        """The best base and rise for a lag."""
+        """Fit baseline and rise for a lag."""
         design = np.stack([np.ones(len(kpa)), gas_k(lag_s)[0]], axis=1) / sigma_kpa[:, None]
         base, *_ = np.linalg.lstsq(design, kpa / sigma_kpa, rcond=None)
         return np.array([*base, lag_s])
@@ -77,11 +77,11 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
     base_kpa, kpa_per_k, lag_s = (float(x) for x in found.x)
     if not kpa_per_k > 0.0 or sigma[1] > _SIGMA_MAX * kpa_per_k:
         return f"baseline per kelvin is {kpa_per_k:.3f} +- {sigma[1]:.3f} kPa: not determined"
-    # What is left beyond noise while the temperature changes, as seconds of a lag.
+    # Residual beyond noise while the temperature changes, as seconds of a lag.
     expected_k, rise_k = gas_k(lag_s)
     left = (base_kpa + kpa_per_k * expected_k - kpa) ** 2 - sigma_kpa**2
     wrong_s = np.sqrt(max(0.0, float(left.sum())) / float(((kpa_per_k * rise_k) ** 2).sum()))
-    # A rigid bubble would follow p/T; what is missing is the wall's give, dp/dT = p/T/(1 + c p).
+    # A rigid bubble would follow p/T; the wall's compliance c lowers it: dp/dT = p/T/(1 + c p).
     rigid = base_kpa / (indicative_degc(float(chip_counts[0])) + _KELVIN)
     wall = (rigid / kpa_per_k - 1.0) / base_kpa
     wall_sigma = rigid / kpa_per_k / base_kpa * float(np.hypot(sigma[1] / kpa_per_k, _T_SIGMA))
@@ -95,7 +95,7 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
 
 
 def bounds_of(effect: TemperatureEffect | None) -> tuple[str, ...]:
-    """Which parameters were found at the end of what is possible."""
+    """Return the names of parameters at a bound."""
     if effect is None:
         return ()
     found = (("lag_s", effect.lag_s, LAG_S), ("wall_per_kpa", effect.wall_per_kpa, (0.0,)))
@@ -104,7 +104,7 @@ def bounds_of(effect: TemperatureEffect | None) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Bins:
-    """Means over tenths of a second of readings that are there, in which none is empty."""
+    """Bins of a tenth of a second with valid readings; none is empty."""
 
     good: Bools
     index: Ints
@@ -125,5 +125,5 @@ def _bins(soak: Soak) -> _Bins | None:
     t_s = soak.t_s[good]
     index = ((t_s - t_s[0]) / _BIN_S).astype(np.int64)
     count = np.bincount(index)
-    # A hole: what the temperature did in it is not known.
+    # The temperature in a hole is unknown.
     return None if (count == 0).any() else _Bins(good, index, count)

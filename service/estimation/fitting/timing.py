@@ -1,8 +1,8 @@
-"""When tiles are sampled, told apart from when the reference is.
+"""Separation of the tiles' sample delays from the reference's delay.
 
-The bench sees each tile against the reference, and so the sum of two delays. What tiles have of
-their own differs between them; what they share may be the tiles' or the reference's, and only
-somebody who knows the reference can say how much is which.
+A rig measures each tile against the reference, and so the sum of two delays. Differences between
+tiles are the tiles' own. The mean may be the tiles' or the reference's; prior knowledge of the
+reference divides it.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from service.estimation.effects import Effects, Parameter
 from service.estimation.fitting.unknowns import LATE_S
 
 UNKNOWN_DELAY = Parameter(value=0.0, sigma=0.0005)
-"""Of a load cell behind an amplifier of some 300 Hz, of which no more is known."""
+"""Delay of a load cell behind an amplifier of some 300 Hz."""
 
 
 def resolved(effects: Sequence[Effects], delay: Parameter) -> list[Effects]:
-    """Tiles of one bench, with when they are sampled by themselves, in the order given.
+    """Return the effects of tiles of one rig with their own sample delays, in the same order.
 
-    The mean over tiles is divided between tiles and reference as their uncertainties are to one
-    another; what is left uncertain of it is common to all tiles.
+    The mean over tiles is divided between tiles and reference in proportion to their variances; its
+    remaining uncertainty is common to all tiles.
 
     Args:
-        effects: of the tiles, with `late_s` as it was seen against the reference.
+        effects: of the tiles, with `late_s` as measured against the reference.
         delay: of the reference.
     """
     seen = [each.late_s.value for each in effects if each.late_s is not None]

@@ -1,8 +1,8 @@
-"""What is fitted of a tile, and what is known of it beforehand.
+"""Unknowns of a tile's fit, with their priors and bounds.
 
-Effects that look alike, as a gas that cools and a fast creep, are kept apart by what is known of
-them: every unknown has a value that it is likely near, and how near. Where readings tell, that is
-next to nothing; where they do not, it is the answer, and as uncertain as that.
+Priors separate effects that look alike, such as a cooling gas and a fast creep: every unknown has a
+likely value with a standard deviation. Informative readings outweigh the prior; without them
+the prior is the result, with its uncertainty.
 """
 
 from __future__ import annotations
@@ -16,31 +16,30 @@ from service.estimation.effects import PART_MOST, STRESS_LEAST_N
 from service.estimation.fitting.bench.press import Presses
 from service.estimation.models.hysteresis import WIDTHS_N
 
-_NO_LIMIT = 1e3  # newtons: no coefficient of a curve of 30 N comes near
+_NO_LIMIT = 1e3  # newtons: far beyond any coefficient of a curve of 30 N
 TERMS_MAX = 3  # of the creep
 _CREEP_S = (0.01, 10.0)
-"""Times that are looked for: a foot's loads come and go within some ten milliseconds, and no bench
-holds a load for long."""
+"""Range of time constants: a foot's loads change within some ten milliseconds, and no rig holds a
+load for long."""
 _STEPS_MIN = 3.0  # readings within the shortest time of a creep
 
 
 LATE_S = 0.00025
-"""How well it is known beforehand when a tile is sampled: somewhere in the first part of a
-conversion of 1.6 ms (DS table 7), of which a quarter is assumed."""
-_LATE_MOST = 2.4  # times that: it is possible, but no more
+"""Prior standard deviation of a tile's sample delay: it samples in the first quarter of a
+conversion of 1.6 ms (DS table 7), by assumption."""
+_LATE_MOST = 2.4  # bound of the delay, in standard deviations
 
 
 @dataclass(frozen=True)
 class Parts:
-    """What is fitted beside the curve.
+    """Effects that are fitted beside the curve.
 
     Attributes:
-        late_s: by how much later than assumed the tile seems sampled, likely, and how near; None:
-            it is not fitted.
-        gas: its heat.
-        terms: of the creep.
-        hysteresis: the loop.
-        flow: the part of the loop that flows.
+        late_s: prior of the tile's sample delay and its standard deviation; None: not fitted.
+        gas: heat of the gas.
+        terms: number of terms of the creep.
+        hysteresis: loop.
+        flow: viscous branch of the loop.
     """
 
     late_s: tuple[float, float] | None = (0.0, LATE_S)
@@ -52,7 +51,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Unknowns of a name: what they are likely near, how near, and what is possible."""
+    """Unknowns of one name: prior values, their standard deviation, and bounds."""
 
     name: str
     likely: tuple[float, ...]
@@ -61,16 +60,15 @@ class Unknowns:
     most: tuple[float, ...]
 
 
-# No gas has more than air, which has 1.40; a single time for a sphere's many makes it less
-# (hardware.md 9), and bubbles cool within 5 to 60 ms.
+# Gamma of air is 1.40; a single time constant for a sphere's many lowers it (hardware.md 9).
+# Bubbles cool within 5 to 60 ms.
 _GAS = (
     Unknowns("gamma", (1.25,), 0.1, (1.001,), (1.4,)),
     Unknowns("ln_tau", (np.log(0.015),), 0.8, (np.log(0.0015),), (np.log(0.135),)),
 )
-_PART = (0.03, 0.05, 0.4)  # of a term: likely, how near, and at most
-_LOOP = (0.05, 0.1, 0.3)  # of a play
-# Loops are 1 to 5 % of full scale from branch to branch, any part of it viscous (hardware.md 9);
-# the part is as little known as that of a creep.
+_PART = (0.03, 0.05, 0.4)  # of a term: prior, standard deviation, bound
+_LOOP = (0.05, 0.1, 0.3)  # of a play, likewise
+# Loops are 1 to 5 % of full scale from branch to branch, any part of it viscous (hardware.md 9).
 _FLOW = (
     Unknowns("flow_part", (0.05,), 0.05, (0.0,), (PART_MOST,)),
     Unknowns("ln_flow_n", (np.log(0.2),), 1.0, (np.log(2.0 * STRESS_LEAST_N),), (np.log(2.0),)),
@@ -80,7 +78,7 @@ _FLOW = (
 
 
 def _creep(terms: int, told_s: tuple[float, float]) -> tuple[Unknowns, ...]:
-    """Parts and times: each term has its share of the times that can be told, and half the next."""
+    """Make the unknowns of creep: each term has its share of the time range, and half the next."""
     least, most = np.log(told_s)
     share = (most - least) / terms
     centre = least + share * (np.arange(terms) + 0.5)
@@ -98,15 +96,15 @@ def _creep(terms: int, told_s: tuple[float, float]) -> tuple[Unknowns, ...]:
 
 
 def unknowns_of(parts: Parts, curve: Floats, told_s: tuple[float, float]) -> list[Unknowns]:
-    """What has to be found, the curve first.
+    """List the unknowns of a fit, the curve first.
 
     Args:
-        parts: what is fitted.
-        curve: c1, c2, c3 to begin with.
-        told_s: shortest and longest time of a creep that can be told.
+        parts: effects to fit.
+        curve: start values of c1, c2, c3.
+        told_s: shortest and longest observable time constant of creep.
     """
     first = tuple(curve.tolist())
-    # Of the force at the end of the range: the slope at zero is never nothing.
+    # The slope at zero is at least a hundredth of the force at the end of the range.
     least = (0.01 * sum(first), -_NO_LIMIT, -_NO_LIMIT)
     unknowns = [Unknowns("curve", first, _NO_LIMIT, least, (_NO_LIMIT,) * 3)]
     if parts.late_s is not None:
@@ -130,7 +128,7 @@ def unknowns_of(parts: Parts, curve: Floats, told_s: tuple[float, float]) -> lis
 
 
 def told_s(points: Presses) -> tuple[float, float]:
-    """Shortest and longest time of a creep that the points can tell."""
+    """Return the shortest and the longest time constant of creep that the points determine."""
     step_s = float(np.median(np.diff(points.t_s)))
     begins = np.searchsorted(points.loading, np.arange(points.loadings))
     longest_s = float(np.diff(np.append(points.t_s[begins], points.t_s[-1])).max())

@@ -1,10 +1,9 @@
-"""A tile's curve from a few dead weights, with an interval that is as wide as they are few.
+"""Fit of a tile's curve to a few dead weights, with a 95 % interval for new settled loads.
 
-The curve is a parabola through zero: five weights do not bear the third coefficient of the paper's
-cubic, which costs 1.5 times the interval and gains nothing (benchmarks/dead_weights.py). Residuals
-are taken relative to the force. The file states standard uncertainties, which estimates multiply by
-1.96; here they are widened by Student's t for the weights that are left over, so that the interval
-holds 95 of 100 new loads that have settled.
+The curve is a parabola through zero: five weights do not determine the third coefficient of the
+paper's cubic, which widens the interval by 1.5 and gains nothing (benchmarks/dead_weights.py).
+Residuals are relative to the force. Estimates multiply the file's standard uncertainties by 1.96;
+here they are widened by Student's t for the degrees of freedom.
 """
 
 from __future__ import annotations
@@ -30,19 +29,15 @@ from service.estimation.fitting.bench.indentation import Indentation, place
 from service.estimation.fitting.bench.weights import Hold, holds
 from service.estimation.fitting.confidence import cubic_basis, curve_n
 from service.estimation.models.static import StaticCurves
+from service.estimation.weights import check_enough
 
-HOLDS_MIN = 5
-LEVELS_MIN = 4
-"""Different weights: three would leave the shape of the curve to a single one."""
-LEVEL_APART = 1.1
-"""Weights within a tenth of one another are one level."""
 SMALL_N = 2.0
-"""Below this force an error is absolute rather than relative."""
+"""Force below which an error is absolute rather than relative."""
 RESIDUAL_MAX = 0.3
-"""Part of the force; six times the paper's scatter between loadings."""
+"""Largest relative residual: six times the paper's scatter between loadings."""
 DRIFT_MAX_KPA = 2.0
-"""Of the unloaded pressure between the first and any later rest: as far as a dome that creeps by
-15 % may go. Each weight is taken above its own rest."""
+"""Largest drift of the unloaded pressure from the first to any later rest, that of 15 % creep. The
+pressure of each weight is relative to its own rest."""
 RANGE_MIN_KPA = 1.0
 TERMS = 2
 _BAND_STEPS = 10
@@ -55,7 +50,7 @@ _NOT_SEEN: dict[EffectName, str] = {
 
 
 def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
-    """Fit the curve of one tile to all weights that stood on it, in one recording or several.
+    """Fit the curve of one tile to all its dead weights, in one recording or several.
 
     Raises:
         CalibrationError: there are too few weights, or they show no curve.
@@ -63,7 +58,7 @@ def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     where = ", ".join(place(recording) for recording in recordings)
     per_file = [holds(recording) for recording in recordings]
     steps = [step for found in per_file for step in found]
-    _refuse_too_few(steps, where)
+    check_enough([step.weight.force_n for step in steps], where)
     drift_kpa = max(
         max(abs(step.baseline_kpa - found[0].baseline_kpa) for step in found)
         for found in per_file
@@ -101,7 +96,7 @@ def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     covariance[:TERMS, :TERMS] = scatter**2 * np.linalg.inv(design.T @ design)
     slope = (c1 + 2.0 * c2 * gauge_kpa / high_kpa) / high_kpa
     settle = slope * np.array([step.settle_kpa for step in steps]) / force_n
-    # One scale weighs them all: their error does not average out.
+    # The weights share one scale: its error does not average out.
     scale = max(step.weight.relative_sigma for step in steps)
     spread_n = force_n - force_n.mean()
     tile = TileCalibration(
@@ -173,20 +168,6 @@ def _left_out_rms_n(design: Floats, force_n: Floats, weight: Floats, basis: Floa
         found, *_ = np.linalg.lstsq(design[others], (force_n * weight)[others], rcond=None)
         errors.append(float(basis[i] @ found - force_n[i]))
     return float(np.sqrt(np.mean(np.square(errors))))
-
-
-def _refuse_too_few(steps: Sequence[Hold], where: str) -> None:
-    levels: list[float] = []
-    for force_n in sorted(step.weight.force_n for step in steps):
-        if not levels or force_n > LEVEL_APART * levels[-1]:
-            levels.append(force_n)
-    if len(steps) < HOLDS_MIN or len(levels) < LEVELS_MIN:
-        raise CalibrationError(
-            f"{len(steps)} weights on the tile, {len(levels)} of them different",
-            where=where,
-            expected=f"{HOLDS_MIN} or more, {LEVELS_MIN} of them different by a tenth or more",
-            remedy="Put more weights on it; two together are a third one",
-        )
 
 
 def _refuse_no_rise(force_n: Floats, gauge_kpa: Floats, steps: Sequence[Hold], where: str) -> None:

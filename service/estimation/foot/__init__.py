@@ -1,7 +1,7 @@
-"""The foot as a whole: where its tiles are, at what angle it stands, when it bears load."""
+"""Foot as a whole: geometry of its tiles, angle, contact."""
 
 UNKNOWN = 255
-"""Contact in a frame in which it is not known."""
+"""Value of `contact` where it is unknown."""
 
 UNSEEN_NS = 50_000_000
-"""A foot not seen for longer than this may have been lifted and put down again."""
+"""Longest time without a reading in which the foot cannot have been lifted and put down again."""

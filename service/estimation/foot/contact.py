@@ -1,28 +1,26 @@
-"""Contact: does the foot bear load? Thresholds with hysteresis, and a minimum time.
+"""Contact: a Schmitt trigger on the GRF with debounce.
 
-A change is believed if it lasts `min_ns`, and is then dated back to its beginning as far as the
-look-ahead allows: with a lag of at least `min_ns` contact begins with the first loaded frame.
+A change is accepted if it lasts `min_ns`, and is then dated back to its beginning within the
+look-ahead: with a lag of at least `min_ns` contact begins with the first loaded frame.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from devices.arrays import Times
 from devices.compiled import compiled, inlined
-from service.estimation.records import Record, record_type
+from service.estimation.records import KernelRecord
 
 
 @dataclass(frozen=True)
 class ContactRule:
-    """When the foot is in contact.
+    """Thresholds of contact.
 
     Attributes:
-        on_n: force above which it seems to be.
-        off_n: force below which it seems not to be; in between it stays what it was.
-        min_ns: how long it has to seem so.
+        on_n: force at which the candidate becomes contact.
+        off_n: force at which it becomes no contact; in between it stays.
+        min_ns: time for which a candidate has to last.
     """
 
     on_n: float
@@ -30,39 +28,42 @@ class ContactRule:
     min_ns: int
 
 
-STATE = record_type([("loaded", np.int64), ("since_ns", np.int64)])
-"""Does the foot seem loaded, and since when has it seemed so? Zeros before the first frame."""
+class ContactState(KernelRecord):
+    """Candidate of contact; zeros before the first frame."""
+
+    is_loaded: int
+    since_ns: int
 
 
 @compiled
 def seeming(
-    on_n: float, off_n: float, state: Record, grf_n: float, t_ns: int, broken: bool
+    on_n: float, off_n: float, state: ContactState, grf_n: float, t_ns: int, after_gap: bool
 ) -> None:
-    """Whether the foot seems loaded in the next frame, and since when it has seemed so.
+    """Update the candidate of contact with the next frame.
 
     Args:
         on_n: of `ContactRule`.
         off_n: likewise.
-        state: from the frame before; becomes that after this one.
-        grf_n: NaN changes nothing.
+        state: after the frame before; updated.
+        grf_n: NaN leaves the candidate as it is.
         t_ns: instant.
-        broken: is the frame broken from the one before, by a gap? Then a new run begins.
+        after_gap: whether a gap precedes the frame; the candidate then starts again.
     """
-    loaded = 1 if grf_n >= on_n else (0 if grf_n <= off_n else state.loaded)
-    if loaded != state.loaded or broken:
+    loaded = 1 if grf_n >= on_n else (0 if grf_n <= off_n else state.is_loaded)
+    if loaded != state.is_loaded or after_gap:
         state.since_ns = t_ns
-    state.loaded = loaded
+    state.is_loaded = loaded
 
 
 @inlined
 def has_lasted(since_ns: Times, t_ns: Times, i: int, end: int, min_ns: int, lag_ns: int) -> bool:
-    """Has what the foot seems to be in frame `i` lasted long enough, as far as can be seen?
+    """Return whether the candidate of frame `i` lasts `min_ns` within the look-ahead.
 
     Args:
-        since_ns: (n,), per frame since when it has seemed so; `seeming` tells.
+        since_ns: (n,), `ContactState.since_ns` after each frame.
         t_ns: (n,), instants.
         i: frame.
-        end: frame after the last that is there; those within the look-ahead must all be.
+        end: frame after the last that is stored; all within the look-ahead must be.
         min_ns: of `ContactRule`.
         lag_ns: look-ahead.
     """

@@ -1,4 +1,4 @@
-"""Where the tiles are: hull, grid, segment angle, and the way from foot frame to ground frame.
+"""Geometry of the tiles: hull, grid, segment angle, transform from foot to ground frame.
 
 Axes as in the design: foot frame x forward, y to the left, z up the segment, origin at the ankle.
 A positive angle is a roll forward (right-handed about y).
@@ -12,14 +12,13 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.compiled import compiled
-from devices.frames import ServoInfo
+from devices.frames import SAME_PLACE_M, ServoInfo
 
-_SAME_PLACE_M = 1e-6  # tiles that differ by less stand in one line
-_CURVED_TILES = 3  # places along x that show how a sole is curved
+_CURVED_TILES = 3  # least positions along x that determine a parabola
 
 
 def hull(positions_m: Floats) -> tuple[Floats, Floats]:
-    """Half-planes `normals @ p <= offsets` whose intersection is the hull of tiles (tiles, 2).
+    """Compute half-planes `normals @ p <= offsets` whose intersection is the hull of (tiles, 2).
 
     Tiles in a line, or a single one, have a hull without area: two half-planes across every
     direction in which they do not extend would forbid any noise, so only the ends of the line
@@ -31,7 +30,7 @@ def hull(positions_m: Floats) -> tuple[Floats, Floats]:
     centre_m = positions_m.mean(axis=0)
     _, spread_m, directions = np.linalg.svd(positions_m - centre_m)
     extends = np.zeros(2, dtype=bool)
-    extends[: len(spread_m)] = spread_m > _SAME_PLACE_M
+    extends[: len(spread_m)] = spread_m > SAME_PLACE_M
     if extends.all():
         from scipy.spatial import ConvexHull
 
@@ -44,12 +43,12 @@ def hull(positions_m: Floats) -> tuple[Floats, Floats]:
 def grid_indices(
     positions_m: Floats,
 ) -> tuple[Floats, Floats] | None:
-    """Index of every tile along x and y, from 1, if the tiles fill a grid (paper eq. 4); else None.
+    """Return each tile's index along x and y, from 1 (paper eq. 4); None if they fill no grid.
 
     A line of tiles is a grid of one row.
     """
-    columns, x = np.unique(np.round(positions_m[:, 0] / _SAME_PLACE_M), return_inverse=True)
-    rows, y = np.unique(np.round(positions_m[:, 1] / _SAME_PLACE_M), return_inverse=True)
+    columns, x = np.unique(np.round(positions_m[:, 0] / SAME_PLACE_M), return_inverse=True)
+    rows, y = np.unique(np.round(positions_m[:, 1] / SAME_PLACE_M), return_inverse=True)
     places = set(zip(x.tolist(), y.tolist(), strict=True))
     if len(places) != len(positions_m) or len(places) != len(columns) * len(rows):
         return None
@@ -57,13 +56,13 @@ def grid_indices(
 
 
 def axes_rad(positions_m: Floats) -> Floats:
-    """Angle of each tile's axis to the segment, (tiles,): as the segment rolls, upright in turn.
+    """Compute the angle of each tile's axis to the segment, (tiles,).
 
-    Tiles stand upright on their sole, whose shape along x is a parabola through their places
-    (tiles, 3). Zero, if these do not show how it is curved.
+    Tiles stand upright on their sole, whose shape along x is a parabola through their positions
+    (tiles, 3). Zero if these do not determine it. As the segment rolls, tiles are vertical in turn.
     """
     x_m, z_m = positions_m[:, 0], positions_m[:, 2]
-    if len(np.unique(np.round(x_m / _SAME_PLACE_M))) < _CURVED_TILES:
+    if len(np.unique(np.round(x_m / SAME_PLACE_M))) < _CURVED_TILES:
         return np.zeros(len(positions_m))
     design = np.stack([np.ones(len(x_m)), x_m, x_m**2], axis=1)
     (_, slope, bend), *_ = np.linalg.lstsq(design, z_m, rcond=None)
@@ -71,18 +70,18 @@ def axes_rad(positions_m: Floats) -> Floats:
 
 
 def lost_by_tilt(axes: Floats) -> Floats:
-    """Part of a force along each tile's axis that is not along the segment: 1 - cos."""
+    """Return the part of a force along each tile's axis that is not along the segment: 1 - cos."""
     return np.asarray(1.0 - np.cos(axes))
 
 
 def rad_per_count(servo: ServoInfo) -> float:
-    """Of the segment's angle, per count of the servo from its zero; signed."""
+    """Return the segment's angle for a count of the servo; signed."""
     return servo.sign * servo.ratio * 2.0 * math.pi / servo.counts_per_turn
 
 
 @compiled
 def to_ground_x_m(x_m: float, z_m: float, angle_rad: float, ankle_travel_m_per_rad: float) -> float:
-    """A point of the foot frame in the ground frame, along x (paper eq. 3 with l = -z, r = -x).
+    """Transform a point's x from foot to ground frame (paper eq. 3 with l = -z, r = -x).
 
     ankle travel + x cos(angle) + z sin(angle); NaN where the ankle's travel is.
     """

@@ -1,1 +1,1 @@
-"""The models that a scene names, one after the other. Asks models, tare, watch; none knows it."""
+"""Signal chain from frames to forces, GRF and COP: applies the models that a scene names."""

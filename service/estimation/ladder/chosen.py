@@ -1,8 +1,7 @@
-"""The model ladder: what of it a scene names, with its constants, over the tiles that bear load.
+"""Model set: the models that a scene names, with their parameters over the load-bearing tiles.
 
-Lower part, reading by reading: baseline (temperature, ambient), gas, static curve, skew. Upper
-part, once the look-ahead is there: denoise, hysteresis, rubber. Loop and creep are undone in the
-opposite order in which the dome makes them, and after the noise, because both remember.
+Sample stage, reading by reading: baseline (temperature, ambient), gas, static curve, skew.
+Smoothing stage, within the look-ahead: denoise, hysteresis, rubber.
 """
 
 from __future__ import annotations
@@ -44,23 +43,23 @@ MODELS = (
 
 @dataclass(frozen=True)
 class Ladder:
-    """Constants of the models; None for what is not named. Arrays over bearing tiles.
+    """Parameters of the models, arrays over load-bearing tiles; None for a model not named.
 
     Attributes:
-        unwrap: are wrapped counts taken back?
-        temperature: of the baseline.
-        ambient: what the domes pass on.
-        gas: of the bubbles.
-        gas_known: does a tile's bench tell of its gas? Others have that of a median tile, for
-            their uncertainty.
-        gas_misfit: part of the gas' correction that is uncertain.
-        curves: static curves; those beneath creep and loop if `rubber` is there.
-        skew: are tiles taken to the frame's instant?
-        denoise: is noise averaged away, and are outliers replaced?
-        hysteresis: of the rubber.
-        flow: the part of it that flows; None if no tile's bench tells of one.
-        rubber: its creep.
-        rubber_misfit: part of creep's and loop's correction that is uncertain.
+        unwrap: whether wrapped counts are corrected.
+        temperature: shift of the baseline.
+        ambient: transmission of the surrounding pressure.
+        gas: heat of the bubbles.
+        gas_known: (tiles,), whether the calibration has a tile's gas. Other tiles use the gas of a
+            median tile, for their uncertainty.
+        gas_misfit: (tiles,), uncertain part of the gas correction.
+        curves: static curves; of settled forces if `rubber` is named.
+        skew: whether tiles are interpolated to the frame's instant.
+        denoise: whether noise is averaged and outliers are replaced.
+        hysteresis: loop of the rubber.
+        flow: viscous branch of the rubber; None if no tile's calibration has one.
+        rubber: creep.
+        rubber_misfit: (tiles,), uncertain part of the corrections of creep and loop.
     """
 
     unwrap: bool
@@ -81,7 +80,7 @@ class Ladder:
 def make_ladder(
     info: ArrayInfo, calibration: Calibration, tare: Tare, models: Sequence[str]
 ) -> Ladder:
-    """Work out the constants of the models named.
+    """Compute the parameters of the models named.
 
     Raises:
         UsageError: an unknown model, no `static`, or `ambient` without a bare tile.
@@ -119,7 +118,7 @@ def make_ladder(
 
 
 def check_models(models: Sequence[str]) -> None:
-    """Refuse unknown models, and a ladder without force.
+    """Reject unknown models, and a model set without forces.
 
     Raises:
         UsageError: an unknown model, or no `static`.
@@ -132,18 +131,18 @@ def check_models(models: Sequence[str]) -> None:
 
 
 _OF_ALL = frozenset({"temperature", "ambient"})
-"""Models that every tile has to have: what they correct is as great as any load. Of the others a
-tile may go without one, alone; its uncertainty says so."""
+"""Models that every tile needs: their corrections are as large as any load. A single tile may lack
+another model; its uncertainty then contains the missing correction."""
 
 
 def _refuse_undetermined(
     name: EffectName, tiles: Sequence[TileCalibration], calibration: Calibration, *, every: bool
 ) -> None:
     needed = "temperature" if name == "ambient" else name
-    lacks = [getattr(tile.effects, needed) is None for tile in tiles]
+    lacks = [getattr(tile.effects, needed) is None for tile in tiles]  # ANY: fields of Effects
     for tile, is_lacking in zip(tiles, lacks, strict=True):
         if is_lacking and (every or all(lacks)):
-            reason = tile.effects.refused.get(name, "its calibration does not know of it")
+            reason = tile.effects.refused.get(name, "its calibration does not contain it")
             raise CalibrationError(
                 f"model {name!r} is not offered for tile {tile.serial}: {reason}",
                 where=f"calibration {calibration.name} ({calibration.id})",
@@ -155,7 +154,7 @@ def _refuse_undetermined(
 def _refuse_mixed(
     tiles: Sequence[TileCalibration], models: Sequence[str], calibration: Calibration
 ) -> None:
-    """All tiles have the plays that are modelled."""
+    """Reject tiles with another number of plays than the model's."""
     plays = {len(e.part) for tile in tiles if (e := tile.effects.hysteresis) is not None}
     if "hysteresis" in models and plays != {len(WIDTHS_N)}:
         raise CalibrationError(
@@ -199,31 +198,32 @@ def _gas(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> Gas:
 def _hysteresis(tiles: Sequence[TileCalibration]) -> Hysteresis:
     found = [tile.effects.hysteresis for tile in tiles]
     none = np.zeros(len(WIDTHS_N))
-    return Hysteresis(np.array([none if e is None else values(e.part) for e in found]))
+    weights = [none if e is None else values(e.part) for e in found]
+    return Hysteresis(play_weights=np.array(weights))
 
 
 def _flow(tiles: Sequence[TileCalibration]) -> Flow | None:
-    """What a tile lacks is no part of any force."""
     found = [None if (e := tile.effects.hysteresis) is None else e.flow for tile in tiles]
     if all(effect is None for effect in found):
         return None
+    # A tile without the branch has the fraction 0.
     return Flow(
-        part=np.array([0.0 if effect is None else effect.part.value for effect in found]),
-        stress_n=np.array([1.0 if effect is None else effect.stress_n.value for effect in found]),
-        power=np.array([4.0 if effect is None else effect.power.value for effect in found]),
+        fraction=np.array([0.0 if e is None else e.part.value for e in found]),
+        stress_scale_n=np.array([1.0 if e is None else e.stress_n.value for e in found]),
+        exponent=np.array([4.0 if e is None else e.power.value for e in found]),
     )
 
 
 def _rubber(tiles: Sequence[TileCalibration]) -> Rubber:
-    """With as many terms as the tile that has most; what a tile lacks is nothing, at any time."""
+    """Make parameters with the largest number of terms of a tile; missing terms are zero."""
     found = [tile.effects.rubber for tile in tiles]
     terms = max(len(effect.part) for effect in found if effect is not None)
-    part, tau_s = np.zeros((len(tiles), terms)), np.ones((len(tiles), terms))
+    fraction, tau_s = np.zeros((len(tiles), terms)), np.ones((len(tiles), terms))
     for i, effect in enumerate(found):
         if effect is not None:
-            part[i, : len(effect.part)] = values(effect.part)
+            fraction[i, : len(effect.part)] = values(effect.part)
             tau_s[i, : len(effect.part)] = values(effect.tau_s)
-    return Rubber(part=part, tau_s=tau_s)
+    return Rubber(creep_fraction=fraction, tau_s=tau_s)
 
 
 def _misfit(effects: Sequence[GasEffect | RubberEffect | None], *, unknown: float) -> Floats:
@@ -235,4 +235,4 @@ def _ambient(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> Ambient:
     found = [effect for tile in tiles if (effect := tile.effects.temperature) is not None]
     wall = [e.wall_per_kpa for e in found]
     relative = max((w.sigma / w.value if w.value > 0.0 else 1.0 for w in wall), default=1.0)
-    return Ambient(passed=give / (1.0 + give), relative_sigma=relative)
+    return Ambient(transmitted_fraction=give / (1.0 + give), relative_sigma=relative)

@@ -1,184 +1,194 @@
-"""All constants of an estimate as records, which compiled code reads; made from its plan."""
+"""Parameters of an estimate as records for compiled code, made from its plan."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from devices.arrays import Floats
+from devices.arrays import Floats, Ints
 from service.estimation.foot.geometry import rad_per_count
 from service.estimation.ladder.plan import SIGMAS, EstimationPlan
-from service.estimation.ladder.unseen import LAW as UNSEEN
-from service.estimation.models import ambient, flow, gas, hysteresis, rubber, static, temperature
+from service.estimation.ladder.unseen import SaturationParams
+from service.estimation.models.ambient import Ambient, AmbientParams
 from service.estimation.models.denoise import AVERAGED_MAX
-from service.estimation.records import Records, record_type, records
-from service.estimation.watch import repeats
-from service.estimation.watch.repeats import SHARES
+from service.estimation.models.flow import Flow, FlowParams
+from service.estimation.models.gas import Gas, GasParams
+from service.estimation.models.hysteresis import Hysteresis, HysteresisParams
+from service.estimation.models.rubber import Rubber, RubberParams
+from service.estimation.models.static import StaticParams
+from service.estimation.models.temperature import Temperature, TemperatureParams
+from service.estimation.records import KernelRecord, RecordArray
+from service.estimation.watch.repeats import SHARES, StuckParams
 
-SCENE = record_type(
-    [
-        # Which models are named; 0 or 1.
-        ("unwrap", np.int64),
-        ("temperature", np.int64),
-        ("ambient", np.int64),
-        ("gas", np.int64),
-        ("skew", np.int64),
-        ("denoise", np.int64),
-        ("hysteresis", np.int64),
-        ("flow", np.int64),
-        ("rubber", np.int64),
-        ("watched", np.int64),
-        ("warms", np.int64),
-        # Look-ahead.
-        ("waits", np.int64),
-        ("lag_ns", np.int64),
-        ("look_ns", np.int64),
-        ("gap_ns", np.int64),
-        # What is known beforehand.
-        ("tare_lost", np.int64),
-        ("tare_ns", np.int64),
-        ("assumed_scale", np.int64),
-        # Contact and centre of pressure.
-        ("on_n", np.float64),
-        ("off_n", np.float64),
-        ("min_ns", np.int64),
-        ("cop_sigma_max_m", np.float64),
-        ("grid", np.int64),
-        # The servo, if there is one, and how it becomes an angle and a place.
-        ("servo", np.int64),
-        ("counts_per_turn", np.int64),
-        ("zero_counts", np.float64),
-        ("rad_per_count", np.float64),
-        ("travel_m_per_rad", np.float64),
-        ("bearing", np.int64),  # number of tiles that bear load
-        ("bound_on_n", np.float64),  # a bound that tells contact: `on_n` as the foot bears it
-        # Is it known which way the ground pushes tiles that are not upright, and which?
-        ("sheared", np.int64),
-        ("shear", np.float64),
-        ("shear_sigma", np.float64),
-        # Of `repeats.Limits`, and of the sum of all tiles as of each of them.
-        ("by_repeats", np.int64, (SHARES + 1,)),
-        ("by_twos", np.int64, (SHARES + 1,)),
-        ("noise_left", np.float64, (AVERAGED_MAX + 1,)),
-    ]
-)
-"""What holds for the whole foot, as in `EstimationPlan`."""
 
-TILE = record_type(
-    [
-        ("bears", np.int64),
-        *((name, np.float64) for name in ("a0", "b1", "b2", "c12")),  # the chip's coefficients
-        ("baseline_kpa", np.float64),
-        ("noise_kpa", np.float64),
-        ("tare_counts", np.float64),
-        ("end_kpa", np.float64),
-        ("unloaded_kpa", np.float64),
-        ("repeats", repeats.LAW),
-        # From here on of a tile that bears load only.
-        ("even", np.float64),
-        ("warms_kpa", np.float64),
-        ("baseline_variance", np.float64),
-        ("late_ns", np.int64),
-        ("late_sigma_s", np.float64),
-        ("late_common_s", np.float64),
-        ("chip_end_kpa", np.float64),
-        ("low_kpa", np.float64),
-        ("unseen", UNSEEN),
-        ("gas_known", np.int64),
-        ("gas_misfit", np.float64),
-        ("rubber_misfit", np.float64),
-        ("place_m", np.float64, (3,)),
-        ("gain", np.float64),
-        ("gain_sigma", np.float64),
-        ("axis_rad", np.float64),
-        ("tilted", np.float64),
-        ("noise_left", np.float64, (AVERAGED_MAX + 1,)),
-        ("grid", np.float64, (2,)),
-        ("static", static.LAW),
-        ("temperature", temperature.LAW),
-        ("ambient", ambient.LAW),
-        ("gas", gas.LAW),
-        ("flow", flow.LAW),
-        ("hysteresis", hysteresis.LAW),
-        ("rubber", rubber.LAW),
-    ]
-)
-"""What holds for a tile; of models that are not named zeros, which nobody reads."""
+class FootParams(KernelRecord):
+    """Parameters of the foot, as in `EstimationPlan`; `has_` and `is_` are 0 or 1."""
+
+    # Models.
+    has_unwrap: int
+    has_temperature: int
+    has_ambient: int
+    has_gas: int
+    has_skew: int
+    has_denoise: int
+    has_hysteresis: int
+    has_flow: int
+    has_rubber: int
+    has_fault_detection: int
+    has_thermal_drift: int  # warmth that no model corrects
+    # Look-ahead.
+    waits_for_next: int
+    lag_ns: int
+    lookahead_ns: int
+    gap_ns: int
+    # Tare and scale.
+    is_tare_lost: int
+    tare_ns: int
+    is_scale_assumed: int
+    # Contact and centre of pressure.
+    contact_on_n: float
+    contact_off_n: float
+    contact_min_ns: int
+    cop_sigma_max_m: float
+    has_grid: int
+    # Servo, and its transform to angle and position.
+    has_servo: int
+    counts_per_turn: int
+    zero_counts: float
+    rad_per_count: float
+    travel_m_per_rad: float
+    n_load_bearing: int  # number of tiles that bear load
+    contact_bound_n: float  # lower bound of the GRF that proves contact: `contact_on_n` as mounted
+    # Direction of the ground's force on tiles that are not upright.
+    is_shear_known: int
+    shear: float
+    shear_sigma: float
+    # As in `repeats.Limits`.
+    run_max_by_equal: Annotated[Ints, (SHARES + 1,)]
+    run_max_by_double_step: Annotated[Ints, (SHARES + 1,)]
+    variance_inflation: Annotated[Floats, (AVERAGED_MAX + 1,)]  # of the sum of tiles
+
+
+class TileParams(KernelRecord):
+    """Parameters of a tile; those of models that are not named are zero and not read."""
+
+    is_load_bearing: int
+    a0: float  # coefficients of the chip
+    b1: float
+    b2: float
+    c12: float
+    baseline_kpa: float
+    noise_kpa: float
+    tare_counts: float
+    stuck_check_max_kpa: float
+    unloaded_band_kpa: float
+    stuck: StuckParams
+    # The rest is of tiles that bear load.
+    asymmetry: float
+    thermal_kpa_per_count: float
+    baseline_variance: float
+    sample_delay_ns: int
+    sample_delay_sigma_s: float
+    sample_delay_common_sigma_s: float
+    chip_max_kpa: float
+    range_low_kpa: float
+    saturation: SaturationParams
+    is_gas_known: int
+    gas_misfit: float
+    rubber_misfit: float
+    position_m: Annotated[Floats, (3,)]
+    mount_gain: float
+    mount_gain_sigma: float
+    axis_rad: float
+    tilt_loss: float
+    variance_inflation: Annotated[Floats, (AVERAGED_MAX + 1,)]
+    grid_index: Annotated[Floats, (2,)]
+    static: StaticParams
+    temperature: TemperatureParams
+    ambient: AmbientParams
+    gas: GasParams
+    flow: FlowParams
+    hysteresis: HysteresisParams
+    rubber: RubberParams
 
 
 class Laws(NamedTuple):
-    """Constants of one estimate.
+    """Parameters of one estimate.
 
     Attributes:
-        scene: (1,), `SCENE`.
-        tiles: (tiles,), `TILE`.
-        hull: (k, 3), unit normals and offsets in m of the half-planes that the tiles lie in.
+        foot: (1,), of the foot.
+        tiles: (tiles,), of the tiles.
+        hull: (k, 3), unit normals and offsets in m of the half-planes that contain the tiles.
     """
 
-    scene: Records
-    tiles: Records
+    foot: RecordArray[FootParams]
+    tiles: RecordArray[TileParams]
     hull: Floats
 
 
 def make_laws(plan: EstimationPlan) -> Laws:
-    """Constants of `plan`, whose fields they repeat."""
+    """Make the kernel's parameters from `plan`."""
     normals, offsets_m = plan.hull
     return Laws(
-        scene=_scene(plan),
-        tiles=_tiles(plan),
+        foot=_foot_params(plan),
+        tiles=_tile_params(plan),
         hull=np.ascontiguousarray(np.column_stack([normals, offsets_m])),
     )
 
 
-def _scene(plan: EstimationPlan) -> Records:
+def _foot_params(plan: EstimationPlan) -> RecordArray[FootParams]:
     ladder, servo = plan.ladder, plan.info.servo
-    scene = records(
-        SCENE,
-        1,
-        unwrap=ladder.unwrap,
-        skew=ladder.skew,
-        denoise=ladder.denoise,
-        watched=plan.watch is not None,
-        warms=plan.watch is not None and plan.watch.kpa_per_count is not None,
-        waits=plan.waits,
+    columns: dict[str, Any] = {
+        "has_unwrap": ladder.unwrap,
+        "has_temperature": ladder.temperature is not None,
+        "has_ambient": ladder.ambient is not None,
+        "has_gas": ladder.gas is not None,
+        "has_hysteresis": ladder.hysteresis is not None,
+        "has_flow": ladder.flow is not None,
+        "has_rubber": ladder.rubber is not None,
+        "has_skew": ladder.skew,
+        "has_denoise": ladder.denoise,
+        "has_fault_detection": plan.watch is not None,
+        "has_thermal_drift": plan.watch is not None and plan.watch.kpa_per_count is not None,
+        "waits_for_next": plan.waits,
         # Without look-ahead the next frame is not there, and may be of the same instant.
-        lag_ns=plan.lag_ns,
-        look_ns=plan.look_ns,
-        gap_ns=plan.gap_ns,
-        tare_lost=plan.tare.is_lost,
-        tare_ns=plan.tare.t_ns,
-        assumed_scale=plan.assumed_scale,
-        on_n=plan.contact.on_n,
-        off_n=plan.contact.off_n,
-        bound_on_n=plan.contact.on_n * plan.gain.max(),
-        min_ns=plan.contact.min_ns,
-        cop_sigma_max_m=plan.cop_sigma_max_m,
-        grid=plan.grid is not None,
-        bearing=len(plan.bearing),
-        noise_left=plan.noise_left.mean(axis=0),
-    )
+        "lag_ns": plan.lag_ns,
+        "lookahead_ns": plan.look_ns,
+        "gap_ns": plan.gap_ns,
+        "is_tare_lost": plan.tare.is_lost,
+        "tare_ns": plan.tare.t_ns,
+        "is_scale_assumed": plan.assumed_scale,
+        "contact_on_n": plan.contact.on_n,
+        "contact_off_n": plan.contact.off_n,
+        "contact_bound_n": plan.contact.on_n * plan.gain.max(),
+        "contact_min_ns": plan.contact.min_ns,
+        "cop_sigma_max_m": plan.cop_sigma_max_m,
+        "has_grid": plan.grid is not None,
+        "n_load_bearing": len(plan.bearing),
+        "variance_inflation": plan.noise_left.mean(axis=0),
+    }
     if plan.watch is not None:
         limits = plan.watch.most
-        scene["by_repeats"], scene["by_twos"] = limits.by_repeats, limits.by_twos
-    for name in ("temperature", "ambient", "gas", "hysteresis", "flow", "rubber"):
-        scene[name] = getattr(ladder, name) is not None
+        columns["run_max_by_equal"] = limits.run_max_by_equal
+        columns["run_max_by_double_step"] = limits.run_max_by_double_step
     if plan.shear is not None:
-        scene["sheared"] = 1
-        scene["shear"], scene["shear_sigma"] = plan.shear.value, plan.shear.sigma
+        columns |= {"is_shear_known": 1, "shear": plan.shear.value, "shear_sigma": plan.shear.sigma}
     if servo is not None:
         travel = servo.ankle_travel_m_per_rad
-        scene["servo"] = 1
-        scene["counts_per_turn"], scene["zero_counts"] = servo.counts_per_turn, servo.zero_counts
-        scene["rad_per_count"] = rad_per_count(servo)
-        scene["travel_m_per_rad"] = np.nan if travel is None else travel
-    return scene
+        columns |= {
+            "has_servo": 1,
+            "counts_per_turn": servo.counts_per_turn,
+            "zero_counts": servo.zero_counts,
+            "rad_per_count": rad_per_count(servo),
+            "travel_m_per_rad": np.nan if travel is None else travel,
+        }
+    return FootParams.array(1, **columns)
 
 
-def _tiles(plan: EstimationPlan) -> Records:
-    tare, ladder, watch, bearing = plan.tare, plan.ladder, plan.watch, plan.bearing
-    tiles = records(
-        TILE,
+def _tile_params(plan: EstimationPlan) -> RecordArray[TileParams]:
+    tare, ladder, watch = plan.tare, plan.ladder, plan.watch
+    tiles = TileParams.array(
         len(plan.info.tiles),
         **vars(plan.compensation),
         baseline_kpa=tare.baseline_kpa,
@@ -186,36 +196,42 @@ def _tiles(plan: EstimationPlan) -> Records:
         tare_counts=tare.tadc_counts,
     )
     if watch is not None:
-        tiles["end_kpa"], tiles["unloaded_kpa"] = watch.end_kpa, watch.unloaded_kpa
-        tiles["repeats"] = watch.most.laws()
-    own = {
-        "bears": 1,
-        "even": 0.0 if watch is None else watch.even,
-        "warms_kpa": 0.0 if watch is None or watch.kpa_per_count is None else watch.kpa_per_count,
+        tiles["stuck_check_max_kpa"], tiles["unloaded_band_kpa"] = watch.end_kpa, watch.unloaded_kpa
+        tiles["stuck"] = watch.most.laws()
+    kpa_per_count = 0.0 if watch is None or watch.kpa_per_count is None else watch.kpa_per_count
+    load_bearing: dict[str, Any] = {
+        "is_load_bearing": 1,
+        "asymmetry": 0.0 if watch is None else watch.even,
+        "thermal_kpa_per_count": kpa_per_count,
         "baseline_variance": plan.baseline_sigma_kpa**2,
-        "late_ns": plan.late_ns,
-        "late_sigma_s": plan.late_sigma_s,
-        "late_common_s": plan.late_common_s,
-        "chip_end_kpa": plan.chip_end_kpa,
-        "low_kpa": ladder.curves.low_kpa - SIGMAS * plan.still_kpa,
-        "unseen": plan.unseen.laws(),
-        "gas_known": ladder.gas_known,
+        "sample_delay_ns": plan.late_ns,
+        "sample_delay_sigma_s": plan.late_sigma_s,
+        "sample_delay_common_sigma_s": plan.late_common_s,
+        "chip_max_kpa": plan.chip_end_kpa,
+        "range_low_kpa": ladder.curves.low_kpa - SIGMAS * plan.still_kpa,
+        "saturation": plan.unseen.laws(),
+        "is_gas_known": ladder.gas_known,
         "gas_misfit": ladder.gas_misfit,
         "rubber_misfit": ladder.rubber_misfit,
-        "place_m": plan.bearing_m,
-        "gain": plan.gain,
-        "gain_sigma": plan.gain_sigma,
+        "position_m": plan.bearing_m,
+        "mount_gain": plan.gain,
+        "mount_gain_sigma": plan.gain_sigma,
         "axis_rad": plan.axis_rad,
-        "tilted": plan.tilted,
-        "noise_left": plan.noise_left,
+        "tilt_loss": plan.tilted,
+        "variance_inflation": plan.noise_left,
         "static": ladder.curves.laws(),
     }
-    for name in ("temperature", "ambient", "gas", "flow", "hysteresis", "rubber"):
-        model = getattr(ladder, name)
-        if model is not None:
-            own[name] = model.laws()
+    models: dict[str, Temperature | Ambient | Gas | Flow | Hysteresis | Rubber | None] = {
+        "temperature": ladder.temperature,
+        "ambient": ladder.ambient,
+        "gas": ladder.gas,
+        "flow": ladder.flow,
+        "hysteresis": ladder.hysteresis,
+        "rubber": ladder.rubber,
+    }
+    load_bearing |= {name: model.laws() for name, model in models.items() if model is not None}
     if plan.grid is not None:
-        own["grid"] = np.column_stack(plan.grid)
-    for name, values in own.items():
-        tiles[name][bearing] = values
+        load_bearing["grid_index"] = np.column_stack(plan.grid)
+    for name, values in load_bearing.items():
+        tiles[name][plan.bearing] = values
     return tiles

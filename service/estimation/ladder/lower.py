@@ -1,6 +1,7 @@
-"""The lower part of the ladder: counts to the apparent force on every dome, reading by reading.
+"""Sample stage: raw pressures to the apparent force on every dome, reading by reading.
 
-Apparent is what the static curve gives, before hysteresis and creep of the rubber are undone.
+Apparent force: by the static curve, before hysteresis and creep of the rubber are removed. Order of
+the models: outliers, temperature, ambient, gas, static, skew.
 """
 
 from __future__ import annotations
@@ -12,17 +13,19 @@ from devices.compiled import compiled, inlined
 from devices.frames import NOT_READ
 from service.estimation.estimates import EstimateStatus
 from service.estimation.foot.contact import seeming
-from service.estimation.ladder.laws import Laws
+from service.estimation.ladder.laws import FootParams, Laws, TileParams
 from service.estimation.ladder.plan import SUCTION_MAX_KPA, TARE_OLD_NS
-from service.estimation.ladder.room import Room
+from service.estimation.ladder.room import FrameRow, Room, TileSample
+from service.estimation.ladder.state import FootState, TileState
 from service.estimation.ladder.unseen import EVENLY, farthest, guess_n, was_away
 from service.estimation.models import gas
 from service.estimation.models.ambient import around
+from service.estimation.models.denoise import AVERAGED_MAX
 from service.estimation.models.outliers import is_spike
 from service.estimation.models.skew import at_frame
 from service.estimation.models.static import curve
 from service.estimation.models.temperature import at_tare
-from service.estimation.records import Record, Records
+from service.estimation.records import RecordArray
 from service.estimation.tare.tare import WARMED_COUNTS
 from service.estimation.watch.baseline import LOST_KPA, lost
 from service.estimation.watch.clip import end_of_range
@@ -44,209 +47,246 @@ _BASELINE_LOST = int(EstimateStatus.BASELINE_LOST)
 
 
 @inlined
-def feel(laws: Laws, scene: Record, tiles: Records, room: Room, i: int) -> None:
-    """Work out what the domes feel in row `i`, the next that is only read.
+def feel(
+    params: Laws,
+    foot_state: FootState,
+    tile_states: RecordArray[TileState],
+    buffer: Room,
+    i: int,
+) -> None:
+    """Compute the apparent forces of row `i` and update contact, in the buffer.
 
     Args:
-        laws: constants of the estimate.
-        scene: state of the whole foot.
-        tiles: state of the tiles.
-        room: with this row as it was taken and, if frames wait for it, the next.
-        i: row.
+        params: of the estimate.
+        foot_state: updated.
+        tile_states: (tiles,), updated.
+        buffer: with this row and, if frames wait for it, the next.
+        i: row, the first that this stage has not processed.
     """
-    law, row, n = laws.scene[0], room.rows[i], len(tiles)
-    t_ns = room.t_mono_ns[i]
-    row.status = _of_frame(law, row)
+    foot_params, row, n = params.foot[0], buffer.rows[i], len(tile_states)
+    t_ns = buffer.t_mono_ns[i]
+    row.flags = _of_frame(foot_params, row)
     # Without a model for the temperature, a tare at another one is old.
-    judges_warmth = law.temperature == 0 and law.tare_lost == 0
-    after = room.rows[i + 1] if i + 1 < scene.end else row
-    has_after = i + 1 < scene.end and after.broken == 0
-    head_kpa, outside_kpa, outside = 0.0, 0.0, 0
+    checks_warmth = foot_params.has_temperature == 0 and foot_params.is_tare_lost == 0
+    after = buffer.rows[i + 1] if i + 1 < foot_state.end_row else row
+    has_after = i + 1 < foot_state.end_row and after.after_gap == 0
+    ambient_kpa, bare_sum_kpa, bare_count = 0.0, 0.0, 0
+    foot_kpa = 0.0
     for j in range(n):
-        of_tile, cell = laws.tiles[j], room.cells[i, j]
-        if judges_warmth and _has_warmed(of_tile, cell):
-            row.status |= _TARE_OLD
-        after_kpa = room.cells[i + 1, j].kpa if has_after else math.nan
-        _judge(law, of_tile, scene, tiles[j], row, cell, after_kpa, n)
-        gauge_kpa = cell.kpa - of_tile.baseline_kpa
+        if params.tiles[j].is_load_bearing == 1:
+            foot_kpa += buffer.samples[i, j].pressure_kpa - params.tiles[j].baseline_kpa
+    for j in range(n):
+        tile_params, sample = params.tiles[j], buffer.samples[i, j]
+        if checks_warmth and _has_warmed(tile_params, sample):
+            row.flags |= _TARE_OLD
+        after_kpa = buffer.samples[i + 1, j].pressure_kpa if has_after else math.nan
+        _judge(
+            foot_params, tile_params, foot_state, tile_states[j], row, sample, after_kpa, foot_kpa,
+            n,
+        )  # fmt: skip
+        gauge_kpa = sample.pressure_kpa - tile_params.baseline_kpa
         # A bare tile beyond the chip's range shows a fault of its own, not the surroundings.
-        if of_tile.bears == 0 and cell.over_range == 0 and math.isfinite(gauge_kpa):
-            outside_kpa += gauge_kpa
-            outside += 1
-    if law.ambient == 1:
-        mean_kpa = outside_kpa / outside if outside > 0 else math.nan
-        head_kpa = around(scene.ambient, mean_kpa, t_ns)
+        is_bare = tile_params.is_load_bearing == 0
+        if is_bare and sample.is_over_range == 0 and math.isfinite(gauge_kpa):
+            bare_sum_kpa += gauge_kpa
+            bare_count += 1
+    if foot_params.has_ambient == 1:
+        mean_kpa = bare_sum_kpa / bare_count if bare_count > 0 else math.nan
+        ambient_kpa = around(foot_state.ambient, mean_kpa, t_ns)
     total_n = known_n = noise_n2 = usable_n = 0.0
-    late_ns = 0
+    offset_sum_ns = 0
     for j in range(n):
-        of_tile, cell = laws.tiles[j], room.cells[i, j]
-        if of_tile.bears == 0:
-            cell.gauge_kpa = cell.kpa - of_tile.baseline_kpa
+        tile_params, sample = params.tiles[j], buffer.samples[i, j]
+        if tile_params.is_load_bearing == 0:
+            sample.gauge_kpa = sample.pressure_kpa - tile_params.baseline_kpa
             continue
-        at_ns = room.sampled_ns[i, j]
-        slope = _feel_tile(law, of_tile, tiles[j], row, cell, at_ns, t_ns, head_kpa)
-        noise_n = abs(slope) * of_tile.noise_kpa
-        # A lower bound would be averaged with what is no bound.
-        usable = math.nan if cell.beyond == 1 else cell.apparent_n
-        room.noise_n[i, j], room.usable_n[i, j] = noise_n, usable
-        total_n += cell.apparent_n
-        known_n += 0.0 if math.isnan(cell.apparent_n) else cell.apparent_n
+        at_ns = buffer.sampled_ns[i, j]
+        slope = _feel_tile(
+            foot_params, tile_params, tile_states[j], row, sample, at_ns, t_ns, ambient_kpa
+        )
+        noise_n = abs(slope) * tile_params.noise_kpa
+        # A lower bound must not be averaged with forces that are none.
+        usable = math.nan if sample.is_saturated == 1 else sample.apparent_n
+        buffer.noise_n[i, j], buffer.usable_n[i, j] = noise_n, usable
+        total_n += sample.apparent_n
+        known_n += 0.0 if math.isnan(sample.apparent_n) else sample.apparent_n
         usable_n += usable
         noise_n2 += noise_n**2
-        # Of offsets: so many instants may add up to more than there are bits.
-        late_ns += at_ns - t_ns
-    # Tiles that are known may show contact by themselves.
-    judged_n = known_n if math.isnan(total_n) and known_n >= law.on_n else total_n
-    seeming(law.on_n, law.off_n, scene.contact, judged_n, t_ns, row.unseen == 1)
-    row.loaded, room.since_ns[i] = scene.contact.loaded, scene.contact.since_ns
-    room.usable_n[i, n], room.noise_n[i, n] = usable_n, math.sqrt(noise_n2)
-    room.sampled_ns[i, n] = t_ns + late_ns // law.bearing
+        # Of offsets: the sum of instants may overflow.
+        offset_sum_ns += at_ns - t_ns
+    # The known tiles may prove contact by themselves.
+    is_known_enough = math.isnan(total_n) and known_n >= foot_params.contact_on_n
+    contact_n = known_n if is_known_enough else total_n
+    on_n, off_n = foot_params.contact_on_n, foot_params.contact_off_n
+    seeming(on_n, off_n, foot_state.contact, contact_n, t_ns, row.after_long_gap == 1)
+    row.is_loaded, buffer.since_ns[i] = foot_state.contact.is_loaded, foot_state.contact.since_ns
+    buffer.usable_n[i, n], buffer.noise_n[i, n] = usable_n, math.sqrt(noise_n2)
+    buffer.sampled_ns[i, n] = t_ns + offset_sum_ns // foot_params.n_load_bearing
 
 
 @compiled
-def _of_frame(law: Record, row: Record) -> int:
-    status = _GAP if row.broken == 1 else 0
-    if law.assumed_scale == 1:
-        status |= _ASSUMED_SCALE
-    if law.tare_lost == 1:
-        return status | _TARE_LOST
-    return status | _TARE_OLD if row.t_ns - law.tare_ns > TARE_OLD_NS else status
+def _of_frame(foot_params: FootParams, row: FrameRow) -> int:
+    flags = _GAP if row.after_gap == 1 else 0
+    if foot_params.is_scale_assumed == 1:
+        flags |= _ASSUMED_SCALE
+    if foot_params.is_tare_lost == 1:
+        return flags | _TARE_LOST
+    return flags | _TARE_OLD if row.t_ns - foot_params.tare_ns > TARE_OLD_NS else flags
 
 
 @compiled
-def _has_warmed(law: Record, cell: Record) -> bool:
-    """Is it warmer or colder than at the tare by more than the baseline can bear?"""
-    moved_counts = abs(cell.tadc - law.tare_counts)
-    return law.bears == 1 and moved_counts > WARMED_COUNTS and not math.isnan(cell.kpa)
+def _has_warmed(tile_params: TileParams, sample: TileSample) -> bool:
+    """Return whether the temperature since the tare has changed by more than a baseline allows."""
+    moved_counts = abs(sample.temperature_raw - tile_params.tare_counts)
+    is_load_bearing = tile_params.is_load_bearing == 1
+    return is_load_bearing and moved_counts > WARMED_COUNTS and not math.isnan(sample.pressure_kpa)
 
 
 @compiled
 def _judge(
-    scene_law: Record,
-    law: Record,
-    scene: Record,
-    tile: Record,
-    row: Record,
-    cell: Record,
+    foot_params: FootParams,
+    tile_params: TileParams,
+    foot_state: FootState,
+    tile_state: TileState,
+    row: FrameRow,
+    sample: TileSample,
     after_kpa: float,
+    foot_kpa: float,
     tiles: int,
 ) -> None:
-    """What a tile's own readings show to be wrong: repeats, an edge, a single reading far off."""
-    as_read = cell.kpa
-    if scene_law.watched == 1:
-        if law.bears == 1:
+    """Detect clipping, a stuck tile and outliers, and remove their pressures."""
+    as_read_kpa = sample.pressure_kpa
+    baseline_kpa, noise_kpa = tile_params.baseline_kpa, tile_params.noise_kpa
+    if foot_params.has_fault_detection == 1:
+        unloaded_band_kpa = tile_params.unloaded_band_kpa
+        if tile_params.is_load_bearing == 1:
             end_of_range(
-                tile.clip, as_read, row.t_ns, law.baseline_kpa, law.unloaded_kpa, law.noise_kpa
-            )
-        above_kpa = math.nan if as_read >= law.end_kpa else as_read - law.baseline_kpa
-        stuck, scene.toggles = is_stuck(
-            scene_law, law.repeats, tile.repeats, cell.padc, above_kpa, law.unloaded_kpa,
-            scene.toggles, tiles,
+                tile_state.clipping, as_read_kpa, row.t_ns, baseline_kpa, unloaded_band_kpa,
+                noise_kpa, tile_params.variance_inflation[AVERAGED_MAX],
+                foot_kpa - (as_read_kpa - baseline_kpa),
+            )  # fmt: skip
+        may_stand_still = as_read_kpa >= tile_params.stuck_check_max_kpa
+        above_kpa = math.nan if may_stand_still else as_read_kpa - baseline_kpa
+        stuck, foot_state.load_toggles = is_stuck(
+            foot_params, tile_params.stuck, tile_state.stuck, sample.pressure_raw, above_kpa,
+            unloaded_band_kpa, foot_state.load_toggles, tiles,
         )  # fmt: skip
         if stuck:
-            row.status |= _STUCK
-            cell.kpa = math.nan
-    if scene_law.waits == 1:
-        before_kpa = math.nan if row.broken == 1 else tile.before_kpa
-        tile.before_kpa = as_read
-        if is_spike(before_kpa, cell.kpa, after_kpa, law.noise_kpa):
-            cell.kpa = 0.5 * (before_kpa + after_kpa)
-            if law.bears == 1:
-                row.status |= _OUTLIER_REPLACED
+            row.flags |= _STUCK
+            sample.pressure_kpa = math.nan
+    if foot_params.waits_for_next == 1:
+        before_kpa = math.nan if row.after_gap == 1 else tile_state.previous_kpa
+        tile_state.previous_kpa = as_read_kpa
+        if is_spike(before_kpa, sample.pressure_kpa, after_kpa, noise_kpa):
+            sample.pressure_kpa = 0.5 * (before_kpa + after_kpa)
+            if tile_params.is_load_bearing == 1:
+                row.flags |= _OUTLIER_REPLACED
 
 
 @compiled
 def _feel_tile(
-    scene: Record,
-    law: Record,
-    tile: Record,
-    row: Record,
-    cell: Record,
+    foot_params: FootParams,
+    tile_params: TileParams,
+    tile_state: TileState,
+    row: FrameRow,
+    sample: TileSample,
     t_ns: int,
     frame_t_ns: int,
-    head_kpa: float,
+    ambient_kpa: float,
 ) -> float:
-    """What a dome that bears load feels; returns the slope of its curve there in N/kPa."""
-    status = 0
-    kpa, variance = cell.kpa, law.baseline_variance
-    if scene.temperature == 1:
-        counts = math.nan if cell.tadc == NOT_READ else float(cell.tadc)
-        kpa, sigma_kpa = at_tare(law.temperature, tile.temperature, kpa, counts, t_ns)
+    """Compute the apparent force on a load-bearing tile; return its curve's slope in N/kPa."""
+    flags = 0
+    kpa, variance = sample.pressure_kpa, tile_params.baseline_variance
+    if foot_params.has_temperature == 1:
+        is_read = sample.temperature_raw != NOT_READ
+        counts = float(sample.temperature_raw) if is_read else math.nan
+        kpa, sigma_kpa = at_tare(tile_params.temperature, tile_state.temperature, kpa, counts, t_ns)
         variance += sigma_kpa**2
-    if scene.ambient == 1:
-        passed_kpa = head_kpa * law.ambient.passed
-        kpa -= passed_kpa
-        variance += (law.ambient.relative_sigma * passed_kpa) ** 2
-    cell.gauge_kpa = kpa - law.baseline_kpa
-    if cell.gauge_kpa < -SUCTION_MAX_KPA:  # a torn dome, or another fault
+    if foot_params.has_ambient == 1:
+        transmitted_kpa = ambient_kpa * tile_params.ambient.transmitted_fraction
+        kpa -= transmitted_kpa
+        variance += (tile_params.ambient.relative_sigma * transmitted_kpa) ** 2
+    sample.gauge_kpa = kpa - tile_params.baseline_kpa
+    if sample.gauge_kpa < -SUCTION_MAX_KPA:  # a torn dome, or another fault
         kpa = math.nan
-    # The chip's range is judged by what was read, the calibrated one by what the gas settles at.
-    end_kpa = law.chip_end_kpa
-    if tile.clip.end_kpa < math.inf:
-        end_kpa = min(end_kpa, tile.clip.end_kpa)
-        status |= _CLIPPED if cell.kpa > tile.clip.end_kpa else 0
-    hidden = cell.kpa > end_kpa
-    # As if the chip's end had been read, with what warmth and surroundings have put into it.
-    least_kpa = kpa - (cell.kpa - end_kpa if hidden else 0.0)
-    settled_kpa, gas_kpa, unseen_kpa = kpa, 0.0, 0.0
-    if scene.gas == 1:
-        found_kpa, unseen_kpa = _settled(law, tile, kpa, least_kpa, t_ns, hidden)
+    # The pressure as read tells the chip's range, the pressure after cooling the calibrated one.
+    end_kpa = tile_params.chip_max_kpa
+    if tile_state.clipping.end_kpa < math.inf:
+        end_kpa = min(end_kpa, tile_state.clipping.end_kpa)
+        flags |= _CLIPPED if sample.pressure_kpa > tile_state.clipping.end_kpa else 0
+    is_hidden = sample.pressure_kpa > end_kpa
+    # As if the chip's end had been read, less the shares of warmth and surroundings.
+    least_kpa = kpa - (sample.pressure_kpa - end_kpa if is_hidden else 0.0)
+    cooled_kpa, gas_kpa, gas_alt_kpa = kpa, 0.0, 0.0
+    if foot_params.has_gas == 1:
+        found_kpa, gas_alt_kpa = _settled(tile_params, tile_state, kpa, least_kpa, t_ns, is_hidden)
         gas_kpa = found_kpa - kpa
-        # A tile whose bench does not tell of its gas goes without, and is that uncertain.
-        settled_kpa = found_kpa if law.gas_known == 1 else kpa
-        least_kpa = gas.settled_at_least(law.gas, least_kpa)
-    static_kpa = (least_kpa if hidden else settled_kpa) - law.baseline_kpa
-    warmed_kpa = lost_kpa = 0.0
-    if scene.watched == 1:
-        if scene.warms == 1:
-            warmed_kpa = moved_kpa(tile.warmth, cell.tadc, law.tare_counts, law.warms_kpa, t_ns)
-        seen_kpa = math.nan if hidden else static_kpa
-        lost_kpa = lost(tile.baseline, law.even, seen_kpa, variance, warmed_kpa, t_ns)
-        if lost_kpa > 0.0 or abs(warmed_kpa) > LOST_KPA:
-            status |= _BASELINE_LOST
-    variance += lost_kpa**2
-    force_n, slope, fit_sigma_n = curve(law.static, static_kpa)
-    if math.isnan(cell.kpa if scene.tare_lost == 1 else force_n):
-        status |= _TILE_MISSING
-    beyond = hidden or static_kpa > law.static.high_kpa
-    cell.guess_n = math.nan
-    if beyond:
-        status |= _SATURATED
-        gauge_kpa = settled_kpa - law.baseline_kpa
-        cell.guess_n = guess_n(law.unseen, curve(law.static, gauge_kpa)[0], gauge_kpa)
-    elif cell.kpa > PRESSURE_MAX_KPA:
-        status |= _OVER_RATED
-    if static_kpa < law.low_kpa:
-        status |= _EXTRAPOLATED
-    if scene.skew == 1 and scene.denoise == 0:
-        force_n = at_frame(tile.skew, force_n, t_ns, frame_t_ns, row.broken == 1)
-    row.status |= status
-    cell.apparent_n, cell.beyond = force_n, 1 if beyond else 0
-    cell.sigma_n = math.sqrt(slope**2 * variance + fit_sigma_n**2)
-    cell.gas_n = slope * law.gas_misfit * gas_kpa
-    cell.unseen_gas_n, cell.warm_n = slope * unseen_kpa, slope * warmed_kpa
+        # A tile whose rig recording does not determine its gas has no correction, but this sigma.
+        cooled_kpa = found_kpa if tile_params.is_gas_known == 1 else kpa
+        least_kpa = gas.settled_at_least(tile_params.gas, least_kpa)
+    static_kpa = (least_kpa if is_hidden else cooled_kpa) - tile_params.baseline_kpa
+    drift_kpa = baseline_error_kpa = 0.0
+    if foot_params.has_fault_detection == 1:
+        if foot_params.has_thermal_drift == 1:
+            drift_kpa = moved_kpa(
+                tile_state.thermal_drift, sample.temperature_raw, tile_params.tare_counts,
+                tile_params.thermal_kpa_per_count, t_ns,
+            )  # fmt: skip
+        seen_kpa = math.nan if is_hidden else static_kpa
+        baseline_error_kpa = lost(
+            tile_state.baseline_loss, tile_params.asymmetry, seen_kpa, variance, drift_kpa, t_ns
+        )
+        if baseline_error_kpa > 0.0 or abs(drift_kpa) > LOST_KPA:
+            flags |= _BASELINE_LOST
+    variance += baseline_error_kpa**2
+    force_n, slope, fit_sigma_n = curve(tile_params.static, static_kpa)
+    if math.isnan(sample.pressure_kpa if foot_params.is_tare_lost == 1 else force_n):
+        flags |= _TILE_MISSING
+    is_saturated = is_hidden or static_kpa > tile_params.static.range_high_kpa
+    sample.extrapolated_n = math.nan
+    if is_saturated:
+        flags |= _SATURATED
+        gauge_kpa = cooled_kpa - tile_params.baseline_kpa
+        curve_n, _, _ = curve(tile_params.static, gauge_kpa)
+        sample.extrapolated_n = guess_n(tile_params.saturation, curve_n, gauge_kpa)
+    elif sample.pressure_kpa > PRESSURE_MAX_KPA:
+        flags |= _OVER_RATED
+    if static_kpa < tile_params.range_low_kpa:
+        flags |= _EXTRAPOLATED
+    if foot_params.has_skew == 1 and foot_params.has_denoise == 0:
+        force_n = at_frame(tile_state.skew, force_n, t_ns, frame_t_ns, row.after_gap == 1)
+    row.flags |= flags
+    sample.apparent_n, sample.is_saturated = force_n, 1 if is_saturated else 0
+    sample.systematic_sigma_n = math.sqrt(slope**2 * variance + fit_sigma_n**2)
+    sample.gas_error_n = slope * tile_params.gas_misfit * gas_kpa
+    sample.gas_alt_error_n, sample.thermal_error_n = slope * gas_alt_kpa, slope * drift_kpa
     return slope
 
 
 @compiled
 def _settled(
-    law: Record, tile: Record, kpa: float, least_kpa: float, t_ns: int, hidden: bool
+    tile_params: TileParams,
+    tile_state: TileState,
+    kpa: float,
+    least_kpa: float,
+    t_ns: int,
+    is_hidden: bool,
 ) -> tuple[float, float]:
-    """Pressure that the gas settles at, and its uncertainty from what it did unseen.
+    """Return the pressure after cooling, and its sigma by saturation and gaps before.
 
-    What is hidden behind the chip's end is taken as it reads: the best guess, which is no more than
-    a guess.
+    A pressure beyond the chip's end is used as read: the best guess, and no more than a guess.
     """
-    most_kpa = law.unseen.most_hot_kpa
-    taken_kpa = min(kpa, most_kpa) if hidden and not math.isnan(kpa) else kpa
-    known = 0.0 < taken_kpa < math.inf and not math.isnan(tile.gas.ln_kpa)
-    away = known and was_away(t_ns, tile.gas.t_ns)
-    if tile.has_gas_else == 0 and not hidden and not away:
-        return gas.settled(law.gas, tile.gas, taken_kpa, t_ns, math.nan), 0.0
-    if tile.has_gas_else == 0:
-        gas.copy(tile.gas, tile.gas_else)
-    found = gas.settled(law.gas, tile.gas, taken_kpa, t_ns, math.nan)
-    else_kpa = farthest(taken_kpa, least_kpa, most_kpa) if hidden else kpa
-    other = gas.settled(law.gas, tile.gas_else, else_kpa, t_ns, law.unseen.end_hot_kpa)
-    tile.has_gas_else = 0 if gas.is_same(tile.gas, tile.gas_else) else 1
-    return found, 0.0 if hidden else EVENLY * (other - found)
+    most_kpa = tile_params.saturation.force_max_hot_kpa
+    used_kpa = min(kpa, most_kpa) if is_hidden and not math.isnan(kpa) else kpa
+    is_known = 0.0 < used_kpa < math.inf and not math.isnan(tile_state.gas.ln_kpa)
+    had_gap = is_known and was_away(t_ns, tile_state.gas.t_ns)
+    if tile_state.has_gas_alt == 0 and not is_hidden and not had_gap:
+        return gas.settled(tile_params.gas, tile_state.gas, used_kpa, t_ns, math.nan), 0.0
+    if tile_state.has_gas_alt == 0:
+        gas.copy(tile_state.gas, tile_state.gas_alt)
+    found = gas.settled(tile_params.gas, tile_state.gas, used_kpa, t_ns, math.nan)
+    alt_kpa = farthest(used_kpa, least_kpa, most_kpa) if is_hidden else kpa
+    gap_kpa = tile_params.saturation.range_end_hot_kpa
+    other = gas.settled(tile_params.gas, tile_state.gas_alt, alt_kpa, t_ns, gap_kpa)
+    tile_state.has_gas_alt = 0 if gas.is_same(tile_state.gas, tile_state.gas_alt) else 1
+    return found, 0.0 if is_hidden else EVENLY * (other - found)

@@ -1,6 +1,6 @@
-"""Everything an estimate needs to know before the first frame, worked out once.
+"""Estimation plan: everything that an estimate needs before the first frame.
 
-A scene says which models it needs and only those are computed; what is not named costs nothing.
+Only the models that a scene names are computed; the others cost nothing.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
 CONTACT_MIN_NS = 10_000_000  # a shorter change is an outlier or a bounce
 SIGMAS = 5.0
-"""COP needs a GRF of so many sigma: below, the first-order variance of a ratio is not valid. And a
-pressure so many sigma below the calibrated range is no noise."""
+"""Least GRF for a COP, in its sigmas: below, the first-order variance of a ratio is invalid. Also
+the distance below the calibrated range that noise does not explain."""
 SUCTION_MAX_KPA = 10.0
-"""No foot pulls at a dome like that, and 30 kelvins make less: a pressure so far below the baseline
-is a count that wrapped and went on far, a torn dome or another fault, and no force."""
-COP_SIGMA_MAX_M = 0.003  # a quarter of a dome: worse says nothing of where the load is
+"""Largest pressure below the baseline that can be a force: no foot pulls a dome that much, and 30 K
+make less. Beyond, a count wrapped far, a dome is torn, or there is another fault."""
+COP_SIGMA_MAX_M = 0.003  # a quarter of a dome: worse does not locate the load
 TARE_OLD_NS = 1_800_000_000_000
-"""Half an hour: at the 0.3 kPa/K of a sealed bubble a degree in that time is half a newton."""
-LAG_MAX_MS = 60_000.0  # so long are frames kept in memory
+"""Age at which a tare is old: half an hour. At 0.3 kPa/K a degree in it is half a newton."""
+LAG_MAX_MS = 60_000.0  # frames stay in memory for that time
 WARM_UP_TIMES = 5.0
-"""Time constants that models run before what they give is used; less than a hundredth is left."""
+"""Time constants until models have settled; less than a hundredth of the initial error remains."""
 WARM_UP_LEAST_S = 10.0
-"""What has no time constant of its own: noise, contact, what holds for the last seconds."""
+"""Settling time of models without a time constant: noise, contact, zero-order holds."""
 GAP = 1.5
-"""A frame this many nominal periods after the one before comes after a gap."""
+"""Least distance of two frames with a gap between them, in nominal periods."""
 
 
 @dataclass(frozen=True)
 class EstimationPlan:
-    """Constants of one estimate of one stream; arrays over tiles. Made by `make_plan`."""
+    """Parameters of one estimate of one stream; arrays over tiles. Made by `make_plan`."""
 
     info: ArrayInfo
     calibration: Calibration
@@ -60,39 +60,41 @@ class EstimationPlan:
     compensation: Compensation
     ladder: Ladder
     bearing: npt.NDArray[np.intp]
-    """Columns of the tiles that bear load; arrays below are over these, unless stated."""
+    """Columns of the load-bearing tiles; arrays below are over these, unless stated."""
     references: npt.NDArray[np.intp]
-    """Columns of bare reference tiles, which are in no sum."""
+    """Columns of bare reference tiles, which no sum contains."""
     baseline_kpa: Floats
     baseline_sigma_kpa: Floats
     noise_kpa: Floats
     noise_left: Floats
-    """(bearing tiles, n), how much more of it an average of n readings leaves than of white."""
+    """(tiles, n), variance of a mean of n readings over that of white noise."""
     late_ns: Ints
-    """How much later a tile is sampled than its frames say."""
+    """Delay of a tile's samples behind the instants in its frames."""
     late_sigma_s: Floats
-    """Its standard uncertainty, every tile's own; ..."""
+    """Standard uncertainty of the delay, independent between tiles."""
     late_common_s: Floats
-    """... and what all tiles share of it."""
+    """Standard uncertainty of the delay that all tiles share."""
     chip_end_kpa: Floats
-    """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
-    range, or of what it told on the bench if that is more, or less because it told no more."""
+    """Absolute pressure above which a chip saturates: the end of its rated range, or the highest
+    pressure in the rig, if that was higher or the chip saturated there."""
     unseen: Unseen
     watch: Watch | None
-    """None: nothing is watched, as benchmarks may want."""
+    """None: no fault detection, for benchmarks."""
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
-    """(bearing tiles, 3)."""
+    """(tiles, 3), positions of the tiles."""
+    cop_measured: tuple[bool, bool]
+    """Measurement of the centre of pressure along x, and along y; False across a row of tiles."""
     gain: Floats
-    """What the ground puts on a tile's part of the foot for a newton of the dome's."""
+    """Newtons of the ground on a tile's part of the foot for a newton of the dome."""
     gain_sigma: Floats
     axis_rad: Floats
     """Angle of a tile's axis to the segment."""
     tilted: Floats
-    """Part of a tile's force that may not be along the segment, for its axis is not."""
+    """Part of a tile's force that is not along the segment, by the angle of its axis."""
     shear: Parameter | None
-    """Which way the ground pushes tiles that are not upright; None: not known."""
+    """Direction of the ground's force on tiles that are not upright; None: unknown."""
     hull: tuple[Floats, Floats]
     grid: tuple[Floats, Floats] | None
     contact: ContactRule
@@ -102,15 +104,12 @@ class EstimationPlan:
 
     @property
     def waits(self) -> bool:
-        """Does every frame wait for the next one, to tell an outlier?"""
+        """True if every frame waits for the next one, for outlier replacement."""
         return self.ladder.denoise and self.lag_ns > 0
 
     @property
     def look_ns(self) -> int:
-        """How far what comes later may be looked at.
-
-        A frame that waits for the next one is not there yet when its instant is.
-        """
+        """Look-ahead of windows; 1 ns shorter if frames wait for the next one."""
         return self.lag_ns - 1 if self.waits else self.lag_ns
 
 
@@ -122,14 +121,14 @@ def make_plan(
     models: Sequence[str],
     lag_ms: float = 0.0,
 ) -> EstimationPlan:
-    """Work out an estimate's constants.
+    """Compute an estimate's parameters.
 
     Args:
         info: the array.
         calibration: of all its tiles, or a preset for any.
         tare: of this recording.
         models: names of `MODELS`, in any order; `static` must be among them.
-        lag_ms: look-ahead: estimates come this much later and know that much more.
+        lag_ms: look-ahead, by which estimates are delayed.
 
     Raises:
         UsageError: an unknown model, no `static`, `ambient` without a bare tile, or a bad lag.
@@ -198,6 +197,7 @@ def make_plan(
         ),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
+        cop_measured=(info.row_place_m[0] is None, info.row_place_m[1] is None),
         gain=np.array([1.0 if gain is None else gain.value for gain in gains]),
         gain_sigma=np.array([0.0 if gain is None else gain.sigma for gain in gains]),
         axis_rad=axis_rad,
@@ -236,12 +236,14 @@ def _chip_end_kpa(entry: TileCalibration, baseline_kpa: float) -> float:
 
 
 def warm_up_s(plan: EstimationPlan) -> float:
-    """How long models have to run before what they give can be used."""
+    """Return the time in seconds until the models have settled."""
     ladder, longest_s = plan.ladder, 0.0
     if ladder.gas is not None:
         longest_s = max(longest_s, float((ladder.gas.gamma * ladder.gas.tau_s).max()))
     if ladder.rubber is not None:
-        longest_s = max(longest_s, float(ladder.rubber.tau_s[ladder.rubber.part > 0.0].max()))
+        longest_s = max(
+            longest_s, float(ladder.rubber.tau_s[ladder.rubber.creep_fraction > 0.0].max())
+        )
     if ladder.temperature is not None:
         longest_s = max(longest_s, float(np.abs(ladder.temperature.lag_s).max()))
     return max(WARM_UP_LEAST_S, WARM_UP_TIMES * longest_s)

@@ -1,77 +1,76 @@
-"""What is known of frames that still wait, and of those that windows reach back to: kept columns.
+"""Ring buffer of the frames that wait for their look-ahead, or that windows reach back to: columns.
 
-Rows are written once and stay where they are until the columns are full; then what is still needed
-moves to the front. So a step costs what its own frames cost, however many wait.
+Rows are written once and stay in place until the columns are full; then the rows that are still
+needed move to the front. So a step costs what its own frames cost, however many wait.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from devices.arrays import Floats, Ints, Times
-from service.estimation.foot.kinematics import READING
-from service.estimation.records import Records, record_type
+from service.estimation.foot.kinematics import ServoReading
+from service.estimation.records import KernelRecord, RecordArray, RecordMatrix
 
 ROWS_LEAST = 1024
-"""Room for so many frames at first: what windows reach back to, and several times as much."""
+"""Initial number of rows: several times the reach of the windows."""
 
-ROW = record_type(
-    [
-        ("seq", np.uint64),  # number in the stream
-        ("t_ns", np.int64),  # UTC
-        ("broken", np.int64),  # does it come after a gap?
-        ("unseen", np.int64),  # or after so long a pause that the foot may have been anywhere?
-        ("status", np.int64),  # bits of `EstimateStatus` that it has by itself
-        ("loaded", np.int64),  # does the foot seem loaded?
-    ]
-)
-"""Facts of a frame."""
 
-CELL = record_type(
-    [
-        # As read.
-        ("kpa", np.float64),  # absolute pressure; NaN where none could be one
-        ("padc", np.int64),
-        ("tadc", np.int64),  # held; `NOT_READ` where unknown
-        ("over_range", np.int64),
-        # As felt.
-        ("gauge_kpa", np.float64),  # pressure above the baseline
-        ("apparent_n", np.float64),  # force by the static curve
-        # Standard uncertainty from all else but noise and gas; does not average away.
-        ("sigma_n", np.float64),
-        # Likewise what the gas' correction leaves, with the correction's sign: all tiles err to the
-        # same side; what the gas did unseen; and what warmth that no model corrects makes of it.
-        ("gas_n", np.float64),
-        ("unseen_gas_n", np.float64),
-        ("warm_n", np.float64),
-        ("beyond", np.int64),  # beyond the calibrated range, or the chip's: a lower bound
-        ("guess_n", np.float64),  # what it may be where there is only that bound; NaN elsewhere
-    ]
-)
-"""Facts of a tile in a frame."""
+class FrameRow(KernelRecord):
+    """Facts of a frame."""
+
+    seq: np.uint64  # number in the stream
+    t_ns: int  # UTC
+    after_gap: int  # 1: a gap precedes it
+    after_long_gap: int  # 1: so long that the foot may have been anywhere
+    flags: int  # bits of `EstimateFlag` of the frame by itself
+    is_loaded: int  # 1: candidate of contact
+
+
+class TileSample(KernelRecord):
+    """Facts of a tile in a frame."""
+
+    # As read.
+    pressure_kpa: float  # absolute; NaN where invalid
+    pressure_raw: int
+    temperature_raw: int  # zero-order hold; `NOT_READ` where unknown
+    is_over_range: int  # flagged by the driver
+    # By the sample stage.
+    gauge_kpa: float  # pressure above the baseline
+    apparent_n: float  # force by the static curve
+    # Standard uncertainty by all but noise and gas; averaging does not reduce it.
+    systematic_sigma_n: float
+    # Signed errors that all tiles share: remaining error of the gas correction, the gas' unknown
+    # state after saturation or a gap, and warmth that no model corrects.
+    gas_error_n: float
+    gas_alt_error_n: float
+    thermal_error_n: float
+    is_saturated: int  # beyond the calibrated range, or the chip's: a lower bound
+    extrapolated_n: float  # best guess while saturated; NaN elsewhere
 
 
 class Room(NamedTuple):
     """Columns of up to n frames.
 
     Attributes:
-        rows: (n,), `ROW`.
-        cells: (n, tiles), `CELL`.
+        rows: (n,), frames.
+        samples: (n, tiles), tiles in frames.
         readings: (n,), of the servo.
         t_mono_ns: (n,), instants on the monotonic clock.
-        run: (n,), number of the unbroken run that each frame belongs to.
-        since_ns: (n,), since when the foot has seemed loaded, or not.
-        usable_n: (n, tiles + 1), apparent forces that averages may be taken of, and their sum; NaN
-            where one is only a lower bound.
-        noise_n: (n, tiles + 1), standard deviation that the noise of a single reading gives them.
-        sampled_ns: (n, tiles + 1), when they were sampled, on the monotonic clock.
+        run: (n,), number of the gapless run of each frame.
+        since_ns: (n,), `ContactState.since_ns` after each frame.
+        usable_n: (n, tiles + 1), apparent forces for averaging, and their sum; NaN while
+            saturated.
+        noise_n: (n, tiles + 1), standard deviation of these by the noise of a single reading.
+        sampled_ns: (n, tiles + 1), their instants on the monotonic clock.
     """
 
-    rows: Records
-    cells: Records
-    readings: Records
+    rows: RecordArray[FrameRow]
+    samples: RecordMatrix[TileSample]
+    readings: RecordArray[ServoReading]
     t_mono_ns: Times
     run: Ints
     since_ns: Times
@@ -81,11 +80,11 @@ class Room(NamedTuple):
 
 
 def make_room(n: int, tiles: int) -> Room:
-    """Empty columns for n frames."""
+    """Allocate columns for n frames."""
     return Room(
-        rows=np.zeros(n, ROW),
-        cells=np.zeros((n, tiles), CELL),
-        readings=np.zeros(n, READING),
+        rows=np.zeros(n, FrameRow.dtype()),
+        samples=np.zeros((n, tiles), TileSample.dtype()),
+        readings=np.zeros(n, ServoReading.dtype()),
         t_mono_ns=np.zeros(n, np.int64),
         run=np.zeros(n, np.int64),
         since_ns=np.zeros(n, np.int64),
@@ -95,11 +94,17 @@ def make_room(n: int, tiles: int) -> Room:
     )
 
 
-def moved(room: Room, first: int, end: int, more: int) -> Room:
-    """Rows `first` to `end` at the front, with room for `more` after them."""
-    # Twice what is needed, or every step would move what is kept.
+def moved(buffer: Room, first: int, end: int, more: int) -> Room:
+    """Move rows `first` to `end` to the front of a buffer with space for `more` rows after them.
+
+    Returns:
+        The same buffer, or a larger one.
+    """
+    # Twice what is needed, or every step would move all rows.
     twice = 2 * (end - first + more)
-    to = room if twice <= len(room.rows) else make_room(twice, room.cells.shape[1])
-    for old, new in zip(room, to, strict=True):
+    fits = twice <= len(buffer.rows)
+    to = buffer if fits else make_room(twice, buffer.usable_n.shape[1] - 1)
+    columns, targets = cast("tuple[tuple[npt.NDArray[Any], ...], ...]", (buffer, to))
+    for old, new in zip(columns, targets, strict=True):
         new[: end - first] = old[first:end]
     return to

@@ -1,83 +1,97 @@
-"""What an estimate remembers from frame to frame: of every tile, and of the whole foot."""
+"""State of an estimate between frames: of every tile, and of the foot."""
 
 from __future__ import annotations
+
+from typing import Annotated
 
 import numpy as np
 
 from devices.frames import NOT_READ
-from service.estimation.foot import contact
+from service.estimation.foot.contact import ContactState
 from service.estimation.models import ambient, flow, gas, hysteresis, rubber, skew, temperature
-from service.estimation.records import Records, record_type, records
+from service.estimation.models.ambient import AmbientState
+from service.estimation.models.flow import FlowState
+from service.estimation.models.gas import GasState
+from service.estimation.models.hysteresis import HysteresisState
+from service.estimation.models.rubber import RubberState
+from service.estimation.models.skew import SkewState
+from service.estimation.models.temperature import TemperatureState
+from service.estimation.records import KernelRecord, Record, RecordArray
 from service.estimation.watch import baseline, clip, repeats, warmth
-
-DOME = record_type(
-    [("flow", flow.STATE), ("hysteresis", hysteresis.STATE), ("rubber", rubber.STATE)]
-)
-"""What a dome remembers of forces."""
-
-TILE = record_type(
-    [
-        ("tadc", np.int64),  # last temperature that was read; `NOT_READ`: none
-        ("tadc_ns", np.int64),
-        ("before_kpa", np.float64),  # as read in the frame before
-        ("repeats", repeats.STATE),
-        ("clip", clip.STATE),
-        ("baseline", baseline.STATE),
-        ("warmth", warmth.STATE),
-        ("temperature", temperature.STATE),
-        ("gas", gas.STATE),
-        # Models that remember, after what is farthest from what was taken; if something was unseen.
-        ("has_gas_else", np.int64),
-        ("gas_else", gas.STATE),
-        ("skew", skew.STATE),
-        ("dome", DOME),
-        ("has_dome_else", np.int64),
-        ("dome_else", DOME),
-        ("last_n", np.float64),  # force in the frame before, ...
-        ("last_ns", np.int64),  # ... and its instant
-        ("has_last", np.int64),
-    ]
-)
-
-SCENE = record_type(
-    [
-        # Rows of the room: the first whose estimate is not given, the first that is only read, and
-        # the one after the last.
-        ("due", np.int64),
-        ("read", np.int64),
-        ("end", np.int64),
-        ("newest_ns", np.int64),  # of the newest frame
-        ("runs", np.int64),
-        ("toggles", np.int64),  # how often tiles have been loaded and let go, for the watch
-        ("ambient", ambient.STATE),
-        ("contact", contact.STATE),
-        ("is_contact", np.int64),  # contact in the last estimate
-    ]
-)
+from service.estimation.watch.baseline import BaselineLossState
+from service.estimation.watch.repeats import StuckState
+from service.estimation.watch.warmth import ThermalDriftState
 
 
-def at_rest(tiles: int) -> tuple[Records, Records]:
-    """Before the first frame: of the whole foot, and of every tile."""
-    scene = records(SCENE, 1, ambient=ambient.at_rest())
-    dome = records(
-        DOME,
+class DomeState(KernelRecord):
+    """State of the models of a dome's forces."""
+
+    flow: FlowState
+    hysteresis: HysteresisState
+    rubber: RubberState
+
+
+class TileState(KernelRecord):
+    """State of a tile."""
+
+    temperature_raw: int  # last one that was read; `NOT_READ`: none
+    temperature_ns: int  # instant of it
+    previous_kpa: float  # as read in the frame before
+    stuck: StuckState
+    clipping: Annotated[Record, clip.STATE]
+    baseline_loss: BaselineLossState
+    thermal_drift: ThermalDriftState
+    temperature: TemperatureState
+    gas: GasState
+    # Alternative hypothesis: the state after the load farthest from the best guess of all that are
+    # possible, if the tile was saturated or had a gap.
+    has_gas_alt: int
+    gas_alt: GasState
+    skew: SkewState
+    dome: DomeState
+    has_dome_alt: int
+    dome_alt: DomeState
+    previous_force_n: float  # force in the frame before, ...
+    previous_force_ns: int  # ... and its instant
+    has_previous_force: int
+
+
+class FootState(KernelRecord):
+    """State of the foot."""
+
+    # Rows of the frame buffer: the first without an estimate, the first that the sample stage has
+    # not processed, and the one after the last.
+    release_row: int
+    sample_row: int
+    end_row: int
+    newest_ns: int  # instant of the newest frame
+    run_count: int  # gapless runs so far
+    load_toggles: int  # loadings and unloadings of all tiles so far
+    ambient: AmbientState
+    contact: ContactState
+    is_contact: int  # contact in the last estimate
+
+
+def at_rest(tiles: int) -> tuple[RecordArray[FootState], RecordArray[TileState]]:
+    """Make the states before the first frame: of the foot (1,), and of the tiles (tiles,)."""
+    foot_state = FootState.array(1, ambient=ambient.at_rest())
+    dome = DomeState.array(
         tiles,
         flow=flow.at_rest(tiles),
         hysteresis=hysteresis.at_rest(tiles),
         rubber=rubber.at_rest(tiles),
     )
-    of_tiles = records(
-        TILE,
+    tile_states = TileState.array(
         tiles,
-        tadc=NOT_READ,
-        before_kpa=np.nan,
-        repeats=repeats.at_rest(tiles),
-        clip=clip.at_rest(tiles),
-        baseline=baseline.at_rest(tiles),
-        warmth=warmth.at_rest(tiles),
+        temperature_raw=NOT_READ,
+        previous_kpa=np.nan,
+        stuck=repeats.at_rest(tiles),
+        clipping=clip.at_rest(tiles),
+        baseline_loss=baseline.at_rest(tiles),
+        thermal_drift=warmth.at_rest(tiles),
         temperature=temperature.at_rest(tiles),
         gas=gas.at_rest(tiles),
         skew=skew.at_rest(tiles),
         dome=dome,
     )
-    return scene, of_tiles
+    return foot_state, tile_states

@@ -1,4 +1,4 @@
-"""Frames as they come: what is read of them into the room, before anything is made of it."""
+"""Loading of frames into the frame buffer: raw counts to pressures, gaps, instants of samples."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from service.estimation.foot import UNSEEN_NS
 from service.estimation.foot.kinematics import carry
 from service.estimation.ladder.laws import Laws
 from service.estimation.ladder.room import Room
+from service.estimation.ladder.state import FootState, TileState
 from service.estimation.models.unwrap import unwrapped
-from service.estimation.records import Record, Records
+from service.estimation.records import RecordArray
 
 _UNUSABLE = int(TileStatus.UNUSABLE)
 _OVER_RANGE = int(TileStatus.OVER_RANGE)
@@ -28,59 +29,64 @@ _kpa_per_count_of = compiled(mpl115a2.kpa_per_count_of)
 
 @inlined
 def take(
-    laws: Laws,
-    scene: Record,
-    tiles: Records,
-    room: Room,
+    params: Laws,
+    foot_state: FootState,
+    tile_states: RecordArray[TileState],
+    buffer: Room,
     seq: npt.NDArray[np.uint64],
     t_mono_ns: Times,
     t_ns: Times,
-    padc: npt.NDArray[np.uint16],
-    tadc: npt.NDArray[np.uint16],
+    pressure_raw: npt.NDArray[np.uint16],
+    temperature_raw: npt.NDArray[np.uint16],
     sample_offset_us: npt.NDArray[np.int32],
     servo_counts: npt.NDArray[np.int32],
     servo_age_us: npt.NDArray[np.int32],
-    status: npt.NDArray[np.uint8],
-    frame_status: npt.NDArray[np.uint8],
+    tile_flags: npt.NDArray[np.uint8],
+    frame_flags: npt.NDArray[np.uint8],
 ) -> None:
-    """Write n frames behind the last row, columns as in `FrameBatch`."""
-    law = laws.scene[0]
+    """Append n frames to the buffer, columns as in `FrameBatch`."""
+    foot_params = params.foot[0]
     for k in range(len(seq)):
-        i = scene.end
-        row, now_ns = room.rows[i], t_mono_ns[k]
-        row.seq, row.t_ns, room.t_mono_ns[i] = seq[k], t_ns[k], now_ns
-        broken = unseen = False
-        if i > 0:  # a row is always left of the frames before
-            passed_ns = now_ns - room.t_mono_ns[i - 1]
+        i = foot_state.end_row
+        row, now_ns = buffer.rows[i], t_mono_ns[k]
+        row.seq, row.t_ns, buffer.t_mono_ns[i] = seq[k], t_ns[k], now_ns
+        gap = long_gap = False
+        if i > 0:  # a row of the frames before always remains
+            passed_ns = now_ns - buffer.t_mono_ns[i - 1]
             # Unsigned throughout: a difference wraps, and any number is compared as it is.
-            follows = np.uint64(seq[k] - room.rows[i - 1].seq) == np.uint64(1)
-            broken, unseen = not follows or passed_ns > law.gap_ns, passed_ns > UNSEEN_NS
-        row.broken, row.unseen = 1 if broken else 0, 1 if unseen else 0
-        scene.runs += row.broken
-        room.run[i] = scene.runs
-        if law.servo == 1:
+            follows = np.uint64(seq[k] - buffer.rows[i - 1].seq) == np.uint64(1)
+            gap, long_gap = not follows or passed_ns > foot_params.gap_ns, passed_ns > UNSEEN_NS
+        row.after_gap, row.after_long_gap = 1 if gap else 0, 1 if long_gap else 0
+        foot_state.run_count += row.after_gap
+        buffer.run[i] = foot_state.run_count
+        if foot_params.has_servo == 1:
             carry(
-                room.readings, i, now_ns, np.int64(servo_counts[k]), np.int64(servo_age_us[k]),
-                frame_status[k], law.counts_per_turn, broken,
+                buffer.readings, i, now_ns, int(servo_counts[k]), int(servo_age_us[k]),
+                frame_flags[k], foot_params.counts_per_turn, gap,
             )  # fmt: skip
-        for j in range(len(tiles)):
-            tile, cell, chip = tiles[j], room.cells[i, j], laws.tiles[j]
-            of_tile = np.int64(status[k, j])
-            cell.over_range = of_tile & _OVER_RANGE
-            cell.padc, cell.tadc = padc[k, j], tadc[k, j]
-            if cell.tadc == NOT_READ:  # a chip's temperature holds for a second
-                if now_ns - tile.tadc_ns <= HELD_NS:
-                    cell.tadc = tile.tadc
-            elif of_tile & _UNUSABLE == 0:
-                tile.tadc, tile.tadc_ns = cell.tadc, now_ns
-            room.sampled_ns[i, j] = now_ns + 1000 * np.int64(sample_offset_us[k, j]) + chip.late_ns
-            cell.kpa = math.nan
-            if of_tile & _UNUSABLE == 0 and cell.padc != NOT_READ and cell.tadc != NOT_READ:
-                p, t = float(cell.padc), float(cell.tadc)
+        for j in range(len(tile_states)):
+            tile_params, tile_state = params.tiles[j], tile_states[j]
+            sample = buffer.samples[i, j]
+            flags = np.int64(tile_flags[k, j])
+            sample.is_over_range = 1 if flags & _OVER_RANGE != 0 else 0
+            sample.pressure_raw, sample.temperature_raw = pressure_raw[k, j], temperature_raw[k, j]
+            if sample.temperature_raw == NOT_READ:  # a chip's temperature holds for a second
+                if now_ns - tile_state.temperature_ns <= HELD_NS:
+                    sample.temperature_raw = tile_state.temperature_raw
+            elif flags & _UNUSABLE == 0:
+                tile_state.temperature_raw = sample.temperature_raw
+                tile_state.temperature_ns = now_ns
+            offset_ns = 1000 * np.int64(sample_offset_us[k, j])
+            buffer.sampled_ns[i, j] = now_ns + offset_ns + tile_params.sample_delay_ns
+            sample.pressure_kpa = math.nan
+            is_read = sample.pressure_raw != NOT_READ and sample.temperature_raw != NOT_READ
+            if flags & _UNUSABLE == 0 and is_read:
+                p, t = float(sample.pressure_raw), float(sample.temperature_raw)
+                chip = tile_params
                 kpa = _kpa_of(p, t, chip.a0, chip.b1, chip.b2, chip.c12)
-                if law.unwrap == 1:
+                if foot_params.has_unwrap == 1:
                     kpa = unwrapped(kpa, _kpa_per_count_of(t, chip.b1, chip.c12))
                 if kpa >= PRESSURE_MIN_KPA:
-                    cell.kpa = kpa
-        scene.newest_ns = now_ns
-        scene.end += 1
+                    sample.pressure_kpa = kpa
+        foot_state.newest_ns = now_ns
+        foot_state.end_row += 1

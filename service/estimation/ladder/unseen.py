@@ -1,9 +1,9 @@
-"""What a tile may have borne while it was not seen, and what that leaves in gas and rubber.
+"""Saturation: bounds of the load during saturation and gaps, and its effect on gas and rubber.
 
-Unseen is a load behind the chip's end or beyond the calibrated range, and a stretch of more than
-`UNSEEN_NS` without a reading. Models that remember are then run twice: on the best guess, and on
-the load that is farthest from it of all that may have been. The second run decays towards the first
-with the models' own times, and how far they are apart is what the next estimates do not know.
+The load is unknown beyond the chip's end or the calibrated range, and during more than `UNSEEN_NS`
+without a reading. Models with a state then run twice: on the best guess, and on the possible load
+farthest from it (alternative hypothesis). The second run decays towards the first with the models'
+own time constants. The difference of the two is the uncertainty of the next estimates.
 """
 
 from __future__ import annotations
@@ -17,80 +17,77 @@ from devices.compiled import compiled
 from service.estimation.foot import UNSEEN_NS
 from service.estimation.models.gas import Gas
 from service.estimation.models.static import StaticCurves
-from service.estimation.records import Record, Records, record_type, records
+from service.estimation.records import KernelRecord, RecordArray
 
 MOST = 2.0
-"""A load beyond what a tile can tell is at most so many times the load where that ends. The paper's
-dome ends at 25 to 35 N and its leg weighs 8.9 N: this is six to eight legs on a single tile. An
-assumption; where loads are greater the dome is the wrong one (`foottile domes`)."""
+"""Largest load during saturation, over the load where saturation begins. The paper's dome ends at
+25 to 35 N and its leg weighs 8.9 N: this is six to eight legs on a single tile. An assumption;
+where loads are greater the dome is the wrong one (`foottile domes`)."""
 EVENLY = 1.0 / 3.0**0.5
-"""Standard uncertainty of a guess, in units of the farthest that it may be off: all between is as
-likely. 1.96 of it reach a little farther than that."""
+"""Standard deviation of a uniform distribution over its half width: 1.96 standard deviations
+reach a little farther."""
 
 
-LAW = record_type(
-    [
-        (name, np.float64)
-        for name in (
-            *("high_kpa", "end_n", "slope_n_per_kpa", "most_n"),
-            *("end_hot_kpa", "most_hot_kpa"),
-        )
-    ]
-)
-"""Constants of a tile, as in `Unseen`."""
+class SaturationParams(KernelRecord):
+    """Parameters of a tile, as in `SaturationBounds`."""
+
+    range_high_kpa: float
+    range_end_n: float
+    slope_n_per_kpa: float
+    force_max_n: float
+    range_end_hot_kpa: float
+    force_max_hot_kpa: float
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """What tiles may bear unseen, over the bearing tiles.
+    """Bounds of the load during saturation and gaps, over the load-bearing tiles.
 
     Attributes:
-        high_kpa: gauge pressure at the calibrated range's end.
-        end_n: load there.
-        slope_n_per_kpa: along which the curve is taken to go on beyond it.
-        most_n: greatest load beyond what the tile can tell.
-        end_hot_kpa: absolute pressure of the load at the range's end, put on too fast for its gas
-            to cool.
-        most_hot_kpa: likewise of the greatest load.
+        range_high_kpa: gauge pressure at the calibrated range's end.
+        range_end_n: load there.
+        slope_n_per_kpa: slope with which the curve is extrapolated.
+        force_max_n: largest possible load during saturation.
+        range_end_hot_kpa: absolute pressure of the load at the range's end before its gas cools.
+        force_max_hot_kpa: same of the largest possible load.
     """
 
-    high_kpa: Floats
-    end_n: Floats
+    range_high_kpa: Floats
+    range_end_n: Floats
     slope_n_per_kpa: Floats
-    most_n: Floats
-    end_hot_kpa: Floats
-    most_hot_kpa: Floats
+    force_max_n: Floats
+    range_end_hot_kpa: Floats
+    force_max_hot_kpa: Floats
 
-    def laws(self) -> Records:
-        """The constants, tile by tile."""
-        return records(LAW, len(self.end_n), **vars(self))
+    def laws(self) -> RecordArray[SaturationParams]:
+        """Make the kernel's parameters, (tiles,)."""
+        return SaturationParams.array(len(self.range_end_n), **vars(self))
 
 
 @compiled
-def guess_n(law: Record, curve_n: float, gauge_kpa: float) -> float:
-    """Load at a pressure that may be beyond the range, at most the greatest; NaN stays NaN.
+def guess_n(params: SaturationParams, curve_n: float, gauge_kpa: float) -> float:
+    """Extrapolate the static curve beyond its range, up to the largest load; NaN stays NaN.
 
     Args:
-        law: constants of the tile.
-        curve_n: force by the static curve, which stays where it ends.
+        params: of the tile.
+        curve_n: force by the static curve, constant beyond its range.
         gauge_kpa: pressure above the baseline.
     """
-    beyond_kpa = gauge_kpa - law.high_kpa
-    guess = curve_n + law.slope_n_per_kpa * beyond_kpa if beyond_kpa > 0.0 else curve_n
-    most_n: float = law.most_n
-    return most_n if guess > most_n else guess
+    beyond_kpa = gauge_kpa - params.range_high_kpa
+    guess = curve_n + params.slope_n_per_kpa * beyond_kpa if beyond_kpa > 0.0 else curve_n
+    return params.force_max_n if guess > params.force_max_n else guess
 
 
 def make_unseen(
     curves: StaticCurves, gas: Gas | None, baseline_kpa: Floats, chip_end_kpa: Floats
 ) -> Unseen:
-    """Work out what tiles may bear unseen.
+    """Compute the bounds.
 
     Args:
-        curves: of the bearing tiles.
-        gas: of them; None: it is not modelled.
-        baseline_kpa: absolute pressure unloaded.
-        chip_end_kpa: absolute pressure up to which the chip tells it.
+        curves: static curves of the load-bearing tiles.
+        gas: their gas model; None: it is not named.
+        baseline_kpa: (tiles,), absolute pressure unloaded.
+        chip_end_kpa: (tiles,), absolute pressure above which the chip saturates.
     """
     at_end = curves.force(curves.high_kpa[None])
     end_n, slope = at_end.force_n[0], at_end.slope_n_per_kpa[0]
@@ -100,7 +97,7 @@ def make_unseen(
     most_n = MOST * (end_n + slope * (tells_kpa - curves.high_kpa))
     most_kpa = curves.high_kpa + (most_n - end_n) / slope
     gamma = np.ones(len(end_n)) if gas is None else gas.gamma
-    # Of a plan that waits for its tare the baseline is nothing.
+    # The baseline is 0 before the first tare.
     base_kpa = np.maximum(baseline_kpa, 1.0)
     end_hot_kpa, most_hot_kpa = (
         base_kpa * (1.0 + gauge_kpa / base_kpa) ** gamma
@@ -111,11 +108,11 @@ def make_unseen(
 
 @compiled
 def farthest(of: float, least: float, most: float) -> float:
-    """Whichever of two is farther."""
+    """Return the bound farther from `of`."""
     return most if most - of > of - least else least
 
 
 @compiled
 def was_away(t_ns: int, last_ns: int) -> bool:
-    """Does a tile give a reading after a stretch of more than `UNSEEN_NS` without?"""
+    """Return whether more than `UNSEEN_NS` passed since the last reading."""
     return t_ns - last_ns > UNSEEN_NS

@@ -1,1 +1,1 @@
-"""A module per model: what an effect does to readings, and how that is undone."""
+"""Models of disturbances, one module each: the effect on readings, and its correction."""

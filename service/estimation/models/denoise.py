@@ -1,59 +1,70 @@
-"""`denoise`: noise averaged away over as long as nothing happens.
+"""`denoise`: noise averaged over the longest window in which nothing happens.
 
 Around every sample a line and a parabola are fitted to windows that grow, up to the look-ahead on
-one side and `PAST_NS` on the other. Each side grows by itself, until what it brings does not agree
-with all shorter windows: beside a contact the window goes on growing on the side away from it. The
-value with the least noise is taken (Lepski's method; Goldenshluger and Nemirovski 1997). Two
-windows, one within the other, agree if their values differ by no more than what the longer one
-averages away would explain. A window never crosses a gap.
+one side and `PAST_NS` on the other. Each side grows by itself until its value disagrees with a
+shorter window: beside a contact the window goes on growing on the side away from it. The value with
+the least variance is used (Lepski's method; Goldenshluger and Nemirovski 1997). Two windows, one
+within the other, agree if the noise that the longer one averages away explains their difference. A
+window never crosses a gap.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 
 from devices.arrays import Floats, Ints, Times
 from devices.compiled import compiled, inlined
-from service.estimation.records import Records
+from service.estimation.records import RecordArray
 
-PAST_NS = 250_000_000  # how far the longest window reaches back
+PAST_NS = 250_000_000  # reach of the longest window into the past
 REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
-"""How far the windows reach to either side, in samples."""
+"""Reaches of the windows to either side, in samples."""
 AVERAGED_MAX = 2 * int(REACHES[-1]) + 2
-"""Readings in the longest window, and one."""
+"""Number of readings in the longest window, plus one."""
 AGREE = 2.25
-"""How far the values of two windows may be apart, in standard uncertainties of their difference:
-chance makes it more in one of forty. A compromise between noise in quiet stance and lag at an
-impact."""
+"""Largest difference of two windows' values, in standard uncertainties; chance exceeds it in one of
+forty. A compromise between noise in quiet stance and lag at an impact."""
 SAME = 1e-6
-"""Of a variance: a longer window that averages less than that away is the same but for rounding."""
+"""Relative reduction of variance below which a longer window differs by rounding only."""
 SINGULAR = 1e-5
-"""A determinant so small, relative to its first term, says that samples lie too close together for
-such a curve, as at two instants a parabola; for windows of equal steps it is a hundred times more.
-"""
+"""Relative determinant below which samples lie too close together for the curve, as two instants
+for a parabola; windows of equal steps have a hundred times more."""
 
 
 Rows = tuple[int, int, int, int]
-"""That a window reaches: of a line the first and the last, and of a parabola."""
+"""First and last row that the window of a line reaches, then those of a parabola."""
 ANYWHERE: Rows = (0, 1 << 62, 0, 1 << 62)
-"""Windows may reach all rows."""
+"""All rows."""
 Columns = tuple[Floats, Floats, Times, Ints]
-"""Values (n, columns), NaN where there is none; standard deviations of single ones, and instants of
-the samples, both likewise; and (n,) the number of the unbroken run that a frame belongs to."""
+"""Values (n, columns), NaN where there is none; standard deviation of each and its instant, both
+(n, columns); and (n,) the number of the gapless run that a frame belongs to."""
 Scratch = tuple[Floats, Floats, Floats]
-"""Room that `averaged` works in, from `scratch_of_windows`: of all windows so far the values, their
+"""Work arrays of `averaged`, from `scratch_of_windows`: values of all smaller windows, their
 variances, and 1 for a parabola."""
 KEPT_MAX = 4 * len(REACHES) + 1
+"""Largest number of windows around a sample."""
 Moments = tuple[float, float, float, float, float, float, float, float]
-"""Of samples: how many, sums of the first four powers of their times, of their values, and of these
+"""Sums over samples: their number, the first four powers of their times, their values, and these
 times time and its square. Eight numbers that stay in registers."""
+
+
+class TileBend(Protocol):
+    """Record of a tile with the change of its average from a shorter window."""
+
+    window_difference_n: float
+    """Average less that of a window of half the length; NaN: there is none."""
+    window_difference_sigma_n: float
+    """Standard deviation of that difference by noise."""
+    smoothing_error_n: float
+    """Load that averaging removes, estimated."""
 
 
 @compiled
 def scratch_of_windows() -> Scratch:
-    """Room that `averaged` works in."""
+    """Allocate the work arrays of `averaged`."""
     return np.empty(KEPT_MAX), np.empty(KEPT_MAX), np.empty(KEPT_MAX)
 
 
@@ -61,15 +72,15 @@ def scratch_of_windows() -> Scratch:
 def in_sight(
     frame_t_ns: Times, i: int, first: int, end: int, rows: tuple[int, int], look_ns: int
 ) -> tuple[int, int]:
-    """Oldest and newest row that windows of row `i` may reach.
+    """Return the oldest and the newest row that windows of row `i` may reach.
 
     Args:
         frame_t_ns: instants of all rows.
         i: row.
-        first: first row that is there.
-        end: row after the last that is there.
-        rows: what this gave for the row before, or any row twice.
-        look_ns: look-ahead; all frames within it are there, or will never come.
+        first: first row that is stored.
+        end: row after the last that is stored.
+        rows: answer for the row before, or any row twice.
+        look_ns: look-ahead; no more frames arrive within it.
     """
     oldest, newest = rows
     while oldest > first and frame_t_ns[oldest - 1] >= frame_t_ns[i] - PAST_NS:
@@ -89,33 +100,32 @@ def averaged(
     j: int,
     at_ns: int,
     rows: tuple[int, int],
-    noise_left: Floats,
+    variance_inflation: Floats,
     within: Rows,
     scratch: Scratch,
 ) -> tuple[tuple[float, float, float, float], Rows]:
-    """Averaged value of row `i`, column `j`, where there is one.
+    """Average the value of row `i`, column `j`, which must exist.
 
     Args:
-        columns: what is averaged.
+        columns: values with their noise, instants and runs.
         i: row.
         j: column.
-        at_ns: instant that is asked for.
+        at_ns: instant at which the fitted curve is evaluated.
         rows: oldest and newest that windows may reach, from `in_sight`.
-        noise_left: (`AVERAGED_MAX` + 1,), how much more of the noise's variance is left of an
-            average of so many readings than of white noise.
-        within: rows that windows may reach: `ANYWHERE`, or what those of the sum of tiles reached.
+        variance_inflation: (`AVERAGED_MAX` + 1,), variance of a mean of n readings over that of
+            white noise.
+        within: rows that windows may reach: `ANYWHERE`, or those of the sum of tiles.
         scratch: from `scratch_of_windows`.
 
     Returns:
-        The value, and its squared standard uncertainty in units of that of a single one: what is
-        left of the noise, and what curvature within the window adds. And how far it is from that of
-        a window of half the length, with the variance that noise gives that, in the same units: for
-        `shared_bend`. And the rows that the windows reached, as `within`.
+        The value; its variance in units of that of a single value: remaining noise, and curvature
+        within the window; its difference from a window of half the length; and the variance of
+        that by noise, in the same units, for `share_bend`. And the rows reached, as `within`.
     """
     values, sigmas, t_ns, run = columns
     oldest, newest = rows
     sigma = sigmas[i, j]
-    # Times relative to the instant asked for, in milliseconds.
+    # Times relative to `at_ns`, in milliseconds.
     kept_values, kept_variances, kept_bent = scratch
     line_low, line_high, bent_low, bent_high = within
     nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -153,7 +163,7 @@ def averaged(
                 value, of_noise = _parabola(trial) if bent else _line(trial)
                 if math.isnan(value):
                     continue
-                of_noise *= _left(noise_left, of_noise)
+                of_noise *= _left(variance_inflation, of_noise)
                 if not _agree(scratch, stored, value, of_noise, bent, (AGREE * sigma) ** 2):
                     agrees = not bent
                     straight = False
@@ -182,8 +192,8 @@ def averaged(
             shorter, shorter_variance = before, before_variance
         if not open_low and not open_high:
             break
-    # A window of half the length gives the same but for noise; if not, neither curve is a
-    # good description of what happens here.
+    # A window of half the length gives the same but for noise; if not, neither curve describes
+    # the load here.
     bend, of_bend = best - shortest, shortest_variance - variance
     if sigma > 0.0:
         variance += max(0.0, (bend / sigma) ** 2 - of_bend)
@@ -191,36 +201,36 @@ def averaged(
 
 
 @inlined
-def share_bend(tiles: Records) -> None:
-    """What of the tiles' bends is more than noise in their sum, signed, into `smoothed_n`.
+def share_bend(tiles: RecordArray[TileBend]) -> None:
+    """Write the part of the tiles' window differences that exceeds noise into `smoothing_error_n`.
 
-    Tiles bear the same load: what a window smooths away of it, it does in all of them, to the same
-    side. One tile does not show that above its noise; their sum may.
+    Tiles bear the same load: a window smooths it in every tile, to the same side. The noise of one
+    tile hides that; in their sum it may show.
 
     Args:
-        tiles: records with `bend_n`, how far averages are from those of shorter windows, NaN: there
-            is none; `of_bend_n`, the standard deviation that noise gives that; and `smoothed_n`.
+        tiles: differences of averages from those of shorter windows; updated.
     """
     total, variance = 0.0, 0.0
     for j in range(len(tiles)):
-        if not math.isnan(tiles[j].bend_n):
-            total += tiles[j].bend_n
-            variance += tiles[j].of_bend_n * tiles[j].of_bend_n
+        if not math.isnan(tiles[j].window_difference_n):
+            total += tiles[j].window_difference_n
+            sigma_n = tiles[j].window_difference_sigma_n
+            variance += sigma_n * sigma_n
     part = 0.0
     if total * total > AGREE * AGREE * variance:
         part = math.sqrt(1.0 - variance / (total * total))
     for j in range(len(tiles)):
-        known = not math.isnan(tiles[j].bend_n)
-        tiles[j].smoothed_n = part * tiles[j].bend_n if known else 0.0
+        difference_n = tiles[j].window_difference_n
+        tiles[j].smoothing_error_n = 0.0 if math.isnan(difference_n) else part * difference_n
 
 
 @inlined
 def _agree(
     kept: Scratch, stored: int, value: float, of_noise: float, bent: bool, most: float
 ) -> bool:
-    """Does a window's value agree with the first `stored` of shorter ones?
+    """Return whether a window's value agrees with the first `stored` of shorter ones.
 
-    A shorter line is not a part of a longer parabola: their noise is taken for independent.
+    A shorter line is not a part of a longer parabola: their noise is treated as independent.
     """
     values, variances, were_bent = kept
     apart = 0
@@ -233,12 +243,12 @@ def _agree(
 
 
 @compiled
-def _left(by_readings: Floats, of_noise: float) -> float:
-    """Of a curve's value, which is as uncertain as a mean of so many readings."""
-    readings = min(1.0 / of_noise, len(by_readings) - 1.5)
+def _left(variance_inflation: Floats, of_noise: float) -> float:
+    """Interpolate the inflation for a curve's value, as uncertain as a mean of 1/of_noise."""
+    readings = min(1.0 / of_noise, len(variance_inflation) - 1.5)
     whole = int(readings)
-    below: float = by_readings[whole]
-    above: float = by_readings[whole + 1]
+    below: float = variance_inflation[whole]
+    above: float = variance_inflation[whole + 1]
     return below + (readings - whole) * (above - below)
 
 
@@ -259,7 +269,7 @@ def _added(m: Moments, time: float, value: float) -> Moments:
 
 @compiled
 def _line(m: Moments) -> tuple[float, float]:
-    """Value of the fitted line at time 0, and its variance in units of a sample's."""
+    """Return the fitted line at time 0, and its variance in units of a sample's."""
     det = m[0] * m[2] - m[1] * m[1]
     if m[0] < 3.0 or det <= SINGULAR * m[0] * m[2]:
         return math.nan, 0.0
@@ -268,7 +278,7 @@ def _line(m: Moments) -> tuple[float, float]:
 
 @compiled
 def _parabola(m: Moments) -> tuple[float, float]:
-    """Likewise of the fitted parabola, by the cofactors of its normal equations."""
+    """Return the fitted parabola at time 0, and its variance, by cofactors of its equations."""
     a0, a1, a2 = m[2] * m[4] - m[3] * m[3], m[2] * m[3] - m[1] * m[4], m[1] * m[3] - m[2] * m[2]
     det = m[0] * a0 + m[1] * a1 + m[2] * a2
     if m[0] < 4.0 or det <= SINGULAR * m[0] * m[2] * m[4]:

@@ -1,4 +1,4 @@
-"""`gas`: what the bubble would read if its gas had the time to cool (hardware.md 9).
+"""`gas`: pressure of the bubble after its gas has cooled (hardware.md 9).
 
 A fast squeeze heats the sealed gas, which gives the heat to its wall within 5 to 42 ms. With T the
 gas' mean temperature over that of its wall, p measured, and an effective ratio of heat capacities
@@ -6,9 +6,9 @@ gamma between 1 and 1.4::
 
     gamma dT/dt = (gamma - 1) T/p dp/dt - (T - 1)/tau
 
-With u = T p^-k, k = (gamma - 1)/gamma, that is one linear low-pass; taken with ln p linear between
-samples it is exact and stable for any step. The wall gives way to the pressure over it by the part
-c of its volume for every kPa, so the pressure that the gas will settle at is::
+With u = T p^-k, k = (gamma - 1)/gamma, that is one linear low-pass. With ln p linear between
+samples it is exact, and stable for any step. The wall gives way to the pressure over it by the part
+c of its volume for every kPa, so the pressure after cooling is::
 
     p_static = p_iso (1 + c g)/(1 + c g_iso),  p_iso = p/T,  g = p - p0,  g_iso = p_iso - p0
 """
@@ -23,23 +23,32 @@ import numpy as np
 from devices.arrays import Floats
 from devices.compiled import compiled
 from service.estimation.foot import UNSEEN_NS
-from service.estimation.records import Record, Records, record_type, records
+from service.estimation.records import KernelRecord, RecordArray
 
 RESTART = 5.0
-"""After this many gamma tau without a reading the gas is as warm as its wall."""
+"""Time without a reading, in gamma tau, after which the gas is as warm as its wall."""
 
 
-LAW = record_type(
-    [(name, np.float64) for name in ("gamma", "tau_s", "wall_per_kpa", "baseline_kpa")]
-)
-"""Constants of a tile, as in `Gas`."""
-STATE = record_type([("temperature", np.float64), ("ln_kpa", np.float64), ("t_ns", np.int64)])
-"""Of a tile: temperature over the wall's, and the reading before (NaN: none)."""
+class GasParams(KernelRecord):
+    """Parameters of a tile, as in `Gas`."""
+
+    gamma: float
+    tau_s: float
+    wall_per_kpa: float
+    baseline_kpa: float
 
 
-def at_rest(tiles: int) -> Records:
-    """Before the first reading."""
-    return records(STATE, tiles, temperature=1.0, ln_kpa=np.nan)
+class GasState(KernelRecord):
+    """State of a tile's gas."""
+
+    temperature_ratio: float  # over the wall's
+    ln_kpa: float  # of the previous reading; NaN before the first
+    t_ns: int  # instant of that reading
+
+
+def at_rest(tiles: int) -> RecordArray[GasState]:
+    """Make the states before the first reading, (tiles,)."""
+    return GasState.array(tiles, temperature_ratio=1.0, ln_kpa=np.nan)
 
 
 @dataclass(frozen=True)
@@ -49,7 +58,7 @@ class Gas:
     Attributes:
         gamma: effective ratio of heat capacities.
         tau_s: time constant of the gas' cooling at constant volume.
-        wall_per_kpa: part of the bubble's volume that its wall gives way for a kPa.
+        wall_per_kpa: compliance of the wall: part of the bubble's volume for a kPa.
         baseline_kpa: absolute pressure unloaded.
     """
 
@@ -58,76 +67,76 @@ class Gas:
     wall_per_kpa: Floats
     baseline_kpa: Floats
 
-    def laws(self) -> Records:
-        """The constants, tile by tile."""
-        return records(LAW, len(self.gamma), **vars(self))
+    def laws(self) -> RecordArray[GasParams]:
+        """Make the kernel's parameters, (tiles,)."""
+        return GasParams.array(len(self.gamma), **vars(self))
 
 
 @compiled
-def settled(law: Record, state: Record, kpa: float, t_ns: int, away_kpa: float) -> float:
-    """Pressure that a measured one would settle at; NaN stays NaN and changes nothing after it.
+def settled(params: GasParams, state: GasState, kpa: float, t_ns: int, gap_kpa: float) -> float:
+    """Return the pressure after cooling; NaN gives NaN and leaves the state unchanged.
 
     Args:
-        law: constants of the tile.
-        state: from its readings before; becomes that after this one.
+        params: of the tile.
+        state: after the tile's readings before; updated.
         kpa: absolute pressure.
         t_ns: instant of the reading.
-        away_kpa: pressure that the gas may have had until just now, if there was no reading for
-            more than `UNSEEN_NS`: it had this one or its baseline, whichever is farther from the
-            present; NaN: a straight line was between, or it has cooled.
+        gap_kpa: pressure that the gas may have had until just now, after more than `UNSEEN_NS`
+            without a reading: the farther of this pressure and the baseline; NaN: a straight line
+            in between, or cooled gas.
     """
     if not 0.0 < kpa < math.inf:
         return math.nan
-    k = (law.gamma - 1.0) / law.gamma
-    c, p0 = law.wall_per_kpa, law.baseline_kpa
+    k = (params.gamma - 1.0) / params.gamma
+    c, p0 = params.wall_per_kpa, params.baseline_kpa
     ln_p, passed_ns = math.log(kpa), t_ns - state.t_ns
-    h = passed_ns / (law.gamma * law.tau_s * 1e9)
-    known = not math.isnan(state.ln_kpa)
-    if known and away_kpa > p0 and passed_ns > UNSEEN_NS:
-        farther = away_kpa if away_kpa * p0 > kpa * kpa else p0
-        state.temperature = (kpa / farther) ** k
-    elif known and 0.0 <= h <= RESTART:
-        state.temperature = warmed(state.temperature, ln_p - state.ln_kpa, h, k)
+    h = passed_ns / (params.gamma * params.tau_s * 1e9)
+    has_reading = not math.isnan(state.ln_kpa)
+    if has_reading and gap_kpa > p0 and passed_ns > UNSEEN_NS:
+        farther = gap_kpa if gap_kpa * p0 > kpa * kpa else p0
+        state.temperature_ratio = (kpa / farther) ** k
+    elif has_reading and 0.0 <= h <= RESTART:
+        state.temperature_ratio = warmed(state.temperature_ratio, ln_p - state.ln_kpa, h, k)
     else:
-        state.temperature = 1.0
+        state.temperature_ratio = 1.0
     state.ln_kpa, state.t_ns = ln_p, t_ns
-    iso = kpa / state.temperature
-    of_iso: float = iso * (1.0 + c * (kpa - p0)) / (1.0 + c * (iso - p0))
-    return of_iso
+    iso = kpa / state.temperature_ratio
+    return iso * (1.0 + c * (kpa - p0)) / (1.0 + c * (iso - p0))
 
 
 @compiled
-def copy(state: Record, to: Record) -> None:
-    """Remember the same."""
-    to.temperature, to.ln_kpa, to.t_ns = state.temperature, state.ln_kpa, state.t_ns
+def copy(state: GasState, to: GasState) -> None:
+    """Copy a state into another."""
+    to.temperature_ratio, to.ln_kpa, to.t_ns = state.temperature_ratio, state.ln_kpa, state.t_ns
 
 
 @compiled
-def is_same(one: Record, other: Record) -> bool:
-    """Do both remember the same?"""
+def is_same(one: GasState, other: GasState) -> bool:
+    """Return whether two states are equal; NaN equals NaN."""
     pressure = one.ln_kpa == other.ln_kpa or (math.isnan(one.ln_kpa) and math.isnan(other.ln_kpa))
-    return pressure and one.temperature == other.temperature and one.t_ns == other.t_ns
+    ratio = one.temperature_ratio == other.temperature_ratio
+    return pressure and ratio and one.t_ns == other.t_ns
 
 
 @compiled
-def settled_at_least(law: Record, kpa: float) -> float:
-    """Least pressure that the gas can settle at from one that it has now, or had more of.
+def settled_at_least(params: GasParams, kpa: float) -> float:
+    """Return the lower bound of the pressure after cooling from `kpa`, or from more.
 
-    None of its heat has gone: p (p0/p)^k. Heat that has gone before only leaves it colder.
+    None of its heat has gone: p (p0/p)^k. Heat that has gone before only leaves the gas colder.
 
     Args:
-        law: constants of the tile.
-        kpa: absolute pressure; below the baseline it may have settled already.
+        params: of the tile.
+        kpa: absolute pressure; below the baseline the gas may have cooled already.
     """
-    if not kpa > law.baseline_kpa:
+    if not kpa > params.baseline_kpa:
         return kpa
-    cooled: float = kpa * (law.baseline_kpa / kpa) ** ((law.gamma - 1.0) / law.gamma)
-    return cooled
+    lowest_kpa: float = kpa * (params.baseline_kpa / kpa) ** ((params.gamma - 1.0) / params.gamma)
+    return lowest_kpa
 
 
 @compiled
 def warmed(before: float, change_ln_p: float, h: float, k: float) -> float:
-    """Temperature over the wall's after a step of `h` gamma tau in which ln p changes linearly."""
+    """Return the temperature over the wall's after a step of `h` gamma tau, ln p linear in it."""
     x = h - k * change_ln_p
     # (1 - exp(-x))/x, which is 1 at x = 0
     mean = -math.expm1(-x) / x if x != 0.0 else 1.0

@@ -1,6 +1,6 @@
 """`hysteresis`: the rubber's loop, which does not depend on speed (hardware.md 9).
 
-The force that appears in the bubble lags behind F by the sum of a few play operators::
+The apparent force lags behind F by the sum of a few play operators::
 
     apparent = F + sum w (y - F),  y kept within F -+ min(r, OPENS F)
 
@@ -13,56 +13,67 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from devices.arrays import Floats
 from devices.compiled import compiled
-from service.estimation.records import Record, Records, record_type, records
+from service.estimation.records import KernelRecord, RecordArray
 
 WIDTHS_N = np.array([0.6, 1.5, 4.0])
-"""Half widths of the plays; their parts are what is fitted."""
+"""Half widths of the plays; their weights are fitted."""
 OPENS = 0.4
 _ITERATIONS = 100  # a bound; see `_inverted`
 _CLOSE = 1e-14
-"""Relative; a smaller step changes nothing any more."""
+"""Smallest relative step of the iteration."""
 PLAYS = len(WIDTHS_N)
-LAW = record_type([("part", np.float64, (PLAYS,))])
-"""Constants of a tile, as in `Hysteresis`."""
-STATE = record_type([("plays_n", np.float64, (PLAYS,))])
-"""Of a tile: where its plays are."""
 
 
-def at_rest(tiles: int) -> Records:
-    """Before the first reading."""
-    return records(STATE, tiles)
+class HysteresisParams(KernelRecord):
+    """Parameters of a tile, as in `Hysteresis`."""
+
+    play_weights: Annotated[Floats, (PLAYS,)]
+
+
+class HysteresisState(KernelRecord):
+    """State of a tile's plays."""
+
+    plays_n: Annotated[Floats, (PLAYS,)]
+
+
+def at_rest(tiles: int) -> RecordArray[HysteresisState]:
+    """Make the states before the first reading, (tiles,)."""
+    return HysteresisState.array(tiles)
 
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """Parts (tiles, plays), each play of half width `WIDTHS_N`; in sum below 1."""
+    """Weights (tiles, plays) of the plays of half widths `WIDTHS_N`; in sum below 1."""
 
-    part: Floats
+    play_weights: Floats
 
-    def laws(self) -> Records:
-        """The constants, tile by tile."""
-        return records(LAW, len(self.part), part=self.part)
+    def laws(self) -> RecordArray[HysteresisParams]:
+        """Make the kernel's parameters, (tiles,)."""
+        return HysteresisParams.array(len(self.play_weights), play_weights=self.play_weights)
 
 
 @compiled
-def compensated(law: Record, state: Record, apparent_n: float, borne_n: float) -> float:
-    """Force that appears as this; NaN stays NaN and changes nothing after it.
+def compensated(
+    params: HysteresisParams, state: HysteresisState, apparent_n: float, state_force_n: float
+) -> float:
+    """Return the force behind an apparent one; NaN gives NaN and leaves the state unchanged.
 
     Args:
-        law: constants of the tile.
-        state: its plays before; becomes those after this force.
-        apparent_n: force that appears.
-        borne_n: force that moves the plays, whatever the apparent one says; NaN: what that says.
+        params: of the tile.
+        state: plays before; updated.
+        apparent_n: apparent force.
+        state_force_n: force that moves the plays instead of the returned one; NaN: that one.
     """
     if not math.isfinite(apparent_n):
         return math.nan
-    found: float = _inverted(apparent_n, law.part, state.plays_n)
-    force = found if math.isnan(borne_n) else borne_n
+    found = _inverted(apparent_n, params.play_weights, state.plays_n)
+    force = found if math.isnan(state_force_n) else state_force_n
     for m in range(PLAYS):
         state.plays_n[m] = played(force, WIDTHS_N[m], state.plays_n[m])
     return found
@@ -70,17 +81,17 @@ def compensated(law: Record, state: Record, apparent_n: float, borne_n: float) -
 
 @compiled
 def played(force: float, width: float, before: float) -> float:
-    """A play after a force; it lags behind by no more than its width allows."""
+    """Return a play after a force; it lags behind by no more than its width allows."""
     half = min(width, OPENS * max(force, 0.0))
     return min(max(before, force - half), force + half)
 
 
 @compiled
-def _inverted(apparent: float, part: Floats, plays: Floats) -> float:
-    """The force that these plays show as `apparent`.
+def _inverted(apparent: float, weights: Floats, plays: Floats) -> float:
+    """Solve for the force that gives `apparent` with these plays.
 
-    It is piecewise linear over the force and rises with it: Newton's steps end on the right piece
-    after a few, and halving an interval around the force keeps them from going in circles.
+    The apparent force is piecewise linear over the force and rises with it. Newton's method ends on
+    the right piece after a few steps; halving an interval around the force prevents cycles.
     """
     if apparent <= 0.0:  # all plays are closed
         return apparent
@@ -88,8 +99,8 @@ def _inverted(apparent: float, part: Floats, plays: Floats) -> float:
     for _ in range(_ITERATIONS):
         value, slope = force, 1.0
         for m in range(PLAYS):
-            value += part[m] * (played(force, WIDTHS_N[m], plays[m]) - force)
-            slope += part[m] * _play_slope(force, WIDTHS_N[m], plays[m])
+            value += weights[m] * (played(force, WIDTHS_N[m], plays[m]) - force)
+            slope += weights[m] * _play_slope(force, WIDTHS_N[m], plays[m])
         if value > apparent:
             high = force
         else:
@@ -103,7 +114,7 @@ def _inverted(apparent: float, part: Floats, plays: Floats) -> float:
 
 @compiled
 def _play_slope(force: float, width: float, before: float) -> float:
-    """How a play's distance from the force changes with the force."""
+    """Return the slope of a play's distance from the force over the force."""
     half = min(width, OPENS * force)
     if force - half <= before <= force + half:
         return -1.0

@@ -1,8 +1,8 @@
-"""Single readings far off: 1.2 % of a real chip's, most of them low (hardware.md 1.3).
+"""Outlier replacement: 1.2 % of a real chip's readings are far off, mostly low.
 
-Part of the model `denoise`, before anything that remembers. A reading counts as an outlier if it
-lies far from the mean of its two neighbours, which lie near each other, and takes that mean. It
-needs the reading after it, so frames wait for one more.
+See hardware.md 1.3. Part of the model `denoise`, before every model with a state. A reading is an
+outlier if it lies far from the mean of its two neighbours, which lie near each other; that mean
+replaces it. It needs the next reading, so frames wait for one more.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _ABOUT_MEAN = math.sqrt(1.5)  # of a reading's own noise and that of a mean of t
 
 
 def spikes(kpa: Floats, noise_kpa: Floats) -> Bools:
-    """Which readings are outliers; the first and the last are never.
+    """Return a mask of the outliers, (n, tiles); the first and the last row have none.
 
     Args:
         kpa: (n, tiles), NaN where there is none.
@@ -33,7 +33,7 @@ def spikes(kpa: Floats, noise_kpa: Floats) -> Bools:
 
 @compiled
 def is_spike(before: float, kpa: float, after: float, noise_kpa: float) -> bool:
-    """Is a reading an outlier, between those before and after it? Beside a NaN none is."""
+    """Return whether a reading is an outlier between its neighbours; False beside a NaN."""
     off_kpa = abs(kpa - 0.5 * (before + after))
     return off_kpa > FAR * _ABOUT_MEAN * noise_kpa and abs(after - before) < off_kpa
 

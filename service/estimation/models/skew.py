@@ -1,7 +1,7 @@
-"""`skew`: tiles are sampled one after another, and a frame is about one instant.
+"""`skew`: tiles are sampled one after another; a frame is about one instant.
 
-Every tile's value at the frame's `t_ns`, on the straight line between the sample before and its
-own. With `denoise` there is no need of it: a window is evaluated at that instant right away.
+Every tile's value at the frame's `t_ns`, on the straight line between the previous sample and its
+own. Not needed with `denoise`, whose windows are evaluated at that instant.
 """
 
 from __future__ import annotations
@@ -11,31 +11,35 @@ import math
 import numpy as np
 
 from devices.compiled import compiled
-from service.estimation.records import Record, Records, record_type, records
-
-STATE = record_type([("value", np.float64), ("t_ns", np.int64)])
-"""Of a tile: the value before (NaN: none), and its instant."""
+from service.estimation.records import KernelRecord, RecordArray
 
 
-def at_rest(tiles: int) -> Records:
-    """Before the first frame."""
-    return records(STATE, tiles, value=np.nan)
+class SkewState(KernelRecord):
+    """Previous sample of a tile."""
+
+    value: float  # NaN before the first
+    t_ns: int
+
+
+def at_rest(tiles: int) -> RecordArray[SkewState]:
+    """Make the states before the first frame, (tiles,)."""
+    return SkewState.array(tiles, value=np.nan)
 
 
 @compiled
-def at_frame(state: Record, value: float, t_ns: int, frame_t_ns: int, broken: bool) -> float:
-    """Value at the frame's instant.
+def at_frame(state: SkewState, value: float, t_ns: int, frame_t_ns: int, after_gap: bool) -> float:
+    """Interpolate a tile's value to the frame's instant.
 
     Args:
-        state: from the frame before; becomes that after this one.
+        state: sample of the previous frame; updated.
         value: NaN if there is none.
-        t_ns: when it was sampled.
-        frame_t_ns: the frame's instant.
-        broken: is it the first after a gap? There is no line across it.
+        t_ns: instant of the sample.
+        frame_t_ns: instant of the frame.
+        after_gap: whether the frame is the first after a gap, across which no line is drawn.
     """
     before, step_ns = state.value, float(t_ns - state.t_ns)
     state.value, state.t_ns = value, t_ns
-    if broken or step_ns <= 0.0 or not math.isfinite(before):
+    if after_gap or step_ns <= 0.0 or not math.isfinite(before):
         return value
     back = (t_ns - frame_t_ns) / step_ns
     return value - back * (value - before) if 0.0 <= back <= 1.0 else value

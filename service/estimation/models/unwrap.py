@@ -1,9 +1,9 @@
-"""`unwrap`: a part pressed past its range, whose count fell through zero and came back near 1023.
+"""`unwrap`: counts that fell through zero and wrapped to near 1023, beyond the chip's range.
 
 Real parts do this beyond some 25 N (hardware.md 1.3), and at face value full load reads as about
-23 kPa. It is recognised without memory: no sealed bubble can be below 50 kPa, the end of the
-chip's range, so what reads lower is a count that wrapped once. A bus that reads all ones is no such
-case: the driver flags it, and it never becomes a pressure.
+23 kPa. Recognised without memory: no sealed bubble can be below 50 kPa, the end of the chip's
+range, so a lower reading is a count that wrapped once. A bus that reads all ones is no such case:
+the driver flags it, and it never becomes a pressure.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from devices.compiled import compiled
 
 @compiled
 def unwrapped(kpa: float, kpa_per_count: float) -> float:
-    """Absolute pressure with a wrapped count taken back below zero.
+    """Return the absolute pressure with a wrapped count corrected to below zero.
 
     Args:
         kpa: compensated pressure.
-        kpa_per_count: pressure step of one count of `padc` (negative).
+        kpa_per_count: pressure step of one raw pressure count (negative).
 
     Returns:
         Pressure in kPa; beyond every calibrated range if the count had wrapped.

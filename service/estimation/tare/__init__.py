@@ -1,1 +1,1 @@
-"""The tare: by hand, by its lead, in flight, and how baselines drift between tares."""
+"""Tares: by hand, from a lead, in flight; drift of baselines between tares."""

@@ -1,11 +1,11 @@
-"""The automatic tare: keeps a true baseline true while the stream runs, and tares no load away.
+"""Automatic tare: follows the drift of baselines while the stream runs, without taring loads away.
 
-A load that builds up slowly looks like a dome that warms up slowly. What tells them apart is the
-chip's own temperature, and what bounds the mistake is how far a baseline may be moved without it:
-by `NEAR_KPA` at once, `APART_NS` apart, and by `FAR_KPA` in all since the last tare by hand.
-However slowly a load comes, no more of it is tared away than that: half a newton on a tile.
+A slow load looks like a dome that warms up. The chip's temperature tells them apart, and limits
+bound the error: beyond the change that temperature explains a baseline moves by at most `NEAR_KPA`
+at once, `APART_NS` apart, and by `FAR_KPA` in all since the last tare by hand. So at most half a
+newton of a slow load on a tile is tared away.
 
-It is taken while the stream runs, from the newest unloaded interval among the frames just seen.
+The tare comes from the newest unloaded window among the last frames of the stream.
 """
 
 from __future__ import annotations
@@ -30,23 +30,22 @@ from service.estimation.tare.unloaded import (
 LOOK_BACK_NS = 10_000_000_000  # a foot that walks is in the air within that time
 WINDOW_NS = 250_000_000  # fits into the flight of a hop, and holds enough readings
 WARMING_COUNTS = 4.0
-"""0.75 K: the gas may be that far from its chip, a quarter of a kilopascal or half a newton."""
+"""Largest change of a chip's temperature for a tare, 0.75 K: 0.25 kPa or half a newton."""
 WINDOW_MAX_NS = 1_000_000_000
-"""Longest window, for arrays so slow that a shorter one would hold too few frames."""
+"""Longest window, for slow arrays, whose shorter windows have too few frames."""
 
 
 def newest_unloaded_tare(
     seen: TareFrames, *, present: Tare | None, bears: Bools | None = None
 ) -> Tare:
-    """The tare from the newest unloaded window of the frames seen.
+    """Compute the tare from the newest unloaded window of the last frames.
 
-    Of all windows in which every tile is quiet and still, those count in which no tile is higher
-    than in the lowest of them, nor far above the present tare or, without one, the bench. The
-    newest of these is taken.
+    A window counts if every tile is quiet and still, no tile is higher than in the lowest such
+    window, and none is far above the present tare or, without one, the rig baseline.
 
     Args:
         seen: the last `LOOK_BACK_NS` of the stream, in order.
-        present: the tare now in force.
+        present: the tare in force.
         bears: (tiles,), False for bare tiles, which follow the weather; None: all bear load.
 
     Raises:
@@ -102,7 +101,7 @@ def _window_ns(since_ns: Times) -> int:
 
 
 def _refuse_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) -> None:
-    """Refuse a tare while a chip's temperature changes: its gas lags by seconds."""
+    """Reject a tare while a chip's temperature changes: its gas lags by seconds."""
     tadc = np.where(frames.tadc == NOT_READ, np.nan, frames.tadc.astype(np.float64))
     since_ns = frames.t_ns - frames.t_ns[0]
     begin = tadc[since_ns <= WINDOW_NS]
@@ -140,33 +139,32 @@ def _refuse_above(
 
 
 APART_NS = 60_000_000_000
-"""Two automatic tares are at least a minute apart."""
+"""Least time between two automatic tares."""
 RATE_KPA_PER_S = 0.005
-"""A baseline is never moved faster: a kelvin a minute, which is what a dome does in the sun."""
+"""Fastest shift of a baseline: a kelvin a minute, as of a dome in the sun."""
 NEAR_KPA = 0.15
-"""How far a baseline may be moved at once beyond what the temperature explains: 0.3 N on a tile,
-the noise of a single reading."""
+"""Largest single shift beyond the shift by temperature: 0.3 N on a tile, the noise of a reading."""
 FAR_KPA = 0.25
-"""Limit of the whole shift since the last tare that was not automatic: half a newton."""
+"""Largest shift in all since the last tare that was not automatic: half a newton."""
 EXPLAINED_PART = 0.5
-"""Gas and chip do not warm at once, and the wall gives way: half of what is explained is open."""
+"""Uncertain part of the shift by temperature: gas and chip differ, and the wall gives way."""
 SETTLE_NS = 100_000_000
-"""How long the rubber recovers after a contact before a window may begin."""
+"""Recovery time of the rubber after a contact, before a window may start."""
 CONFIRM_NS = 900_000_000_000
-"""If nothing has moved, the tare is renewed only after this, long before it counts as old."""
+"""Time after which a tare without drift is renewed, long before it counts as old."""
 MOVED_SIGMAS = 4.0  # of both tares: less may be chance
 MOVED_MIN_KPA = 0.02
-"""Less than this is not worth an entry in the history."""
+"""Least shift that makes an entry in the history."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a look at the last seconds has found.
+    """Result of a check of the last seconds.
 
     Attributes:
-        tare: to be put in force, and `reason` says why; None if the one in force is good.
-        reason: in words, for the history.
-        doubt: the foot seems to be in the air, and the baseline does not fit: why it was left.
+        tare: to be put in force; None if the present one is good.
+        reason: reason for the tare, for the history.
+        doubt: reason why no tare was made although the foot seems to be in the air.
     """
 
     tare: Tare | None = None
@@ -185,13 +183,13 @@ def look_in_flight(
     free_since_t_ns: int,
     bears: Bools | None = None,
 ) -> Look:
-    """Decide whether the baseline should follow the readings of a foot in the air.
+    """Check whether a foot in the air needs a new tare.
 
     Args:
         seen: the last `LOOK_BACK_NS` of the stream, in order.
         present: the tare in force.
         anchor: the last tare that was not automatic; None without one.
-        free_since_t_ns: since when there has been no contact, nor any doubt about it.
+        free_since_t_ns: start of the present time without contact, known in every frame.
         bears: (tiles,), False for bare tiles, which follow the weather and no load; None: all do.
     """
     frames, serials = seen.frames, seen.serials
@@ -229,10 +227,10 @@ def look_in_flight(
 
 
 def first_in_flight(seen: TareFrames) -> Look:
-    """A first tare without a request, if it cannot be a mistake.
+    """Make a first tare without a request, if the foot has certainly been lifted.
 
-    The foot has to have been loaded in these seconds and to be off the ground at their end, every
-    tile near its baseline on the bench: a foot that stands light is quiet and near as well.
+    It has to have been loaded in these seconds and to be off the ground at their end, every tile
+    near its rig baseline: a lightly loaded foot is quiet and near its baseline as well.
     """
     if not seen.has_bench or not len(seen.frames):
         return NOTHING
@@ -258,7 +256,7 @@ def _too_far(
     bears: Bools,
     which: str,
 ) -> str | None:
-    """Why a baseline has moved too far from another one to be believed."""
+    """Return the reason why a baseline is too far from another one; None if it is near."""
     warmer = np.nan_to_num(warmer_k(other, tare.tadc_counts), nan=0.0)
     explained_kpa = expected_shift_kpa(other, warmer)
     shift_kpa = tare.baseline_kpa - other.baseline_kpa

@@ -1,8 +1,8 @@
-"""Noise that lasts: which part of an unloaded tile's scatter is still there some readings later.
+"""Correlated noise of an unloaded tile.
 
-White noise averages away with the number of readings; what a supply, a cable or the ground gives
-does not. It is taken for a part c of the variance that decays with a time, over k readings with
-phi^k, beside a white rest. Then the mean of n readings has the variance s^2/n times::
+White noise averages away with the number of readings; noise of a supply, a cable or the ground does
+not. Model: a part c of the variance whose correlation over k readings is phi^k, and a white rest.
+Then the mean of n readings has the variance s^2/n times::
 
     1 + 2 c (phi/(1-phi) - phi (1-phi^n) / (n (1-phi)^2))
 
@@ -17,21 +17,21 @@ import numpy.typing as npt
 from devices.arrays import Floats
 
 _LAGS = 64
-"""Correlation over so many readings is looked at, or over a quarter of those that are there."""
+"""Largest lag of the correlation, in readings; a quarter of the readings if there are fewer."""
 _TESTED = 8
 _CHANCE = 3.5
-"""Standard deviations of the sum of rho over `_TESTED` readings: what does not add up averages."""
+"""Least sum of rho over `_TESTED` readings that is significant, in standard deviations."""
 _TIMES = np.geomspace(1.0, _LAGS, 25)
 
 
 def lasting(kpa: Floats) -> tuple[Floats, Floats]:
-    """The part of the variance that lasts, and how long, of unloaded readings.
+    """Fit the correlated part of the variance of unloaded readings, and its time constant.
 
     Args:
         kpa: (n, tiles), evenly spaced, NaN where a tile gave none.
 
     Returns:
-        Part c (tiles,), 0 where chance alone would do, and time in readings (tiles,), 0 there.
+        Part c (tiles,), 0 where not significant, and time constant in readings (tiles,), 0 there.
     """
     n, tiles = kpa.shape
     part, readings = np.zeros(tiles), np.zeros(tiles)
@@ -65,12 +65,12 @@ def _fitted(rho: Floats, n: int) -> tuple[float, float]:
 
 
 def left_by_mean(part: Floats, readings: Floats, n: npt.ArrayLike) -> Floats:
-    """How much greater the variance of a mean of n readings is than that of white noise.
+    """Return the variance of a mean of n readings over that of white noise.
 
     Args:
-        part: (tiles,), from `lasting`.
-        readings: (tiles,), likewise; 0 where nothing lasts.
-        n: 1 or more, of a shape that goes with (tiles,).
+        part: (tiles,), correlated part of the variance.
+        readings: (tiles,), time constant in readings; 0 for white noise.
+        n: 1 or more, broadcast with (tiles,).
     """
     count = np.asarray(n, dtype=np.float64)
     phi = np.exp(-1.0 / np.where(readings > 0.0, readings, 1.0))

@@ -1,6 +1,6 @@
-"""The tare: each tile's baseline and noise, from an interval without load.
+"""Tare: each tile's baseline and noise, from an interval without load.
 
-Here also: how baselines move, with temperature since a tare and over a history of tares.
+Also the drift of baselines, with temperature since a tare and over a history of tares.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ TakenFrom = Literal["interval", "lead", "recognised", "unloaded", "flight"]
 Source = TakenFrom | Literal["lost"]
 _LASTING_MAX = {"noise_lasting": 1.0, "noise_lasting_s": 3600.0}
 _KPA_MAX = 1000.0
-"""Nine times as much as a chip tells, and near enough that no square of it overflows."""
+"""Largest valid pressure: nine times a chip's range, and no square overflows."""
 _TADC_MAX = 1023.0
 
 
 @dataclass(frozen=True)
 class Tare:
-    """Baselines with their uncertainty; arrays over tiles.
+    """Baselines with their uncertainties; arrays over tiles.
 
     Attributes:
         baseline_kpa: absolute pressure unloaded.
         baseline_sigma_kpa: its standard uncertainty.
         noise_kpa: standard deviation of a single reading.
-        tadc_counts: mean temperature counts; NaN in tares of older versions, which kept none.
+        tadc_counts: mean raw temperature; NaN in tares of older versions, which stored none.
         t_ns: instant at which the interval ended, in UTC.
         begin_s: begin of the interval, in seconds from the first frame.
         end_s: its end.
-        frames: number of frames it was taken from.
-        source: how the interval was found; "lost": there was a tare, and it is not known what it
-            said: its arrays are NaN, and so is every force while it is in force.
-        noise_lasting: part of the noise's variance that lasts, 0 for white noise; None in tares of
-            older versions, which took all for white.
-        noise_lasting_s: how long it lasts, a time constant; likewise.
+        frames: number of frames in the interval.
+        source: origin of the interval; "lost": the tare is damaged on disk. Its arrays are NaN, and
+            so is every force while it is in force.
+        noise_lasting: correlated part of the noise's variance, 0 for white noise; None in tares of
+            older versions, which assumed white noise.
+        noise_lasting_s: time constant of that part; None likewise.
     """
 
     baseline_kpa: Floats
@@ -58,17 +58,17 @@ class Tare:
 
     @classmethod
     def lost(cls, *, tiles: int, t_ns: int) -> Tare:
-        """In place of one that was lost; it may have been in force from `t_ns` on."""
+        """Make the stand-in of a lost tare that may have been in force from `t_ns` on."""
         unknown = np.full(tiles, np.nan)
         return cls(unknown, unknown, unknown, unknown, t_ns, 0.0, 0.0, 0, "lost")
 
     @property
     def is_lost(self) -> bool:
-        """Does it stand for one that was lost?"""
+        """True for the stand-in of a lost tare."""
         return self.source == "lost"
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON, which has no NaN: `None`."""
+        """Return its content for JSON, with `None` for NaN."""
         content = {f.name: getattr(self, f.name) for f in fields(self)}
         return {
             name: [None if np.isnan(x) else x for x in value.tolist()]
@@ -79,7 +79,7 @@ class Tare:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, tiles: int) -> Tare:
-        """From JSON, for an array of `tiles` tiles.
+        """Parse a tare of `tiles` tiles from JSON.
 
         Raises:
             TareError: it is no tare, or of another number of tiles.
@@ -118,30 +118,30 @@ class Tare:
 SEALED_AT_K = 298.0
 """A sealed bubble's pressure is proportional to its absolute temperature; about 25 degC."""
 WARMED_COUNTS = 4.0
-"""A baseline is in doubt if a tile's chip changed by more since the tare: 0.75 K are 0.25 kPa,
+"""Largest change of a chip's temperature since the tare with a valid baseline: 0.75 K are 0.25 kPa,
 half a newton on a tile and one and a half on a foot of four."""
 TREND_OVER_NS = 6 * 3_600_000_000_000
-"""A trend is over the last hours; earlier tares are another day's."""
+"""Time span of a trend."""
 TREND_SPAN_MIN_NS = 600_000_000_000
-"""A straight line through less than ten minutes says nothing about an hour."""
+"""Least time span of a trend in kPa/h."""
 
 
 def warmer_k(tare: Tare, tadc_counts: Floats) -> Floats:
-    """How much warmer each chip is than at the tare; NaN where that is not known."""
+    """Return the rise of each chip's temperature since the tare in kelvin; NaN where unknown."""
     return np.asarray((tadc_counts - tare.tadc_counts) / TADC_PER_KELVIN)
 
 
 def expected_shift_kpa(tare: Tare, warmer: Floats) -> Floats:
-    """What a sealed bubble's baseline moves by when it gets so much warmer, in kelvin."""
+    """Return the shift of a sealed bubble's baseline for a rise of temperature in kelvin."""
     return np.asarray(tare.baseline_kpa / SEALED_AT_K * warmer)
 
 
 def has_warmed(tare: Tare, tadc_counts: npt.ArrayLike) -> Bools:
-    """Which tiles are warmer or colder than at the tare by more than the baseline can bear.
+    """Return a mask of tiles whose temperature since the tare invalidates the baseline.
 
     Args:
-        tare: the one in force; with an unknown temperature the answer is never True.
-        tadc_counts: (..., tiles), NaN where not known.
+        tare: in force; False for tiles without a temperature.
+        tadc_counts: (..., tiles), NaN where unknown.
     """
     moved_counts = np.abs(np.asarray(tadc_counts, dtype=np.float64) - tare.tadc_counts)
     return np.asarray(moved_counts > WARMED_COUNTS)
@@ -152,9 +152,9 @@ class Trend:
     """Straight lines through a history of baselines; arrays over tiles, NaN if undetermined.
 
     Attributes:
-        kpa_per_hour: of the baseline.
+        kpa_per_hour: slope of the baseline.
         sigma_kpa_per_hour: its standard uncertainty, from the tares' own.
-        kelvin_per_hour: of the chip.
+        kelvin_per_hour: slope of the chip's temperature.
     """
 
     kpa_per_hour: Floats
@@ -163,11 +163,11 @@ class Trend:
 
 
 def trend(tares: Sequence[Tare], *, tiles: int) -> Trend:
-    """The trend of the last hours.
+    """Fit the trend of the last hours.
 
     Args:
-        tares: of the same tiles, that were in force, in any order.
-        tiles: how many tiles that is.
+        tares: of the same tiles, in any order.
+        tiles: number of tiles.
     """
     newest_ns = max((tare.t_ns for tare in tares), default=0)
     recent = [tare for tare in tares if newest_ns - tare.t_ns <= TREND_OVER_NS]

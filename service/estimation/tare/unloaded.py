@@ -1,11 +1,11 @@
-"""Frames to take a tare from: windows without load, and when a baseline is refused.
+"""Detection of unloaded windows, and checks of a baseline.
 
-A foot that stands still is as quiet as one in the air, but it presses: so of all quiet windows
-those count in which no tile reads higher than in the lowest of them.
+A standing foot is as quiet as one in the air, but it presses. So of all quiet windows only those
+count in which no tile reads higher than in the lowest window.
 
-The tare of a recording comes from an interval the user names, else from frames marked as lead, else
-from an interval that can be recognised as unloaded; else there is none, and that is an error,
-because a wrong baseline is a wrong force that looks right.
+The tare of a recording comes from an interval that the user names, else from frames marked as lead,
+else from a window recognised as unloaded. Else there is none, which is an error: a wrong baseline
+gives a wrong force that looks right.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from service.estimation.tare.tare import Source, Tare
 
 FRAMES_MIN = 20  # fewer do not tell noise from drift
 NEAR_BASELINE_KPA = 1.5
-"""How far an unloaded bubble may be from its baseline on the bench: 5 K, by p0 / T0."""
+"""Largest distance of an unloaded bubble from its baseline in the rig: 5 K, by p0 / T0."""
 LOADED_KPA = 3.0
-"""A tile this far above its bench baseline, 10 K by p0 / T0, is not taken for an unloaded one, even
-if the user or a flag says so."""
+"""Distance above the rig baseline, 10 K by p0 / T0, from which a tile counts as loaded, even if the
+user or a flag marks it as unloaded."""
 QUIET = 1.5
-"""How much more an unloaded tile's readings scatter at most than on the bench."""
+"""Largest scatter of an unloaded tile over that in the rig."""
 STILL_SIGMAS = 4.0
-"""The halves of a window, and the window and the lowest one, differ by no more than chance does."""
+"""Largest difference of a window's halves, or from the lowest window, in sigmas."""
 STUCK_COUNTS = 0.5
-"""A part with more scatter than this, in counts, does not read the same count twenty times."""
+"""Scatter in counts above which a healthy chip does not read the same count twenty times."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """A window where every tile is quiet and still.
+    """Window in which every tile is quiet and still.
 
     Attributes:
-        rows: of the frames.
+        rows: rows of the frames.
         mean_kpa: (tiles,), mean pressures.
         sigma_kpa: (tiles,), their standard uncertainty.
     """
@@ -54,18 +54,18 @@ class Window:
 
 
 class TareFrames:
-    """Frames in order, with their pressures and what the bench says of their tiles.
+    """Frames in order, with their pressures and the rig data of their tiles.
 
     Args:
         frames: n frames.
         compensation: of the array's chips.
-        calibration: of its tiles, whose bench baselines tell an unloaded tile.
+        calibration: of its tiles, with baselines in the rig.
         serials: of the tiles, in order.
 
     Attributes:
         kpa: (n, tiles), absolute pressures; NaN where a tile gave none.
         since_ns: (n,), from the first frame.
-        bench_kpa: (tiles,), baselines on the bench; NaN where not known.
+        bench_kpa: (tiles,), baselines in the rig; NaN where unknown.
         bench_noise_kpa: (tiles,), standard deviations of a reading there; likewise.
         calibrated: (tiles,), False for bare tiles, which bear no load.
     """
@@ -89,13 +89,13 @@ class TareFrames:
 
     @property
     def has_bench(self) -> bool:
-        """Does the calibration have the unloaded baselines of all tiles?"""
+        """True if the calibration has the unloaded baselines of all tiles."""
         known = np.isfinite(self.bench_kpa) & np.isfinite(self.bench_noise_kpa)
         return bool(self.calibrated.any() and known[self.calibrated].all())
 
     @property
     def step_noise_kpa(self) -> Floats:
-        """(tiles,), noise from differences between two frames, which slow motion hardly changes.
+        """Noise (tiles,) from differences of successive frames, which slow motion hardly changes.
 
         NaN where there are none.
         """
@@ -106,11 +106,11 @@ class TareFrames:
         return noise_kpa
 
     def quiet_windows(self, spans: Iterable[tuple[int, int]], noise_kpa: Floats) -> list[Window]:
-        """The `spans`, each first row and row after the last, that may be without load.
+        """Return the windows among `spans` in which every tile is quiet and still.
 
         Args:
-            spans: to be looked at.
-            noise_kpa: (tiles,), that an unloaded tile shows.
+            spans: first row, and row after the last, of each window.
+            noise_kpa: (tiles,), noise of an unloaded tile.
         """
         found = []
         for first, end in spans:
@@ -127,7 +127,7 @@ class TareFrames:
         return found
 
     def tare(self, rows: Bools | slice, source: Source) -> Tare:
-        """The tare from those frames that `rows` names.
+        """Compute the tare from the frames of `rows`.
 
         Raises:
             TareError: a tile has fewer than `FRAMES_MIN` readable frames among them.
@@ -162,16 +162,16 @@ class TareFrames:
         )
 
     def rounding_kpa(self, tadc_counts: Floats) -> Floats:
-        """(tiles,), standard uncertainty that rounding to a count leaves."""
+        """Return the standard uncertainty of rounding to a count, (tiles,)."""
         return self._compensation.rounding_kpa(tadc_counts)
 
     def refuse_loaded(self, tare: Tare) -> None:
-        """Refuse a tare under load, which would make every force after it too small.
+        """Reject a tare under load, which would make every later force too small.
 
-        A colder tile lies lower than on the bench, and no load does that, so only above is refused.
+        A colder tile reads less than in the rig, and no load does that: only more is rejected.
 
         Raises:
-            TareError: a tile lies far above its bench baseline, where that is known.
+            TareError: a tile is far above its rig baseline, where that is known.
         """
         for serial, baseline_kpa, bench_kpa in zip(
             self.serials, tare.baseline_kpa, self.bench_kpa, strict=True
@@ -186,10 +186,10 @@ class TareFrames:
                 )
 
     def refuse_stuck(self, tare: Tare, rows: Bools | slice) -> None:
-        """Refuse a baseline of which half is one count in a row, unless the bench saw no noise.
+        """Reject a baseline with half of its counts equal in a row, unless the rig showed no noise.
 
         Raises:
-            TareError: a tile gave the same count again and again, as a part does that hangs.
+            TareError: a tile repeated one count, as a stuck chip does.
         """
         count_kpa = np.sqrt(12.0) * self.rounding_kpa(tare.tadc_counts)
         readable = np.isfinite(self.kpa[rows])
@@ -209,10 +209,10 @@ class TareFrames:
 
 
 def window_begins(since_ns: Times, begin_ns: int, step_ns: int, length_ns: int) -> Times:
-    """Return the begins of the windows that hold a frame, (windows,), rising, from 0 on.
+    """Return the starts of the windows with at least one frame, (windows,), rising, from 0 on.
 
-    Windows begin every step before and after one instant. A long gap, or a clock that was set, has
-    no windows: how many there are does not follow from how long the time is.
+    Windows start every step before and after one instant. A long gap, or a step of the clock, has
+    no windows, so their number is bounded by that of the frames.
 
     Args:
         since_ns: (n,), of frames, rising.
@@ -227,7 +227,7 @@ def window_begins(since_ns: Times, begin_ns: int, step_ns: int, length_ns: int) 
 
 
 def lowest(windows: list[Window]) -> list[Window]:
-    """Windows where no tile is higher than in the lowest window, except by chance."""
+    """Return the windows in which no tile exceeds the lowest window by more than chance."""
     lowest_kpa = np.min([window.mean_kpa for window in windows], axis=0, initial=np.inf)
     return [
         window
@@ -238,7 +238,7 @@ def lowest(windows: list[Window]) -> list[Window]:
 
 
 RECOGNISE_WITHIN_NS = 60_000_000_000
-"""An unloaded interval is looked for in the first minute of a recording."""
+"""Time from the beginning of a recording that is searched for an unloaded window."""
 WINDOW_NS = 500_000_000  # longer than in flight: a recording begins at rest
 
 
@@ -250,12 +250,12 @@ def take_tare(
     *,
     interval_s: tuple[float, float] | None = None,
 ) -> Tare:
-    """The tare of a recording from its beginning `frames`.
+    """Compute the tare of a recording from its first frames.
 
     Args:
         frames: frames from the first of the recording on.
         compensation: of the array's chips.
-        calibration: of its tiles, whose bench baselines tell an unloaded tile.
+        calibration: of its tiles, with baselines in the rig.
         serials: of the tiles, in order.
         interval_s: the user's interval, in seconds from the first frame.
 
@@ -278,7 +278,7 @@ def take_tare(
         seen.refuse_loaded(tare)
         seen.refuse_stuck(tare, lead)
         return tare
-    # How many frames are at hand must not matter, only which ones a recording begins with.
+    # The result must not depend on the number of frames passed.
     last_ns = frames.t_ns[0] + RECOGNISE_WITHIN_NS
     frames = frames.rows(0, int(np.searchsorted(frames.t_ns, last_ns, side="right")))
     seen = TareFrames(frames, compensation, calibration, serials)
@@ -289,10 +289,10 @@ def take_tare(
 
 
 def _recognised(seen: TareFrames, calibration: Calibration) -> slice:
-    """Rows of the first half second with every tile quiet, still, low and near its bench baseline.
+    """Return the rows of the first half second with every tile quiet, still, and near its baseline.
 
     Raises:
-        TareError: there is none, or the bench baselines are not known.
+        TareError: there is none, or the rig baselines are unknown.
     """
     if not seen.has_bench:
         raise TareError(

@@ -1,1 +1,1 @@
-"""What a tile's own readings show to be wrong with it: repeats, a clip, a baseline that is lost."""
+"""Fault detection: stuck and clipping tiles, thermal drift, and baselines that are lost."""

@@ -1,15 +1,15 @@
-"""A tile that repeats itself: its word stands still for longer than its noise allows.
+"""Stuck tiles: the raw pressure stays the same for longer than its noise allows.
 
-However a load moves, the chance that a reading is the same count as the one before is at most that
-of noise centred on that count. How often a tile does repeat is learnt while it is unloaded, where
-nothing else moves it; that takes correlated noise for what it is. So is how often it moves by two
-counts, because one that wavers between two may yet be quiet in the middle of one; and a light load
-must not pass for noise, so the tare's noise counts as well. From these follows how many equal words
-in a row come once in `HOURS` by chance. A tile whose noise is far below a count may repeat for
-ever: it is believed, unless it stays at a load while the others are loaded and let go again and
-again.
+However a load moves, the chance that a reading equals the previous count is at most that of noise
+centred on that count. The share of equal neighbours is learnt while a tile is unloaded, where
+nothing else moves it; that includes correlated noise. So is the share of steps by two counts,
+because a tile that wavers between two counts may yet be quiet in the middle of one. A light load
+must not pass for noise, so the tare's noise counts as well. From these follows the number of equal
+counts in a row that occurs once in `HOURS` by chance. A tile whose noise is far below a count may
+repeat for ever: it is accepted, unless it stays at a load while the others are loaded and unloaded
+again and again.
 
-One value for a word is not a value of this instant, so nothing is known of the force: NaN.
+A repeated count is no measurement of this instant, so the force is unknown: NaN.
 """
 
 from __future__ import annotations
@@ -17,67 +17,78 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import Protocol
 
 import numpy as np
 
 from devices.arrays import Floats, Ints
 from devices.compiled import compiled
-from service.estimation.records import Record, Records, record_type, records
+from service.estimation.records import KernelRecord, RecordArray
 
 HOURS = 100.0
-"""A healthy array is called stuck once in so many hours, if it repeats as often as it has shown."""
+"""Mean time between false alarms of a healthy array with the learnt share of repeats."""
 CORRELATED_S = 0.010
-"""Noise may be correlated over so long until a tile has shown otherwise."""
+"""Correlation time of the noise that is assumed at first."""
 PRIOR_PAIRS = 50
-"""As many pairs of readings is that supposition worth."""
+"""Weight of that assumption, in pairs of readings."""
 PART_OF_NOISE = 0.75
-"""The tare's noise has outliers in it; without them it is a quarter less (hardware.md 1.3)."""
+"""Part of the tare's noise without its outliers (hardware.md 1.3)."""
 DOUBT = 2.0
-"""In standard deviations: how much more often it may repeat than so far."""
+"""Margin on the learnt shares, in standard deviations."""
 SHARES = 256
-"""Shares of repeats for which limits are worked out."""
+"""Number of steps of the share in the tables of limits."""
 RUN_MIN = 8
-"""So few in a row are never looked at."""
+"""Longest run that is never judged."""
 LEARNT_MAX = 1 << 14
-"""Pairs; then the older ones count half."""
+"""Number of pairs after which the older ones count half."""
 LOADINGS = 5
-"""So often are the other tiles loaded and let go, on average, while one that is quiet stays."""
+"""Mean loadings of the other tiles after which a loaded tile without noise is stuck."""
 UNLIMITED = 1 << 40
 _STEP_MIN, _STEP_MAX = 0.02, 20.0
 
-STATE = record_type(
-    [
-        ("padc", np.int64),  # the last word; -1 before the first
-        ("run", np.int64),  # how often in a row
-        ("toggles", np.int64),  # of all tiles when that began
-        ("quiet", np.int64),  # was the last reading unloaded?
-        ("pairs", np.int64),  # of unloaded readings, one after the other
-        ("repeats", np.int64),  # of these, equal
-        ("twos", np.int64),  # of these, two counts apart
-        ("loaded", np.int64),
-    ]
-)
-"""What is remembered of each tile."""
+
+class StuckState(KernelRecord):
+    """State of a tile."""
+
+    pressure_raw: int  # last count; -1 before the first
+    run_length: int  # number of equal counts in a row
+    toggles_at_start: int  # of all tiles, when the run began
+    was_unloaded: int  # 1: the last reading was
+    unloaded_pairs: int  # consecutive unloaded readings
+    equal_pairs: int  # of these
+    double_step_pairs: int  # of these, two counts apart
+    is_loaded: int
 
 
-LAW = record_type([("repeats", np.float64), ("twos", np.float64), ("least", np.int64)])
-"""Constants of a tile, as in `Limits`."""
+class StuckParams(KernelRecord):
+    """Parameters of a tile, as in `Limits`."""
+
+    equal_share: float
+    double_step_share: float
+    run_max: int
 
 
-def at_rest(tiles: int) -> Records:
-    """Before the first reading."""
-    return records(STATE, tiles, padc=-1)
+class RunLimits(Protocol):
+    """Record with the array's limits of equal counts in a row, as in `Limits`."""
+
+    run_max_by_equal: Ints
+    run_max_by_double_step: Ints
+
+
+def at_rest(tiles: int) -> RecordArray[StuckState]:
+    """Make the states before the first reading, (tiles,)."""
+    return StuckState.array(tiles, pressure_raw=-1)
 
 
 def limits(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
-    """How many equal words in a row are too many.
+    """Compute the limits of equal counts in a row.
 
-    Differences of neighbours of standard deviation d, in counts, are equal, or two counts apart,
-    with chances that are solved for d here; noise of d / sqrt(2) then repeats with erf(1 / 2d) at
+    Neighbours whose difference has the standard deviation d, in counts, are equal or two counts
+    apart with chances that are solved for d. Noise of d / sqrt(2) then repeats with erf(1 / 2d) at
     most.
 
     Returns:
-        By the share of repeats in 0 to `SHARES`, and by that of steps of two.
+        Limits by the share of equal neighbours in 0 to `SHARES`, and by that of double steps.
     """
     chance = 1.0 / (HOURS * 3600.0 * rate_hz * tiles)
     most = []
@@ -87,14 +98,14 @@ def limits(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
     return most[0], most[1]
 
 
-@cache  # a server works them out at every tare, and nobody is told of frames meanwhile
+@cache  # computed at every tare, during which a server sends no frames
 def _chances_of_repeats() -> tuple[Floats, Floats]:
-    """The greatest chance of a repeat by the share of repeats, and by that of steps of two."""
+    """Compute the largest chance of a repeat, by either share (see `limits`)."""
     shares = np.arange(SHARES + 1) / SHARES
     steps = np.geomspace(_STEP_MAX, _STEP_MIN, 2000)
     by_repeats = np.interp(shares, apart(steps, 0), steps)
     twos = apart(steps, 2)
-    rising = slice(int(np.argmax(twos)), None)  # of great noise they are few again
+    rising = slice(int(np.argmax(twos)), None)  # with much noise they are few again
     by_twos = np.interp(shares, twos[rising][::-1], steps[rising][::-1])
     by_twos[0] = _STEP_MIN
     at_most = [np.array([math.erf(0.5 / d) for d in step]) for step in (by_repeats, by_twos)]
@@ -102,7 +113,7 @@ def _chances_of_repeats() -> tuple[Floats, Floats]:
 
 
 def apart(steps: Floats, counts: int) -> Floats:
-    """Share of neighbours so many counts apart, by the standard deviation of their difference.
+    """Compute the share of neighbours `counts` apart by the standard deviation of their difference.
 
     Rounding makes a difference of d counts one of n with the chance 1 - |d - n|.
     """
@@ -115,114 +126,115 @@ def apart(steps: Floats, counts: int) -> Floats:
     return np.asarray(one_side if counts == 0 else 2.0 * one_side)
 
 
-def step_of(noise_counts: Floats, kept: float) -> Floats:
-    """Standard deviation of steps of tiles of such noise, so much of which is left at the next."""
-    # What rounding to a count adds is no reason for another count.
+def step_of(noise_counts: Floats, correlation: float) -> Floats:
+    """Compute the standard deviation of steps from noise and neighbours' correlation."""
+    # Rounding adds noise, but no change of the count.
     latent = np.sqrt(np.maximum(noise_counts**2 - 1.0 / 12.0, 0.0))
-    return np.maximum(PART_OF_NOISE * latent * math.sqrt(2.0 * (1.0 - kept)), _STEP_MIN)
+    return np.maximum(PART_OF_NOISE * latent * math.sqrt(2.0 * (1.0 - correlation)), _STEP_MIN)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How many equal words in a row are too many.
+    """Limits of equal counts in a row.
 
     Attributes:
-        repeats: (tiles,), supposed share of equal neighbours before any is seen.
-        twos: (tiles,), that of neighbours two counts apart.
-        least: (tiles,), of white noise as at the tare.
-        by_repeats: (`SHARES` + 1,), by the share of equal neighbours.
-        by_twos: (`SHARES` + 1,), by that of neighbours two counts apart.
+        equal_share: (tiles,), prior share of equal neighbours.
+        double_step_share: (tiles,), prior share of neighbours two counts apart.
+        run_max: (tiles,), limit for white noise as at the tare.
+        run_max_by_equal: (`SHARES` + 1,), limit by the share of equal neighbours.
+        run_max_by_double_step: (`SHARES` + 1,), limit by the share of double steps.
     """
 
-    repeats: Floats
-    twos: Floats
-    least: Ints
-    by_repeats: Ints
-    by_twos: Ints
+    equal_share: Floats
+    double_step_share: Floats
+    run_max: Ints
+    run_max_by_equal: Ints
+    run_max_by_double_step: Ints
 
-    def laws(self) -> Records:
-        """What differs from tile to tile."""
-        return records(
-            LAW, len(self.repeats), repeats=self.repeats, twos=self.twos, least=self.least
+    def laws(self) -> RecordArray[StuckParams]:
+        """Make the kernel's parameters, (tiles,)."""
+        return StuckParams.array(
+            len(self.equal_share),
+            equal_share=self.equal_share,
+            double_step_share=self.double_step_share,
+            run_max=self.run_max,
         )
 
 
 def make_limits(noise_counts: Floats, rate_hz: float) -> Limits:
-    """The limits of tiles with such noise at the tare, outliers and rounding in it, in counts."""
-    by_repeats, by_twos = limits(rate_hz, len(noise_counts))
+    """Compute the limits from the noise at the tare, in counts with outliers and rounding."""
+    by_equal, by_double_step = limits(rate_hz, len(noise_counts))
     supposed = step_of(noise_counts, math.exp(-1.0 / (rate_hz * CORRELATED_S)))
     white = np.ceil(apart(step_of(noise_counts, 0.0), 0) * SHARES).astype(np.int64)
     return Limits(
-        repeats=apart(supposed, 0),
-        twos=apart(supposed, 2),
-        least=by_repeats[np.minimum(white, SHARES)],
-        by_repeats=by_repeats,
-        by_twos=by_twos,
+        equal_share=apart(supposed, 0),
+        double_step_share=apart(supposed, 2),
+        run_max=by_equal[np.minimum(white, SHARES)],
+        run_max_by_equal=by_equal,
+        run_max_by_double_step=by_double_step,
     )
 
 
 @compiled
 def is_stuck(
-    scene: Record,
-    law: Record,
-    tile: Record,
-    word: int,
+    limits: RunLimits,
+    params: StuckParams,
+    state: StuckState,
+    pressure_raw: int,
     above_kpa: float,
-    unloaded_kpa: float,
-    toggles: int,
+    unloaded_band_kpa: float,
+    load_toggles: int,
     tiles: int,
 ) -> tuple[bool, int]:
-    """Is a reading a repeat that noise does not explain?
+    """Return whether a reading is a repeat that noise does not explain, and the new toggle count.
 
     Args:
-        scene: with `by_repeats` and `by_twos` of `Limits`.
-        law: constants of the tile.
-        tile: state from its readings before; becomes that after this one.
-        word: `padc`.
-        above_kpa: pressure above the baseline; NaN where none could be read, or where it is so
-            great that a chip may stand still, and is no tile that repeats itself.
-        unloaded_kpa: so near the baseline no load is seen.
-        toggles: how often tiles have been loaded and let go so far, all together.
-        tiles: how many there are.
-
-    Returns:
-        Whether it is, and how often tiles have been loaded and let go.
+        limits: of the array.
+        params: of the tile.
+        state: after the tile's readings before; updated.
+        pressure_raw: count.
+        above_kpa: pressure above the baseline; NaN where none was readable, or where it is so great
+            that a healthy chip may stand still.
+        unloaded_band_kpa: distance from the baseline within which a tile counts as unloaded.
+        load_toggles: number of loadings and unloadings of all tiles before.
+        tiles: number of tiles.
     """
     if math.isnan(above_kpa):
-        tile.quiet = 0
-        return False, toggles
-    step = abs(word - tile.padc)
-    quiet = abs(above_kpa) < unloaded_kpa
-    loaded = 1 if above_kpa > 2.0 * unloaded_kpa else (0 if quiet else tile.loaded)
-    if loaded != tile.loaded:
-        toggles += 1
-        tile.loaded = loaded
+        state.was_unloaded = 0
+        return False, load_toggles
+    step = abs(pressure_raw - state.pressure_raw)
+    unloaded = abs(above_kpa) < unloaded_band_kpa
+    is_loaded = 1 if above_kpa > 2.0 * unloaded_band_kpa else (0 if unloaded else state.is_loaded)
+    if is_loaded != state.is_loaded:
+        load_toggles += 1
+        state.is_loaded = is_loaded
     if step == 0:
-        tile.run += 1
+        state.run_length += 1
     else:
-        tile.padc, tile.run, tile.toggles = word, 1, toggles
-    found = False
-    if tile.run > RUN_MIN:
-        weight = PRIOR_PAIRS + tile.pairs
-        share = (PRIOR_PAIRS * law.repeats + tile.repeats) / weight
+        state.pressure_raw, state.run_length = pressure_raw, 1
+        state.toggles_at_start = load_toggles
+    stuck = False
+    if state.run_length > RUN_MIN:
+        weight = PRIOR_PAIRS + state.unloaded_pairs
+        share = (PRIOR_PAIRS * params.equal_share + state.equal_pairs) / weight
         share += DOUBT * math.sqrt(share * (1.0 - share) / weight)
-        two = (PRIOR_PAIRS * law.twos + tile.twos) / weight
+        two = (PRIOR_PAIRS * params.double_step_share + state.double_step_pairs) / weight
         two -= DOUBT * math.sqrt(two * (1.0 - two) / weight)
         limit = max(
-            law.least,
-            scene.by_repeats[min(math.ceil(share * SHARES), SHARES)],
-            scene.by_twos[max(int(two * SHARES), 0)],
+            params.run_max,
+            limits.run_max_by_equal[min(math.ceil(share * SHARES), SHARES)],
+            limits.run_max_by_double_step[max(int(two * SHARES), 0)],
         )
-        others = toggles - tile.toggles
-        held = loaded == 1 and tiles > 1 and others >= 2 * LOADINGS * (tiles - 1)
-        found = tile.run >= limit or held
-    if quiet and tile.quiet == 1 and not found:
-        tile.pairs += 1
-        tile.repeats += 1 if step == 0 else 0
-        tile.twos += 1 if step == 2 else 0
-        if tile.pairs > LEARNT_MAX:
-            tile.pairs //= 2
-            tile.repeats //= 2
-            tile.twos //= 2
-    tile.quiet = 1 if quiet else 0
-    return found, toggles
+        others = load_toggles - state.toggles_at_start
+        stays_loaded = is_loaded == 1 and tiles > 1 and others >= 2 * LOADINGS * (tiles - 1)
+        stuck = state.run_length >= limit or stays_loaded
+    if unloaded and state.was_unloaded == 1 and not stuck:
+        state.unloaded_pairs += 1
+        state.equal_pairs += 1 if step == 0 else 0
+        state.double_step_pairs += 1 if step == 2 else 0
+        if state.unloaded_pairs > LEARNT_MAX:
+            state.unloaded_pairs //= 2
+            state.equal_pairs //= 2
+            state.double_step_pairs //= 2
+    state.was_unloaded = 1 if unloaded else 0
+    return stuck, load_toggles

@@ -1,7 +1,7 @@
-"""Warmth that no model corrects: how far it has moved the baseline, as far as the chip tells.
+"""Thermal drift: shift of the baseline by warmth that no model corrects.
 
-Without the model `temperature` all of it is error, and all tiles err to the same side. The gas
-follows its chip within seconds, so what counts is the more of what the chip is, and has been.
+Without the model `temperature` the whole shift is error, and all tiles err to the same side. The
+gas follows its chip within seconds, so the larger shift counts: the chip's, or its low-pass.
 """
 
 from __future__ import annotations
@@ -12,41 +12,50 @@ import numpy as np
 
 from devices.compiled import compiled
 from devices.frames import NOT_READ
-from service.estimation.records import Record, Records, record_type, records
+from service.estimation.records import KernelRecord, RecordArray
 
 SMOOTH_S = 0.5  # long against the noise of half a count
 LAG_S = 5.0  # of the gas behind its chip, at most
 
-STATE = record_type([("chip", np.float64), ("gas", np.float64), ("t_ns", np.int64)])
-"""What is remembered of each tile: counts from the tare's, NaN before the first."""
+
+class ThermalDriftState(KernelRecord):
+    """State of a tile: counts from the tare's, low-passed; NaN before the first reading."""
+
+    chip_counts: float
+    gas_counts: float
+    t_ns: int
 
 
-def at_rest(tiles: int) -> Records:
-    """Before the first reading."""
-    return records(STATE, tiles, chip=np.nan, gas=np.nan)
+def at_rest(tiles: int) -> RecordArray[ThermalDriftState]:
+    """Make the states before the first reading, (tiles,)."""
+    return ThermalDriftState.array(tiles, chip_counts=np.nan, gas_counts=np.nan)
 
 
 @compiled
 def moved_kpa(
-    tile: Record, tadc: int, tare_counts: float, kpa_per_count: float, t_ns: int
+    state: ThermalDriftState,
+    temperature_raw: int,
+    tare_counts: float,
+    kpa_per_count: float,
+    t_ns: int,
 ) -> float:
-    """What warmth since the tare has moved the baseline by, signed; 0 where it is not known.
+    """Return the signed shift of the baseline by warmth since the tare; 0 where unknown.
 
     Args:
-        tile: state from its readings before; becomes that after this one.
-        tadc: `NOT_READ` where unknown.
-        tare_counts: at the tare, NaN where not known.
-        kpa_per_count: of the baseline.
+        state: after the tile's readings before; updated.
+        temperature_raw: counts; `NOT_READ` where unknown.
+        tare_counts: at the tare, NaN where unknown.
+        kpa_per_count: shift of the baseline for a count.
         t_ns: instant.
     """
-    now = tadc - tare_counts
-    if tadc != NOT_READ and not math.isnan(now):
-        if math.isnan(tile.chip):
-            tile.chip = tile.gas = now
+    now = temperature_raw - tare_counts
+    if temperature_raw != NOT_READ and not math.isnan(now):
+        if math.isnan(state.chip_counts):
+            state.chip_counts = state.gas_counts = now
         else:
-            step_s = max(0.0, (t_ns - tile.t_ns) * 1e-9)
-            tile.chip += step_s / (SMOOTH_S + step_s) * (now - tile.chip)
-            tile.gas += step_s / (LAG_S + step_s) * (tile.chip - tile.gas)
-        tile.t_ns = t_ns
-    more = tile.chip if abs(tile.chip) > abs(tile.gas) else tile.gas
+            step_s = max(0.0, (t_ns - state.t_ns) * 1e-9)
+            state.chip_counts += step_s / (SMOOTH_S + step_s) * (now - state.chip_counts)
+            state.gas_counts += step_s / (LAG_S + step_s) * (state.chip_counts - state.gas_counts)
+        state.t_ns = t_ns
+    more = state.chip_counts if abs(state.chip_counts) > abs(state.gas_counts) else state.gas_counts
     return 0.0 if math.isnan(more) else kpa_per_count * more

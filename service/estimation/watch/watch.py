@@ -1,7 +1,7 @@
-"""All that is watched of an array's tiles, with its constants and its state.
+"""Limits of fault detection for an array's tiles.
 
-Before the models: words that repeat, and an edge below the chip's end. Behind them: what is left of
-the baseline, by what the models say and by warmth that none of them corrects.
+Before the models: counts that repeat, and clipping below the chip's end. After them: the error of
+the baseline, by the corrected pressure and by warmth that no model corrects.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from service.estimation.tare.tare import Tare, expected_shift_kpa
 from service.estimation.watch import baseline, repeats
 
 UNLOADED_SIGMAS = 4.0
-"""Of a reading about the baseline: so near it, no load is seen."""
+"""Distance from the baseline within which a tile is unloaded, in sigmas of a reading."""
 
 
 @dataclass(frozen=True)
 class Watch:
-    """Constants over an array's tiles; the last two over those that bear load.
+    """Limits over an array's tiles; the last two over load-bearing tiles only.
 
     Attributes:
-        end_kpa: absolute pressure behind which a chip may stand still, and is no tile that repeats
-            itself.
-        unloaded_kpa: so near the baseline no load is seen.
-        most: how often a word may repeat.
-        even: for `baseline.lost`.
-        kpa_per_count: of warmth that no model corrects; None if one does.
+        end_kpa: absolute pressure above which a healthy chip may stand still.
+        unloaded_kpa: distance from the baseline within which a tile counts as unloaded.
+        most: limits of equal counts in a row.
+        even: asymmetry for `baseline_loss.update_baseline_error`.
+        kpa_per_count: shift of the baseline for a raw temperature count; None if a model
+            corrects it.
     """
 
     end_kpa: Floats
@@ -51,15 +51,15 @@ def make_watch(
     gas_known: Bools,
     warms: bool,
 ) -> Watch:
-    """Work out the constants.
+    """Compute the limits.
 
     Args:
         info: the array.
         calibration: of its tiles.
         tare: in force.
-        chip_end_kpa: (bearing tiles,), absolute pressures that no chip is believed above.
-        gas_known: (bearing tiles,), is a tile's gas corrected?
-        warms: is there no model for the temperature?
+        chip_end_kpa: (bearing tiles,), absolute pressure above which a chip saturates.
+        gas_known: (bearing tiles,), whether the tile's gas is corrected.
+        warms: whether no model corrects the temperature.
     """
     tiles = info.tiles
     bearing = np.flatnonzero([not tile.reference for tile in tiles])
@@ -67,7 +67,7 @@ def make_watch(
     end_kpa[bearing] = chip_end_kpa
     counts = np.where(np.isfinite(tare.tadc_counts), tare.tadc_counts, 500.0)
     count_kpa = np.abs(Compensation(tiles).kpa_per_count(counts))
-    # A lost tare has no noise; nothing is judged then, since no pressure is above its baseline.
+    # A lost tare has no noise; no tile is checked then, since no pressure is above its baseline.
     noise = np.zeros(len(tiles))
     np.divide(
         tare.noise_kpa, count_kpa, out=noise, where=(count_kpa > 0.0) & np.isfinite(tare.noise_kpa)

@@ -1,1 +1,1 @@
-"""Many sessions at once: where they are, a plan over them, its results, and questions in SQL."""
+"""Batch processing of many sessions: locations, jobs, results and SQL queries."""

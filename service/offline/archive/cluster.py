@@ -1,10 +1,10 @@
-"""The same jobs on a Dask cluster: one under way for each thread of its workers, and no more.
+"""Execution of jobs on a Dask cluster, with at most one task per worker thread.
 
-None waits behind another one: if a worker dies of a task, no other is held to have killed it.
+No task is queued on a worker, so the death of a worker is blamed on its running task only.
 
-A worker that is killed is the scheduler's business: it gives the task to another one, and gives it
-up when it has cost several (`distributed.scheduler.allowed-failures`). That a task may run twice
-does no harm: its result is asked for first.
+The scheduler handles killed workers: it moves the task to another worker, and fails it after
+several losses (`distributed.scheduler.allowed-failures`). A task may run twice without harm,
+because each job checks for an existing result first.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Result = TypeVar("Result")
 _NONE: Any = object()
 _CONNECT_S = 15.0
 _NUMBERS = ("numpy", "numba", "pyarrow")
-"""Of other versions they may give other numbers."""
+"""Packages whose version may change numeric results."""
 
 
 def versions() -> dict[str, str]:
-    """What a result depends on, besides its input and options."""
+    """Return the versions that a result depends on: foottile, Python and numeric packages."""
     found = {"foottile": exact_software(), "python": ".".join(platform.python_version_tuple()[:2])}
     for name in _NUMBERS:
         try:
@@ -44,23 +44,23 @@ def versions() -> dict[str, str]:
 def spread_over_cluster(
     work: Callable[[Task], Result | GoesOn], tasks: Iterable[Task], *, address: str
 ) -> Iterator[tuple[Task, Result | Exception]]:
-    """Every task with its result as it is finished, or with the error that its worker raised.
+    """Run tasks on a Dask cluster; yield each with its result or its worker's exception.
 
     Args:
-        work: a function of a module, that raises nothing it expects.
-        tasks: what to call it with; no more are taken than are under way. With one that goes on
-            it is called again, by any worker.
-        address: of the scheduler, as tcp://host:8786.
+        work: a module-level function, which returns expected failures as results.
+        tasks: arguments of `work`, consumed only as threads become free. A task that returns
+            `Unfinished` is submitted again, to any worker.
+        scheduler_address: the scheduler's, such as tcp://host:8786.
 
     Raises:
         MissingExtraError: Dask is not installed.
-        LinkError: the scheduler does not answer, or is gone, or has no workers.
-        UsageError: a worker is of another version.
+        LinkError: the scheduler does not answer, disconnects, or has no workers.
+        UsageError: a worker runs another version.
     """
     with needs_extra("archive", "--scheduler"):
         import distributed
-    dask: Any = distributed  # it has types, but not for what is called here
-    for name in ("distributed", "distributed.client"):  # what matters of it is said by us
+    dask: Any = distributed  # its type stubs lack the functions used here
+    for name in ("distributed", "distributed.client"):  # its errors are reported below
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         try:
@@ -92,7 +92,7 @@ def spread_over_cluster(
             elif future.status == "error":
                 result = future.exception()
                 if isinstance(result, dask.scheduler.KilledWorker):
-                    result = WorkerLostError("workers were killed over it, again and again")
+                    result = WorkerLostError("several workers were killed while running it")
             else:
                 raise _away(address, f"a task is {future.status}")
             future.release()
@@ -103,7 +103,7 @@ def spread_over_cluster(
 
 
 def _threads(client: Any, address: str) -> int:
-    """Of all workers that are there now; one at least, for one may come."""
+    """Return the thread count of all connected workers, at least 1: a worker may still join."""
     try:
         return max(1, sum(int(n) for n in client.nthreads().values()))
     except OSError as error:
@@ -119,11 +119,15 @@ def _away(address: str, why: object) -> LinkError:
 
 
 def _check(found: dict[str, Any]) -> None:
-    """Refuse workers that may give other numbers than this client."""
+    """Reject workers whose versions differ from this client's.
+
+    Raises:
+        UsageError: a worker runs another version.
+    """
     ours = versions()
     for worker, theirs in found.items():
         if isinstance(theirs, OSError):
-            continue  # it is gone; one that comes back is asked by the job
+            continue  # disconnected; `run_job` checks the version again if it returns
         if theirs != ours:
             differ = (
                 ", ".join(
@@ -132,7 +136,7 @@ def _check(found: dict[str, Any]) -> None:
                     if theirs.get(name) != ours[name]
                 )
                 if isinstance(theirs, dict)
-                else f"it cannot say: {theirs}"
+                else f"version unknown: {theirs}"
             )
             raise UsageError(
                 f"a worker is of another version: {printable(differ)[:300]}",

@@ -1,7 +1,7 @@
-"""Sealed sessions, found for questions about many of them, and why others are left out.
+"""Search for sealed sessions, with the reason for each one left out.
 
-Each is taken by its `session.json`, held against its hash; its frames have the length that it says
-there.
+A session is accepted if the checksum of its `session.json` is right and its frames file has the
+length stated there.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ from storage.sessions.folder import FRAMES_NAME
 
 
 def find_sessions(places: Sequence[str], mirror: Path | None = None) -> Archive:
-    """All sealed sessions in some places.
+    """Find all sealed sessions at some locations.
 
     Args:
-        places: as `service.offline.archive.places` knows them.
-        mirror: empty folder for what is copied of sessions in a store; needed if there are any.
+        locations: paths, globs or URIs; see `service.offline.archive.locations`.
+        download_folder: empty folder for metadata copied from object stores; required for
+            remote sessions.
 
     Raises:
-        UsageError: one of them is not there.
+        UsageError: a location does not exist.
         StorageError: a store does not answer.
     """
     found = Archive()
@@ -70,9 +71,9 @@ def _are_same(one: str, other: str) -> bool:
 
 
 def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]:
-    """The session, or why it is left out."""
+    """Return the session; or, with None, the reason to leave it out."""
     if place.is_file:
-        return "it is a file by itself, and no session's folder", None
+        return "it is a single file, not a session's folder", None
     try:
         check_text(place)
     except FootTileError as error:
@@ -80,7 +81,7 @@ def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]
     folder, sizes = Path(place.where), None
     if is_remote(place.where):
         if mirror is None:
-            raise ValueError("sessions of a store need a mirror")
+            raise ValueError("remote sessions need a folder for downloads")
         folder = mirror / hashlib.sha256(place.where.encode()).hexdigest()[:16] / place.name
         try:
             sizes = sizes_in(place.where)
@@ -91,12 +92,12 @@ def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]
         except FootTileError as error:
             return str(error), None
     problems: list[str] = []
-    said = claims_in(folder, bytes_of(folder / SESSION_NAME), problems, [])
-    if problems or said is None:
+    metadata = claims_in(folder, bytes_of(folder / SESSION_NAME), problems, [])
+    if problems or metadata is None:
         return f"damaged: {'; '.join(problems)}", None
-    content = said.content
+    content = metadata.content
     if content["id"] != place.name:
-        return f"it is session {content['id']}, in the folder of another", None
+        return f"it is session {content['id']} in another session's folder", None
     if content["state"] != "sealed":
         return f"it is {content['state']}, and not sealed yet", None
     if content.get("sha256") is not None:
@@ -107,4 +108,4 @@ def _looked_at(place: Place, mirror: Path | None) -> tuple[str, Archived | None]
             return f"damaged: {FRAMES_NAME} is missing", None
         if sizes[FRAMES_NAME] != content["bytes"]:
             return f"damaged: {FRAMES_NAME} is not as long as {SESSION_NAME} says", None
-    return "", Archived(place, folder, said)
+    return "", Archived(place, folder, metadata)

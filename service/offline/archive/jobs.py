@@ -1,6 +1,6 @@
-"""One job: a task and one session. It is a function of these, and may be done twice.
+"""A job: one task applied to one session. It is idempotent.
 
-Whether it was done before is asked where it runs: of what is there nothing is kept in memory.
+The worker that runs a job checks for an existing result; the client keeps no list of results.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ log = logging.getLogger("foottile.archive")
 
 @dataclass(frozen=True)
 class Job:
-    """A task for one session.
+    """Task applied to one session.
 
     Attributes:
-        place: of the session.
-        task: what to do.
-        out: where results are put, as a path or URI; None: nothing is kept.
-        software: of the client; a worker of another one refuses.
+        location: location of the session.
+        task: the operation.
+        results_location: results folder, as a path or URI; None: results are discarded.
+        client_version: the client's version; a worker of another version refuses the job.
     """
 
     place: Place
@@ -48,14 +48,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
+    """Outcome of a job.
 
     Attributes:
-        name: of the session, and of its result's folder.
-        place: of the session.
-        state: made now, there already, or failed.
-        facts: what there is to say of it; of one that failed nothing.
-        reason: why it failed.
+        name: session id, and name of its result folder.
+        place: location of the session.
+        state: made now, present already ("there"), or failed.
+        facts: the task's report; empty after a failure.
+        reason: cause of the failure.
     """
 
     name: str
@@ -66,15 +66,15 @@ class Outcome:
 
 
 def begin_worker() -> None:
-    """In a process of its own: there are as many as cores, so none needs threads for Arrow."""
+    """Limit Arrow to one thread: there is one worker process per core."""
     pa.set_cpu_count(1)
 
 
 def run_job(job: Job) -> Outcome | GoesOn:
-    """Do a job, unless its result is there; of a long session one piece.
+    """Run a job, or one chunk of it if the session is long; skip it if its result exists.
 
     Raises:
-        UsageError: this worker is of another version than the client.
+        UsageError: worker and client run different versions.
     """
     if job.software != exact_software():
         raise UsageError(
@@ -86,14 +86,14 @@ def run_job(job: Job) -> Outcome | GoesOn:
         done = _done(job)
     except FootTileError as error:
         return failed(job, str(error))
-    except Exception as error:  # one session may not hold up all others
+    except Exception as error:  # one session must not stop the others
         log.exception("%s: this is a bug", where)
         return failed(job, f"this is a bug: {type(error).__name__}: {error}")
     return done if isinstance(done, GoesOn) else Outcome(name, where, *done)
 
 
 def failed(job: Job, reason: str) -> Outcome:
-    """A job of which nothing came."""
+    """Return the outcome of a failed job."""
     return Outcome(job.place.name, job.place.where, "failed", reason=reason)
 
 
@@ -150,10 +150,10 @@ def _made(
 
 
 def _check_target(place: Place, out: str) -> None:
-    """A result has a folder of its own, in `out` and nowhere else.
+    """Check that the result folder lies directly in `out` and is not the session's own folder.
 
     Raises:
-        UsageError: it would be the session's, or its name is none.
+        UsageError: it is the session's folder, or the name is not usable.
     """
     if place.name.startswith(".") or not place.name:
         raise UsageError(f"{place.name!r} cannot be the name of a result", where=place.where)
@@ -170,5 +170,5 @@ def _check_target(place: Place, out: str) -> None:
 
 
 def plain(value: Any) -> Any:
-    """As JSON gives it back."""
+    """Return a value as a JSON round trip gives it back."""
     return json.loads(json.dumps(value))

@@ -1,4 +1,4 @@
-"""A manifest: a CSV file with a row for each session, read row by row."""
+"""Reader of manifests: CSV files with one row per session."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from devices.inputs import check_file
 from service.offline.archive.places import absolute, is_remote
 
 _HEAD_LINES = 20
-"""The names stand in one of the first so many lines."""
+"""Number of lines that are searched for the column names."""
 _STATED = re.compile(r"(?i)sep=(.)")
 """Excel's line that states the delimiter."""
 _PIECE = 1 << 20
 _LINE_MAX = 1 << 16
-"""A longer line is none of a table: no file is read into memory for it."""
+"""Longest accepted line, in characters; it bounds the memory for files that are no table."""
 _BYTES_MAX = 64 << 20
-"""Some 600,000 sessions. All of a file is read before its encoding is known."""
+"""Largest manifest, some 600,000 sessions: detecting the encoding reads the whole file."""
 
 
 def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
@@ -33,10 +33,10 @@ def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
 
     Args:
         path: the file.
-        known: columns that it may have; `session` it must.
+        allowed_columns: allowed columns; `session` is required.
 
     Raises:
-        UsageError: it cannot be read, or has other columns; said before the first row is given.
+        UsageError: it cannot be read, or has other columns; raised before the first row.
         FileFormatError: a row has no session, or more or fewer cells than there are columns.
     """
     try:
@@ -47,7 +47,7 @@ def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
     except (OSError, UnicodeError, csv.Error) as error:
         raise UsageError(f"--manifest {str(path)!r} cannot be read: {error}") from error
     if any("\0" in line for line in head):
-        raise UsageError(f"--manifest {str(path)!r} is no text")
+        raise UsageError(f"--manifest {str(path)!r} is not a text file")
     at = next((i for i, line in enumerate(head) if line.strip(" ,;\t\r\n")), 0)
     stated = _STATED.fullmatch(head[at].strip()) if head else None
     delimiters = stated[1] if stated else ",;\t"
@@ -64,14 +64,14 @@ def rows_in(path: Path, known: Collection[str]) -> Iterator[dict[str, str]]:
 
 
 def resolved(path: Path, named: str) -> str:
-    """A path in a manifest: relative to the manifest's folder, unless it is a URI."""
+    """Resolve a path of a manifest: relative to the manifest's folder, unless it is a URI."""
     return named if is_remote(named) else absolute(str(path.parent / named))
 
 
 def _rows(
     path: Path, columns: list[str], encoding: str, delimiter: str, begin: int
 ) -> Iterator[dict[str, str]]:
-    """Yield the rows below the names, which stand in line `begin`, from 0."""
+    """Yield the rows below the column names, which are in line `begin`, counted from 0."""
     with path.open(encoding=encoding, newline="") as file:
         try:
             lines = islice(_lines(file), begin, None)
@@ -93,7 +93,7 @@ def _rows(
 
 
 def _cells(row: list[str]) -> list[str]:
-    """Return the cells of a row, without those that are empty at its end."""
+    """Return the cells of a row without empty ones at its end."""
     cells = [cell.strip() for cell in row]
     while cells and not cells[-1]:
         cells.pop()

@@ -1,7 +1,7 @@
-"""Pieces of a result that is not finished: beside the results, where every worker finds them.
+"""Store of the finished chunks of an unfinished result, beside the results, shared by all workers.
 
-They are in a folder of what they are made from, so those of another version, input or options are
-never taken for them; it is deleted when the result is there.
+The folder's name contains the hash of version, input and options, so chunks made from other input
+are never used. It is deleted once the result is written.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ PIECES_NAME = ".pieces"
 
 
 class Pieces:
-    """Pieces of a session's result.
+    """Store of the chunks of one session's result.
 
     Args:
-        out: where results are put, as a path or URI.
-        name: of the session.
-        key: of what they are made from.
+        out: results folder, as a path or URI.
+        name: session id.
+        key: hash of version, input and options.
     """
 
     def __init__(self, out: str, name: str, key: str) -> None:
@@ -33,13 +33,13 @@ class Pieces:
 
     @contextmanager
     def folder(self, endings: Sequence[str] | None = None) -> Iterator[Path]:
-        """Their folder; what is put into it is there for others when the block has ended well.
+        """Open the folder of the chunks; files added to it are published when the block succeeds.
 
         Args:
-            endings: of files that are needed; None: all.
+            suffixes: suffixes of the files to load; None: all.
 
         Raises:
-            StorageError: they cannot be read, or written.
+            StorageError: chunks cannot be read or written.
         """
         if not is_remote(self._where):
             path = Path(self._where)
@@ -58,12 +58,12 @@ class Pieces:
                 upload(f"{self._where}/{file.name}", file)
 
     def forget(self) -> None:
-        """Delete them, and others of this session; the result is there."""
+        """Delete all chunks of this session, once its result is written."""
         filesystem, path = opened(self._all)
         with storing(self._all):
             filesystem.delete_dir(path)
 
 
 def _names_others(file: Path) -> bool:
-    """What names the other files goes last: without it they are nothing."""
+    """Return whether a file names the other files of its chunk; it must be published last."""
     return file.suffix == ".json"

@@ -1,8 +1,8 @@
-"""What a place is: where sessions are, on this machine or in a store that a filesystem opens.
+"""Locations of sessions: local paths and URIs of object stores, with uniform file access.
 
-A place is a session (its folder, or a lone file), a folder of sessions, a data folder, a glob of
-these on this machine, or a URI: `s3://bucket/prefix`, which Arrow opens, or of any other filesystem
-of fsspec. Sessions are given one by one as they are found: a folder may hold any number.
+A location is a session (its folder, or a single file), a folder of sessions, a data folder, a local
+glob of these, or a URI: `s3://bucket/prefix`, opened by Arrow, or that of any other fsspec
+filesystem. Sessions are yielded one by one, because a folder may contain any number.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ _EXPECTED = "a session, a folder of sessions, a data folder, a glob of these, or
 _OF_DATA = ("sessions", "journal")
 _S3_ATTEMPTS = 6
 _BLOCK = 1 << 20
-"""Of a request that a store refuses or breaks off; they wait longer and longer, 3 s in all."""
+"""Attempts of a request that the store refuses or aborts, with exponential backoff, 3 s in all."""
 _S3_CONNECT_S = 10.0
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where one session is.
+    """Location of one session.
 
     Attributes:
-        where: its folder or its file, as a path or a URI.
-        name: the session's id; of a lone file its name without the ending.
-        is_file: is it a lone file?
+        uri: its folder or file, as a path or URI.
+        session_id: session id; for a single file, its name without suffix.
+        is_single_file: True for a single file without a session folder.
     """
 
     where: str
@@ -51,25 +51,25 @@ class Place:
 
     @property
     def frames(self) -> str:
-        """Where its frames are, if it is sealed."""
+        """Path or URI of the frames file of a sealed session."""
         return self.where if self.is_file else f"{self.where}/{FRAMES_NAME}"
 
 
 def is_remote(where: str) -> bool:
-    """Is it a URI, and no path of this machine?"""
+    """Return whether a location is a URI instead of a local path."""
     return "://" in where
 
 
 def absolute(where: str) -> str:
-    """A place as a worker knows it, whatever folder it works in."""
+    """Return a location that is independent of the working directory."""
     return where if is_remote(where) else os.path.abspath(where)
 
 
 def opened(where: str) -> tuple[fs.FileSystem, str]:
-    """The filesystem in which a place is, and its path there.
+    """Return the filesystem of a location, and the path in it.
 
     Raises:
-        UsageError: nothing is known of such a filesystem.
+        UsageError: the filesystem is not supported.
     """
     if not is_remote(where):
         return _local(), os.path.abspath(where)
@@ -80,10 +80,10 @@ def opened(where: str) -> tuple[fs.FileSystem, str]:
 
 
 def sessions_in(places: Iterable[str]) -> Iterator[Place]:
-    """Every session in some places, in no order.
+    """Find every session at some locations, in no order.
 
     Raises:
-        UsageError: one of them is not there; said before the first session is given.
+        UsageError: a location does not exist; raised before the first session.
         StorageError: a store does not answer.
     """
     roots = [root for place in places for root in _roots(place)]
@@ -91,7 +91,7 @@ def sessions_in(places: Iterable[str]) -> Iterator[Place]:
 
 
 def no_session_in(places: Iterable[str]) -> UsageError:
-    """What is said of places in which no session is; lone files in their folders are named."""
+    """Return the error for locations without a session; it names single files found in them."""
     folders = [root for place in places if not is_remote(place) for root in _roots(place)]
     lone = [path for root in folders for path in sorted(glob.glob("*.parquet", root_dir=root))]
     what = "there is no session in these places"
@@ -106,12 +106,12 @@ def no_session_in(places: Iterable[str]) -> UsageError:
 
 
 def is_data_folder(place: str) -> bool:
-    """Is it a server's or a node's folder, which may well have no session yet?"""
+    """Return whether a location is a data folder of a server or node, perhaps without a session."""
     return any(_kind(f"{place.rstrip('/')}/{name}") == fs.FileType.Directory for name in _OF_DATA)
 
 
 def place_of(where: str) -> Place:
-    """The one session that a folder or a file is; nobody looks whether it is there."""
+    """Return the location of one session by its folder or file, without checking that it exists."""
     where = where.rstrip("/") or "/"
     folder, _, name = where.rpartition("/")
     if name == FRAMES_NAME and SESSION_ID.fullmatch(folder.rpartition("/")[2]):
@@ -121,10 +121,10 @@ def place_of(where: str) -> Place:
 
 
 def read_bytes(where: str) -> bytes:
-    """A file's content, wherever it is.
+    """Read a local or remote file.
 
     Raises:
-        FileFormatError: there is none.
+        FileFormatError: the file does not exist.
         StorageError: it cannot be read now.
     """
     with reading(where) as file:
@@ -133,10 +133,10 @@ def read_bytes(where: str) -> bytes:
 
 @contextmanager
 def reading(where: str) -> Iterator[BinaryIO]:
-    """A file to read from, wherever it is.
+    """Open a local or remote file for reading.
 
     Raises:
-        FileFormatError: there is none.
+        FileFormatError: the file does not exist.
         StorageError: it cannot be read now.
     """
     filesystem, path = opened(where)
@@ -150,7 +150,7 @@ def reading(where: str) -> Iterator[BinaryIO]:
 
 
 def read_error(where: str, error: OSError) -> FileFormatError | StorageError:
-    """What is said of a file or folder that cannot be read."""
+    """Return the error for a file or folder that cannot be read."""
     if isinstance(error, FileNotFoundError):
         return FileFormatError("there is no such file", where=where)
     text = printable(" ".join(str(error).split()))[:300]
@@ -160,7 +160,7 @@ def read_error(where: str, error: OSError) -> FileFormatError | StorageError:
 
 
 def upload(where: str, content: bytes | Path) -> None:
-    """Put a file into a store: bytes, or what is in a file here.
+    """Write bytes or a local file's content to a store.
 
     Raises:
         StorageError: it cannot be written.
@@ -176,7 +176,7 @@ def upload(where: str, content: bytes | Path) -> None:
 
 @contextmanager
 def storing(where: str) -> Iterator[None]:
-    """What a place says when it cannot be written to is a `StorageError`."""
+    """Convert a filesystem's write errors to `StorageError`."""
     try:
         yield
     except StorageError:
@@ -189,7 +189,7 @@ def storing(where: str) -> Iterator[None]:
 
 
 def sizes_in(where: str) -> dict[str, int]:
-    """Lengths of the files in a folder by their names, hidden ones left out.
+    """Return the sizes in bytes of the files in a folder by name, without hidden files.
 
     Raises:
         StorageError: a store does not answer.
@@ -210,7 +210,7 @@ def _local() -> fs.FileSystem:
 
 @cache
 def _s3() -> fs.FileSystem:
-    """Of credentials, region and endpoint that the environment says, as other programs know it."""
+    """Open S3 with credentials, region and endpoint from the usual environment variables."""
     endpoint = read_variable("AWS_ENDPOINT_URL_S3") or read_variable("AWS_ENDPOINT_URL")
     library: Any = fs  # its stubs are of an older one
     filesystem: fs.FileSystem = library.S3FileSystem(
@@ -238,7 +238,7 @@ def _by_fsspec(where: str) -> tuple[fs.FileSystem, str]:
 
 
 def _roots(place: str) -> list[str]:
-    """Folders and files that a place names; one at least."""
+    """Return the folders and files that a location names, at least one."""
     if is_remote(place):
         if _kind(place) == fs.FileType.NotFound:
             raise UsageError(f"no place {place!r}", expected=_EXPECTED)
@@ -264,16 +264,16 @@ def _inside(root: str) -> Iterator[Place]:
 
 
 def _is_renamed(where: str, name: str) -> bool:
-    """Is it a session whose folder has another name than its id? In a store nobody looks."""
+    """Return whether a local session's folder name differs from its id; not checked in a store."""
     is_ours = name.startswith(".") or ASIDE in name
     return not is_ours and not is_remote(where) and os.path.isfile(f"{where}/{SESSION_NAME}")
 
 
 def check_text(place: Place) -> None:
-    """Refuse a path that results could not state.
+    """Check that a path can be written to results.
 
     Raises:
-        UsageError: it is not UTF-8.
+        UsageError: it is not valid UTF-8.
     """
     if not is_utf8(place.where):
         raise UsageError(
@@ -285,7 +285,7 @@ def check_text(place: Place) -> None:
 
 
 def _names(folder: str) -> Iterator[str]:
-    """Names in a folder: one by one on this machine, from a store a list of all."""
+    """Yield the names in a folder: one by one locally, from one listing in a store."""
     if not is_remote(folder):
         with os.scandir(folder) as entries:
             for entry in entries:

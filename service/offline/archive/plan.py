@@ -1,7 +1,7 @@
-"""A plan over sessions: jobs go out as places are found, and outcomes come back as they are there.
+"""Streaming execution of jobs over many sessions: jobs start while sessions are still searched.
 
-No more is in memory than what is under way, however many sessions there are. Who spreads the jobs
-over processes, or over a cluster, is told; both give each job with its outcome.
+Only running jobs are in memory, however many sessions there are. The caller passes the function
+that maps jobs over processes or a cluster; both yield each job with its outcome.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ Spread = Callable[
     [Callable[[Job], Outcome | GoesOn], Iterable[Job]], Iterator[tuple[Job, Outcome | Exception]]
 ]
 LISTED_MAX = 20
-"""So many failures are kept to be shown; the report has all."""
+"""Number of failures kept for display; the report has all."""
 
 
 @dataclass
 class Summary:
-    """What became of a plan.
+    """Counts over the outcomes of a batch of jobs.
 
     Attributes:
-        states: how many jobs were made, there, or failed.
-        verdicts: how often each was given, by tasks that give any.
-        failures: the first of them.
+        states: number of jobs by state: made, there, failed.
+        verdicts: number of each verdict, for tasks with a verdict.
+        failures: the first `LISTED_MAX` failures.
     """
 
     states: Counter[str] = field(default_factory=Counter)
@@ -36,7 +36,7 @@ class Summary:
     failures: list[Outcome] = field(default_factory=list)
 
     def add(self, outcome: Outcome) -> None:
-        """Take the next outcome."""
+        """Count an outcome."""
         self.states[outcome.state] += 1
         if verdict := outcome.facts.get("verdict"):
             self.verdicts[verdict] += 1
@@ -45,10 +45,10 @@ class Summary:
 
 
 def outcomes(jobs: Iterable[Job], spread: Spread) -> Iterator[Outcome]:
-    """What becomes of every job, in the order in which they end.
+    """Run every job and yield its outcome, in order of completion.
 
     Raises:
-        FootTileError: no job can be done in this way: workers are of another version, or away.
+        FootTileError: no job can run: workers have another version, or are not reachable.
     """
     for job, outcome in spread(run_job, jobs):
         if isinstance(outcome, WorkerLostError):

@@ -1,7 +1,7 @@
-"""Questions about many sessions in SQL, answered by DuckDB from what is handed to it.
+"""SQL queries over many sessions, run by DuckDB on Arrow tables.
 
-DuckDB itself opens no file and no connection: tables and frames are given to it through Arrow, and
-everything else that it could reach is locked before the first question is read.
+DuckDB itself opens no file and no connection: it receives tables and frames through Arrow, and all
+other access is disabled before the query is parsed.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ LOCKED: dict[str, Any] = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "allow_community_extensions": False,
-    "python_enable_replacements": False,  # a name is a view, and no variable of this program
+    "python_enable_replacements": False,  # no access to Python variables by name
     "temp_directory": "",
-    # Half of the machine's: a question that needs more is refused. DuckDB takes no "50%" up to 1.5.
+    # Half of the machine's memory. DuckDB up to 1.5 does not accept "50%".
     "memory_limit": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2}B",
     "lock_configuration": True,
 }
 
 
 def ask(archive: Archive, sql: str) -> pa.Table:
-    """The answer to one SELECT.
+    """Run one SELECT statement.
 
     Args:
-        archive: the sessions; what of them turns out to be damaged is left out, and noted there.
-        sql: over the views `VIEWS`, which are made only if they are named in it.
+        archive: the sessions; damaged ones are left out and added to `archive.left_out`.
+        sql: statement over the views `VIEWS`; only views that it names are created.
 
     Raises:
         MissingExtraError: DuckDB is not installed.
-        UsageError: it is not one SELECT, names what is not there, or asks for what is locked.
+        UsageError: it is not one SELECT, names an unknown object, or needs disabled access.
         FileFormatError: frames that it reads are damaged.
     """
     with needs_extra("archive", "`foottile query`"):
@@ -57,7 +57,7 @@ def ask(archive: Archive, sql: str) -> pa.Table:
                 "frames": archive.frames,
                 "stances": archive.stances_table,
                 "events": archive.events_table,
-                "sessions": archive.sessions_table,  # last, without those found damaged by then
+                "sessions": archive.sessions_table,  # last: without those found damaged
             }
             asked = _views_in(connection, sql)
             for name, make in makers.items():
@@ -78,11 +78,11 @@ def _check(connection: duckdb.DuckDBPyConnection, sql: str) -> None:
 
 
 def _views_in(connection: duckdb.DuckDBPyConnection, sql: str) -> set[str]:
-    """Which views a question is about: of the others nothing is read."""
+    """Return the views that a statement names; data of other views is not read."""
     mentioned = {name for name in VIEWS if re.search(rf"\b{name}\b", sql, re.IGNORECASE)}
     found = connection.execute("SELECT json_serialize_sql(?::VARCHAR)", [sql]).fetchall()
     tree = json.loads(found[0][0])
-    if tree["error"]:  # it does not say, as of an EXPLAIN
+    if tree["error"]:  # not given for some statements, such as EXPLAIN
         return mentioned
     return {name for name in _tables_in(tree) if name in mentioned}
 
@@ -98,7 +98,7 @@ def _tables_in(node: Any) -> Iterator[str]:
 
 
 def _without_intervals(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
-    """Return the answer with intervals as text: of months neither CSV, Parquet nor JSON has any."""
+    """Cast intervals to text: CSV, Parquet and JSON have no type for months."""
     if not any("INTERVAL" in str(kind) for kind in answer.types):
         return answer
     names = [f'"{name.replace(chr(34), chr(34) * 2)}"' for name in answer.columns]
@@ -111,13 +111,13 @@ def _without_intervals(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelati
 
 
 def _plain(table: pa.Table) -> pa.Table:
-    """Sums of integers as int64: DuckDB makes them decimals of 38 digits."""
+    """Cast integer sums to int64: DuckDB returns decimals of 38 digits."""
     if len(set(table.column_names)) < len(table.column_names):
         twice = next(n for n in table.column_names if table.column_names.count(n) > 1)
         raise UsageError(f"two columns are called {twice!r}", remedy="Name one of them with AS")
     for i, column in enumerate(table.schema):
         if pa.types.is_decimal(column.type) and column.type.scale == 0:
-            with suppress(pa.ArrowInvalid):  # one that is too great stays what it is
+            with suppress(pa.ArrowInvalid):  # a sum beyond int64 stays a decimal
                 table = table.set_column(i, column.name, table.column(i).cast(pa.int64()))
     return table
 

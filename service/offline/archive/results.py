@@ -1,7 +1,7 @@
-"""Results of jobs: a folder for each session, and in it a note of what they were made from.
+"""Store of job results: a folder per session, with a note of the input of each result.
 
-Files come first, each whole, then the note that names them with their hashes: without it they are
-nothing, and a job that was broken off is done again. A store keeps objects whole by itself.
+Files are written first, atomically, then the note with their hashes. Files without a note do not
+count, so an interrupted job runs again. Object stores write objects atomically.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ _WORK = ".work"
 
 @dataclass(frozen=True)
 class Note:
-    """What a result was made from.
+    """Provenance of a result.
 
     Attributes:
-        command: that made it.
+        command: command that made it.
         software: version that made it.
-        place: of the session.
-        input_sha256: of what the session is.
-        options: of the command.
-        files: hash and length of every file, by its name.
-        facts: what there is to say of it.
+        place: location of the session.
+        input_sha256: hash of the session, see `hash_session`.
+        options: options of the command.
+        files: hash and length of every file, by name.
+        facts: the task's report.
     """
 
     command: str
@@ -56,12 +56,12 @@ class Note:
 
     @property
     def key(self) -> str:
-        """The same for what is made from the same in the same way."""
-        said = json.dumps([self.command, self.software, self.input_sha256, self.options])
-        return hashlib.sha256(said.encode()).hexdigest()[:16]
+        """Hash of version, input and options: equal for equal results."""
+        content = json.dumps([self.command, self.software, self.input_sha256, self.options])
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def is_of(self, other: Note) -> bool:
-        """Were both made from the same, in the same way?"""
+        """Return whether both were made from the same input by the same version and options."""
         return (self.software, self.input_sha256, self.options) == (
             other.software,
             other.input_sha256,
@@ -70,14 +70,14 @@ class Note:
 
 
 class Results:
-    """A folder of results, on this machine or in a store."""
+    """Results folder, local or in a store."""
 
     def __init__(self, out: str) -> None:
         self.out = out.rstrip("/")
         self.is_remote = is_remote(out)
 
     def note(self, name: str, command: str) -> Note | None:
-        """What was made by a command for a session, and is there with all its files; else None.
+        """Read the note of a command's result for a session; None unless all its files exist.
 
         Raises:
             StorageError: it cannot be read now.
@@ -93,7 +93,7 @@ class Results:
 
     @contextmanager
     def made(self, name: str, command: str) -> Iterator[Path]:
-        """An empty folder to work in; what is in it is put into the results, if all goes well.
+        """Provide an empty folder; move its files into the results if the block succeeds.
 
         Raises:
             StorageError: it cannot be written.
@@ -103,7 +103,7 @@ class Results:
             self._put(work, name, command)
 
     def keep(self, name: str, note: Note) -> None:
-        """Write the note, the last of all. It is not waited for: without it all is made again.
+        """Write the note last, without fsync: if it is lost, the job runs again.
 
         Raises:
             StorageError: it cannot be written.
@@ -119,7 +119,7 @@ class Results:
             temporary.replace(where)
 
     def begin(self) -> None:
-        """Make the folder, and take away what killed workers of this machine have left.
+        """Create the folder, and delete work folders left by killed workers of this machine.
 
         Raises:
             StorageError: it cannot be made.
@@ -131,7 +131,7 @@ class Results:
             remove_stale_workspaces(Path(self.out) / _WORK)
 
     def end(self) -> None:
-        """All workers have ended."""
+        """Delete the folder for work in progress, after all workers have ended."""
         if not self.is_remote:
             remove_stale_workspaces(Path(self.out) / _WORK)
             for name in (_WORK, PIECES_NAME):
@@ -139,7 +139,7 @@ class Results:
                     (Path(self.out) / name).rmdir()
 
     def put_file(self, name: str, path: Path) -> None:
-        """Put a file beside the results."""
+        """Write a file beside the results."""
         if self.is_remote:
             upload(f"{self.out}/{name}", path)
 
@@ -168,7 +168,7 @@ class Results:
             sync_folder(Path(target))  # before the note that names them
 
     def _forget(self, name: str, command: str) -> None:
-        """The note goes first: no reader may take it for that of other files."""
+        """Delete a result; the note first, so that it never describes other files."""
         there = set(sizes_in(f"{self.out}/{name}"))
         if _note_name(command) not in there:
             return
@@ -181,7 +181,7 @@ class Results:
 
 
 def files_in(work: Path) -> dict[str, dict[str, Any]]:
-    """Hash and length of every file in a folder, by its name."""
+    """Return hash and length of every file in a folder, by name."""
     return {
         path.name: {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
         for path in sorted(work.iterdir())

@@ -1,7 +1,7 @@
-"""Sealed sessions as tables, for questions about many of them, and what is left out.
+"""Tables over sealed sessions, for queries, with the reason for each session left out.
 
-What is read of frames is proven when it is read. No session is changed: stances that an older one
-lacks are made beside its frames, where its folder may be written to.
+Frames are verified as they are read. Sessions are not changed, except that missing stances of an
+older session are computed and stored beside its frames if its folder is writable.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ STANCES = pa.schema([_ID, *(SCHEMA.field(name) for name in SCHEMA.names)])
 
 @dataclass(frozen=True)
 class Archived:
-    """One sealed session.
+    """Sealed session of an archive.
 
     Attributes:
-        place: where it is.
-        folder: the same, or what of it was copied here from a store.
-        said: what it says of itself.
+        location: its location.
+        folder: local folder of the session, or of the files copied from a store.
+        metadata: content of its `session.json`.
     """
 
     place: Place
@@ -69,21 +69,21 @@ class Archived:
 
     @property
     def id(self) -> str:
-        """Of the session, and its folder's name."""
+        """Session id, which is also the folder's name."""
         return self.place.name
 
     @property
     def has_frames(self) -> bool:
-        """Was a frame recorded?"""
+        """True if a frame was recorded."""
         return self.said.content.get("sha256") is not None
 
     @property
     def is_remote(self) -> bool:
-        """Is it in a store?"""
+        """True if the session is in an object store."""
         return is_remote(self.place.where)
 
     def stances(self) -> pa.Table:
-        """As of `service.sessions.stances`; frames of a store are copied if they are needed."""
+        """Return the stances, as of `service.sessions.stances`; download the frames if needed."""
         sha256 = str(self.said.content["sha256"])
         if self.is_remote:
             with suppress(FileFormatError):
@@ -92,7 +92,7 @@ class Archived:
         return stances_of_session(self.folder, frames_sha256=sha256, keep=True)
 
     def fetch(self, name: str) -> None:
-        """Copy a file from the store, if the session is in one, has it, and it was not before."""
+        """Download a file of a remote session, if it exists and was not downloaded before."""
         if self.is_remote and not (self.folder / name).exists():
             with suppress(FileFormatError):
                 write_whole(self.folder / name, read_bytes(f"{self.place.where}/{name}"))
@@ -100,18 +100,18 @@ class Archived:
 
 @dataclass
 class Archive:
-    """Sessions, and what was left out of them.
+    """Sealed sessions for queries, and the ones left out.
 
     Attributes:
-        sessions: sealed and whole as far as was looked.
-        left_out: why something is not in the answers, by its place.
+        sessions: sealed sessions without known damage.
+        left_out_reasons: reasons for missing sessions, by location.
     """
 
     sessions: list[Archived] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
 
     def sessions_table(self) -> pa.Table:
-        """A row for each session."""
+        """Build the table of sessions, one row each."""
         rows = []
         for each in self.sessions:
             ledger = each.said.ledger
@@ -121,7 +121,7 @@ class Archive:
         return pa.Table.from_pylist(rows, schema=SESSIONS)
 
     def events_table(self) -> pa.Table:
-        """A row for each mark."""
+        """Build the table of markers, one row each."""
         rows: list[dict[str, Any]] = []
         self._fetch(EVENTS_NAME)
         for each in list(self.sessions):
@@ -134,7 +134,7 @@ class Archive:
         return pa.Table.from_pylist(rows, schema=EVENTS)
 
     def stances_table(self) -> pa.Table:
-        """A row for each stance; sessions without estimates have none."""
+        """Build the table of stances, one row each; sessions without estimates have none."""
         tables, ids = [SCHEMA.empty_table()], [pa.array([], pa.string())]
         self._fetch(STANCES_NAME)
         for each in list(self.sessions):
@@ -153,7 +153,7 @@ class Archive:
         return pa.Table.from_arrays([pa.chunked_array(ids), *columns], schema=STANCES)
 
     def frames(self) -> ds.Dataset:
-        """All frames, of which no more is read than a question needs; each page is proven."""
+        """Return the frames of all sessions as a lazy dataset; each page is verified when read."""
         schema = pa.schema([_ID])
         by_filesystem: list[tuple[fs.FileSystem, list[str], list[str]]] = []
         for each, own in list(self._schemas()):
@@ -181,13 +181,13 @@ class Archive:
         return parts[0] if len(parts) == 1 else ds.dataset(parts, schema=schema)
 
     def _schemas(self) -> Iterator[tuple[Archived, pa.Schema | Exception]]:
-        """Of the frames of every session that has any, proven; or why they cannot be."""
+        """Yield the verified frames schema of every session with frames, or the error."""
         having = [each for each in self.sessions if each.has_frames]
         waits = any(each.is_remote for each in having)
         yield from zip(having, side_by_side(_schema_of, having, is_remote=waits), strict=True)
 
     def _fetch(self, name: str) -> None:
-        """Copy a file of every session of a store; one that cannot be read is left out."""
+        """Download a file of every remote session; leave out sessions that cannot be read."""
 
         def fetch(session: Archived) -> Exception | None:
             try:
@@ -202,7 +202,7 @@ class Archive:
                 self._leave_out(each, error)
 
     def _leave_out(self, session: Archived, reason: Exception) -> None:
-        """Found damaged only when it is read: it is in no table then that is made from now on."""
+        """Leave a session found damaged while reading out of all tables made from now on."""
         self.sessions.remove(session)
         what = reason.what if isinstance(reason, FootTileError) else str(reason)
         self.left_out[session.place.where] = f"damaged: {what}"

@@ -1,4 +1,4 @@
-"""A session as files of this machine: those that are here, or a copy of what a store has."""
+"""Local copies of sessions and files in object stores; local ones are used in place."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from storage.sessions.folder import FRAMES_NAME
 
 _BLOCK = 1 << 20
 _REQUESTS = 16
-"""Under way to a store at the same time."""
+"""Concurrent requests to a store."""
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
 
 
 def identity(place: Place) -> str:
-    """Hash of what a session says of itself, with the hash of its frames in it.
+    """Hash a session's `session.json`, which contains the hash of its frames.
 
     Raises:
         FileFormatError: it is not there.
@@ -40,14 +40,14 @@ def identity(place: Place) -> str:
     """
     if place.is_file:
         with reading(place.where) as file:
-            said = footer_in(file)
+            metadata = footer_in(file)
     else:
-        said = read_bytes(f"{place.where}/{SESSION_NAME}")
-    return hashlib.sha256(said).hexdigest()
+        metadata = read_bytes(f"{place.where}/{SESSION_NAME}")
+    return hashlib.sha256(metadata).hexdigest()
 
 
 def identity_of_file(where: str) -> str:
-    """Hash of any file; of a session's frames as for `identity`.
+    """Hash any file; for a session's frames, return `hash_session` of the session.
 
     Raises:
         FileFormatError: it is not there.
@@ -65,11 +65,11 @@ def identity_of_file(where: str) -> str:
 
 @contextmanager
 def staged(place: Place) -> Iterator[Path]:
-    """The session's folder, or its file.
+    """Provide a session's folder or file locally; a download is deleted when the block ends.
 
     Raises:
-        FileFormatError: it is not there, or what came is not what its hash is of.
-        StorageError: it cannot be read, or the copy not be written.
+        FileFormatError: it does not exist, or the downloaded frames have another hash.
+        StorageError: it cannot be read, or the copy cannot be written.
     """
     if not is_remote(place.where):
         yield Path(place.where)
@@ -89,20 +89,20 @@ def staged(place: Place) -> Iterator[Path]:
         stated = claims_of(folder).content.get("sha256")
         if stated is not None and hashes.get(FRAMES_NAME, stated) != stated:
             raise DamagedFileError(
-                f"the {FRAMES_NAME} that came is not the one that {SESSION_NAME} names",
+                f"the {FRAMES_NAME} received does not have the hash in {SESSION_NAME}",
                 where=place.where,
-                remedy="Try again; if it stays, the store's copy is damaged",
+                remedy="Retry. If the error remains, the store's copy is damaged",
             )
         yield folder
 
 
 @contextmanager
 def staged_file(where: str) -> Iterator[Path]:
-    """Any file; of a session's frames with what lies beside them.
+    """Provide any file locally; with a session's frames, the files beside them.
 
     Raises:
-        FileFormatError: as for `staged`.
-        StorageError: as for `staged`.
+        FileFormatError: as for `open_local_session`.
+        StorageError: as for `open_local_session`.
     """
     place = place_of(where)
     if not is_remote(where):
@@ -118,41 +118,41 @@ def staged_file(where: str) -> Iterator[Path]:
 
 
 def claims_of(folder: Path) -> Claims:
-    """What a session's folder says of itself.
+    """Read the metadata of a session's folder.
 
     Raises:
-        FileFormatError: it is not there, or damaged.
+        FileFormatError: `session.json` is missing or damaged.
     """
     problems: list[str] = []
-    said = claims_in(folder, bytes_of(folder / SESSION_NAME), problems, [])
-    if problems or said is None:
+    metadata = claims_in(folder, bytes_of(folder / SESSION_NAME), problems, [])
+    if problems or metadata is None:
         raise FileFormatError("; ".join(problems), where=str(folder))
-    return said
+    return metadata
 
 
 def frames_of(source: Path) -> Path:
-    """The sealed frames of a folder, or the lone file itself.
+    """Return the path of a sealed session's frames; a single file is returned as it is.
 
     Raises:
         StateError: the session is not sealed.
-        FileFormatError: there are none, or what it says of itself is damaged.
+        FileFormatError: the frames are missing, or the metadata is damaged.
     """
     if not source.is_dir():
         return source
-    said, frames = claims_of(source).content, source / FRAMES_NAME
-    if said["state"] != "sealed":
-        raise StateError(f"it is {said['state']}, and not sealed yet", where=str(source))
-    if said.get("sha256") is None:
+    metadata, frames = claims_of(source).content, source / FRAMES_NAME
+    if metadata["state"] != "sealed":
+        raise StateError(f"it is {metadata['state']}, and not sealed yet", where=str(source))
+    if metadata.get("sha256") is None:
         raise FileFormatError("no frame was recorded", where=str(source))
-    if not frames.is_file() or frames.stat().st_size != said["bytes"]:
-        raise DamagedFileError(f"{FRAMES_NAME} is not the one that it names", where=str(source))
+    if not frames.is_file() or frames.stat().st_size != metadata["bytes"]:
+        raise DamagedFileError(f"{FRAMES_NAME} does not match session.json", where=str(source))
     return frames
 
 
 def side_by_side(
     work: Callable[[_In], _Out], each: Sequence[_In], *, is_remote: bool
 ) -> Iterator[_Out]:
-    """In order; what waits for a store waits together."""
+    """Map a function in order; for a remote store in parallel threads."""
     if not is_remote:
         yield from map(work, each)
         return
@@ -161,7 +161,7 @@ def side_by_side(
 
 
 def copied(where: str, path: Path) -> str:
-    """Copy a file here; its hash."""
+    """Copy a file to a local path, and return its SHA-256."""
     hash_ = hashlib.sha256()
     with reading(where) as source, storage_errors(path), path.open("wb") as file:
         while block := source.read(_BLOCK):

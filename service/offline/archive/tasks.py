@@ -1,6 +1,6 @@
-"""What is done with each of many sessions: a task has options, and makes files of one session.
+"""Tasks that are applied to each of many sessions: each has options, and makes files of a session.
 
-Options are values, not names of files: a worker on another machine has none of the client's.
+Options are values, not file names: a worker on another machine cannot read the client's files.
 """
 
 from __future__ import annotations
@@ -38,64 +38,64 @@ _ALL = Slice()
 
 
 class Task(Protocol):
-    """What a job does."""
+    """Operation on one session."""
 
     @property
     def command(self) -> str:
-        """Which command it is, of which notes and reports have their names."""
+        """Name of the command, used in the names of notes and reports."""
 
     def options(self) -> dict[str, Any]:
-        """What it is asked for, as JSON."""
+        """Return the options as JSON values."""
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """Do it.
+        """Process one session.
 
         Args:
-            source: the session's folder, or its file.
-            work: empty folder, for the files of the result; who calls puts them on the disk.
+            source: the session's folder or file.
+            result_folder: empty folder for the result's files; the caller makes them durable.
 
         Returns:
-            What there is to say of it, as JSON.
+            Report of the task, as JSON values.
 
         Raises:
-            FootTileError: it cannot be done with this session.
+            FootTileError: this session cannot be processed.
         """
 
 
 @runtime_checkable
 class LongTask(Task, Protocol):
-    """A task that does a long session in pieces, one after the other."""
+    """Task that processes a long session in consecutive chunks."""
 
     PIECES: ClassVar[tuple[str, ...]]
-    """Endings of the files that the next piece needs of those before."""
+    """Suffixes of the files of earlier chunks that the next chunk needs."""
 
     def is_long(self, source: Path) -> bool:
-        """Is it worth more than one piece?"""
+        """Return whether the session needs more than one chunk."""
 
     def make_piece(self, source: Path, folder: Path) -> bool:
-        """Make the next piece.
+        """Process the next chunk.
 
         Args:
             source: as for `run`.
-            folder: of the pieces; gets this one.
+            chunks_folder: folder of the chunks; the new one is written to it.
 
         Returns:
-            Whether there was one left.
+            False if all chunks existed already.
 
         Raises:
             FootTileError: as for `run`.
         """
 
     def join(self, source: Path, folder: Path, work: Path) -> dict[str, Any]:
-        """As `run`, of what is in the folder of the pieces."""
+        """Make the result of `run` from the folder of the chunks."""
 
 
 @dataclass(frozen=True)
 class EstimateTask(EstimateRequest):
-    """Estimates a session again; the result is a session's folder as the source was.
+    """Re-estimation of a session; the result is a session's folder if the source is one.
 
     Attributes:
-        piece_frames: a longer session is done in pieces of so many; makes no difference to it.
+        piece_frames: frames of a chunk of a long session; the result does not depend on it.
     """
 
     piece_frames: int = PIECE_FRAMES
@@ -103,7 +103,7 @@ class EstimateTask(EstimateRequest):
     PIECES: ClassVar[tuple[str, ...]] = ("json", "npz")
 
     def options(self) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         named = self.calibration
         return {
             **{name: value for name, value in vars(self).items() if name != "piece_frames"},
@@ -113,7 +113,7 @@ class EstimateTask(EstimateRequest):
         }
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         from service.offline.estimate.session import estimate_session
 
         frames, remarks = frames_of(source), list[str]()
@@ -122,13 +122,13 @@ class EstimateTask(EstimateRequest):
         return self._finished(source, work, made, remarks)
 
     def is_long(self, source: Path) -> bool:
-        """As for any long task."""
+        """See `ChunkedTask`."""
         from service.offline.estimate.pieces import has_pieces
 
         return has_pieces(frames_of(source), self, self.piece_frames)
 
     def make_piece(self, source: Path, folder: Path) -> bool:
-        """As for any long task."""
+        """See `ChunkedTask`."""
         from service.offline.estimate.pieces import make_piece
 
         return make_piece(
@@ -136,7 +136,7 @@ class EstimateTask(EstimateRequest):
         )
 
     def join(self, source: Path, folder: Path, work: Path) -> dict[str, Any]:
-        """As for any long task."""
+        """See `ChunkedTask`."""
         from service.offline.estimate.pieces import join_pieces
 
         remarks, out = list[str](), work / FRAMES_NAME
@@ -158,18 +158,18 @@ class EstimateTask(EstimateRequest):
 
 @dataclass(frozen=True)
 class ExportTask:
-    """Writes a session in another format."""
+    """Export of a session to another format."""
 
     export: ExportOptions
     command: ClassVar[str] = "export"
 
     def options(self) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         asked = self.export.options.model_dump(exclude_none=True)
         return {**vars(self.export), "part": vars(self.export.part), "options": asked}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         name = f"{Path(FRAMES_NAME).stem}.{format_named(self.export.to).ending}"
         done = export_session(frames_of(source), work / name, self.export)
         left_out = {mark.event.label: mark.left_out for mark in done.left_out}
@@ -178,16 +178,16 @@ class ExportTask:
 
 @dataclass(frozen=True)
 class VerifyTask:
-    """Proves a session from its files."""
+    """Verification of a session's files."""
 
     command: ClassVar[str] = "verify"
 
     def options(self) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         return {}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         report = verify(source)
         text = json.dumps(report.as_dict(), indent=1).encode()
         (work / "verify.json").write_bytes(text)
@@ -196,22 +196,22 @@ class VerifyTask:
 
 @dataclass(frozen=True)
 class CompareTask:
-    """Compares a session with a reference."""
+    """Comparison of a session with a reference."""
 
     reference: str
-    """A file, or a session's `frames.parquet`; as a path or URI."""
+    """Path or URI of a file, or of a session's `frames.parquet`."""
     compare: CompareOptions
     limits: Mapping[str, float]
     command: ClassVar[str] = "compare"
 
     def options(self) -> dict[str, Any]:
-        """As for any task; the reference is what is in it."""
+        """Return the options as JSON values, with the reference by its hash."""
         said = identity_of_file(self.reference)
         options = {**vars(self.compare), "stated": asdict(self.compare.stated)}
         return {"reference_sha256": said, "limits": self.limits, **options}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         from service.offline.comparison_files import write_comparison
 
         title = f"{source.name} against {self.reference.rpartition('/')[2]}"
@@ -226,22 +226,22 @@ class CompareTask:
 
 @dataclass(frozen=True)
 class RefusedTask:
-    """What was asked for one session cannot be meant."""
+    """Task with invalid options for one session; running it raises `UsageError`."""
 
     reason: str
     command: str
 
     def options(self) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         raise UsageError(self.reason)
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """As for any task."""
+        """See `SessionTask`."""
         raise UsageError(self.reason)
 
 
 def _complete(source: Path, work: Path) -> None:
-    """Make a session's folder of the estimated frames: what lay beside the old ones."""
+    """Complete the session's folder: `session.json`, and copies of the source's sidecar files."""
     said = claims_of(source)
     out = work / FRAMES_NAME
     with SessionReader(out, is_checked=True) as session:

@@ -1,6 +1,6 @@
-"""Folders in which a worker works: what a killed one has left is taken away by the next.
+"""Temporary folders of workers; leftovers of a killed worker are deleted by the next one.
 
-They are named after machine and process, since several machines may work in one folder.
+They are named by machine and process, because several machines may share the parent folder.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from storage.durable import is_stale, storage_errors, temporary_of
 
 _MACHINE = re.sub(r"[^\w-]", "-", socket.gethostname())
 SYSTEM = Path(tempfile.gettempdir()) / f"foottile-{os.getuid()}"
-"""For what comes from a store, and goes to one."""
+"""Parent of the temporary folders for downloads and uploads."""
 
 
 @contextmanager
 def workspace(parent: Path) -> Iterator[Path]:
-    """An empty folder in `parent`, which is made if it is missing; gone when the block ends.
+    """Provide an empty folder in `parent`, created if missing; delete it when the block ends.
 
     Raises:
-        StorageError: it cannot be made.
+        StorageError: it cannot be created.
     """
     with storage_errors(parent, "Name a folder that can be written to"):
         parent.mkdir(0o700, parents=True, exist_ok=True)
@@ -39,7 +39,7 @@ def workspace(parent: Path) -> Iterator[Path]:
 
 
 def remove_stale_workspaces(parent: Path) -> None:
-    """Take away what processes of this machine have left that were killed."""
+    """Delete folders left by killed processes of this machine."""
     for folder in parent.glob(f".{_MACHINE}.*.tmp"):
         if is_stale(folder.name):
             shutil.rmtree(folder, ignore_errors=True)

@@ -1,1 +1,1 @@
-"""Speed against error: every rung of the model ladder, over many draws of an emulated scene."""
+"""Benchmark of run time and error of model sets, over many random draws of emulated scenes."""

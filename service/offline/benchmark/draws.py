@@ -1,9 +1,9 @@
-"""One draw of tiles, calibration and noise: recorded once, then estimated by every rung.
+"""A random draw of tiles, calibration and noise: recorded once, estimated by every model set.
 
-Live and offline differ by the look-ahead alone; how frames are cut into batches does not change a
-bit of the result, so both are estimated in the chunks of the pipeline.
+Live and offline differ only by the look-ahead. The result is bit-identical for any batch size, so
+both are estimated in the pipeline's chunks.
 
-Timed as well: what an estimate costs per frame, `step` and `finish` alone.
+The CPU time per frame is measured over `step` and `finish` alone.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from service.rig.emulated import EmulatedFoot
 from service.sessions.pipeline import CHUNK, EstimateOptions, EstimateStream
 
 BATCH: Mapping[str, int] = {"live": 10, "offline": CHUNK}
-"""Frames of one step."""
+"""Frames per estimator step, by mode."""
 _WARM_STEPS = 30
 
 
 class Endless:
-    """A recording over and over again, as one stream without a gap."""
+    """Recording that is repeated endlessly, as one stream without gaps."""
 
     def __init__(self, frames: FrameBatch) -> None:
         self._frames = frames
         self._period_ns = round(float(np.median(np.diff(frames.t_mono_ns))))
 
     def rows(self, begin: int, end: int) -> FrameBatch:
-        """Frames `begin` to `end` of the stream; `seq` and time rise throughout."""
+        """Return frames `begin` to `end` of the stream, with rising `seq` and time."""
         n = len(self._frames)
         lap, at = np.divmod(np.arange(begin, end), n)
         once = self._frames.select(at)
@@ -66,16 +66,16 @@ def time_rungs(
     frames: Mapping[str, int],
     repetitions: int,
 ) -> tuple[dict[tuple[str, str], list[float]], list[Failure]]:
-    """Nanoseconds per frame of every repetition, by mode and label of the rung.
+    """Measure ns per frame in every repetition, by mode and label of the model set.
 
     Args:
-        recording: whose frames are estimated over and over again.
-        rungs: what to time.
-        frames: how many frames make one repetition, by mode.
-        repetitions: how many.
+        recording: recording that is estimated repeatedly.
+        model_sets: model sets to time.
+        frames_per_repetition: frames per repetition, by mode.
+        repetitions: number of repetitions.
 
     Returns:
-        The times, and the rungs that could not be timed.
+        The times, and the model sets that could not be timed.
     """
     stream = Endless(recording.frames)
     plans: dict[tuple[str, str], EstimationPlan] = {}
@@ -98,10 +98,10 @@ def time_rungs(
 
 
 def plan_of(recording: Recording, models: tuple[str, ...], lag_ms: float) -> EstimationPlan:
-    """The constants of an estimate of a recording, tared from its lead.
+    """Make the constants of a recording's estimate, with the tare from its lead-in.
 
     Raises:
-        FootTileError: no estimate with these models.
+        FootTileError: the recording cannot be estimated with these models.
     """
     info, calibration = recording.info, recording.calibration
     tare = take_tare(recording.frames, Compensation(info.tiles), calibration, info.serials)
@@ -109,7 +109,7 @@ def plan_of(recording: Recording, models: tuple[str, ...], lag_ms: float) -> Est
 
 
 def ns_per_frame(plan: EstimationPlan, stream: Endless, frames: int, batch: int) -> float:
-    """CPU time of estimating the first `frames` frames of a stream, `batch` of them a step."""
+    """Measure the CPU time per frame in ns, over `frames` frames, `batch_frames` per step."""
     estimator = Estimator(plan)
     spent_ns = 0
     for begin in range(0, frames, batch):
@@ -123,17 +123,17 @@ def ns_per_frame(plan: EstimationPlan, stream: Endless, frames: int, batch: int)
 
 
 LAGS_MS: Mapping[str, float] = {"live": 10.0, "offline": 100.0}
-"""Look-ahead of the two ways to estimate."""
+"""Look-ahead of the two estimation modes."""
 
 SECONDS = 20.0
-"""Length of a scene that has no end of its own."""
+"""Duration of a scene without an end."""
 
 _TRUTH = (*(name for name in COMPARED if name.startswith("true_")), "true_force_n")
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One draw's frames with their truth, and the calibration of its tiles."""
+    """Frames of one draw with their truth, and the calibration of its tiles."""
 
     info: ArrayInfo
     frames: FrameBatch
@@ -143,7 +143,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Task:
-    """What one process is to do."""
+    """Work of one process: one draw of a scene, estimated by all model sets."""
 
     scene: Scene
     seconds: float | None
@@ -153,7 +153,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Failure:
-    """Something that could not be measured, and why."""
+    """Measurement that failed, with the reason."""
 
     what: str
     why: str
@@ -161,13 +161,13 @@ class Failure:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What came of one draw.
+    """Result of one draw.
 
     Attributes:
-        draw: its number: the seed of noise and of parts.
-        frames: how many frames it has.
-        accuracy: by mode and label of the rung.
-        failures: what could not be measured.
+        draw: its number, the seed of noise and parts.
+        frames: number of frames.
+        accuracy: errors by mode and label of the model set.
+        failures: failed measurements.
     """
 
     draw: int
@@ -185,10 +185,10 @@ def record(
     """Calibrate the tiles of a draw as a user would, and record the scene with them.
 
     Args:
-        scene: what to run.
-        seconds: its length; None: as long as it is, or `SECONDS` if it has no end.
-        draw: seed of tiles and of noise.
-        progress: told what takes time.
+        scene: scene to run.
+        seconds: duration; None: the scene's, or `SECONDS` if it has no end.
+        draw: seed of tiles and noise.
+        on_progress: called before slow steps.
 
     Raises:
         FootTileError: scene or calibration is not usable.
@@ -210,14 +210,14 @@ def recorded(
     calibration: Calibration,
     foot: EmulatedFoot = EmulatedFoot(),  # noqa: B008  # frozen, so one for all is safe
 ) -> tuple[Recording, World]:
-    """Record a scene with tiles of a draw, whose calibration is known, and where it came from.
+    """Record a scene with calibrated tiles of a draw; also return the emulated world.
 
     Args:
-        scene: what to run.
-        seconds: its length, as for `record`.
-        draw: seed of tiles and of noise.
-        calibration: of the tiles.
-        foot: what presses it; its seeds are those of the draw.
+        scene: scene to run.
+        seconds: duration, as for `record_draw`.
+        draw: seed of tiles and noise.
+        calibration: calibration of the tiles.
+        foot: emulated foot; the draw replaces its seeds.
 
     Raises:
         FootTileError: the scene is not usable.
@@ -240,10 +240,10 @@ def recorded(
 
 
 def estimated(recording: Recording, models: tuple[str, ...], lag_ms: float) -> Accuracy:
-    """How far off the estimates of a recording are, tared from its lead.
+    """Estimate a recording, with the tare from its lead-in, and compute the errors.
 
     Raises:
-        FootTileError: no estimate with these models.
+        FootTileError: the recording cannot be estimated with these models.
     """
     return accuracy_of(estimates_of(recording, models, lag_ms, COMPARED), lag_ms=lag_ms)
 
@@ -251,10 +251,10 @@ def estimated(recording: Recording, models: tuple[str, ...], lag_ms: float) -> A
 def estimates_of(
     recording: Recording, models: tuple[str, ...], lag_ms: float, names: Sequence[str]
 ) -> dict[str, npt.NDArray[Any]]:
-    """Columns of a recording's estimates and truth, one row per frame.
+    """Estimate a recording; return columns of estimates and truth, one row per frame.
 
     Raises:
-        FootTileError: no estimate with these models.
+        FootTileError: the recording cannot be estimated with these models.
     """
     options = EstimateOptions(recording.calibration, models, lag_ms, exact=True)
     stream = EstimateStream(recording.info, options)
@@ -266,7 +266,7 @@ def estimates_of(
 
 
 def run_draw(task: Task) -> Drawn:
-    """Record one draw and estimate it by every rung; what fails is reported, not raised."""
+    """Record one draw and estimate it by every model set; failures are returned, not raised."""
     try:
         recording = record(task.scene, task.seconds, task.draw)
     except Exception as error:
@@ -284,5 +284,5 @@ def run_draw(task: Task) -> Drawn:
 
 
 def reason(error: Exception) -> str:
-    """Why something failed; an unexpected error is named by its type."""
+    """Describe an error; an unexpected one with its type."""
     return str(error) if isinstance(error, FootTileError) else f"{type(error).__name__}: {error}"

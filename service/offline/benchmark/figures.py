@@ -1,7 +1,4 @@
-"""From draws to figures: medians with their range, pooled coverage, the Pareto front.
-
-And the goals: what the project has set itself to reach, and whether a ladder reaches it.
-"""
+"""Figures over draws: medians with ranges, pooled coverage, the Pareto front, and the goals."""
 
 from __future__ import annotations
 
@@ -27,19 +24,19 @@ SIGMA_MID_STANCE_N = 0.25
 COVERAGE = (0.93, 0.97)
 COVERAGE_OF_A_PHASE = (0.90, 0.99)
 COVERAGE_DRAWS = 100
-"""Coverage is meant to be pooled over so many draws."""
+"""Number of draws for which the coverage goals are defined."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One figure with its goal.
+    """Measured figure with its goal.
 
     Attributes:
         mode: live or offline.
-        figure: what is meant, with its unit.
-        value: what was measured; NaN if nothing was.
-        least: the goal's lower end; None: none.
-        most: its upper end.
+        figure: title of the figure, with its unit.
+        value: measured value; NaN if not measured.
+        least: lower limit; None: none.
+        most: upper limit.
     """
 
     mode: str
@@ -50,17 +47,17 @@ class Goal:
 
     @property
     def met(self) -> bool:
-        """Whether the figure is where it should be; not, if it is not known."""
+        """True if the value is within the limits; False for NaN."""
         low = -math.inf if self.least is None else self.least
         return low <= self.value <= self.most
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return the JSON representation."""
         return asdict(self) | {"met": self.met}
 
 
 def goals_of(figures: SceneFigures) -> list[Goal]:
-    """The goals of a scene with what was measured of them."""
+    """Compare a scene's figures with the goals."""
     goals = []
     for mode in LAGS_MS:
         measured = figures.measured[mode, figures.default.label]
@@ -79,7 +76,7 @@ def goals_of(figures: SceneFigures) -> list[Goal]:
         ]
         for name, covered in measured.coverage.items():
             if name == "after_saturation":
-                continue  # stated, without a goal
+                continue  # reported, without a goal
             low, high = COVERAGE_OF_A_PHASE if name in PHASES else COVERAGE
             title = f"covered by the 95 % interval, {COVERED[name]}, %"
             goals.append(Goal(mode, title, 100 * covered.share, 100 * low, 100 * high))
@@ -92,20 +89,20 @@ COVERED = {
     "cop_x": "COP x",
     "after_saturation": "GRF, after saturation",
 }
-"""Names of what coverage is counted of."""
+"""Titles of the coverage figures."""
 
 
 MAGNITUDES = ("flight_mean_n", "grf_bias_n")
-"""Figures with a sign: of them the magnitude is taken, or draws of both signs would cancel."""
+"""Signed figures, summarized by magnitude so that draws do not cancel."""
 
 
 BUDGETED = ("grf_mae_n", "cop_p95_m")
-"""Figures that are compared with those of the whole ladder, draw by draw."""
+"""Figures that are compared with those of the full model set, draw by draw."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A figure over draws or repetitions: median, 5th and 95th percentile, and of how many."""
+    """Median, 5th and 95th percentile and number of a figure's values over draws or repetitions."""
 
     median: float
     p5: float
@@ -114,7 +111,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """Of all values that are finite."""
+        """Compute the percentiles of all finite values."""
         finite = [value for value in values if math.isfinite(value)]
         if not finite:
             return cls(math.nan, math.nan, math.nan, 0)
@@ -124,16 +121,16 @@ class Spread:
 
 @dataclass(frozen=True)
 class Measured:
-    """One rung in one mode.
+    """Figures of one model set in one mode.
 
     Attributes:
-        lag_ms: its look-ahead.
-        ns_per_frame: over repetitions.
-        figures: over draws, by the names of `Accuracy`; magnitudes of those that have a sign.
+        lag_ms: look-ahead.
+        ns_per_frame: CPU time over repetitions.
+        figures: fields of `Accuracy` over draws; magnitudes of signed ones.
         coverage: pooled over all frames of all draws: GRF in all frames and in each of `PHASES`,
             "cop_x" and "after_saturation".
-        beyond_whole: how much greater `BUDGETED` figures are than those of the whole ladder in the
-            same draw, over draws.
+        beyond_whole: excess of `BUDGET_FIGURES` over those of the full model set in the same
+            draw, over draws.
     """
 
     lag_ms: float
@@ -145,7 +142,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class SceneFigures:
-    """All that was measured of one scene."""
+    """Figures of one scene."""
 
     scene: str
     tiles: int
@@ -153,20 +150,20 @@ class SceneFigures:
     absent_models: tuple[str, ...]
     assumed_scale: bool
     draws: int
-    """Draws that gave figures."""
+    """Number of draws with figures."""
     frames: Spread
     rungs: tuple[Rung, ...]
     measured: Mapping[tuple[str, str], Measured]
-    """By mode and label of the rung."""
+    """Figures by mode and label of the model set."""
     failures: tuple[Failure, ...]
 
     @property
     def default(self) -> Rung:
-        """The scene's whole ladder."""
+        """The scene's full model set."""
         return next(rung for rung in self.rungs if rung.is_default)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the JSON representation."""
         return {
             "scene": self.scene,
             "tiles": self.tiles,
@@ -197,7 +194,7 @@ def measured_of(
     draws: Sequence[Drawn],
     times_ns: Mapping[tuple[str, str], Sequence[float]],
 ) -> dict[tuple[str, str], Measured]:
-    """Every rung in every mode, by mode and label."""
+    """Summarize every model set in every mode, by mode and label."""
     measured = {}
     whole = next(rung for rung in rungs if rung.is_default)
     for rung in rungs:
@@ -223,7 +220,7 @@ def measured_of(
 
 
 def figures_of(judged: Sequence[Accuracy]) -> dict[str, Spread]:
-    """Every number of `Accuracy` over draws."""
+    """Summarize every numeric field of `Accuracy` over draws."""
     names = [f.name for f in fields(Accuracy) if f.type in ("float", "int")]
     figures = {}
     for name in names:
@@ -233,7 +230,7 @@ def figures_of(judged: Sequence[Accuracy]) -> dict[str, Spread]:
 
 
 def coverage_of(judged: Sequence[Accuracy]) -> dict[str, Covered]:
-    """Coverage of the 95 % interval over the frames of all draws together."""
+    """Pool the coverage of the 95 % interval over the frames of all draws."""
     nothing = Covered(0, 0)
     phases = {phase: sum((a.grf_phases[phase] for a in judged), nothing) for phase in PHASES}
     return {
@@ -245,10 +242,10 @@ def coverage_of(judged: Sequence[Accuracy]) -> dict[str, Covered]:
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points that no other beats, by rising first coordinate.
+    """Return the indices of the Pareto front, by rising first coordinate.
 
-    A point is beaten by one that is no worse in both coordinates and better in one. What is not
-    finite is on no front.
+    A point is dominated by one that is no worse in both coordinates and better in one. Points that
+    are not finite are left out.
     """
     order = sorted(
         (i for i, point in enumerate(points) if all(map(math.isfinite, point))),

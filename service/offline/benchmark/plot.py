@@ -1,6 +1,6 @@
-"""Time per frame against GRF error, one panel per scene, with the Pareto front of each mode.
+"""Plot of time per frame against GRF error, by scene, with the Pareto front of each mode.
 
-A panel has a half for each mode: their times lie two decades apart, with nothing in between.
+A panel has a half for each mode, because their times are two decades apart.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Two of Okabe and Ito's colours, and two shapes, so that neither colour nor print is needed.
+# Two of Okabe and Ito's colours, and two shapes, for any colour vision and for black and white.
 STYLES = {"live": ("#0072B2", "o"), "offline": ("#D55E00", "s")}
 HALVES = ("offline", "live")
 GREY = "#595959"
@@ -41,7 +41,7 @@ class _Mark:
 
 
 def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
-    """The plot as a PNG.
+    """Draw the plot as a PNG.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -64,7 +64,7 @@ def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
         )
     figure.suptitle("What the estimate of a frame costs, and how far its force is off", fontsize=14)
     _legend(figure)
-    # Places are known in pixels only after everything else has found its own.
+    # Pixel positions are known only after the layout is done.
     figure.set_dpi(DPI)
     engine: Any = figure.get_layout_engine()
     engine.set(wspace=0.02, hspace=0.05)
@@ -76,7 +76,7 @@ def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
 
 
 def _half(axes: Axes, figures: SceneFigures, mode: str, goal_n: float | None) -> list[_Mark]:
-    """Marks, bars, front and goal of one mode."""
+    """Draw points, bars, front and goal of one mode."""
     colour, shape = STYLES[mode]
     marks = []
     for rung in figures.rungs:
@@ -141,7 +141,7 @@ def _scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> Non
 
 
 def time_text(ns: float, _: object = None) -> str:
-    """A time of so many nanoseconds in the unit that suits it."""
+    """Format a time in ns with a suitable unit."""
     for unit, size in (("ms", 1e6), ("µs", 1e3)):
         if ns >= size:
             return f"{ns / size:g} {unit}"
@@ -165,14 +165,14 @@ def _legend(figure: Figure) -> None:
 
     figure.legend(
         handles=[
-            mark("#BFBFBF", "black", 2.0, 11, "the scene's whole ladder"),
+            mark("#BFBFBF", "black", 2.0, 11, "the scene's full model set"),
             mark(GREY, GREY, 1.2, 6, "built up, one model more each"),
             mark(
                 "white",
                 GREY,
                 1.2,
                 6,
-                "whole ladder without (\N{MINUS SIGN}) or with one more (++) model",
+                "full model set without (\N{MINUS SIGN}) or with one more (++) model",
             ),
             Line2D([], [], color=GREY, linewidth=1.5, label="Pareto front"),
             Line2D([], [], color=GREY, linewidth=1.0, linestyle=GOAL_DASHES, label="goal"),
@@ -187,12 +187,12 @@ def _legend(figure: Figure) -> None:
 
 
 def _label(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_Mark]) -> None:
-    """Write every name where nothing is yet, as near to its mark as there is room."""
+    """Place every label in free space, as near to its point as possible."""
     from textalloc import allocate
 
     if not marks:
         return
-    # The scene's own ladder first, then what is built up: they get the best places.
+    # The full model set and the built-up ones first: they get the best places.
     marks = sorted(marks, key=lambda m: (not m.rung.is_default, not m.rung.is_built_up))
     ns, errors_n = [m.ns for m in marks], [m.error_n.median for m in marks]
     front = pareto(list(zip(ns, errors_n, strict=True)))

@@ -1,4 +1,4 @@
-"""The benchmark as Markdown: figures, coverage, error budget, goals, and what failed."""
+"""Markdown report of the benchmark: figures, coverage, error budget, goals, failures."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ ERRORS = (
     ("COP mean mm", "cop_mean_m", 1e3, 2),
     ("COP 95th percentile mm", "cop_p95_m", 1e3, 2),
 )
-_WORDS = {"rung", "mode", "ladder", "of the whole ladder", "met"} | {
+_WORDS = {"model set", "mode", "of the full model set", "met"} | {
     *("scene", "condition", "figure", "model", "of", "reason")
 }
-"""Heads of columns that are words, not figures."""
+"""Heads of text columns."""
 BESIDE = (
     ("in flight, mean N", "flight_mean_n", 1.0, 3),
     ("in flight, mean abs N", "flight_mae_n", 1.0, 3),
@@ -47,7 +47,7 @@ BESIDE = (
 
 
 def markdown(bench: Bench) -> str:
-    """All tables of a benchmark."""
+    """Format the report of a benchmark."""
     o = bench.options
     lines = [
         "# Speed against error",
@@ -64,8 +64,8 @@ def markdown(bench: Bench) -> str:
         "",
         EMULATED,
     ]
-    said = {"repeatability": o.repeatability, "noise correlated over ms": o.correlated_ms}
-    named = ", ".join(f"{name} {value:g}" for name, value in said.items() if value is not None)
+    overrides = {"repeatability": o.repeatability, "noise correlated over ms": o.correlated_ms}
+    named = ", ".join(f"{name} {value:g}" for name, value in overrides.items() if value is not None)
     if named:
         lines += ["", f"The emulation differs from that of the scenes: {named}."]
     for figures in bench.scenes:
@@ -78,19 +78,22 @@ def _scene(figures: SceneFigures) -> list[str]:
         f"## {figures.scene}",
         "",
         f"{figures.tiles} tiles at {figures.rate_hz:.0f} frames/s, {draws_text(figures.draws)} "
-        f"of {figures.frames.median:.0f} frames. Its whole ladder: "
+        f"of {figures.frames.median:.0f} frames. Its full model set: "
         f"{', '.join(figures.default.models)}.",
     ]
     if figures.absent_models:
-        lines += ["", f"Named by the scene and not there: {', '.join(figures.absent_models)}."]
+        lines += ["", f"Models of the scene that do not exist: {', '.join(figures.absent_models)}."]
     if figures.assumed_scale:
-        lines += ["", "The scale of its calibration is assumed: newtons are not to be trusted."]
+        lines += [
+            "",
+            "The scale of its calibration is assumed, so forces in newtons are unreliable.",
+        ]
     if figures.failures:
         lines += ["", f"Not measured, {len(figures.failures)}:", ""]
         lines += [f"- {failure.what}: {failure.why}" for failure in figures.failures]
     for title, part in (
         ("Error and time", _errors(figures)),
-        ("Beside it", _beside(figures)),
+        ("Further figures", _beside(figures)),
         ("Covered by the 95 % interval", _coverage(figures)),
         ("Error budget", _budget(figures)),
         ("Goals", _goals(goals_of(figures), figures.draws)),
@@ -105,12 +108,12 @@ def _errors(figures: SceneFigures) -> list[str]:
         (*names, f"{m.lag_ms:g}", spread_text(m.ns_per_frame, 1.0, 0), *_cells(m, ERRORS))
         for names, m in _rows(figures)
     ]
-    return table(("rung", "mode", *head), rows)
+    return table(("model set", "mode", *head), rows)
 
 
 def _beside(figures: SceneFigures) -> list[str]:
     rows = [(*names, *_cells(m, BESIDE)) for names, m in _rows(figures)]
-    return table(("rung", "mode", *(title for title, *_ in BESIDE)), rows)
+    return table(("model set", "mode", *(title for title, *_ in BESIDE)), rows)
 
 
 def _coverage(figures: SceneFigures) -> list[str]:
@@ -121,14 +124,14 @@ def _coverage(figures: SceneFigures) -> list[str]:
     default = figures.measured["offline", figures.default.label].coverage
     counts = ", ".join(f"{title} {default[name].frames}" for name, title in COVERED.items())
     return [
-        *table(("rung", "mode", *COVERED.values()), rows),
+        *table(("model set", "mode", *COVERED.values()), rows),
         "",
-        f"Frames of the whole ladder offline: {counts}.",
+        f"Frames of the full model set offline: {counts}.",
     ]
 
 
 def _budget(figures: SceneFigures) -> list[str]:
-    """What each model takes away: how much greater the error is without it."""
+    """Format the error budget: the increase of the error without each model."""
     rows = []
     for rung in figures.rungs:
         if rung.lacks is None and rung.spare is None:
@@ -143,14 +146,14 @@ def _budget(figures: SceneFigures) -> list[str]:
         rows.append(row)
     if not rows:
         if len(figures.rungs) == 1 and len(figures.rungs[0].models) > 1:
-            return ["Not measured: only the whole ladder was estimated."]
-        return ["No model of this ladder can be left out."]
+            return ["Not measured: only the full model set was estimated."]
+        return ["No model of this set can be left out."]
     head = [f"{q}, {mode}" for mode in LAGS_MS for q in ("GRF mean abs N", "COP p95 mm")]
     text = (
-        "How much greater the error is without each model, or with one more, than with the whole "
-        "ladder; the median of the differences draw by draw, and their range."
+        "Increase of the error without each model, or with one more, over the full model set: "
+        "median of the differences by draw, and their range."
     )
-    return [text, "", *table(("ladder", *head), rows)]
+    return [text, "", *table(("model set", *head), rows)]
 
 
 def _goals(goals: Sequence[Goal], draws: int) -> list[str]:
@@ -160,9 +163,9 @@ def _goals(goals: Sequence[Goal], draws: int) -> list[str]:
         value = "-" if math.isnan(goal.value) else f"{goal.value:.3g}"
         asked = f"{least}{goal.most:g}" if least else f"at most {goal.most:g}"
         rows.append((goal.figure, goal.mode, value, asked, "yes" if goal.met else "NO"))
-    lines = table(("of the whole ladder", "mode", "measured", "goal", "met"), rows)
+    lines = table(("of the full model set", "mode", "measured", "goal", "met"), rows)
     if draws < COVERAGE_DRAWS:
-        lines += ["", f"Coverage is meant to be pooled over {COVERAGE_DRAWS} draws or more."]
+        lines += ["", f"The coverage goals are for {COVERAGE_DRAWS} draws or more."]
     return lines
 
 
@@ -180,7 +183,7 @@ def _cells(m: Measured, columns: Sequence[tuple[str, str, float, int]]) -> list[
 
 
 def spread_text(spread: Spread, scale: float, digits: int, *, sign: str = "") -> str:
-    """Median and range in one cell; `sign` "+": with the sign also of what is positive."""
+    """Format median and range in one cell; `sign` "+" also shows positive signs."""
     if not spread.n:
         return "-"
     low, median, high = (
@@ -190,11 +193,11 @@ def spread_text(spread: Spread, scale: float, digits: int, *, sign: str = "") ->
 
 
 def draws_text(n: int) -> str:
-    """So many draws."""
+    """Format a number of draws."""
     return "1 draw" if n == 1 else f"{n} draws"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table in Markdown: text to the left, figures to the right."""
+    """Format a Markdown table: text left-aligned, figures right-aligned."""
     rule = ["---" if title in _WORDS else "--:" for title in head]
     return [f"| {' | '.join(cells)} |" for cells in (head, rule, *rows)]

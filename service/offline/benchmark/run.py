@@ -1,4 +1,4 @@
-"""The whole benchmark: draws in parallel processes, then the times on a machine that is idle."""
+"""Run of the benchmark: draws in parallel processes, then timing on the idle machine."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from service.version import SOFTWARE
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What to compare; see `foottile benchmark --help`."""
+    """Options of a benchmark; see `foottile benchmark --help`."""
 
     scenes: tuple[Scene, ...]
     draws: int
@@ -46,14 +46,14 @@ class BenchOptions:
     live_frames: int
     repetitions: int
     whole_only: bool = False
-    """Only the scenes' whole ladders, for many draws."""
+    """Only the scenes' full model sets, for many draws."""
     repeatability: float | None = None
-    """Of the emulated domes, instead of the scenes'."""
+    """Standard deviation between loadings of the emulated domes; None: the scenes'."""
     correlated_ms: float | None = None
-    """Correlation time of the emulated noise, instead of the scenes'."""
+    """Correlation time of the emulated noise; None: the scenes'."""
 
     def emulated(self, scene: Scene) -> Scene:
-        """The scene with the emulation that is asked for."""
+        """Return the scene with the options of its emulation replaced."""
         asked = {"repeatability": self.repeatability, "correlated_ms": self.correlated_ms}
         given = {name: value for name, value in asked.items() if value is not None}
         emulation = scene.emulation.model_copy(update=given)
@@ -62,27 +62,27 @@ class BenchOptions:
 
 @dataclass(frozen=True)
 class Bench:
-    """What came of it."""
+    """Result of a benchmark."""
 
     options: BenchOptions
     made: str
-    """When, ISO 8601 in UTC."""
+    """Time of the run, ISO 8601 in UTC."""
     software: str
     machine: str
     scenes: tuple[SceneFigures, ...]
 
     @property
     def goals(self) -> dict[str, list[Goal]]:
-        """The goals of every scene."""
+        """Goals of every scene."""
         return {figures.scene: goals_of(figures) for figures in self.scenes}
 
     @property
     def failures(self) -> list[tuple[str, Failure]]:
-        """What could not be measured, with its scene."""
+        """Failed measurements, each with its scene."""
         return [(figures.scene, f) for figures in self.scenes for f in figures.failures]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the JSON representation."""
         options = self.options
         return {
             "software": self.software,
@@ -103,14 +103,14 @@ class Bench:
 
 
 def run_bench(options: BenchOptions, tell: Callable[[str], None]) -> Bench:
-    """Measure every scene.
+    """Run the benchmark on every scene.
 
     Args:
-        options: what to compare.
-        tell: told what is being done.
+        options: options of the benchmark.
+        on_progress: called with progress messages.
 
     Raises:
-        FootTileError: no draw of a scene gave a figure.
+        FootTileError: every draw of a scene failed.
     """
     scenes = []
     for scene in map(options.emulated, options.scenes):
@@ -130,7 +130,7 @@ def run_bench(options: BenchOptions, tell: Callable[[str], None]) -> Bench:
 
 def _offered(scene: Scene) -> tuple[str, ...]:
     has_bare_tile = any(tile.reference for tile in scene.tile)
-    if scene.calibration in PRESETS:  # which know of a static curve only
+    if scene.calibration in PRESETS:  # presets have a static curve only
         return ("skew", "denoise")
     return tuple(name for name in MODELS if name != "ambient" or has_bare_tile)
 
@@ -173,7 +173,7 @@ def _is_assumed(recording: Recording) -> bool:
 
 
 def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
-    """Every draw as it is finished."""
+    """Run draws in processes; yield each as it finishes."""
     for task, draw in spread(run_draw, tasks, jobs):
         if isinstance(draw, Drawn):
             yield draw
@@ -182,7 +182,7 @@ def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
 
 
 def machine() -> str:
-    """What the times were measured on."""
+    """Describe this machine, for the report."""
     model = platform.machine()
     with suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()

@@ -1,6 +1,6 @@
-"""Which ladders of models are compared: built up one model at a time, and the whole less each one.
+"""Model sets that are compared: built up one model at a time, and the full set without each one.
 
-The first shows what a model buys for its time, the second what would be left without it.
+The first show the gain of each model for its run time, the second show its effect in the full set.
 """
 
 from __future__ import annotations
@@ -11,23 +11,22 @@ from dataclasses import dataclass
 from service.estimation.ladder.chosen import MODELS
 
 FOUNDATION = ("unwrap", "static")
-"""The first rung: what every force needs."""
+"""First model set: the models that every force needs."""
 BY_WHAT_MATTERS = ("denoise", "skew", "gas", "rubber", "hysteresis", "temperature", "ambient")
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One ladder of models, and its place among the others.
+    """Model set, and its relation to the others.
 
     Attributes:
         label: short name for tables and plots.
         models: the models, in the order of `MODELS`.
-        is_built_up: it is the first rung, or one more than the rung before; else it is only there
-            as the whole ladder less a model.
-        adds: what it has more than the rung before it; None for the first and what is not built up.
-        lacks: what the whole ladder has more, if that is one model that can be left out.
-        spare: what it has more than the whole ladder: a model that the scene does without.
-        is_default: it is the scene's whole ladder.
+        is_built_up: True for the first set and each set with one model more than the set before.
+        added_model: model that it adds to the set before; None for the first and ablated sets.
+        missing_model: the one model of the full set that is missing in it; None otherwise.
+        extra_model: model that it adds to the full set.
+        is_full_set: True for the scene's full set.
     """
 
     label: str
@@ -44,16 +43,16 @@ def rungs(
     existing: Sequence[str] = MODELS,
     offered: Sequence[str] = (),
 ) -> tuple[Rung, ...]:
-    """The ladders to compare for a scene, each once.
+    """List the model sets to compare for a scene, without duplicates.
 
-    First those that are built up, ending with the scene's whole ladder, then those that lack one
-    of its models, then those that have one more than it names: what it was right or wrong to do
-    without. Models that do not exist are left out; `absent` names them.
+    First the built-up ones, ending with the scene's full set, then the full set without each of its
+    models, then the full set with each further model. Unknown models are left out; see
+    `list_missing_models`.
 
     Args:
-        models_of_scene: the models that the scene names, `static` among them.
-        existing: all models there are, in the order in which they are applied.
-        offered: models that the array and its calibration could do as well.
+        scene_models: models of the scene, with `static`.
+        all_models: all models, in order of application.
+        extra_models: further models that array and calibration support.
     """
     whole = tuple(name for name in existing if name in models_of_scene)
     later = [name for name in existing if name not in (*FOUNDATION, *BY_WHAT_MATTERS)]
@@ -91,5 +90,5 @@ def rungs(
 
 
 def absent(models_of_scene: Sequence[str], existing: Sequence[str] = MODELS) -> tuple[str, ...]:
-    """Models that a scene names but that do not exist."""
+    """Return the models of a scene that do not exist."""
     return tuple(name for name in models_of_scene if name not in existing)

@@ -1,1 +1,1 @@
-"""A session against a reference: aligned in time, errors with intervals, limits. Reads no file."""
+"""Comparison of a session with a reference: alignment, errors with intervals. No file access."""

@@ -1,12 +1,11 @@
-"""A reference's clock and scale against our force: lag, drift, offset and scale, with intervals.
+"""Alignment of a reference with our force: lag, drift, offset and scale, with intervals.
 
-The lag is found coarsely by cross-correlation, then all four together by robust least squares under
-narrower and narrower windows. Landings, where plate and foot ring each in its own way, count less:
-the loss is the pseudo-Huber one. Residuals are ours, `ours - scale (reference - offset)`: noise of
-what stands on the right would make the scale too small, and a reference is the better of the two.
-Intervals are those of `blocks`. In them is what our foot may get wrong in the same way in every
-stance, if it states its uncertainty: as if all of that went one way, and as phases of the load
-contradict one another.
+Cross-correlation finds a coarse lag; robust least squares then fits all four parameters under
+ever narrower windows. The loss is pseudo-Huber, so landings count less, where plate and foot ring
+differently. The residual is `ours - scale (reference - offset)`: noise of the regressor would bias
+the scale low, and the reference is the less noisy of the two. Intervals are those of `blocks`. If
+our foot states its uncertainty, they include errors that repeat in every stance: as if all of that
+uncertainty had one sign, and by the differences between phases of the load.
 """
 
 from __future__ import annotations
@@ -31,37 +30,37 @@ from service.offline.compare.lags import Peak, Peaks, likely_lags
 from service.offline.compare.signals import Even, Signal, smooth
 
 ROBUST = 1.345
-"""Beyond so many standard deviations a residual counts less (Huber)."""
+"""Huber's tuning constant: beyond so many standard deviations a residual counts less."""
 WIDTHS_S = (0.04, 0.01)
-"""Windows before the last one, which is as narrow as samples allow."""
+"""Window widths of the first fits, in s; the sample rate limits the last width."""
 WIDTH_STEPS = 2.0
-"""The last window, in steps of the slower signal: narrower ones would tell sample from sample."""
+"""Width of the last window, in steps of the slower signal: a narrower one fits single samples."""
 STEPS_A_WIDTH = 32.0
-"""A window has no more steps than that in its width, however fast one of the signals is."""
+"""Largest number of steps per window width, for a signal much faster than the other."""
 DRIFT_MAX = 0.01
-"""No clock of a reference is further off than by a hundredth: what lies beyond cannot overlap."""
+"""Upper bound of a reference clock's relative drift, which limits the part that can overlap."""
 SAMPLES_MIN = 16
-"""Samples under a window, a width apart, from which four parameters are fitted."""
+"""Least number of samples, a window width apart, to fit four parameters."""
 CORRELATION_MIN = 0.5
-"""Signals that resemble each other less at their best lag are not of the same load."""
+"""Least correlation at the best lag for two signals of the same load."""
 RIVAL_FROM = 0.8
-"""Of the best lag's correlation: a rival below that is no rival."""
+"""Least correlation of a rival lag, relative to the best lag's."""
 CHANCE = 1e-3
-"""A rival is ruled out if what it fits worse would come by chance less often than that."""
+"""Significance level at which an F test rejects a rival lag."""
 LOADED = 0.1
-"""Of the greatest force: noise of a residual is judged where there is more."""
+"""Force above which residual noise is estimated, relative to the greatest force."""
 
 _LAG, _DRIFT, _OFFSET, _SCALE = range(4)
 
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """The best other lag.
+    """Second-best lag that fits nearly as well.
 
     Attributes:
-        lag_s: it.
-        correlation: at that lag.
-        best_correlation: at the lag that was taken.
+        lag_s: its value.
+        correlation: coefficient at this lag.
+        best_correlation: coefficient at the chosen lag.
     """
 
     lag_s: float
@@ -71,19 +70,19 @@ class Ambiguity:
 
 @dataclass(frozen=True)
 class Alignment:
-    """How a reference is to ours: what is at our `t` is in the reference at `reference_s(t)`.
+    """Clock and scale of a reference relative to ours: our time `t` is its `reference_s(t)`.
 
     Attributes:
-        lag_s: reference time less our time of the same event, at `at_s`.
-        drift_ppm: by how much the lag grows, microseconds a second.
-        offset_n: what the reference reads where our force is zero, by the fit.
-        scale: newtons of ours for a newton of the reference.
-        at_s: our instant in the middle of what overlaps.
-        covariance: (2, 2), of lag and drift, in s and 1; without what our foot gets wrong, which is
-            in the sigma of our force already.
-        residual_n: root mean square of what the fit leaves, under its last window.
-        blocks: of time, from which the uncertainties are.
-        ambiguity: None if no other lag comes near.
+        lag_s: reference time minus our time of the same event, at `mid_t_s`.
+        drift_ppm: rate of change of the lag, microseconds per second.
+        offset_n: reference reading at zero force of ours, by the fit.
+        scale: our force per reference force, N/N.
+        mid_t_s: our time at the middle of the overlap.
+        covariance: (2, 2), of lag and drift, in s and 1; without our foot's repeating error, which
+            the sigma of our force contains already.
+        residual_n: root mean square of the residuals under the last window.
+        block_count: number of time blocks behind the uncertainties.
+        ambiguity: a rival lag; None if no other lag fits nearly as well.
     """
 
     lag_s: Estimate
@@ -97,12 +96,12 @@ class Alignment:
     ambiguity: Ambiguity | None
 
     def reference_s(self, t_s: Floats) -> Floats:
-        """Reference times of our instants (n,)."""
+        """Convert our times to reference times, (n,)."""
         drift = self.drift_ppm.value * 1e-6
         return np.asarray(t_s + self.lag_s.value + drift * (t_s - self.at_s))
 
     def lag_sigma_s(self, t_s: Floats) -> Floats:
-        """Standard error of the lag at our instants (n,)."""
+        """Compute the standard error of the lag at our times, (n,)."""
         since = np.stack([np.ones(len(t_s)), t_s - self.at_s])
         variance = np.einsum("in,ij,jn->n", since, self.covariance, since)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -115,12 +114,12 @@ def align(
 
     Args:
         ours: our GRF.
-        reference: the same force by the reference, on a clock of its own.
-        lag_range_s: least and greatest lag that can be, where several would fit; None: any.
+        reference: the reference's vertical force, on its own clock.
+        lag_range_s: smallest and largest allowed lag, where several would fit; None: any.
 
     Raises:
-        ComparisonError: one of them is constant, they do not overlap or do not resemble each other,
-            the reference's sign is wrong, or two lags fit equally well.
+        ComparisonError: a signal is constant, the two do not overlap or correlate, the reference's
+            sign is wrong, or two lags fit equally well.
     """
     for signal, whose in ((ours, "our GRF"), (reference, "the reference's force")):
         _check_varies(signal, whose)
@@ -171,11 +170,11 @@ def _check_varies(signal: Signal, whose: str) -> None:
         raise ComparisonError(f"{whose} has {len(signal.t_s)} samples", expected="at least two")
     height_n = float(np.ptp(signal.force_n))
     noise_n = _deviation(np.diff(signal.force_n)) / np.sqrt(2.0)
-    # Of so many samples noise alone reaches some five sigma to either side.
+    # With many samples, noise alone spans some five sigma to either side.
     if not height_n > 12.0 * noise_n or height_n == 0.0:
         raise ComparisonError(
             f"{whose} is constant but for noise: {height_n:.3g} N from least to greatest",
-            expected="a load that comes and goes",
+            expected="a varying load",
         )
 
 
@@ -201,7 +200,7 @@ def _within(lag_range_s: tuple[float, float] | None) -> str:
 
 
 def _elsewhere(ours: Signal, reference: Signal, lag_range_s: tuple[float, float] | None) -> str:
-    """Where a lag fits that the range leaves out; empty: nowhere."""
+    """Describe the best lag outside the allowed range; empty if none correlates."""
     anywhere = None if lag_range_s is None else likely_lags(ours, reference, None)
     if anywhere is None or anywhere.best.correlation < CORRELATION_MIN:
         return ""
@@ -222,7 +221,7 @@ def _wrong_sign(elsewhere: str = "") -> ComparisonError:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Parameters at which the residuals are least, and the residuals, at even steps of our time."""
+    """Fitted parameters and residuals, at even steps of our time."""
 
     x: Floats
     residual: Floats
@@ -238,7 +237,7 @@ class _Fit:
         return float(np.sqrt(np.mean(self.residual**2)))
 
     def spread(self, ours: Signal) -> Spread:
-        """How uncertain they are, and by what our foot states to be uncertain of."""
+        """Compute the parameters' uncertainty, with that stated for our force."""
         ratio = 1.0 + (self.residual / self.bend_n) ** 2
         score, curvature = self.residual / np.sqrt(ratio), ratio**-1.5
         spread = spread_of(self.jacobian, score, curvature, self.samples)
@@ -257,7 +256,7 @@ def _fit(ours: Signal, reference: Signal, peak: Peak, coarse_s: float) -> _Fit:
     fit: _Fit | None = None
     for width_s in (*(width for width in WIDTHS_S if width > last_s), last_s, last_s):
         margin_s = max(width_s, coarse_s)
-        # A signal that is much faster than the other one need not be resampled at all its samples.
+        # A much faster signal need not keep all its samples.
         step_s = max(min(ours.step_s, reference.step_s), width_s / STEPS_A_WIDTH)
         step_s = min(0.5 * width_s, step_s)
         begin_s, end_s = (float(ours.t_s[i] + lag_s) for i in (0, -1))
@@ -321,7 +320,7 @@ def _fit_under(
 
 
 def _noise_n(residual: Floats, own_n: Floats) -> float:
-    """Standard deviation of residuals under load, whatever a few of them are."""
+    """Estimate the standard deviation of residuals under load, robust to outliers."""
     loaded = own_n - np.median(own_n[own_n <= np.median(own_n)]) > LOADED * np.ptp(own_n)
     noise_n = _deviation(residual[loaded] if loaded.sum() > 1 else residual)
     return max(noise_n, _deviation(residual), 1e-6 * float(np.ptp(own_n)))
@@ -332,9 +331,9 @@ def _deviation(values: Floats) -> float:
 
 
 def _is_worse(other: _Fit, best: _Fit) -> bool:
-    """Whether a fit leaves more than another one, beyond chance: an F test of the residuals.
+    """Return whether a fit is significantly worse than another, by an F test of the residuals.
 
-    Its degrees of freedom are stretches of the residuals' memory, not samples.
+    Degrees of freedom count correlation times of the residuals, not samples.
     """
     left, more = best.residual, other.residual
     free, free_of_best = (max(1.0, len(one) / memory_of(one)) for one in (more, left))

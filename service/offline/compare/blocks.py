@@ -1,16 +1,16 @@
-"""Intervals that are true where residuals are correlated: by how much blocks of time differ.
+"""Confidence intervals for correlated residuals, by cluster-robust covariance over time blocks.
 
-Residuals of a force follow one another: what rubber has left, what averaging smooths, what a plate
-rings by. Counting each as new would give intervals several times too narrow. Blocks of time that
-are much longer than this memory are as good as independent, and how far each pulls an answer says
-how uncertain it is, whatever is in it: the sandwich of cluster-robust regression, of a robust fit
-to first order, from its scores and its curvature. What a block tells of its own residuals is put
-back (CR2 of Bell and McCaffrey, Survey Methodology 28, 2002, p. 169): leaving blocks out, the
-jackknife, puts back too much where few tell most, as three stances do.
+Residuals of a force are correlated in time: rubber creeps, averaging smooths, a plate rings.
+Treating samples as independent would give intervals several times too narrow. Blocks of time much
+longer than the correlation time are nearly independent. The covariance is the sandwich estimator of
+cluster-robust regression, to first order for a robust fit, from its scores and its curvature. It
+corrects for the block's own influence on its residuals (CR2 of Bell and McCaffrey, Survey
+Methodology 28, 2002, p. 169); the jackknife over-corrects where few blocks have most of the
+information, as with three stances.
 
-What a model of rubber gets wrong in the same way in every stance, no block of time can show. It
-shows where phases of the load contradict one another: how far the answer moves without one of the
-rise and the fall of a load, each low and high, of all stances together (`over_phases`).
+Errors of the rubber model that repeat in every stance do not differ between blocks. They show as
+differences between phases of the load: `compute_phase_covariance` leaves out one of rise and fall,
+each low and high, over all stances, and measures how far the estimate moves.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from devices.arrays import Floats, Ints
 BLOCKS = 20
 BLOCKS_MIN = 8
 MEMORIES = 5.0
-"""A block is so many times longer than the residuals' memory."""
+"""Block length, in correlation times of the residuals."""
 SHARE_MAX = 0.999
-"""Of what a block alone tells, the rest is noise of rounding."""
+"""Largest leverage of a block; beyond it, rounding errors dominate."""
 SHARED_MAX = 0.5
-"""No variance is more than doubled for what blocks share."""
+"""Largest correction for correlation across block edges: it at most doubles a variance."""
 
 NORMAL_95 = 1.96
 _UPPER_95 = 0.975
@@ -38,13 +38,13 @@ _UPPER_95 = 0.975
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its uncertainty.
+    """Estimated value with its uncertainty.
 
     Attributes:
-        value: it.
+        value: estimate.
         sigma: standard error.
-        dof: degrees of freedom of that, not whole: blocks tell unequally much.
-        own: standard uncertainty from what our foot gets wrong in the same way all the time.
+        dof: its degrees of freedom, not an integer, as blocks have unequal information.
+        repeating_sigma: standard uncertainty from our foot's error that repeats in every stance.
     """
 
     value: float
@@ -54,17 +54,17 @@ class Estimate:
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """By Student's t; for what our foot gets wrong, of which blocks do not tell, normal."""
+        """95 % interval, by Student's t; the part of our foot's repeating error is normal."""
         half = math.hypot(float(stdtrit(self.dof, _UPPER_95)) * self.sigma, NORMAL_95 * self.own)
         return self.value - half, self.value + half
 
     def times(self, factor: float) -> Estimate:
-        """The same in another unit."""
+        """Return the estimate multiplied by a unit factor."""
         more = abs(factor)
         return Estimate(factor * self.value, more * self.sigma, self.dof, more * self.own)
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return the JSON representation."""
         return {
             "value": self.value,
             "sigma": self.sigma,
@@ -75,13 +75,13 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Spread:
-    """How uncertain the parameters of a fit are.
+    """Uncertainty of the parameters of a fit.
 
     Attributes:
         covariance: (p, p).
-        dof: (p,).
-        blocks: how many there were.
-        own: (p, p), covariance of what our foot gets wrong all the time.
+        dof: (p,), degrees of freedom.
+        block_count: number of time blocks.
+        repeating_covariance: (p, p), covariance of our foot's error that repeats in every stance.
     """
 
     covariance: Floats
@@ -90,26 +90,26 @@ class Spread:
     own: Floats
 
     def estimate(self, values: Floats, i: int) -> Estimate:
-        """Of parameter number i."""
+        """Return parameter `i` with its uncertainty."""
         sigma, own = (math.sqrt(matrix[i, i]) for matrix in (self.covariance, self.own))
         return Estimate(float(values[i]), sigma, float(self.dof[i]), own)
 
 
 def block_of(scores: Floats, samples: Ints, weight: Floats) -> Ints:
-    """To which block of time each residual belongs: blocks that tell equally much.
+    """Assign residuals to consecutive time blocks with equal information.
 
     Args:
-        scores: (n, p), what each residual says to each parameter; the one with the longest memory
-            counts.
-        samples: (n,), rising; number of the even time step at which it is.
-        weight: (n,), how much each tells.
+        scores: (n, p), score of each residual for each parameter; the longest correlation time of
+            the p columns sets the block length.
+        samples: (n,), rising; index of the even time step of each residual.
+        weight: (n,), information of each residual.
 
     Returns:
-        (n,), from 0; there are `BLOCKS_MIN` to `BLOCKS`.
+        Block index of each residual (n,), from 0; there are `BLOCKS_MIN` to `BLOCKS`.
     """
     memory = max(1.0, *(memory_of(column) for column in scores.T))
-    # In a long rest beside a few stances nothing is told: counted is the time that does tell, as
-    # many memories of it as would tell as much if all told the same (Kish's effective size).
+    # A long rest has no information: only informative time counts, as the number of correlation
+    # times of equal weight (Kish's effective sample size).
     told = np.bincount(((samples - samples[0]) / memory).astype(np.intp), weight)
     length, least = memory * told.sum() ** 2 / (told**2).sum(), MEMORIES * memory
     blocks = int(np.clip(length / least, BLOCKS_MIN, BLOCKS))
@@ -117,7 +117,7 @@ def block_of(scores: Floats, samples: Ints, weight: Floats) -> Ints:
     told = np.cumsum(weight) / weight.sum()
     edges, begin, before = [], 0, 0.0
     for left in range(blocks, 1, -1):
-        # As much as its share of what is left, and no shorter than that of the memory.
+        # Its share of the remaining information, and at least the correlation-limited length.
         end = int(np.searchsorted(told, before + (1.0 - before) / left)) + 1
         end = max(end, int(np.searchsorted(samples, samples[begin] + least)))
         end = min(end, int(np.searchsorted(samples, samples[-1] + 1 - least * (left - 1))))
@@ -130,7 +130,7 @@ def block_of(scores: Floats, samples: Ints, weight: Floats) -> Ints:
 
 
 def memory_of(residual: Floats) -> float:
-    """Samples over which residuals are correlated: 1 + 2 (sum of it until it is nothing)."""
+    """Estimate the correlation time in samples: 1 + 2 (sum of autocorrelation to first zero)."""
     centred = residual - residual.mean()
     size = 2 * len(centred)
     power = np.fft.irfft(np.abs(np.fft.rfft(centred, size)) ** 2, size)[: len(centred)]
@@ -142,13 +142,13 @@ def memory_of(residual: Floats) -> float:
 
 
 def spread_of(jacobian: Floats, score: Floats, curvature: Floats, samples: Ints) -> Spread:
-    """Uncertainty of a fit at its least.
+    """Compute the uncertainty of a fit at its minimum.
 
     Args:
-        jacobian: (n, p), of the residuals by the parameters.
+        jacobian: (n, p), derivatives of the residuals by the parameters.
         score: (n,), derivative of half the loss by the residual: the residual in least squares.
         curvature: (n,), derivative of the score: one in least squares.
-        samples: (n,), rising; number of the even time step at which each residual is.
+        samples: (n,), rising; index of the even time step of each residual.
     """
     scores = jacobian * score[:, None]
     telling = jacobian**2 * curvature[:, None]
@@ -161,7 +161,7 @@ def spread_of(jacobian: Floats, score: Floats, curvature: Floats, samples: Ints)
     share = np.einsum("ij,bjk,ki->bi", inverse, normals, inverse)
     with np.errstate(divide="ignore", invalid="ignore"):
         even = share.sum(axis=0) ** 2 / (share**2).sum(axis=0)
-    # Blocks side by side share what residuals remember across their edge: half a memory of each.
+    # Adjacent blocks are correlated across their edge, over half a correlation time of each.
     length = (samples[-1] - samples[0] + 1) / blocks
     shared = np.array([memory_of(column) for column in scores.T]) / (2.0 * length)
     wider = 1.0 / np.sqrt(1.0 - np.minimum(shared, SHARED_MAX))
@@ -174,16 +174,16 @@ def spread_of(jacobian: Floats, score: Floats, curvature: Floats, samples: Ints)
 
 
 def over_phases(jacobian: Floats, score: Floats, curvature: Floats, force_n: Floats) -> Floats:
-    """Covariance of a fit from its phases: how far it moves without one of them, in all stances.
+    """Compute the covariance of a fit by leaving out one load phase of all stances at a time.
 
-    Four phases tell little of how much they differ: it is so much wider that 1.96 of its square
-    root is Student's interval with three degrees of freedom.
+    With four phases only, it is widened so that 1.96 of its square root is Student's interval
+    with three degrees of freedom.
 
     Args:
-        jacobian: (n, p), of the residuals by the parameters; the first is a time.
-        score: as for `spread_of`.
+        jacobian: (n, p), derivatives of the residuals by the parameters; the first one is a time.
+        score: as for `compute_fit_uncertainty`.
         curvature: likewise.
-        force_n: (n,), how high the load is.
+        force_n: (n,), load.
     """
     rises, telling = jacobian[:, 0] < 0.0, jacobian[:, 0] ** 2 * curvature
     phase = np.zeros(len(force_n), dtype=np.intp)
@@ -202,7 +202,7 @@ def over_phases(jacobian: Floats, score: Floats, curvature: Floats, force_n: Flo
 def _by_group(
     jacobian: Floats, score: Floats, curvature: Floats, group: Ints
 ) -> tuple[Floats, Floats]:
-    """Normal matrices (g, p, p) and slopes of the loss (g, p) of groups from 0."""
+    """Compute normal matrices (g, p, p) and loss gradients (g, p) of groups numbered from 0."""
     groups = int(group.max()) + 1
     slopes = np.zeros((groups, jacobian.shape[1]))
     np.add.at(slopes, group, jacobian * score[:, None])
@@ -214,7 +214,7 @@ def _by_group(
 
 
 def _moved(normals: Floats, slopes: Floats) -> Floats:
-    """By how much a fit moves without each group, (g, p)."""
+    """Compute how far a fit moves without each group, (g, p)."""
     whole = normals.sum(axis=0)
     return np.stack(
         [
@@ -225,9 +225,9 @@ def _moved(normals: Floats, slopes: Floats) -> Floats:
 
 
 def _pulls(normals: Floats, slopes: Floats) -> Floats:
-    """By how much each block pulls a fit, (g, p), as if it had had no part in it (CR2)."""
+    """Compute each block's influence on a fit, (g, p), with the CR2 correction."""
     size, axes = np.linalg.eigh(normals.sum(axis=0))
-    # Of a parameter that nothing determines nothing is known; the fit says so elsewhere.
+    # An undetermined parameter is reported by the fit.
     known = size > size[-1] * len(size) * np.finfo(np.float64).eps
     root = (axes[:, known] / np.sqrt(size[known])) @ axes[:, known].T
     pulls = []
@@ -239,7 +239,7 @@ def _pulls(normals: Floats, slopes: Floats) -> Floats:
 
 
 def mean_of(values: Floats, samples: Ints) -> Estimate:
-    """Mean of values that are correlated in time; `samples` as for `block_of`."""
+    """Compute the mean of values correlated in time; `samples` as for `assign_blocks`."""
     mean = float(values.mean())
     ones = np.ones((len(values), 1))
     spread = spread_of(ones, values - mean, ones[:, 0], samples)

@@ -1,4 +1,4 @@
-"""The lag that two clock tables say, where both sessions were compared with one server's clock."""
+"""Lag by the clock tables of two sessions that share one server's clock."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from service.offline.compare.align import Alignment
 
 @dataclass(frozen=True)
 class ClockLag:
-    """What a lag has to be by the clocks alone.
+    """Lag by the clock tables alone.
 
     Attributes:
-        lag_s: as of `Alignment`, at the same instant.
-        within_s: it is off by no more: a bound, and no standard uncertainty.
+        lag_s: as in `Alignment`, at the same time.
+        error_bound_s: bound of its error; not a standard uncertainty.
     """
 
     lag_s: float
     within_s: float
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return the JSON representation."""
         return {
             "value": self.lag_s,
             "within": (self.lag_s - self.within_s, self.lag_s + self.within_s),
@@ -28,7 +28,7 @@ class ClockLag:
 
 
 def clock_notes(alignment: Alignment, by_clocks: ClockLag | None) -> list[str]:
-    """What is to be said if forces and clocks contradict each other."""
+    """Return a note if the lag by forces contradicts the lag by clocks; else an empty list."""
     if by_clocks is None:
         return []
     low_s, high_s = alignment.lag_s.interval_95

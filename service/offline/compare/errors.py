@@ -1,7 +1,7 @@
-"""How far ours is from a reference: GRF, stances, COP and coverage, by trial and over trials.
+"""Errors against a reference: GRF, stances, COP and coverage, by trial and over trials.
 
-Error is ours minus reference. Frames count in which the reference bears load and our GRF is known;
-what phases are, and coverage, is as in `service.offline.accuracy`.
+Error is ours minus reference. Frames count while the reference is loaded and our GRF is known.
+Phases and coverage are defined as in `service.offline.accuracy`.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from service.offline.compare.pairs import Pairs
 from service.offline.compare.trials import OverTrials, Trial, over_trials
 
 MARGIN_NS = 50_000_000
-"""The reference may land so much sooner than ours, or lift off so much later."""
+"""Window beyond our stance in which the reference may land earlier or lift off later."""
 
 
 @dataclass(frozen=True)
 class StanceError:
-    """One stance that both have seen from beginning to end. Ours minus reference.
+    """Errors of one stance that both recorded completely; ours minus reference.
 
     Attributes:
-        number: of the stance in the session.
+        number: index of the stance in the session.
         t_ns: UTC of its first frame.
-        peak_n: of the greatest GRF.
-        impulse_n_s: of the impulse.
-        contact_s: of the instant of contact; where both cross the same force upwards.
-        lift_off_s: of lift-off, likewise.
+        peak_n: error of the greatest GRF.
+        impulse_n_s: error of the impulse.
+        contact_s: error of the contact time: both cross the same force upwards.
+        lift_off_s: error of the lift-off time, likewise downwards.
     """
 
     number: int
@@ -48,7 +48,7 @@ class StanceError:
 
 @dataclass(frozen=True)
 class PhaseError:
-    """Frames of a phase: how many, their mean and mean absolute error, and coverage."""
+    """Errors in one phase: number of frames, mean error, mean absolute error, coverage."""
 
     frames: int
     bias_n: float
@@ -58,17 +58,17 @@ class PhaseError:
 
 @dataclass(frozen=True)
 class TrialErrors:
-    """One trial.
+    """Errors of one trial.
 
     Attributes:
-        name: of the trial.
+        name: name of the trial.
         figures: by name, as in docs/compare.md; NaN where there is nothing to judge.
-        limits_of_agreement_n: bias less and plus 1.96 standard deviations of the error.
-        phases: by name of the phase.
-        stances: those that can be compared.
-        stances_left_out: ours that cannot: cut by the trial's or the recording's end, with unknown
-            frames, or not seen by the reference.
-        cop_frames: with a COP by ours, by the reference, and by both.
+        limits_of_agreement_n: bias minus and plus 1.96 standard deviations of the error.
+        phases: errors by name of the phase.
+        stances: errors of comparable stances.
+        stances_left_out: number of our stances that are not comparable: cut by the end of trial
+            or recording, with unknown frames, or not in the reference.
+        cop_frames: number of frames with a COP by ours, by the reference, and by both.
     """
 
     name: str
@@ -82,7 +82,7 @@ class TrialErrors:
 
 @dataclass(frozen=True)
 class Errors:
-    """All trials, and each figure over them."""
+    """Errors of all trials, and each figure over them."""
 
     trials: tuple[TrialErrors, ...]
     figures: Mapping[str, OverTrials]
@@ -95,14 +95,14 @@ def errors_of(
     reference_sigma_n: float | None = None,
     reference_cop_sigma_m: float | None = None,
 ) -> Errors:
-    """Judge every trial.
+    """Compute the errors of every trial.
 
     Args:
         pairs: frames of ours with the reference.
         trials: rows of `pairs`.
-        reference_sigma_n: the reference's own standard uncertainty; None: not known, and nothing is
-            said of coverage.
-        reference_cop_sigma_m: likewise of each coordinate of its centre of pressure.
+        reference_sigma_n: standard uncertainty of the reference force; None: unknown, so
+            coverage is not computed.
+        reference_cop_sigma_m: standard uncertainty of each coordinate of its COP, likewise.
 
     Raises:
         ComparisonError: no trial has a frame.
@@ -126,7 +126,7 @@ def errors_of(
 
 
 def _within(pairs: Pairs, reference_sigma_n: float) -> Bools:
-    """Whether the error is within 1.96 of all that is uncertain: ours, the reference, the lag."""
+    """Return where the error is within 1.96 sigma of our force, the reference and the lag."""
     variance = pairs.columns["grf_sigma_n"] ** 2 + reference_sigma_n**2 + pairs.lag_n**2
     return np.asarray(np.abs(pairs.error_n) <= INTERVAL_95 * np.sqrt(variance))
 
@@ -168,7 +168,7 @@ def _trial(
     by_phase = {}
     for i, name in enumerate(PHASES):
         of_phase = rows & (phases == i)
-        # In flight the truth is zero: what the reference still reads there is its own.
+        # In flight the true force is zero: the rest is the reference's own offset.
         off_n = pairs.error_n[of_phase]
         covered = None
         if within is not None:
@@ -187,14 +187,14 @@ def _trial(
 
 
 def _stances(pairs: Pairs, rows: Bools, stances: Sequence[Stance]) -> tuple[list[StanceError], int]:
-    """Errors of the stances that begin in some rows, and how many of these cannot be compared."""
+    """Compute errors of stances that begin in `rows`; also count those not comparable."""
     t_ns, error_n = pairs.columns["t_ns"], pairs.error_n
     compared, left_out = [], 0
     for i, stance in enumerate(stances):
         first = int(np.searchsorted(t_ns, stance.begin_t_ns))
         if not rows[first]:
             continue
-        # No further than half way to the stances beside it.
+        # At most half way to the adjacent stances.
         before_ns = stances[i - 1].end_t_ns if i else stance.begin_t_ns - 2 * MARGIN_NS
         last = i == len(stances) - 1
         behind_ns = stance.end_t_ns + 2 * MARGIN_NS if last else stances[i + 1].begin_t_ns
@@ -225,7 +225,7 @@ def _stances(pairs: Pairs, rows: Bools, stances: Sequence[Stance]) -> tuple[list
 
 
 def _crossings(pairs: Pairs, window: slice) -> tuple[float, float] | None:
-    """How much later ours crosses the contact force, up and down; None if one does not."""
+    """Return our delay in s at crossing the contact force, up and down; None without a crossing."""
     t_s, found = pairs.t_s[window], []
     for force_n in (
         pairs.columns["grf_n"][window],
@@ -244,17 +244,25 @@ def _crossings(pairs: Pairs, window: slice) -> tuple[float, float] | None:
 def _cop(
     pairs: Pairs, rows: Bools, reference_sigma_m: float | None
 ) -> tuple[dict[str, float], dict[str, int]]:
-    """Errors of the COP where both are in contact and state it, and the counts."""
-    ours = np.stack([pairs.columns["cop_x_m"], pairs.columns["cop_y_m"]], axis=1)
-    by_ours = rows & (pairs.columns["contact"] == 1) & np.isfinite(ours).all(axis=1)
+    """Compute COP errors where both have contact and a COP; also the frame counts.
+
+    Only axes that our tiles measure count: tiles in one row measure one, a single tile none.
+    """
+    ours, sigma_m = (
+        np.stack([pairs.columns[f"{name}_{axis}_m"] for axis in "xy"], axis=1)
+        for name in ("cop", "cop_sigma")
+    )
+    measured = (sigma_m[rows] > 0.0).any(axis=0)
+    by_ours = rows & (pairs.columns["contact"] == 1) & measured.any()
+    by_ours &= np.isfinite(ours[:, measured]).all(axis=1)
     known = np.isfinite(pairs.reference_cop_m)
-    axes = known[rows].any(axis=0)  # of a treadmill there is one
+    axes = known[rows].any(axis=0)  # a treadmill has one axis only
     by_reference = rows & pairs.contact & known[:, axes].all(axis=1) & axes.any()
     both = by_ours & by_reference
-    off_m = ours[both] - pairs.reference_cop_m[both]
-    distance_m = np.hypot(*off_m.T)
+    off_m = np.where(measured, ours - pairs.reference_cop_m, np.nan)[both]
     mean_m = off_m.mean(axis=0) if len(off_m) else np.full(2, np.nan)
-    about_mean_m = np.hypot(*(off_m - mean_m).T)
+    distance_m = np.hypot(*np.where(measured, off_m, 0.0).T)
+    about_mean_m = np.hypot(*np.where(measured, off_m - mean_m, 0.0).T)
     figures = {
         "cop_mean_m": _mean(distance_m),
         "cop_p95_m": _p95(distance_m),
@@ -262,12 +270,10 @@ def _cop(
         "cop_bias_y_m": float(mean_m[1]),
         "cop_p95_about_mean_m": _p95(about_mean_m),
     }
-    for axis, off in zip("xy", off_m.T, strict=True):
-        sigma_m = pairs.columns[f"cop_sigma_{axis}_m"][both].astype(np.float64)
-        # Across a line of tiles nothing is measured, and nothing is uncertain.
-        told = reference_sigma_m is not None and (sigma_m > 0.0).any() and np.isfinite(off).any()
-        most_m = INTERVAL_95 * np.hypot(sigma_m, reference_sigma_m or 0.0)
-        figures[f"cop_coverage_{axis}_95"] = _mean(np.abs(off) <= most_m) if told else math.nan
+    most_m = INTERVAL_95 * np.hypot(sigma_m[both].astype(np.float64), reference_sigma_m or 0.0)
+    for axis, off, most in zip("xy", off_m.T, most_m.T, strict=True):
+        told = reference_sigma_m is not None and np.isfinite(off).any()
+        figures[f"cop_coverage_{axis}_95"] = _mean(np.abs(off) <= most) if told else math.nan
     counts = {"ours": by_ours, "reference": by_reference, "both": both}
     return figures, {name: int(which.sum()) for name, which in counts.items()}
 

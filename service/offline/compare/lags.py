@@ -1,7 +1,7 @@
-"""Lags at which two forces resemble each other, from their masked cross-correlation.
+"""Candidate lags of two forces, from their masked cross-correlation.
 
-Masked as by Padfield (2012): at every lag the correlation coefficient of the samples that both
-have, so that neither an overlap that shrinks nor a gap makes one lag look better than another.
+Masked after Padfield (2012): at every lag, the correlation coefficient of the samples that both
+have, so that neither a shrinking overlap nor a gap favours a lag.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from service.offline.compare.signals import Even, Signal, even
 STEP_S = 0.005
 SAMPLES_MAX = 1 << 22
 ISLANDS_MAX = 256
-"""Stretches of one signal, parted by its longest gaps, in which nothing is resampled."""
+"""Largest number of islands: parts of a signal between its longest gaps, which are skipped."""
 OVERLAP_MIN = 0.5
-"""Of what the one with fewer samples has, so much has to overlap at a lag."""
+"""Least overlap at a lag, relative to the signal with fewer samples."""
 
 
 @dataclass(frozen=True)
 class Peak:
-    """A lag at which correlation has a maximum.
+    """Local maximum of the correlation.
 
     Attributes:
-        lag_s: reference time less our time of the same event.
-        correlation: coefficient.
+        lag_s: reference time minus our time of the same event.
+        correlation: coefficient at that lag.
     """
 
     lag_s: float
@@ -41,13 +41,13 @@ class Peak:
 
 @dataclass(frozen=True)
 class Peaks:
-    """The best lag, and the best of those beyond the hill that it stands on.
+    """Best lag, and the second-best local maximum.
 
     Attributes:
-        best: it.
-        rival: None if there is no other maximum.
-        opposite: correlation at the best lag of the reference's force turned.
-        step_s: of the lags.
+        best: highest maximum.
+        rival: highest maximum outside the best one's hill; None if there is none.
+        inverted_correlation: highest correlation with the reference's sign inverted.
+        step_s: resolution of the lags.
     """
 
     best: Peak
@@ -59,15 +59,15 @@ class Peaks:
 def likely_lags(
     ours: Signal, reference: Signal, lag_range_s: tuple[float, float] | None
 ) -> Peaks | None:
-    """Lags of a reference behind our force, coarsely.
+    """Find candidate lags of a reference behind our force, coarsely.
 
     Args:
         ours: our force.
-        reference: that of the reference.
-        lag_range_s: least and greatest lag that can be; None: any.
+        reference: the reference force.
+        lag_range_s: smallest and largest allowed lag; None: any.
 
     Returns:
-        The lags; None if there is none at which enough overlaps.
+        The lags; None if no lag has enough overlap.
     """
     sides, step_s = _even_sides(ours, reference)
     lags_s, correlation = _correlation(*sides)
@@ -94,7 +94,7 @@ def likely_lags(
 def _even_sides(ours: Signal, reference: Signal) -> tuple[tuple[Even, Even], float]:
     """Return both signals at the same even steps, and the step in s.
 
-    Long gaps part them into islands, in as many as make least work.
+    Long gaps split them into islands; the number of islands minimises the work.
     """
     # Of each pair of islands there are as many lags as both have samples.
     work_s, own, theirs = min(
@@ -111,7 +111,7 @@ def _even_sides(ours: Signal, reference: Signal) -> tuple[tuple[Even, Even], flo
 
 
 class _Split(NamedTuple):
-    """A way to part a signal into islands: at gaps beyond so many s, leaving so many s in them."""
+    """Split of a signal into islands at gaps longer than `gap_s`; `held_s` of signal remain."""
 
     islands: int
     held_s: float
@@ -130,7 +130,7 @@ def _splits(signal: Signal) -> list[_Split]:
 
 
 def _islands(side: Even) -> list[slice]:
-    """Return the stretches of a signal without a long gap in them."""
+    """Return the islands of a signal, parts without a long gap, as slices."""
     ends = np.flatnonzero(np.diff(side.step) > 1) + 1
     return [slice(int(a), int(b)) for a, b in pairwise([0, *ends, len(side.step)])]
 
@@ -138,15 +138,15 @@ def _islands(side: Even) -> list[slice]:
 def _correlation(ours: Even, reference: Even) -> tuple[Floats, Floats]:
     """Return lags, and the correlation coefficient at each.
 
-    It is -inf where too little overlaps, or is constant. Of lags at which no islands overlap there
-    are none, and one of -inf stands in their place.
+    The coefficient is -inf where the overlap is too short or constant. Lags at which no islands
+    overlap are left out, except one per gap, with -inf.
     """
     masks = [one.known.astype(np.float64) for one in (ours, reference)]
     values = [
         mask * (one.force_n - one.force_n[one.known].mean() if one.known.any() else 0.0)
         for one, mask in zip((ours, reference), masks, strict=True)
     ]
-    # What is summed over the samples of both at a lag: how many, and their moments.
+    # Sums over the common samples at a lag: their count and moments.
     factors = [
         (masks[0], masks[1]),
         (values[0], masks[1]),
@@ -174,9 +174,9 @@ def _correlation(ours: Even, reference: Even) -> tuple[Floats, Floats]:
 def _summed(
     ours: Even, reference: Even, factors: Sequence[tuple[Floats, Floats]]
 ) -> tuple[Floats, list[Floats]]:
-    """Return lags in steps, rising, and at each the sums over i of a[i] b[i + lag] of all factors.
+    """Return lags in steps, rising, and for all factors the sums over i of a[i] b[i + lag].
 
-    Lags at which no two islands overlap are left out, but for one beside those that do.
+    Lags at which no two islands overlap are left out, except one per gap.
     """
     pairs = [
         (mine, theirs, int(reference.step[theirs.start] - ours.step[mine.stop - 1]))
@@ -192,7 +192,7 @@ def _summed(
         if merged and begin <= merged[-1][1]:
             merged[-1][1] = max(merged[-1][1], end)
         else:
-            merged.append([begin, end + 1])  # one more, where nothing overlaps
+            merged.append([begin, end + 1])  # one more, without overlap
     lags = np.concatenate([np.arange(begin, end) for begin, end in merged])
     sums = [np.zeros(len(lags)) for _ in factors]
     for (mine, theirs, first), (begin, end) in zip(pairs, ranges, strict=True):

@@ -1,11 +1,11 @@
-"""What a plate shows of a mounted foot: the gain of its tiles, and which way the ground pushes.
+"""Fit of a mounted foot's tile gains and shear against a force plate.
 
     reference = zero + sum of gain F (1 + shear (1 - cos a)) + late dF/dt
 
-by robust least squares, with F what our tiles say they bear, `a` the angle between a tile's axis
-and the vertical, and `late` what is left of the lag, which would else go into the gains. All of it
-is refused that the load does not determine: gains of tiles that always bear their loads together,
-or the shear of a foot whose tiles are never far from upright.
+by robust least squares, where F are our tile forces, `a` is the angle between a tile's axis and the
+vertical, and `late` is the residual lag, which would otherwise bias the gains. Parameters that the
+load does not determine are rejected: gains of tiles that are always loaded together, or the shear
+of a foot whose tiles stay nearly upright.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from service.offline.compare.blocks import NORMAL_95, Estimate, over_phases, spr
 from service.offline.compare.pairs import Pairs
 
 GAIN_SIGMA_MAX = 0.05
-"""Of a gain: a bench is as good as that without any plate."""
+"""Largest standard uncertainty of a gain: a calibration rig reaches it without a plate."""
 SHEAR_SIGMA_MAX = 0.3
-"""Half of what is known beforehand: all from -1 to 1 alike has 0.58."""
+"""Largest standard uncertainty of the shear: half of the 0.58 of a uniform prior from -1 to 1."""
 SINGULAR = 1e-10
-"""Part of the greatest eigenvalue of the columns' correlations at which they are the same."""
+"""Relative eigenvalue of the columns' correlation matrix below which columns are collinear."""
 FRAMES_MIN = 200
-"""Under load: fewer tell nothing of phases and blocks."""
+"""Least number of loaded frames for phases and blocks."""
 FOLDS = 10
-"""Blocks of time, every other one judged by what the rest has told."""
+"""Number of time blocks for cross-validation."""
 
 _LATE, _ZERO, _GAINS = 0, 1, 2
 
 
 @dataclass(frozen=True)
 class Mount:
-    """What was found.
+    """Result of a fit against a plate.
 
     Attributes:
-        gains: of each tile, the same for all if one was asked for.
-        shear: None if it was not asked for.
-        late_s: what was left of the lag.
-        before_n: mean absolute error of the GRF under load, as it was, zero of the reference off.
-        after_n: the same with gains and shear, in stretches that they were not fitted to.
-        frames: under load.
-        blocks: of time, from which the uncertainties are.
+        gains: gain of each tile; all equal if one common gain was fitted.
+        shear: shear coefficient; None if it was not fitted.
+        residual_lag_s: residual lag.
+        mae_before_n: mean absolute GRF error under load before the fit, reference zero removed.
+        mae_after_n: cross-validated mean absolute GRF error with gains and shear.
+        frame_count: number of loaded frames.
+        block_count: number of time blocks behind the uncertainties.
     """
 
     gains: tuple[Parameter, ...]
@@ -64,7 +64,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class _Load:
-    """Frames that tell, n of them, and to which gain (g of them) each tile belongs."""
+    """Loaded frames (n), and the index of the gain (g gains) of each tile."""
 
     reference_n: Floats
     force_n: Floats
@@ -75,17 +75,17 @@ class _Load:
     with_shear: bool
 
     def model_n(self, x: Floats) -> Floats:
-        """What the reference should read, (n,)."""
+        """Compute the modelled reference force, (n,)."""
         upright = 1.0 + (x[-1] if self.with_shear else 0.0) * self.tilted
         gained = (self.force_n * upright) @ x[_GAINS + self.gain_of]
         return np.asarray(gained + x[_ZERO] + x[_LATE] * self.rate)
 
     def off_n(self, x: Floats) -> Floats:
-        """How far the reference is from that, (n,)."""
+        """Compute the residual of the reference, (n,)."""
         return np.asarray(self.reference_n - self.model_n(x))
 
     def jacobian(self, x: Floats) -> Floats:
-        """Of `off_n`, (n, p)."""
+        """Compute the derivatives of `compute_residual_n`, (n, p)."""
         upright = 1.0 + (x[-1] if self.with_shear else 0.0) * self.tilted
         columns = [self.rate, np.ones(len(self.rate))]
         for g in range(self.gains):
@@ -95,11 +95,11 @@ class _Load:
         return -np.stack(columns, axis=1)
 
     def grf_n(self, x: Floats) -> Floats:
-        """The GRF with gains and shear, (n,)."""
+        """Compute the GRF with gains and shear, (n,)."""
         return np.asarray(self.model_n(x) - x[_ZERO] - x[_LATE] * self.rate)
 
     def of(self, rows: Bools) -> _Load:
-        """Some of the frames."""
+        """Select frames."""
         return _Load(
             self.reference_n[rows],
             self.force_n[rows],
@@ -111,7 +111,7 @@ class _Load:
         )
 
     def fit(self) -> tuple[Floats, float]:
-        """Parameters (p,), late, zero, gains, shear; and from where on residuals count less."""
+        """Fit the parameters (p,), late, zero, gains, shear; also return Huber's threshold in N."""
         x = np.concatenate([[0.0, 0.0], np.ones(self.gains), np.zeros(int(self.with_shear))])
         start = self.jacobian(x)[:, : _GAINS + self.gains]
         x[: _GAINS + self.gains] = -np.linalg.lstsq(start, self.reference_n, rcond=None)[0]
@@ -145,19 +145,19 @@ def fit_mount(
     shear: bool = False,
     reference_gain_sigma: float = 0.0,
 ) -> Mount:
-    """Fit gains, and shear if asked for.
+    """Fit tile gains, and optionally shear, against a plate.
 
     Args:
-        pairs: our frames with the reference, its zero taken off.
-        force_n: (n, tiles), what each bearing tile says it bears.
-        tilted: (n, tiles), 1 - cos of the angle between its axis and the vertical; NaN: not known.
-        serials: of the tiles.
-        per_tile: a gain for each tile, and not one for all.
-        shear: which way the ground pushes, too.
-        reference_gain_sigma: standard uncertainty of the reference's own gain.
+        pairs: our frames with the reference, its zero removed.
+        force_n: (n, tiles), forces of the load-bearing tiles.
+        tilt_loss: (n, tiles), 1 - cos of the angle between tile axis and vertical; NaN: unknown.
+        serials: serials of the tiles.
+        per_tile: fit a gain for each tile instead of one for all.
+        fit_shear: fit the shear coefficient too.
+        reference_gain_sigma: standard uncertainty of the reference's gain.
 
     Raises:
-        CalibrationError: the load does not determine what was asked for.
+        CalibrationError: the load does not determine the requested parameters.
     """
     known = pairs.judged & np.isfinite(pairs.error_n) & np.isfinite(force_n).all(axis=1)
     known &= np.isfinite(tilted).all(axis=1) | (not shear)
@@ -209,12 +209,12 @@ def fit_mount(
 
 
 def _parameter(found: Estimate) -> Parameter:
-    """With a sigma whose 1.96 are the interval, few as the blocks may be."""
+    """Convert to a `Parameter` whose 1.96 sigma is Student's 95 % interval."""
     return Parameter(value=found.value, sigma=(found.interval_95[1] - found.value) / NORMAL_95)
 
 
 def _refuse_alike(jacobian: Floats, names: Sequence[str]) -> None:
-    """Refuse what the load does not tell apart at all: columns that are the same, or nothing."""
+    """Reject parameters whose columns are zero or collinear."""
     size = np.linalg.norm(jacobian, axis=0)
     alike = size <= SINGULAR * size.max()
     if not alike.any():
@@ -228,7 +228,7 @@ def _refuse_alike(jacobian: Floats, names: Sequence[str]) -> None:
 def _refuse_doubtful(
     gains: Sequence[Parameter], shear: Parameter | None, names: Sequence[str]
 ) -> None:
-    """Refuse what is known less well than a bench, or friction, would tell."""
+    """Reject parameters with too large an uncertainty: see `GAIN_SIGMA_MAX`, `SHEAR_SIGMA_MAX`."""
     doubtful = [
         f"{name} ({gain.value:.3f} with a sigma of {gain.sigma:.3f})"
         for name, gain in zip(names, gains, strict=False)
@@ -258,9 +258,9 @@ def _undetermined(what: Sequence[str]) -> CalibrationError:
 
 
 def _judged(load: _Load, pairs: Pairs, known: Bools) -> tuple[float, float]:
-    """Mean absolute error under load before and after, each stretch by a fit to the others."""
+    """Compute the mean absolute error under load before, and cross-validated after, the fit."""
     contact = pairs.contact[known]
-    # Stretches with equally much load: a few stances may be all there is.
+    # Folds with equal numbers of loaded frames: there may be a few stances only.
     fold = (np.cumsum(contact) - contact) * FOLDS // contact.sum() % 2
     before_n = np.abs(pairs.error_n[known])
     after_n = np.empty(len(contact))

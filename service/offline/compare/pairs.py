@@ -1,4 +1,4 @@
-"""Our frames with what the reference says at the same instants."""
+"""Our frames paired with the reference's values at the same times."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from service.offline.compare.blocks import Estimate, mean_of
 from service.offline.compare.signals import Signal
 
 COMPARED = ("seq", "t_ns", *GATHERED, "cop_y_m", "cop_sigma_y_m")
-"""Columns of a session that are compared."""
+"""Session columns that a comparison reads."""
 
 CONTACT_SIGMA = 5.0
-"""The reference bears load above so many sigma of its noise without load, as for our contact."""
+"""Contact threshold of the reference, in sigma of its unloaded noise, as for our contact."""
 SETTLE_S = 0.02
-"""A frame in flight is this far from any contact: averaging is over, and ringing nearly."""
+"""Time from any contact after which a frame is in flight: averaging and most ringing have ended."""
 SAME_RATE = 1.05
-"""Steps that differ by less are of one rate."""
+"""Largest ratio of time steps that count as the same rate."""
 FLIGHT_MIN = 50
-"""Frames in flight from which a zero can be told."""
+"""Least number of flight frames to estimate the zero."""
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What a reference has measured, in SI units and with our signs.
+    """Measurements of a reference, in SI units and with our signs.
 
     Attributes:
         force: vertical force of the ground on the foot.
-        cop_m: (n, 2), in the foot frame; NaN where it is not stated; None if it never is.
+        cop_m: (n, 2), COP in the foot frame; NaN where missing; None if there is none.
     """
 
     force: Signal
     cop_m: Floats | None = None
 
     def cop_at(self, t_s: Floats) -> Floats:
-        """Centre of pressure at instants (m,), (m, 2); NaN unless both samples beside state it."""
+        """Interpolate the COP at times (m,), (m, 2); NaN unless both adjacent samples have it."""
         if self.cop_m is None:
             return np.full((len(t_s), 2), np.nan)
         known = self.force.known_at(t_s)
@@ -54,21 +54,20 @@ class Reference:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Frames of ours at which the reference is known, n of them.
+    """Our n frames at which the reference is known.
 
     Attributes:
-        columns: ours, `COMPARED`.
+        columns: our columns, `COMPARED_COLUMNS`.
         t_s: (n,), since the first frame of the session.
-        reference_n: (n,), its force; less its zero, if that was asked for.
-        reference_cop_m: (n, 2).
-        contact: (n,), the reference bears load.
-        contact_n: above how many newtons over its zero it does.
-        lag_n: (n,), what the lag's uncertainty makes of the reference's force: its rate of change
-            times that.
-        judged: (n,), frames that count: all, or of a reference that is slower than ours those
-            nearest to its samples, so that none of these counts twice.
-        zero_n: what the reference reads in flight; None if it was never in flight long enough.
-        removed: whether that was taken off.
+        reference_n: (n,), reference force, minus its zero if `is_zero_removed`.
+        reference_cop_m: (n, 2), reference COP.
+        reference_contact: (n,), True where the reference is loaded.
+        contact_threshold_n: contact threshold of the reference above its zero.
+        lag_sigma_n: (n,), force uncertainty due to the lag: rate of change times lag sigma.
+        is_counted: (n,), frames that count: all; with a reference slower than ours, the nearest to
+            each of its samples, so that no sample counts twice.
+        reference_zero_n: reference reading in flight; None without a long enough flight.
+        is_zero_removed: True if the zero is subtracted from `reference_n`.
     """
 
     columns: Columns
@@ -84,17 +83,17 @@ class Pairs:
 
     @property
     def zero_left_n(self) -> float:
-        """What is still in `reference_n` where nothing presses."""
+        """Zero still contained in `reference_n`."""
         return 0.0 if self.removed or self.zero_n is None else self.zero_n.value
 
     @property
     def error_n(self) -> Floats:
-        """Ours less the reference, (n,); NaN where our GRF is not known."""
+        """Our GRF minus the reference, (n,); NaN where our GRF is unknown."""
         return np.asarray(self.columns["grf_n"] - self.reference_n)
 
 
 def seconds_of(t_ns: Times) -> Floats:
-    """Seconds since the first frame."""
+    """Convert times in ns to seconds since the first frame."""
     return np.asarray((t_ns - t_ns[0]) * 1e-9)
 
 
@@ -106,15 +105,15 @@ def pair(
     remove_offset: bool = False,
     contact_n: float | None = None,
 ) -> Pairs:
-    """Put the reference beside our frames.
+    """Interpolate the reference at the times of our frames.
 
     Args:
-        columns: `COMPARED` of a session, one value per frame.
-        reference: it.
-        alignment: of the two.
-        remove_offset: take off what the reference reads in flight.
-        contact_n: above how many newtons the reference bears load; None: `CONTACT_SIGMA` of its
-            noise in flight, and `GRF_FROM_N` at least.
+        columns: `COMPARED_COLUMNS` of a session, one value per frame.
+        reference: measurements of the reference.
+        alignment: alignment of both.
+        remove_offset: subtract the reference's mean reading in flight.
+        contact_n: contact threshold of the reference; None: `CONTACT_SIGMA` times its noise in
+            flight, at least `GRF_FROM_N`.
     """
     t_s = seconds_of(columns["t_ns"])
     to_s = alignment.reference_s(t_s)
@@ -144,7 +143,7 @@ def pair(
 def _flight(
     t_s: Floats, contact: npt.NDArray[np.uint8], reference_n: Floats
 ) -> tuple[Estimate | None, float]:
-    """Zero of the reference, and its noise, where our foot is in flight."""
+    """Estimate zero and noise of the reference from frames in which our foot is in flight."""
     loaded_s = t_s[contact != 0]
     flying = (contact == 0) & np.isfinite(reference_n)
     if len(loaded_s):
@@ -156,7 +155,7 @@ def _flight(
     if len(rows) < FLIGHT_MIN:
         return None, 0.0
     values_n = reference_n[rows]
-    # Contacts that only the reference has seen are none of its noise.
+    # Contacts that only the reference shows are not noise.
     middle_n = np.median(values_n)
     noise_n = 1.4826 * float(np.median(np.abs(values_n - middle_n)))
     quiet = np.abs(values_n - middle_n) <= max(CONTACT_SIGMA * noise_n, GRF_FROM_N)
@@ -166,7 +165,7 @@ def _flight(
 
 
 def _nearest(at_s: Floats, samples_s: Floats) -> Bools:
-    """Which of n instants count: all if samples are closer than they, else the nearest to each."""
+    """Select the times that count: all, or the nearest to each sample of a slower reference."""
     if len(at_s) < 2 or not (np.median(np.diff(samples_s)) > SAME_RATE * np.median(np.diff(at_s))):
         return np.ones(len(at_s), dtype=np.bool_)
     after = np.clip(np.searchsorted(at_s, samples_s), 1, len(at_s) - 1)

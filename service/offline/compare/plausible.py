@@ -1,4 +1,4 @@
-"""What a reference's numbers cannot be, judged by ours: a wrong unit, a place off the foot."""
+"""Plausibility checks of a reference against our data: units, scale, drift, COP position."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from service.offline.compare.signals import Signal
 
 THOUSAND = 1000.0
 STEP_MIN_S = 0.3
-"""Between two samples of a reference whose unit of time is in doubt."""
+"""Sample interval from which a reference's time unit is doubtful."""
 NEAR = 3.0
-"""A scale within this factor of a thousand, or of a thousandth, is a wrong unit."""
+"""A scale within this factor of 1000 or 1/1000 means a wrong unit."""
 FEET = 10.0
-"""A COP that travels over so many lengths of the foot is in another unit."""
+"""COP range, in foot lengths, from which the COP must be in another unit."""
 BORNE = 0.1
-"""Of the greatest force: where there is less, a COP does not tell its unit or its place."""
+"""Force, relative to the greatest, below which the COP is not checked."""
 OUTSIDE_SHARE = 0.05
 SCALE_FAR = 2.0
-"""No gain of a mounted foot is further from one; a unit, or another foot, is."""
+"""Scale, or its inverse, beyond any mounted foot's gain: the unit or the foot is another."""
 OTHER_UNITS = {"kgf": 9.80665, "lbf": 4.44822}
 DRIFT_FAR_PPM = 500.0
-"""Clocks of crystals are within 100 ppm of one another."""
+"""Implausible drift; crystal clocks differ by at most 100 ppm."""
 RANGE = (5.0, 95.0)
-"""Percentiles between which it travels."""
+"""Percentiles that define the COP's range."""
 
 
 def check_time_unit(ours: Signal, reference: Signal) -> None:
-    """Refuse a reference whose seconds are milliseconds, or less.
+    """Reject a reference whose times are not in seconds.
 
     Raises:
-        ComparisonError: it is some thousand times as long, with samples too far apart to tell
-            steps: a long recording at a usual rate is none of these.
+        ComparisonError: it lasts some thousand times as long, and its samples are too far apart
+            to resolve steps. A long recording at a usual rate passes.
     """
     if reference.step_s < STEP_MIN_S:
         return
@@ -51,10 +51,10 @@ def check_time_unit(ours: Signal, reference: Signal) -> None:
 
 
 def check_force_unit(alignment: Alignment) -> None:
-    """Refuse a reference whose force is some thousand times ours, or a thousandth.
+    """Reject a reference whose force is about 1000 times ours, or 1/1000.
 
     Raises:
-        ComparisonError: it is.
+        ComparisonError: the scale is near 1000 or 1/1000.
     """
     scale = alignment.scale.value
     for factor, unit in ((THOUSAND, "kN"), (1.0 / THOUSAND, "mN")):
@@ -67,7 +67,7 @@ def check_force_unit(alignment: Alignment) -> None:
 
 
 def far_notes(alignment: Alignment) -> list[str]:
-    """What scale and drift say where no foot and no clock is that far off."""
+    """Return notes on an implausible scale or drift."""
     notes, scale = [], alignment.scale.value
     if not 1.0 / SCALE_FAR < scale < SCALE_FAR:
         near = next((u for u, n in OTHER_UNITS.items() if n / 1.25 < scale < n * 1.25), None)
@@ -83,7 +83,7 @@ def far_notes(alignment: Alignment) -> list[str]:
 
 
 def gain_notes(alignment: Alignment) -> list[str]:
-    """What to do about a scale that is not one, and may be a foot's."""
+    """Return advice for a plausible scale that differs from one."""
     low, high = alignment.scale.interval_95
     if low <= 1.0 <= high or not 1.0 / SCALE_FAR < alignment.scale.value < SCALE_FAR:
         return []
@@ -94,17 +94,17 @@ def gain_notes(alignment: Alignment) -> list[str]:
 
 
 def cop_notes(pairs: Pairs, places_m: Floats) -> list[str]:
-    """What is odd about where the reference's centre of pressure is.
+    """Return notes on an implausible COP of the reference.
 
     Args:
         pairs: our frames with the reference.
-        places_m: (tiles, 2), of the tiles that bear load, in the foot frame.
+        tile_positions_m: (tiles, 2), positions of the load-bearing tiles in the foot frame.
 
     Raises:
-        ComparisonError: it is in another unit.
+        ComparisonError: the COP is in another unit.
     """
     rows = pairs.contact & np.isfinite(pairs.reference_cop_m).all(axis=1)
-    # Under a few newtons a plate's centre of pressure is noise over noise, whatever its unit.
+    # At a few newtons a plate's COP is noise divided by noise.
     over_zero_n = pairs.reference_n - pairs.zero_left_n
     rows &= over_zero_n > BORNE * np.max(over_zero_n, initial=0.0, where=rows)
     if not rows.any() or len(places_m) < 2:

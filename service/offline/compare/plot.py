@@ -1,4 +1,4 @@
-"""The picture of a comparison: GRF, tiles, COP, and how the error goes with the force."""
+"""Plot of a comparison: GRF, tiles, COP, and error over force."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from service.offline.plots import new_figure, png_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito: told apart with any colour vision.
+# Okabe and Ito: distinct for any colour vision.
 OURS, THEIRS = "#0072B2", "#D55E00"
 TILES = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#F0E442", "#0072B2", "#D55E00", "#999999")
 SHOWN_S = 4.0
-"""Of the recording so much is drawn over time, from shortly before the first common contact."""
+"""Duration of the time plots, from shortly before the first common contact."""
 LEAD_S = 0.2
 POINTS_MAX = 5000
 
@@ -28,14 +28,14 @@ POINTS_MAX = 5000
 def plot_comparison(
     title: str, pairs: Pairs, force_n: Floats, serials: Sequence[str], errors: Errors
 ) -> bytes:
-    """The picture as a PNG.
+    """Draw a comparison as a PNG.
 
     Args:
-        title: above it.
+        title: title of the figure.
         pairs: our frames with the reference, n of them.
         force_n: (n, tiles), forces of the tiles.
-        serials: of the tiles.
-        errors: limits of agreement are those of its trials.
+        serials: serials of the tiles.
+        errors: source of the limits of agreement.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -67,7 +67,7 @@ def _shown(pairs: Pairs) -> Bools:
 
 
 def stretch(shown_s: Floats, all_s: Floats) -> str:
-    """Which part of what was compared is drawn over time."""
+    """Describe the part of the comparison shown in the time plots."""
     shown, whole = (f"{s[0]:.1f} to {s[-1]:.1f} s" for s in (shown_s, all_s))
     if len(shown_s) == len(all_s):
         return f"over time: all that was compared, {whole}"
@@ -99,7 +99,7 @@ def _tiles(
 ) -> None:
     borne = [i for i in range(force_n.shape[1]) if np.isfinite(force_n[:, i]).any()]
     if borne:
-        # Tiles on top of one another come to the GRF; what is below zero has no place in that.
+        # Stacked tiles sum to the GRF; negative forces cannot be stacked.
         heights_n = np.maximum(np.nan_to_num(force_n[:, borne].T), 0.0)
         colours = [TILES[k % len(TILES)] for k in range(len(borne))]
         names = [serials[i] for i in borne]

@@ -1,4 +1,4 @@
-"""A comparison as Markdown."""
+"""Markdown report of a comparison."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ FIGURES: Mapping[str, str] = {
     "cop_coverage_x_95": "COP, part within the 95 % interval along x",
     "cop_coverage_y_95": "COP, part within the 95 % interval along y",
 }
-"""Every figure, and what it is."""
+"""Title of every figure, by name."""
 AT_LEAST = frozenset(
     {
         *("grf_frames", "stances", "grf_r2", "grf_coverage_95"),
         *("cop_coverage_x_95", "cop_coverage_y_95"),
     }
 )
-"""Figures of which more is better: a limit is the least they may be, and of others the most."""
+"""Figures with a lower limit; the limits of all others are upper limits."""
 
 
 def markdown(
@@ -58,7 +58,7 @@ def markdown(
     trials_are: str,
     notes: Sequence[str],
 ) -> str:
-    """All of a comparison that people read."""
+    """Format the report of a comparison."""
     lines = [f"# {printable(title)}", "", *(f"- {printable(note)}" for note in notes), ""]
     lines += _alignment(alignment, by_clocks, pairs)
     lines += _figures(errors, trials_are)
@@ -172,5 +172,5 @@ def _interval(found: OverTrials) -> str:
 
 
 def number(value: float) -> str:
-    """Four digits; a dash for what is not known."""
+    """Format a number with four digits; NaN as a dash."""
     return "-" if math.isnan(value) else f"{value:.4g}"

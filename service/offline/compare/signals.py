@@ -1,4 +1,4 @@
-"""Two forces over time, as alignment needs them: evenly sampled, low-passed alike, gaps known."""
+"""Force signals for alignment: even sampling, identical low-pass, known gaps."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from devices.arrays import Bools, Floats, Ints
 from devices.errors import ComparisonError
 
 GAP_STEPS = 3.5
-"""A step in time of so many usual ones is a gap: nothing is known in it."""
+"""Shortest gap, in usual time steps; the signal is unknown within gaps."""
 
 STEPS_MAX = 32_000_000
-"""An hour of a foot at 544 Hz beside a plate of any rate; some 2 GB while it is resampled."""
+"""An hour of a foot at 544 Hz with a plate of any rate; some 2 GB during resampling."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A force over time on a clock of its own.
+    """Force over time on its own clock.
 
     Attributes:
         t_s: (n,), rising.
-        force_n: (n,), finite: samples without a force are left out, and are gaps then.
-        sigma_n: (n,), its stated standard uncertainty, which may be the same from stance to stance;
-            None: nothing is stated.
+        force_n: (n,), finite; samples without a force are left out and leave gaps.
+        sigma_n: (n,), stated standard uncertainty, whose error may repeat in every stance; None:
+            not stated.
     """
 
     t_s: Floats
@@ -34,11 +34,11 @@ class Signal:
 
     @property
     def step_s(self) -> float:
-        """The usual time between two samples."""
+        """Median time between two samples."""
         return float(np.median(np.diff(self.t_s)))
 
     def known_at(self, t_s: Floats) -> Bools:
-        """Whether instants (m,) lie between two samples with no gap between them."""
+        """Return which times (m,) are between two samples without a gap."""
         after = np.searchsorted(self.t_s, t_s)
         inside = (after > 0) & (after < len(self.t_s))
         after = np.clip(after, 1, len(self.t_s) - 1)
@@ -47,7 +47,7 @@ class Signal:
         return np.asarray(exact | (inside & (gap_s <= GAP_STEPS * self.step_s)))
 
     def at(self, t_s: Floats) -> Floats:
-        """Force at instants (m,), straight between samples; NaN where it is not known."""
+        """Interpolate the force linearly at times (m,); NaN within gaps."""
         force_n = np.interp(t_s, self.t_s, self.force_n)
         force_n[~self.known_at(t_s)] = np.nan
         return np.asarray(force_n, dtype=np.float64)
@@ -55,14 +55,14 @@ class Signal:
 
 @dataclass(frozen=True)
 class Even:
-    """A signal at even steps, without the inside of long gaps; n samples.
+    """Signal at even steps, without the inside of long gaps; n samples.
 
     Attributes:
-        begin_s: instant of step 0.
-        step_s: between two steps.
-        step: (n,), rising; number of the step of each sample. It jumps over long gaps.
-        force_n: (n,); straight across where it is not known.
-        known: (n,).
+        begin_s: time of step 0.
+        step_s: time between two steps.
+        step_index: (n,), rising; step number of each sample. It jumps over long gaps.
+        force_n: (n,); linear across unknown parts.
+        is_known: (n,), False within gaps.
     """
 
     begin_s: float
@@ -73,11 +73,11 @@ class Even:
 
     @property
     def t_s(self) -> Floats:
-        """Instants of the samples."""
+        """Times of the samples."""
         return np.asarray(self.begin_s + self.step_s * self.step, dtype=np.float64)
 
     def known_at(self, t_s: Floats) -> Bools:
-        """Tell whether the samples nearest to instants (m,) are known."""
+        """Return whether the samples nearest to times (m,) are known."""
         if not len(self.step):
             return np.zeros(len(t_s), dtype=np.bool_)
         step = np.rint((t_s - self.begin_s) / self.step_s)
@@ -93,20 +93,20 @@ def even(
     gap_s: float = 0.0,
     within_s: tuple[float, float] = (-np.inf, np.inf),
 ) -> Even:
-    """Return a signal at even steps, straight between its samples.
+    """Resample a signal linearly at even steps.
 
-    The size does not follow from how long a signal is, which one wrong time stamp decides, but from
-    how much of it there is.
+    The size depends on the time with samples, not on the total duration, which a single wrong time
+    stamp can make huge.
 
     Args:
         signal: the signal.
-        step_s: between two steps.
-        edge_steps: steps that are kept at either side of a long gap.
-        gap_s: a gap that is longer, and longer than its edges, is long.
-        within_s: nothing is returned of before and after.
+        step_s: time between two steps.
+        edge_steps: steps kept at either side of a long gap.
+        gap_s: shortest long gap; a long gap is also longer than its edges.
+        range_s: begin and end of the returned range.
 
     Raises:
-        ComparisonError: there were more than `STEPS_MAX` steps.
+        ComparisonError: more than `STEPS_MAX` steps would result.
     """
     place = (signal.t_s - signal.t_s[0]) / step_s
     long = np.diff(place) > max(2 * edge_steps + 2, gap_s / step_s)
@@ -138,20 +138,20 @@ def smooth(
     margin_s: float = 0.0,
     within_s: tuple[float, float] = (-np.inf, np.inf),
 ) -> Even:
-    """A signal under a Gaussian window, at even steps.
+    """Low-pass a signal with a Gaussian window, at even steps.
 
-    Two signals under the same window are as far apart in time as before, while their noise has no
-    say in where between two samples they fit best: straight lines between noisy samples do.
+    The same window for two signals keeps their lag, and removes the bias that linear interpolation
+    between noisy samples would add to it.
 
     Args:
         signal: the signal.
         width_s: standard deviation of the window.
-        step_s: of the result; at most half the width.
-        margin_s: further than the window that a known sample is away from any gap.
-        within_s: nothing is returned of before and after.
+        step_s: step of the result; at most half the width.
+        margin_s: distance from any gap, beyond the window, that known samples keep.
+        range_s: begin and end of the returned range.
     """
     reach = round((3.0 * width_s + margin_s) / step_s)
-    # The window reaches over four of its widths: no sample that is known sees beyond an edge.
+    # The window spans four widths per side: no known sample depends on values beyond an edge.
     edge_steps = reach + round(4.0 * width_s / step_s)
     raw = even(signal, step_s, edge_steps, within_s=within_s)
     known = minimum_filter1d(raw.known.view(np.uint8), 2 * reach + 1, mode="constant", cval=0)

@@ -1,4 +1,4 @@
-"""Trials: what is as good as independent of one another, and means over them with intervals."""
+"""Trials, the nearly independent units of a comparison, and means over trials with intervals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.stats import bootstrap
 from devices.arrays import Bools, Floats, Times
 
 BOOTSTRAP_FROM = 20
-"""From so many trials on their own distribution is taken, below that Student's t."""
+"""Least number of trials for a bootstrap interval; below, Student's t is used."""
 RESAMPLES = 9999
 _SEED = 0
 _UPPER_95 = 0.975
@@ -22,11 +22,11 @@ _UPPER_95 = 0.975
 
 @dataclass(frozen=True)
 class Mark:
-    """Something a person marked.
+    """Marker that begins a trial.
 
     Attributes:
-        label: what they wrote.
-        t_ns: UTC of the frame nearest to it.
+        label: its text.
+        t_ns: UTC of the nearest frame.
     """
 
     label: str
@@ -35,11 +35,11 @@ class Mark:
 
 @dataclass(frozen=True)
 class Trial:
-    """Frames that are judged together.
+    """Frames that are evaluated together.
 
     Attributes:
-        name: for tables.
-        rows: (n,), which frames.
+        name: name in tables.
+        rows: (n,), mask of its frames.
     """
 
     name: str
@@ -48,12 +48,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class OverTrials:
-    """A figure over trials.
+    """Mean of a figure over trials.
 
     Attributes:
-        mean: of those that have it.
-        interval_95: of that mean; None with a single trial, which has no spread.
-        trials: how many have it.
+        mean: mean over trials that have the figure.
+        interval_95: 95 % interval of the mean; None with a single trial.
+        trials: number of trials that have it.
         method: "t", "bootstrap" or "single".
     """
 
@@ -66,15 +66,15 @@ class OverTrials:
 def trials_of(
     t_ns: Times, part: npt.NDArray[Any], marks: Sequence[Mark]
 ) -> tuple[list[Trial], str]:
-    """Trials of a session, and what they are.
+    """Split a session into trials; also return the definition of a trial.
 
-    Marks cut it: each begins a trial that lasts until the next one, or the end; what is before the
-    first is in none. Without marks each part that was recorded without a break is one.
+    Each marker begins a trial that lasts until the next marker or the end; frames before the first
+    marker are in none. Without markers, each contiguously recorded part is a trial.
 
     Args:
-        t_ns: (n,), of frames.
-        part: (n,), of the session.
-        marks: in any order.
+        t_ns: (n,), UTC of the frames.
+        part: (n,), session part of the frames.
+        markers: markers in any order.
     """
     if marks:
         ordered = sorted(marks, key=lambda mark: mark.t_ns)
@@ -89,7 +89,7 @@ def trials_of(
 
 
 def over_trials(values: Floats) -> OverTrials:
-    """Mean of a figure with its 95 % interval; trials without the figure (NaN) do not count."""
+    """Compute the mean of a figure with its 95 % interval; trials with NaN do not count."""
     known = values[np.isfinite(values)]
     if len(known) < 2:
         mean = float(known[0]) if len(known) else float("nan")

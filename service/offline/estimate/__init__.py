@@ -1,1 +1,1 @@
-"""A session estimated again: all of it, some seconds, or piece after piece in turns."""
+"""Re-estimation of sessions: complete, a time range, or chunk by chunk."""

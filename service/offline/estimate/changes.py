@@ -1,4 +1,4 @@
-"""What a new estimate of a session changes in the one that it had."""
+"""Difference between a new estimate of a session and its stored one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COLUMNS = ("t_ns", "grf_n", "contact")
 
 @dataclass(frozen=True)
 class Stored:
-    """GRF and contact of a session's frames, and the look-ahead that they were estimated with."""
+    """Stored GRF and contact of a session's frames, with the look-ahead of their estimate."""
 
     lag_ms: float
     t_ns: Ints
@@ -31,7 +31,7 @@ class Change:
 
     lag_before_ms: float
     frames: int
-    """Frames in both that have a GRF in both."""
+    """Number of common frames with a GRF in both."""
     grf_rms_n: float
     grf_most_n: float
     contact_frames: int
@@ -39,9 +39,9 @@ class Change:
 
 
 def read_stored(path: Path) -> Stored | None:
-    """Return a session's estimates; None: it has none, or they are damaged.
+    """Read a session's stored estimates; None if it has none or they are damaged.
 
-    A session whose estimates are damaged can be estimated again: it needs the counts only.
+    Damaged estimates are no error here: a new estimate needs the raw counts only.
     """
     try:
         with SessionReader(path, only_slices=True) as session:
@@ -58,7 +58,7 @@ def read_stored(path: Path) -> Stored | None:
 
 
 def change_between(before: Stored, after: Stored) -> Change:
-    """Compare the frames that both have."""
+    """Compute the difference over the common frames."""
     _, i, j = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
     apart_n = after.grf_n[j].astype(np.float64) - before.grf_n[i]
     known_n = apart_n[np.isfinite(apart_n)]

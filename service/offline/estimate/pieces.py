@@ -1,11 +1,10 @@
-"""A long session in pieces: each goes on with the state that the one before has kept.
+"""Estimation of a long session in consecutive chunks; each continues from the previous state.
 
-Any cut gives the same bits, so what is joined in the end is what one process would have made; and
-whoever takes the session up after a kill, on whichever machine, has one piece to do again. Pieces
-follow one another: no model can begin before what it remembers is there.
+The result is bit-identical for any chunk size. After a kill, any machine continues with at most one
+chunk repeated. Chunks cannot run in parallel, because each needs the model state of the one before.
 
-A piece is a sealed file of its frames with their estimates, `0000.parquet`, what its stream
-remembers, `0000.npz`, and last, naming both by their hashes, `0000.json`.
+A chunk consists of a sealed file of frames with estimates, `0000.parquet`, the estimator's state,
+`0000.npz`, and, written last, an index with the hashes of both, `0000.json`.
 """
 
 from __future__ import annotations
@@ -35,18 +34,18 @@ from storage.sessions.frame_order import in_order
 from storage.sessions.reader import SessionReader
 
 NAMES = ("json", "npz")
-"""What the next piece needs of those before; to join them their frames are needed as well."""
+"""Suffixes of the files that the next chunk needs; joining needs the Parquet files too."""
 
 
 @dataclass(frozen=True)
 class _Done:
-    """A piece that is there.
+    """Index of a finished chunk.
 
     Attributes:
-        number: from 0.
-        groups: row groups of the session up to its end.
-        frames: that it gives.
-        sha256: of its files by their endings.
+        number: index, from 0.
+        groups: number of the session's row groups up to its end.
+        frames: number of its output frames.
+        sha256: hashes of its files by suffix.
     """
 
     number: int
@@ -56,10 +55,10 @@ class _Done:
 
 
 def has_pieces(source: Path, request: EstimateRequest, piece_frames: int) -> bool:
-    """Is a session worth more than one piece?
+    """Return whether a session is longer than one chunk.
 
     Raises:
-        FileFormatError: it is none.
+        FileFormatError: the file is no session.
     """
     if not request.part.is_all:
         return False
@@ -75,17 +74,18 @@ def make_piece(
     piece_frames: int = PIECE_FRAMES,
     remark: Callable[[str], None],
 ) -> bool:
-    """Estimate the next piece of a session.
+    """Estimate the next chunk of a session.
 
     Args:
         source: the session.
-        folder: has the pieces before, or what `NAMES` says of them, and gets this one.
-        request: how.
-        piece_frames: of a piece, about: row groups are not cut.
-        remark: told what is worth knowing.
+        chunks_folder: folder with the earlier chunks, at least their `NEEDED_SUFFIXES`; the new
+            chunk is written to it.
+        request: options of the estimate.
+        chunk_frames: approximate number of frames; row groups are not split.
+        on_remark: called with each remark.
 
     Returns:
-        Whether there was one left.
+        False if all chunks existed already.
 
     Raises:
         FootTileError: the session, scene, calibration or tare is not usable.
@@ -101,7 +101,7 @@ def make_piece(
         taken: list[int] = []
 
         def source_frames() -> Iterator[Piece]:
-            """Row groups until the piece is full; and on until there is a tare, however late."""
+            """Yield row groups until the chunk is full and a tare was found."""
             for group in range(done, len(rows)):
                 is_full = sum(rows[each] for each in (*taken, group)) > piece_frames
                 if taken and is_full and stream.plan is not None:
@@ -134,15 +134,15 @@ def join_pieces(
     *,
     remark: Callable[[str], None],
 ) -> Estimated:
-    """Write the session of which all pieces are there, as `estimate_session` would have.
+    """Join all chunks into one session, identical to the output of `estimate_session`.
 
     Raises:
-        FootTileError: as for `estimate_session`; or a piece is damaged.
+        FootTileError: as for `estimate_session`; or a chunk is damaged.
     """
     pieces = _pieces_in(folder)
     with SessionReader(source, only_slices=True) as session:
         if not pieces or pieces[-1].groups != len(session.footer.group_rows):
-            raise FileFormatError("not all pieces are there", where=str(folder))
+            raise FileFormatError("chunks are missing", where=str(folder))
         what = prepared(session, request, remark)
         stream = _going_on(what, folder, pieces)
         ordered = in_order(_read(what, folder, pieces), where=str(source))
@@ -154,7 +154,7 @@ def join_pieces(
 
 def _write(path: Path, what: Prepared, given: Iterator[Piece]) -> int:
     first = next(given, None)
-    if first is None:  # all still wait: the look-ahead is longer than the piece
+    if first is None:  # no output yet: the look-ahead is longer than the chunk
         return 0
     frames = 0
     with SessionWriter(path, what.info, {}) as writer:
@@ -186,15 +186,15 @@ def _going_on(what: Prepared, folder: Path, before: list[_Done]) -> EstimateStre
 
 
 def _pieces_in(folder: Path) -> list[_Done]:
-    """Those that follow one another from the first on."""
+    """Return the finished chunks from the first one to the first gap."""
     found: list[_Done] = []
     while True:
         path = folder / f"{len(found):04}.json"
         try:
-            said: dict[str, Any] = json.loads(checked(read_whole(path), where=str(path)).text)
+            index: dict[str, Any] = json.loads(checked(read_whole(path), where=str(path)).text)
         except FileNotFoundError:
             return found
-        found.append(_Done(**said))
+        found.append(_Done(**index))
 
 
 def _proven(folder: Path, piece: _Done, ending: str) -> Path:
@@ -205,9 +205,9 @@ def _proven(folder: Path, piece: _Done, ending: str) -> Path:
         is_same = False
     if not is_same:
         raise DamagedFileError(
-            "a piece of a session is not the one that was made",
+            "a chunk of a session has another hash than its index states",
             where=str(path),
-            remedy="Delete its folder: the session is begun again",
+            remedy="Delete its folder; the session is then estimated from its begin",
         )
     return path
 

@@ -1,4 +1,4 @@
-"""What a request to estimate means for a session: its array, calibration, models and tares."""
+"""Resolution of an estimate request for a session: array, calibration, models and tares."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from storage.sessions.reader import SessionReader
 
 @dataclass(frozen=True)
 class Prepared:
-    """The same for a session.
+    """Resolved request for one session.
 
     Attributes:
-        info: its array, with tiles where they are wanted.
-        options: of the estimate.
-        kept: columns of the session, besides frames, that stay as they are.
+        info: its array, with the requested tile positions.
+        options: options of the estimate.
+        kept_columns: columns of the session, beside the frames, that are copied unchanged.
     """
 
     info: ArrayInfo
@@ -37,10 +37,10 @@ class Prepared:
 def prepared(
     session: SessionReader, request: EstimateRequest, remark: Callable[[str], None]
 ) -> Prepared:
-    """What a request means for a session.
+    """Resolve a request for a session.
 
     Raises:
-        FootTileError: scene or calibration are not usable with it.
+        FootTileError: scene or calibration do not fit the session.
     """
     scene, info = request.scene, _placed(session.info, request.scene)
     options = EstimateOptions(
@@ -56,7 +56,7 @@ def prepared(
 
 
 def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:
-    """Tares that were taken while the session was recorded, oldest first."""
+    """Read the tares recorded in the session, oldest first."""
     recorded = session.notes.get("tares", [])
     tiles = len(session.info.tiles)
     try:
@@ -70,7 +70,7 @@ def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:
 
 
 def _placed(info: ArrayInfo, scene: Scene | None) -> ArrayInfo:
-    """The array with its tiles where the scene says they are."""
+    """Return the array with the scene's tile positions."""
     if scene is None:
         return info
     places = {tile.serial: tile for tile in scene.tile}
@@ -124,11 +124,11 @@ def _calibration(
             remedy="Add --calibration FILE, or --scene with a scene that names one",
         )
     if name == EMULATED_RIG and "parts_seed" not in notes:
-        # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
+        # The emulated rig would calibrate an emulated tile of the same serial: plausible and wrong.
         raise CalibrationError(
-            "the emulated bench knows emulated tiles only, and this session is of real ones",
+            "the emulated rig calibrates emulated tiles only, and this session has real ones",
             where=where,
-            remedy="Press the tiles on a real bench and run `foottile calibrate`",
+            remedy="Load the tiles on a real rig and run `foottile calibrate`",
         )
     return find_calibration(
         name,
@@ -140,7 +140,7 @@ def _calibration(
 
 
 def _family(notes: Mapping[str, Any]) -> Family:
-    """Of the emulated parts of a session; those of before there was another are the usual ones."""
+    """Return the part family of an emulated session; "default" if none is recorded."""
     scene = notes.get("scene")
     emulation = scene.get("emulation") if isinstance(scene, dict) else None
     named = emulation.get("family") if isinstance(emulation, dict) else None

@@ -1,4 +1,4 @@
-"""What an estimate of a session is asked to be: values, which may go to another machine."""
+"""Options of a session's re-estimation, as values that can be sent to another machine."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from storage.formats.slice import Slice
 
 _ALL = Slice()
 PIECE_FRAMES = 1 << 20
-"""About ten seconds of work, which is what a kill may cost: half an hour at 544 Hz."""
+"""Frames per chunk: half an hour at 544 Hz, some ten seconds of work, which a kill may cost."""
 
 
 @dataclass(frozen=True)
 class EstimateRequest:
-    """What is asked for; see `foottile estimate --help` for what is taken from where.
+    """Options of an estimate; see `foottile estimate --help` for their defaults.
 
     Attributes:
-        calibration: one, or its file, preset or id; None: the session's own.
-        models: None: the scene's.
+        calibration: a calibration, or its file, preset or id; None: the session's own.
+        models: model names; None: the scene's.
         lag_ms: look-ahead.
-        scene: whose models, calibration and places are used; None: the session's.
+        scene: source of models, calibration and tile positions; None: the session's.
         tare_s: unloaded interval, in seconds from the first frame of the session.
-        part: seconds that are estimated; no more is read of the file than they need.
-        exact: nothing is rounded.
+        part: time range to estimate; only the needed part of the file is read.
+        exact: True to store unquantized values.
     """
 
     calibration: str | Calibration | None

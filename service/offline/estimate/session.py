@@ -1,4 +1,4 @@
-"""A sealed session in, the same session with new estimates out."""
+"""Re-estimation of a sealed session into a new file."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from storage.sessions.reader import SessionReader
 from storage.sessions.time_axis import TIME_AXIS_NOTE
 
 _OF_THE_WHOLE = frozenset({"session", "ledger"})
-"""Notes of a session that its part cannot keep: it has other frames."""
+"""Notes of a session that do not hold for a part of it."""
 
 
 @dataclass(frozen=True)
 class Estimated:
-    """What came of it.
+    """Result of a re-estimation.
 
     Attributes:
-        frames: how many.
-        plan: what their estimates begin with.
-        begin_t_ns: of the first frame of the session.
-        findings: stances, and errors against the truth; empty if nobody asked.
-        asked: models that it asks for and that were not named, with the newtons expected of each;
-            likewise.
+        frame_count: number of frames.
+        plan: initial constants of the estimate.
+        begin_t_ns: UTC of the first frame of the session.
+        findings: stances, and errors against the truth; empty if not requested.
+        omitted_effects_n: omitted models with a considerable effect, with that effect in N; empty
+            if not requested.
     """
 
     frames: int
@@ -51,7 +51,7 @@ class Estimated:
 
     @property
     def tare_s(self) -> tuple[float, float]:
-        """Begin and end of the tare from the first frame; negative before it."""
+        """Begin and end of the tare, in s from the first frame; negative before it."""
         tare = self.plan.tare
         end_s = (tare.t_ns - self.begin_t_ns) * 1e-9
         return end_s - (tare.end_s - tare.begin_s), end_s
@@ -69,14 +69,14 @@ def estimate_session(
 
     Args:
         source: the session.
-        out: the session to write; may be the same file if all of it is estimated.
-        request: how.
-        remark: told what is worth knowing.
-        is_judged: look at what came of it, which takes as long again.
+        out: the session to write; may be the same file unless a part is estimated.
+        request: options of the estimate.
+        on_remark: called with each remark.
+        with_findings: True to compute findings, which doubles the run time.
 
     Raises:
-        FootTileError: the session, scene, calibration or tare is not usable, or no frame is in
-            the part; `out` is untouched.
+        FootTileError: the session, scene, calibration or tare is not usable, or the part has no
+            frame; `out` is unchanged.
     """
     part = request.part
     if not part.is_all and out.exists() and out.samefile(source):
@@ -88,7 +88,7 @@ def estimate_session(
         what = prepared(session, request, remark)
         begin_t_ns = session.span_ns()[0] if session.footer.group_rows else 0
         notes, stretch = dict(session.notes), Stretch()
-        if session.axis.is_shifted:  # the clock table may not lie beside what is written
+        if session.axis.is_shifted:  # the output may have no clock table beside it
             notes[TIME_AXIS_NOTE] = session.axis.as_dicts()
         if not part.is_all:
             options, stretch = _of_part(session, what.info, what.options, part)
@@ -117,27 +117,27 @@ def write_estimated(
     pieces: Iterable[Piece],
     remark: Callable[[str], None],
 ) -> int:
-    """Write frames with their estimates, and in a session's folder their stances beside them.
+    """Write frames with estimates; in a session's folder also the stances file.
 
     Args:
         out: the file.
-        what: what they are.
-        notes: of the session.
-        stream: has the plan by the time that the first piece is there.
-        pieces: all of them.
-        remark: told what could not be written beside them.
+        prepared_estimate: the resolved request.
+        notes: notes of the session.
+        stream: the estimator; its plan must exist once the first batch is yielded.
+        batches: all batches with their columns.
+        on_remark: called if the stances cannot be written.
 
     Returns:
-        How many frames there were; of none no file is written.
+        Number of frames; with none, no file is written.
 
     Raises:
-        FootTileError: from `pieces`, or the file cannot be written.
+        FootTileError: from `batches`, or the file cannot be written.
     """
     left = iter(pieces)
     first = next(left, None)
     if first is None:
         return 0
-    assert stream.plan is not None  # noqa: S101  # what it gives was made with it
+    assert stream.plan is not None  # noqa: S101  # it exists before the first output
     notes = {**notes, **notes_of(stream.plan, stream.rounding, what.options.tares)}
     stances, frames = StancesBeside(), 0
     with SessionWriter(out, what.info, notes) as writer:
@@ -153,7 +153,7 @@ def write_estimated(
 
 
 class _Judged:
-    """Looks at frames with estimates as they pass."""
+    """Observer of estimated frames, for findings and the effect of omitted models."""
 
     def __init__(self, what: Prepared) -> None:
         self._found = FindingsOf(judging=all(c.name in what.kept for c in TRUTH))
@@ -173,13 +173,13 @@ class _Judged:
 def _of_part(
     session: SessionReader, info: ArrayInfo, options: EstimateOptions, part: Slice
 ) -> tuple[EstimateOptions, Stretch]:
-    """Options with the tares in force in a part, as in the whole session, and what is read."""
+    """Return options with the tares in force in a part, and the range to read."""
     stream, tares = EstimateStream(info, options), options.tares
     if not tares:
         ordered = in_order(session.batches(), where=str(session.path))
         tares = (stream.find_tare(ordered),)
     stretch = stretch_of(session, part, stream.plan_of(tares[0]))
-    if not stretch.axis.is_shifted:  # tares are by the node's date
+    if not stretch.axis.is_shifted:  # tares are on the node's time axis
         tares = since(tares, stretch.from_ns)
     return replace(options, tare_s=None, tares=tares), stretch
 
@@ -187,7 +187,7 @@ def _of_part(
 def _notes_of_part(
     session: SessionReader, notes: Mapping[str, object], part: Slice, stretch: Stretch
 ) -> dict[str, object]:
-    """The session's, without what is true only of all of it."""
+    """Return the notes that hold for a part of the session."""
     notes = {name: said for name, said in notes.items() if name not in _OF_THE_WHOLE}
     seconds = {"start_s": part.start_s, "end_s": part.end_s, "warm_up_s": stretch.warm_up_s}
     return {**notes, "part_of": {**session.identity, **seconds}}

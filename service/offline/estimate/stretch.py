@@ -1,9 +1,8 @@
-"""A part of a session to estimate: what is read for it, and from when on models have to run.
+"""Time range of a partial estimate: the frames to read, the warm-up and the output.
 
-Models remember: what the rubber has crept, what the gas has cooled, how the temperature went. So
-they begin before the part, by several times their longest time constant, and what they then have
-forgotten of the time before is small. What lasts without limit - loops of the rubber that no load
-has closed since, edges that the watch has seen - begins with them.
+Models have state: rubber creep, gas temperature, temperature trend. They start before the part by
+several times their longest time constant, so that the effect of earlier frames is small. State
+without a time limit, such as open hysteresis loops and past faults, starts empty.
 """
 
 from __future__ import annotations
@@ -25,19 +24,19 @@ from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 Piece = tuple[FrameBatch, Extra]
 _SETTLE_NS = 1_000_000_000
-"""Behind the part, beyond the look-ahead: a frame may wait for the next one."""
+"""Time read behind the part beyond the look-ahead: a frame may need its successor."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Which frames are read, and which are given; by default all.
+    """Range of frames to read and to output; by default all.
 
     Attributes:
-        from_ns: instant of the time axis from which models run; None: from the first frame.
-        begin_ns: of the first frame that is given; None: the session's.
-        end_ns: behind the last one; None: to the end.
-        until_ns: behind the last one that is needed for its look-ahead.
-        groups: row groups that are read; None: all.
+        run_from_ns: time from which models run, on the time axis; None: from the first frame.
+        output_begin_ns: begin of the output; None: the session's first frame.
+        output_end_ns: end of the output, exclusive; None: to the end.
+        read_until_ns: end of the frames needed for the look-ahead, exclusive.
+        row_groups: row groups to read; None: all.
         axis: the session's time axis.
     """
 
@@ -50,17 +49,17 @@ class Stretch:
 
     @property
     def warm_up_s(self) -> float | None:
-        """How long models run before the part; None: since the session began."""
+        """Warm-up time of the models before the part; None: from the session's begin."""
         if self.from_ns is None or self.begin_ns is None:
             return None
         return (self.begin_ns - self.from_ns) * 1e-9
 
     def needed(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
-        """Of the frames that the row groups have, those that models run over."""
+        """Yield the frames that models run over."""
         return self._within(pieces, self.from_ns, self.until_ns)
 
     def given(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
-        """Of those the frames that are given."""
+        """Yield the output frames."""
         return self._within(pieces, self.begin_ns, self.end_ns)
 
     def _within(
@@ -80,12 +79,12 @@ class Stretch:
 
 
 def stretch_of(session: SessionReader, part: Slice, plan: EstimationPlan) -> Stretch:
-    """What has to be read of a session to estimate a part of it.
+    """Compute the range to read for the estimate of a part of a session.
 
     Args:
         session: the session.
-        part: its seconds; columns are not looked at.
-        plan: what it is estimated with.
+        part: time range; its columns are ignored.
+        plan: constants of the estimate.
 
     Raises:
         UsageError: the part begins after the session's end.
@@ -107,7 +106,7 @@ def stretch_of(session: SessionReader, part: Slice, plan: EstimationPlan) -> Str
 
 
 def since(tares: Sequence[Tare], from_ns: int | None) -> tuple[Tare, ...]:
-    """Those of all tares, oldest first, that are in force from an instant on; None: all."""
+    """Return the tares in force from a time on, oldest first; None: all tares."""
     if from_ns is None:
         return tuple(tares)
     over = sum(later.t_ns < from_ns for _, later in pairwise(tares))

@@ -1,1 +1,1 @@
-"""The paper's experiments on emulated hardware: what is pressed, recorded, compared and drawn."""
+"""Reproduction of the paper's experiments on emulated hardware, with comparison and figures."""

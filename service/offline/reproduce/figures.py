@@ -1,4 +1,4 @@
-"""The figures of a reproduction, each a PNG of its own."""
+"""Figures of a reproduction, one PNG each."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 
 MARGIN_S = 0.25
 LIFTED_S = 0.3
-"""A foot that touches nothing for so long has been lifted."""
+"""Time without contact after which the foot counts as lifted."""
 _BESIDE_KPA = 0.4
 _MATERIALS = {"40": ("#56B4E9", "#0072B2", "#003B5C"), "60": ("#F5B889", "#D55E00", "#7A3600")}
 _LINES_N = {False: "the paper's 1 N", True: "the paper's 1 N, on seeds"}
-"""In mud, of which no number of the paper is known here?"""
+"""Label of the paper's limit, by whether the setup is mud, for which the paper states none."""
 _MARKERS = {10.0: "o", 11.0: "s", 12.0: "^"}
 _QUANTITIES = (("lag_s", "lag"), ("drift_ppm", "drift"), ("offset_n", "offset"), ("scale", "scale"))
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
 def figures_of(result: Reproduction) -> Mapping[str, bytes]:
-    """PNGs by their names, of what was measured.
+    """Draw the figures of all measured experiments; return PNGs by file name.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -83,7 +83,7 @@ def _domes(domes: Sequence[DomeFound]) -> bytes:
                 label=f"the paper's range of {found.dome.name}",
             )
     curves.set_xlabel("pressure above the unloaded one, kPa, up to the chip's 115")
-    curves.set_ylabel("force on the mill, N")
+    curves.set_ylabel("indentation force, N")
     curves.set_title("Six domes, four loadings each: cubics with 95 % bands", fontsize=9.5)
     curves.legend(fontsize=8, loc="upper left")
     curves.set_xlim(0.0, None)
@@ -117,6 +117,8 @@ def _rolling(experiment: Experiment) -> bytes:
     _tiles(force, first, rows, t_s)
     for k, (name, colour) in enumerate((("x", OURS), ("y", "#009E73"))):
         ours_mm = 1e3 * pairs.columns[f"cop_{name}_m"][rows]
+        if np.isnan(ours_mm).all():  # across a row of tiles
+            continue
         half_mm = INTERVAL_95 * 1e3 * pairs.columns[f"cop_sigma_{name}_m"][rows]
         place.fill_between(
             t_s, ours_mm - half_mm, ours_mm + half_mm, color=colour, alpha=0.3, linewidth=0
@@ -209,7 +211,7 @@ def _hops(experiment: Experiment) -> bytes:
     error.plot(t_s, pairs.error_n[rows], color="black", linewidth=0.8)
     error.set_ylabel("foot less\nplate, N")
     error.set_xlabel("time since first contact, s")
-    # What a plate sees while mud pulls at the foot would leave nothing to be seen of the rest.
+    # The error while mud pulls at the foot would dominate the scale.
     loaded = rows & pairs.contact
     edge_n = max(2.5, 1.2 * float(np.nanpercentile(np.abs(pairs.error_n[loaded]), 98.0)))
     error.set_ylim(-edge_n, edge_n)
@@ -251,7 +253,7 @@ def _means(axis: Axes, experiment: Experiment) -> None:
 
 
 def _references(experiments: Sequence[Experiment]) -> bytes:
-    """How far what the comparison found of each reference is from what was injected."""
+    """Draw the difference of found and injected properties of each reference."""
     judged = [(e, one) for e in experiments for one in e.judged]
     figure = new_figure(9.6, 1.9 + 0.22 * len(judged))
     axes = figure.subplots(1, len(_QUANTITIES), sharey=True)
@@ -290,14 +292,14 @@ def _off_along_x(one: Judged) -> tuple[Floats, Floats]:
 
 
 def _begin_s(one: Judged) -> float:
-    """Where both are in contact for the first time."""
+    """Return the time of the first common contact."""
     pairs = one.comparison.pairs
     both = np.flatnonzero(pairs.contact & (pairs.columns["contact"] == 1))
     return float(pairs.t_s[both[0]]) if len(both) else float(pairs.t_s[0])
 
 
 def _shown(one: Judged) -> Bools:
-    """From shortly before the first contact until shortly after the last."""
+    """Select the frames from shortly before the first contact until shortly after the last."""
     pairs = one.comparison.pairs
     touched_s = pairs.t_s[pairs.contact]
     end_s = float(touched_s[-1]) if len(touched_s) else float(pairs.t_s[-1])
@@ -305,7 +307,7 @@ def _shown(one: Judged) -> Bools:
 
 
 def _first_roll(one: Judged) -> Bools:
-    """From shortly before the first contact until shortly after the foot is lifted."""
+    """Select the frames from shortly before the first contact until shortly after lifting."""
     pairs, begin_s = one.comparison.pairs, _begin_s(one)
     touched_s = pairs.t_s[pairs.contact & (pairs.t_s >= begin_s)]
     lifted = np.flatnonzero(np.diff(touched_s) > LIFTED_S)

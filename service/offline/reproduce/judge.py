@@ -1,7 +1,7 @@
-"""A trial judged: compared with its reference, and the comparison with what was injected.
+"""Evaluation of a trial: comparison with its reference, and a check of the comparison itself.
 
-The comparison has two files and what a user would state of them. Only then, and for the report
-alone, it is held against what the emulated instrument's clock, gain and offset really were.
+The comparison uses two files and the options a user would give. Afterwards, for the report only,
+its result is checked against the true clock, gain and offset of the emulated instrument.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ SHOWN = (
     "cop_p95_about_mean_m",
     "cop_coverage_x_95",
 )
-"""Figures of a comparison that the report has."""
+"""Figures of a comparison shown in the report."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One property of the reference, as the comparison found it and as it was.
+    """Property of the reference, as found by the comparison and as injected.
 
     Attributes:
-        found: by the comparison; None if it could not tell.
-        injected: as it was.
-        beside: standard deviation of what the instrument's slow noise adds to that.
+        found: value found; None if not determined.
+        injected: true value.
+        beside: standard deviation that the instrument's slow noise adds to the true value.
     """
 
     found: Estimate | None
@@ -55,7 +55,7 @@ class Check:
 
     @property
     def off(self) -> float:
-        """Found less injected, in halves of the 95 % interval; NaN if nothing was found."""
+        """Found minus injected, in half widths of the 95 % interval; NaN if nothing was found."""
         if self.found is None:
             return math.nan
         sigma = float(np.hypot(self.found.sigma, self.beside))
@@ -64,22 +64,22 @@ class Check:
 
     @property
     def inside(self) -> bool:
-        """Is what was injected within that interval?"""
+        """True if the injected value is within the 95 % interval."""
         return abs(self.off) <= 1.0
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One trial.
+    """Result of one trial.
 
     Attributes:
-        name: of it.
-        comparison: with its reference.
-        checks: lag (s), drift (ppm), offset (N) and scale.
-        frames: of the session.
-        rate_hz: of them.
-        lost_frames: that no file has.
-        missed_slots: in which none was taken.
+        name: name of the trial.
+        comparison: comparison with its reference.
+        checks: checks of lag (s), drift (ppm), offset (N) and scale.
+        frames: number of frames of the session.
+        rate_hz: frame rate.
+        lost_frames: number of frames missing in the session.
+        missed_slots: number of time slots without a frame.
     """
 
     name: str
@@ -92,11 +92,11 @@ class Judged:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Of the comparison, for the one trial that it is."""
+        """Figures of the comparison's only trial."""
         return {name: over.mean for name, over in self.comparison.errors.figures.items()}
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return the JSON representation."""
         return {
             "name": self.name,
             "frames": self.frames,
@@ -126,7 +126,7 @@ def judge(
     lost_frames: int = 0,
     missed_slots: int = 0,
 ) -> Judged:
-    """Compare a trial with its reference.
+    """Compare a trial with its reference, and check the result against the injected values.
 
     Raises:
         FootTileError: the two cannot be compared.
@@ -180,7 +180,7 @@ def _checks(
 
 
 def over_all(judged: Sequence[Judged]) -> dict[str, OverTrials]:
-    """Every figure over trials, with its interval."""
+    """Average every figure over trials, with its interval."""
     return {
         name: over_trials(np.array([one.figures[name] for one in judged], dtype=np.float64))
         for name in (judged[0].figures if judged else ())

@@ -1,4 +1,4 @@
-"""Tiles on the emulated mill: pressed in virtual time, fitted as `foottile calibrate` does."""
+"""Tiles under the emulated indenter, in virtual time, fitted as by `foottile calibrate`."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from service.offline.simulate import SimulateOptions, simulate
 from service.rig.emulated import EmulatedFoot
 
 OVERLOAD = 1.15
-"""A dome is pressed so much beyond the end that `foottile domes` expects at the most."""
+"""Greatest indentation force, relative to the upper range end expected by `foottile domes`."""
 _LEVELS = 40
 
 
 @dataclass(frozen=True)
 class Pressed:
-    """A tile that was pressed.
+    """Indented tile with its fitted curve.
 
     Attributes:
         tile: its curve.
-        strokes: what that was fitted to.
+        strokes: data behind the fit.
     """
 
     tile: TileCalibration
@@ -44,16 +44,16 @@ class Pressed:
 
 @dataclass(frozen=True)
 class DomeFound:
-    """One dome of Table I.
+    """Result for one dome of Table I.
 
     Attributes:
-        dome: which.
-        pressed: what was recorded and fitted.
-        expected: its range by the paper or, scaled, by `foottile domes`.
-        end_kpa: the chip's end, as pressure above the tile's baseline.
-        full_scale_n: force there by its curve, and half of its 95 % interval.
-        reached: was it pressed to that end? Else the curve is drawn out to it.
-        spread: standard deviation of the normalised output between loadings.
+        dome: the dome.
+        indented_tile: its recording and fit.
+        expected_range: its range by the paper or, scaled, by `foottile domes`.
+        end_kpa: end of the chip's range, above the tile's baseline.
+        full_scale_n: force at that end, and half width of its 95 % interval.
+        is_full_scale_reached: True if the recording reached that end; else extrapolated.
+        repeatability: standard deviation of the normalised output between loadings.
     """
 
     dome: Dome
@@ -66,17 +66,17 @@ class DomeFound:
 
 
 def table_scene(dome: Dome) -> Scene:
-    """The mill with one dome of Table I under it, pressed past its expected end."""
+    """Build the indenter scene of one dome of Table I, loaded beyond its expected range."""
     scene = bench_scene(dome.name, "table-1")
     load_n = OVERLOAD * range_of(dome).high_n
     return scene.model_copy(update={"ground": scene.ground.model_copy(update={"load_n": load_n})})
 
 
 def press(scene: Scene, *, seed: int, parts_seed: int) -> Pressed:
-    """Press the one tile of a scene, and fit its curve.
+    """Indent the only tile of a scene, and fit its curve.
 
     Raises:
-        CalibrationError: it has no believable curve.
+        CalibrationError: the tile has no valid curve.
     """
     with _recorded(scene, seed, parts_seed) as recordings:
         ((pressed,),) = recordings.values()
@@ -85,10 +85,10 @@ def press(scene: Scene, *, seed: int, parts_seed: int) -> Pressed:
 
 
 def calibrate(scene: Scene, *, seed: int, parts_seed: int) -> Calibration:
-    """Press the one tile of a scene, and fit its curve and all that a dome does beside.
+    """Indent the only tile of a scene, and fit its curve and all dome effects.
 
     Raises:
-        CalibrationError: it has no believable curve.
+        CalibrationError: the tile has no valid curve.
     """
     name = f"mill-{scene.tile[0].serial}"
     with _recorded(scene, seed, parts_seed) as recordings:
@@ -107,7 +107,7 @@ def _recorded(
 
 
 def together(calibrations: Sequence[Calibration], name: str) -> Calibration:
-    """Calibrations of single tiles as one of all."""
+    """Merge calibrations of single tiles."""
     return Calibration(
         name=name,
         reference=RIG_REFERENCE,
@@ -117,7 +117,7 @@ def together(calibrations: Sequence[Calibration], name: str) -> Calibration:
 
 
 def found_of(dome: Dome, pressed: Pressed) -> DomeFound:
-    """What a dome's recording says of it."""
+    """Evaluate a dome's recording."""
     tile = pressed.tile
     beyond_kpa = 0.0 if tile.bench is None else tile.bench.spare_kpa
     end_kpa = tile.range_kpa[1] + beyond_kpa
@@ -134,9 +134,9 @@ def found_of(dome: Dome, pressed: Pressed) -> DomeFound:
 
 
 def spread_of(blocks: Strokes) -> float:
-    """Standard deviation of the output between loadings, in parts of the greatest output.
+    """Compute the standard deviation of the output between loadings, over the greatest output.
 
-    Each loading's output over force is that of their mean times a gain of its own.
+    Model: each loading's output over force is the mean curve times the loading's gain.
     """
     loadings = [one.select(one.loading) for one in blocks.by_repeat()]
     end_n = min(float(one.force_n.max()) for one in loadings)
@@ -153,7 +153,7 @@ def _output_at(loading: Strokes, levels_n: Floats) -> Floats:
 
 
 def pooled(spreads: Sequence[float], loadings: int) -> tuple[float, tuple[float, float]]:
-    """Standard deviation over all tiles with its 95 % interval, as of a normal distribution."""
+    """Pool the standard deviations of all tiles, with the 95 % interval of a normal variable."""
     dof = len(spreads) * (loadings - 1)
     variance = float(np.mean(np.square(spreads)))
     low, high = (float(np.sqrt(dof * variance / chdtri(dof, tail))) for tail in (0.025, 0.975))

@@ -1,4 +1,4 @@
-"""A reproduction as Markdown: the paper beside ours, then each experiment."""
+"""Markdown report of a reproduction: table of paper and ours, then each experiment."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CHECKED: tuple[tuple[str, str, float, int], ...] = (
     ("offset_n", "the offset", 1.0, 3),
     ("scale", "the scale", 1.0, 3),
 )
-"""What is checked of a reference: in words, and how it is shown."""
+"""Checked properties of a reference: field, title, display factor, digits."""
 _MM = ("cop_mean_m", "cop_p95_m", "cop_p95_about_mean_m")
 _HEADS = {
     "grf_mae_n": "GRF mean absolute error, N",
@@ -39,7 +39,7 @@ _HEADS = {
 
 
 def markdown(result: Reproduction) -> str:
-    """All that people read; figures lie beside it."""
+    """Format the report; figures are separate files."""
     lines = [
         "# The paper, end to end",
         "",
@@ -68,7 +68,7 @@ def _took(result: Reproduction) -> str:
 
 
 def _beside(result: Reproduction) -> Iterator[str]:
-    """The table of the paper beside ours."""
+    """Yield the table of the paper's and our values."""
     yield from ("## The paper beside this", "", "| | paper | here |", "|---|---|---|")
     rows: list[tuple[str, str, str]] = []
     if result.domes:
@@ -126,7 +126,7 @@ def _domes(result: Reproduction) -> Iterator[str]:
     if not result.domes:
         return
     yield from (
-        "## Table I: six domes on the mill",
+        "## Table I: six indented domes",
         "",
         "Two polyurethanes, three diameters, pressed four times each past the chip's 115 kPa, in "
         "virtual time, and fitted as `foottile calibrate` does. The paper states a range for 11 "
@@ -229,7 +229,7 @@ def _references(result: Reproduction) -> Iterator[str]:
     for one in judged:
         cells = (_found(one.checks[name], factor, digits) for name, _, factor, digits in _CHECKED)
         yield f"| {one.name} | " + " | ".join(cells) + " |"
-    # Where a plate sees what no dome bears, ours and its newtons are not of the same load.
+    # The scale is comparable only if the plate measures no load beside that on the domes.
     same = [t for e in result.experiments if not result.not_borne_n[e.setup.name] for t in e.judged]
     counts = ", ".join(
         f"{words} in {_inside(same if name == 'scale' else judged, name)}"
@@ -270,7 +270,7 @@ def _of(one: Experiment, name: str) -> str:
     if over.interval_95 is None:
         return _number(name, over.mean)
     ends = over.interval_95
-    if "coverage" in name:  # Student's interval knows of no end
+    if "coverage" in name:  # clip Student's interval to [0, 1]
         ends = max(ends[0], 0.0), min(ends[1], 1.0)
     low, high = (_number(name, end) for end in ends)
     return f"{_number(name, over.mean)} ({low} to {high})"

@@ -1,4 +1,4 @@
-"""All that came of a reproduction."""
+"""Result of a reproduction."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from service.offline.reproduce.setups import Setup
 
 @dataclass(frozen=True)
 class Experiment:
-    """All trials of one setup that were judged."""
+    """Evaluated trials of one setup."""
 
     setup: Setup
     judged: tuple[Judged, ...]
 
     @property
     def figures(self) -> Mapping[str, OverTrials]:
-        """Over trials."""
+        """Figures over trials."""
         return over_all(self.judged)
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """Everything.
+    """Result of a reproduction.
 
     Attributes:
         software: version.
-        made: when, UTC.
-        seed: of all that was drawn.
-        quick: was it a first look?
-        domes: of Table I that were pressed.
-        calibration: of the foot's tiles.
-        experiments: those of which a trial was judged.
-        not_borne_n: by name of an experiment, the mean over trials of the vertical force that the
-            emulated plate sees and no dome bears, while it is loaded: known because it is emulated.
-        failures: what was not measured, and why.
-        seconds: that it took.
-        notes: on how it was run.
+        run_at: time of the run, UTC.
+        seed: seed of all random draws.
+        is_shortened: True for a shortened run.
+        domes: results of the indented domes of Table I.
+        calibration: calibration of the foot's tiles.
+        experiments: experiments with at least one evaluated trial.
+        not_borne_n: by experiment, the mean over trials of the vertical force on the loaded plate
+            that no dome bears; known because it is emulated.
+        failures: reasons of failed measurements, by name.
+        seconds: run time, by step.
+        notes: remarks on the run.
     """
 
     software: str
@@ -60,18 +60,18 @@ class Reproduction:
     notes: Sequence[str] = ()
 
     def of(self, name: str) -> Experiment | None:
-        """An experiment by its name."""
+        """Return an experiment by name; None if it has no result."""
         return next((one for one in self.experiments if one.setup.name == name), None)
 
     @property
     def spread(self) -> tuple[float, tuple[float, float]] | None:
-        """Between loadings, over all domes, with its interval."""
+        """Standard deviation between loadings over all domes, with its 95 % interval."""
         if not self.domes:
             return None
         return pooled([one.spread for one in self.domes], self.domes[0].pressed.tile.repeats)
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return the JSON representation."""
         return {
             "software": self.software,
             "made": self.made,

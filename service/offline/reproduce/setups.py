@@ -1,7 +1,7 @@
-"""What is recorded: the scenes of the paper's experiments, and which plate lies under the foot.
+"""Setups of the paper's experiments: scene, instrument under the foot, and duration.
 
-Scenes are the built-in ones with what the paper says of its own tiles, a standard deviation of 0.03
-between loadings, and with the calibration that was made here.
+Scenes are the built-in ones, with the paper's standard deviation of 0.03 between loadings and the
+calibration made in this run.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ FORCE_PLATE, PRESSURE_PLATE = "force plate", "pressure plate"
 
 @dataclass(frozen=True)
 class Setup:
-    """One experiment.
+    """Setup of one experiment.
 
     Attributes:
-        name: of it, and of its scene's file.
-        scene: built-in scene.
-        whole_sole: do the domes bear all that the sole bears? Else they bear what the scene says.
-        instrument: that it is compared with.
-        seconds: of a trial, behind the lead.
-        title: for people.
+        name: its name, and that of its scene file.
+        scene: name of the built-in scene.
+        instrument: reference instrument.
+        trial_seconds: duration of a trial after the lead-in.
+        title: title in reports.
+        domes_cover_sole: True if the domes bear the sole's entire load; else the scene's share.
     """
 
     name: str
@@ -39,12 +39,12 @@ class Setup:
 
     @property
     def ending(self) -> str:
-        """Of the instrument's file."""
+        """Suffix of the instrument's file."""
         return ".csv" if self.instrument == FORCE_PLATE else ".npz"
 
     @property
     def option(self) -> str:
-        """Of `foottile node`, for that file."""
+        """Option of `foottile node` for the instrument's file."""
         return f"--{self.instrument.replace(' ', '-')}"
 
 
@@ -58,7 +58,7 @@ SETUPS = (ROLLING, POPPY, POPPY_RIM, MUD)
 
 
 def scene_text(setup: Setup, calibration: Path) -> str:
-    """The scene's file."""
+    """Compose the text of the setup's scene file."""
     folder = resources.files("devices.scene") / "builtin"
     text = (folder / f"{setup.scene}.toml").read_text("utf-8").rstrip()
     # The ground is a built-in scene's last section.

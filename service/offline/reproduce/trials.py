@@ -1,4 +1,4 @@
-"""Which trials there are, and what a node is to be told for each."""
+"""Plan of all trials, with each node's command-line arguments."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 from service.offline.reproduce.setups import Setup
 
 LEAD_S = 1.5
-"""Without load before each trial: the tare, and time for a plate to be started."""
+"""Unloaded lead-in of each trial, for the tare and the plate's start."""
 
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """One trial of a setup.
+    """Plan of one trial of a setup.
 
     Attributes:
-        setup: which.
-        number: from 1.
-        seed: draws its noise and ground, and how the plate was set up.
-        reference: file of its plate.
-        is_repeated: was it spoiled before?
+        setup: its setup.
+        number: number, from 1.
+        seed: seed of noise, ground and the plate's properties.
+        reference_path: path of the plate's file.
+        is_repeated: True for the repetition of a failed trial.
     """
 
     setup: Setup
@@ -32,27 +32,27 @@ class TrialPlan:
 
     @property
     def trial(self) -> str:
-        """Its name, however often it is tried."""
+        """Name of the trial, the same for its repetition."""
         return f"{self.setup.name}-{self.number}"
 
     @property
     def name(self) -> str:
-        """Of node and session."""
+        """Name of node and session."""
         return f"{self.trial}-again" if self.is_repeated else self.trial
 
     def again(self) -> TrialPlan:
-        """The same, after it was spoiled; of a seed of its own it would be another trial."""
+        """Return the plan of a repetition with the same seed, after a failure."""
         path = self.reference
         beside = path.with_name(f"{path.stem}-again{path.suffix}")
         return replace(self, is_repeated=True, reference=beside)
 
     @property
     def seconds(self) -> float:
-        """To record from when the node is there: its scene's time began a moment before."""
+        """Recording time from the node's connection on, shortly after its scene begins."""
         return LEAD_S + self.setup.seconds
 
     def arguments(self, scene: Path, parts_seed: int) -> list[str]:
-        """Of `foottile node`."""
+        """Return the arguments of `foottile node`."""
         return [
             f"--scene={scene}",
             f"--seed={self.seed}",
@@ -63,7 +63,7 @@ class TrialPlan:
 
 
 def plans(setups: tuple[Setup, ...], trials: int, seed: int, folder: Path) -> list[TrialPlan]:
-    """All trials, those of a setup one after another."""
+    """Plan all trials, in order of setups."""
     return [
         TrialPlan(
             setup,

@@ -1,7 +1,7 @@
-"""What a plate sees of an emulated foot and no dome bears: rim, drag, suction and buoyancy.
+"""True force on the plate beside the domes' load: rim, drag, suction and buoyancy.
 
-A real laboratory cannot know it. It tells a reader how much of a difference between foot and plate
-is not the foot's error; no figure of a comparison is made with it.
+It is known in emulation only. The report states it to show how much of the difference between foot
+and plate is not the foot's error; no comparison uses it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _LOADED_N = 0.5
 
 
 def not_borne_n(scene: Scene, seed: int, seconds: float) -> float:
-    """Mean magnitude of it while the plate is loaded, over one trial behind the lead."""
+    """Compute its mean magnitude in N while the plate is loaded, over one trial without lead-in."""
     ground = make_ground(scene, seed=seed, lead_s=0.0, pressed=None)
     t_s = np.arange(0.0, seconds, _STEP_S)
     borne_n = (ground.forces_n(t_s) * np.cos(ground.tilt_rad(t_s))).sum(axis=1)

@@ -1,1 +1,1 @@
-"""What makes forces of the frames of a node as they come: calibration, tares, estimator."""
+"""Live estimation of a node's frames: calibration, tares, estimator."""

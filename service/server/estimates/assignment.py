@@ -1,8 +1,9 @@
-"""Which calibration the tiles of a node are estimated with, where the server was told which.
+"""Calibration assigned to a node on the server.
 
-A node says its own with its hello. The server's choice takes its place, from the next frame on and
-for sessions that begin then, until it is taken back; it is a copy, kept with the node. If that is
-damaged, it is not known which calibration was meant: then there is none, rather than another one.
+A node sends its own calibration with hello. An assigned one replaces it, from the next frame on and
+for sessions that begin then, until it is unassigned; it is a copy, stored with the node. If the
+file is damaged, the assigned calibration is unknown: then the node has none, rather than another
+one.
 """
 
 from __future__ import annotations
@@ -17,30 +18,30 @@ from service.estimation.calibration import Calibration
 from storage.checked_json import read_checked, write_checked
 from storage.durable import ASIDE, make_folder, put_aside, storage_errors
 
-_LOST = "assign a calibration again, or take the assignment back"
+_LOST = "assign a calibration again, or unassign it"
 
 
 @dataclass(frozen=True)
 class Assigned:
-    """A choice, and when it was made, in the server's UTC."""
+    """Assigned calibration, and the time of the assignment, server's UTC."""
 
     calibration: Calibration
     t_ns: int
 
 
 class Assignment:
-    """The choice for one node.
+    """Assignment for one node.
 
     Args:
-        path: file that it is kept in.
+        path: file of the assignment.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.present: Assigned | None = None
-        """None: the node's own calibration counts, unless the choice is lost."""
+        """None: the node's own calibration is used, unless `problem` is set."""
         self.problem: str | None = None
-        """Why the choice is not known; None: it is, or there is none."""
+        """Reason why the assignment is unknown; None: it is known, or there is none."""
         try:
             self.present = _read(path)
         except FileNotFoundError:
@@ -53,19 +54,19 @@ class Assignment:
             self.problem = f"the calibration that was assigned cannot be read: {error}"
 
     def put(self, calibration: Calibration, t_ns: int) -> None:
-        """Choose a calibration.
+        """Assign a calibration.
 
         Raises:
-            StorageError: that cannot be kept; the choice is what it was.
+            StorageError: it cannot be stored; the assignment is unchanged.
         """
         self._keep({"id": calibration.id, **calibration.model_dump(mode="json")}, t_ns)
         self.present, self.problem = Assigned(calibration, t_ns), None
 
     def take_back(self, t_ns: int) -> None:
-        """The node's own counts again.
+        """Remove the assignment: the node's own calibration is used again.
 
         Raises:
-            StorageError: that cannot be kept; the choice is what it was.
+            StorageError: that cannot be stored; the assignment is unchanged.
         """
         self._keep(None, t_ns)
         self.present, self.problem = None, None
@@ -78,11 +79,11 @@ class Assignment:
 
 
 def _read(path: Path) -> Assigned | None:
-    """What was chosen last; None: it was taken back.
+    """Read the last assignment; None: it was removed.
 
     Raises:
-        FileNotFoundError: nothing ever was.
-        DamagedFileError: it is not what was written.
+        FileNotFoundError: there never was one.
+        DamagedFileError: the file is damaged.
         StorageError: it cannot be read now.
     """
     text = read_checked(path).text

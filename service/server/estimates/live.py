@@ -1,4 +1,4 @@
-"""Estimates of one node's frames as they come, with a tare that may change at any moment."""
+"""Live estimates of one stream, with a tare that may change at any frame."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _BEGUN_MAX = 256
 
 @dataclass(frozen=True)
 class Begun:
-    """From this frame on estimates were begun anew, with these; None: there were none."""
+    """Frames from `seq` on, estimated with one calibration and tare; None: not estimated."""
 
     seq: int
     calibration: Calibration | None
@@ -45,14 +45,14 @@ class Begun:
 
 
 class LiveEstimates:
-    """One stream's estimates; without calibration or tare, frames pass through without any.
+    """Estimator of one stream; without calibration or tare, frames pass through.
 
     Args:
         info: the array.
-        calibration: of its tiles; None if there is none.
-        tare: the one in force, from before.
-        before: what estimated this node until now; if that was this stream, what it says of where
-            it began goes on here.
+        calibration: calibration of its tiles; None if there is none.
+        tare: tare in force.
+        previous: former estimator of this node; if it was of the same stream, its epochs are
+            copied.
     """
 
     def __init__(
@@ -68,48 +68,48 @@ class LiveEstimates:
         self._bears = np.array([not tile.reference for tile in info.tiles])
         self._calibration: Calibration | None = None
         self.calibration_id: str | None = None
-        """Of the calibration in use: a hash, which takes longer than all else a screen is told."""
+        """Id of the calibration in use: a hash that is slow to compute."""
         self.ranges: Ranges | None = None
-        """What the calibration in use says of the tiles; None without one."""
+        """Calibrated ranges of the tiles; None without a calibration."""
         self.free_since_t_ns: int | None = None
-        """Since when every estimate has said that there is no contact; None: not yet."""
+        """Time since which all estimates are without contact; None: not yet."""
         self._run: EstimateRun | None = None
         self._recent: deque[FrameBatch] = deque()
         self._left: list[tuple[FrameBatch, Columns]] = []
         self._due_t_ns: int | None = None
         self._has_begun = False
         is_same = before is not None and before.info.boot_id == info.boot_id
-        known = before.begun if before is not None and is_same else ()
-        self.begun: deque[Begun] = deque(known, _BEGUN_MAX)
-        """With what it has estimated, oldest first: who computes its frames again asks."""
+        epochs = before.begun if before is not None and is_same else ()
+        self.begun: deque[Begun] = deque(epochs, _BEGUN_MAX)
+        """Epochs of the estimates, oldest first, to recompute frames as they were."""
         if calibration is not None:
             try:
                 EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
                 self._calibration = calibration
                 self.calibration_id = calibration.id
                 self.ranges = Ranges.of(info, calibration)
-            except FootTileError as error:  # does not fit these tiles: report it and go without
+            except FootTileError as error:  # it does not fit these tiles: report it
                 self.calibration_problem = str(error)
         self.use(tare)
 
     @property
     def info(self) -> ArrayInfo:
-        """The array."""
+        """Description of the array."""
         return self._info
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration in use."""
+        """Calibration in use."""
         return self._calibration
 
     @property
     def tare(self) -> Tare | None:
-        """The tare in use; None: there is none, or it is lost."""
+        """Tare in use; None: there is none, or it is lost."""
         tare = self._run.plan.tare if self._run is not None else None
         return None if tare is None or tare.is_lost else tare
 
     def use(self, tare: Tare | None) -> None:
-        """Estimate with this tare from the next frame on; all is NaN with one that is lost."""
+        """Estimate with this tare from the next frame on; all is NaN with a lost one."""
         if self._run is not None:  # frames that wait for their look-ahead
             self._left.extend(self._run.finish())
         self.free_since_t_ns = None
@@ -127,20 +127,21 @@ class LiveEstimates:
         self._run = EstimateRun(plan)
 
     def go_on_from(self, before: LiveEstimates) -> None:
-        """Go on where the estimates of the same stream with another calibration end.
+        """Continue the same stream from an estimator with another calibration.
 
-        Its last seconds are known here, too, and the frames that it still holds leave first.
+        Its recent frames are copied, and its frames that wait for their look-ahead are flushed
+        first.
         """
         before.use(None)
         self._recent, self._left = before._recent, before._left
 
     def feed(self, frames: FrameBatch) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Take the next frames; return the frames that are due, with or without estimates."""
+        """Add the next frames; yield the frames that are due, with or without estimates."""
         self._recent.append(frames)
         while int(frames.t_ns[-1]) - int(self._recent[0].t_ns[-1]) > LOOK_BACK_NS:
             self._recent.popleft()
-        left, self._left = self._left, []
-        yield from left
+        flushed, self._left = self._left, []
+        yield from flushed
         if not self._has_begun and not (self._run is not None and is_warming()):
             self._has_begun = True
             tare = None if self._run is None else self._run.plan.tare
@@ -149,8 +150,10 @@ class LiveEstimates:
             yield frames, {}
             return
         if is_warming():
-            held, _ = hold_temperature(frames)
-            kpa = self._compensation.readable_kpa(held) - self._run.plan.tare.baseline_kpa
+            with_temperature, _ = hold_temperature(frames)
+            kpa = (
+                self._compensation.readable_kpa(with_temperature) - self._run.plan.tare.baseline_kpa
+            )
             yield frames, {"gauge_kpa": kpa}
             return
         for due, columns in self._run.feed(frames, {}):
@@ -159,29 +162,29 @@ class LiveEstimates:
 
     @property
     def newest(self) -> FrameBatch | None:
-        """The last frames that came; None before the first."""
+        """Last batch of frames; None before the first."""
         return self._recent[-1] if self._recent else None
 
     @property
     def newest_t_ns(self) -> int | None:
-        """Instant of the newest frame, in the node's UTC."""
+        """Time of the newest frame, node's UTC."""
         return int(self._recent[-1].t_ns[-1]) if self._recent else None
 
     def recent_tadc(self) -> Floats:
-        """Mean temperature counts of the last second, per tile; NaN where none was read."""
+        """Return the mean temperature counts of the last second, per tile; NaN if none was read."""
         if not self._recent:
             return np.full(len(self._info.tiles), np.nan)
         since_t_ns = int(self._recent[-1].t_ns[-1]) - _TADC_OVER_NS
         recent = [*takewhile(lambda each: each.t_ns[-1] >= since_t_ns, reversed(self._recent))]
         tadc = np.concatenate([frames.tadc for frames in recent])
         status = np.concatenate([frames.status for frames in recent])
-        known = (tadc != NOT_READ) & ((status & np.uint8(TileStatus.UNUSABLE)) == 0)
-        counts = known.sum(axis=0)
-        total = np.where(known, tadc, 0).sum(axis=0)
+        is_usable = (tadc != NOT_READ) & ((status & np.uint8(TileStatus.UNUSABLE)) == 0)
+        counts = is_usable.sum(axis=0)
+        total = np.where(is_usable, tadc, 0).sum(axis=0)
         return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
     def newtons(self, shift_kpa: Floats) -> float | None:
-        """What a shift of all baselines makes of the GRF; None where that is not known."""
+        """Return the GRF shift that follows from a shift of all baselines; None if unknown."""
         if self.ranges is None:
             return None
         slope_n_per_kpa = self.ranges.slope_n_per_kpa
@@ -189,18 +192,18 @@ class LiveEstimates:
         return float(shift_n.sum()) if np.isfinite(shift_n).all() else None
 
     def tare_from_lead(self, lead: FrameBatch) -> Tare:
-        """The tare of an emulated lead.
+        """Compute the tare from an emulated lead.
 
         Raises:
-            TareError: its frames are no tare, or there is no calibration.
+            TareError: its frames give no tare, or there is no calibration.
         """
         return take_tare(lead, self._compensation, self._needed(), self._info.serials)
 
     def look_in_flight(self, anchor: Tare | None) -> Look:
-        """Whether the last seconds give reason to tare unasked.
+        """Look for an automatic tare in the last seconds.
 
         Args:
-            anchor: the tare that an automatic one is compared with; None if there was no tare.
+            anchor: tare with which an automatic one is compared; None without a tare.
         """
         calibration, tare = self._calibration, self.tare
         if calibration is None or not self._recent:
@@ -210,10 +213,10 @@ class LiveEstimates:
             return first_in_flight(self._seen(frames, calibration))
         if self.free_since_t_ns is None or self._due_t_ns is None:
             return Look()
-        # For younger frames it is not known yet whether there was contact.
-        known = int(np.searchsorted(frames.t_ns, self._due_t_ns, side="right"))
+        # Contact of newer frames is not estimated yet.
+        count = int(np.searchsorted(frames.t_ns, self._due_t_ns, side="right"))
         return look_in_flight(
-            self._seen(frames.rows(0, known), calibration),
+            self._seen(frames.rows(0, count), calibration),
             present=tare,
             anchor=anchor,
             free_since_t_ns=self.free_since_t_ns,
@@ -221,14 +224,14 @@ class LiveEstimates:
         )
 
     def tare_now(self) -> Tare:
-        """The tare from the newest unloaded interval of the last seconds.
+        """Compute the tare from the newest unloaded interval of the last seconds.
 
         Raises:
-            TareError: there was none, no calibration, or no frames.
+            TareError: there is no such interval, no calibration, or no frame.
         """
         calibration = self._needed()
         if not self._recent:
-            raise TareError("no frames have come yet", remedy="Is the node connected?")
+            raise TareError("no frames have come yet", remedy="Connect the node")
         frames = FrameBatch.concatenate(list(self._recent))
         seen = self._seen(frames, calibration)
         return newest_unloaded_tare(seen, present=self.tare, bears=self._bears)
@@ -247,13 +250,13 @@ class LiveEstimates:
     def _note_contact(self, frames: FrameBatch, columns: Columns) -> None:
         t_ns = frames.t_ns
         before_t_ns = self._due_t_ns if self._due_t_ns is not None else int(t_ns[0])
-        taken = columns["contact"] != 0  # or not known
+        may_have_contact = columns["contact"] != 0  # in contact, or unknown
         # A gap that is too short for a step, such as a missed slot, cannot hide a contact.
         if int(t_ns[-1]) - before_t_ns > UNSEEN_NS:
-            taken[0] |= int(t_ns[0]) - before_t_ns > UNSEEN_NS
-            taken[1:] |= t_ns[1:] - t_ns[:-1] > UNSEEN_NS
+            may_have_contact[0] |= int(t_ns[0]) - before_t_ns > UNSEEN_NS
+            may_have_contact[1:] |= t_ns[1:] - t_ns[:-1] > UNSEEN_NS
         self._due_t_ns = int(t_ns[-1])
-        if np.count_nonzero(taken):
-            self.free_since_t_ns = int(t_ns[np.flatnonzero(taken)[-1]])
+        if np.count_nonzero(may_have_contact):
+            self.free_since_t_ns = int(t_ns[np.flatnonzero(may_have_contact)[-1]])
         elif self.free_since_t_ns is None:
             self.free_since_t_ns = int(t_ns[0])

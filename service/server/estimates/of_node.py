@@ -1,4 +1,4 @@
-"""The estimates of one node over all its streams: with which calibration, from which tare."""
+"""Estimation of one node over all its streams: calibration, tares, live estimator."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ from storage.journal.journal import Journal
 log = logging.getLogger("foottile.nodes")
 
 Estimated = tuple[FrameBatch, Columns]
+"""Frames with their estimates by column; no columns without estimates."""
 _ENDED_MAX = 16
-"""Streams that have ended of which is known where their estimates began anew."""
+"""Number of ended streams whose epochs are kept."""
 
 
 class NodeEstimates:
-    """What estimates a node's present stream; a bug there costs its estimates, no more.
+    """Estimator of a node's present stream; a bug there costs its estimates only.
 
     Args:
-        folder: what is kept of the node: its tares, and the calibration chosen here.
-        hello: what it said last.
+        folder: files of the node: its tares, and the calibration assigned here.
+        hello: last hello of the node.
     """
 
     def __init__(self, folder: Path, hello: Hello) -> None:
@@ -43,25 +44,25 @@ class NodeEstimates:
         self._hello = hello
         self._has_failed = False
         self._begun: OrderedDict[str, tuple[Begun, ...]] = OrderedDict()
-        """Of streams before the present one."""
+        """Epochs of streams before the present one."""
         self._begin()
 
     @property
     def info(self) -> ArrayInfo:
-        """The present stream's array."""
+        """Array of the present stream."""
         return self._hello.array_info
 
     @property
     def damages(self) -> list[str]:
-        """What was found damaged of what is kept, and what became of it, in words."""
-        said = (self.tares.problem, self.assignment.problem)
-        return [problem for problem in said if problem is not None]
+        """Damage found in the files, and the consequence, as text."""
+        texts = (self.tares.problem, self.assignment.problem)
+        return [problem for problem in texts if problem is not None]
 
     @property
     def calibration(self) -> Calibration | None:
-        """What its tiles are to be estimated with: the server's choice, else what it says itself.
+        """Calibration to use for its tiles: the assigned one, else the node's own.
 
-        It may not fit them; what is in use is `live.calibration`.
+        It may not fit them; the calibration in use is `live.calibration`.
         """
         if self.assignment.problem is not None:
             return None
@@ -70,33 +71,35 @@ class NodeEstimates:
 
     @property
     def calibration_source(self) -> Literal["node", "server"]:
-        """Who says which that is."""
+        """Origin of `chosen_calibration`."""
         chosen = self.assignment.present is not None or self.assignment.problem is not None
         return "server" if chosen else "node"
 
     @property
     def calibration_problem(self) -> str | None:
-        """Why none is in use."""
-        own = self._hello.calibration_problem if self.calibration_source == "node" else None
-        return self.assignment.problem or self.live.calibration_problem or own
+        """Reason why no calibration is in use."""
+        node_problem = (
+            self._hello.calibration_problem if self.calibration_source == "node" else None
+        )
+        return self.assignment.problem or self.live.calibration_problem or node_problem
 
     def begun(self, boot_id: str) -> tuple[Begun, ...]:
-        """Where estimates of a stream were begun anew since the server was started, in order."""
+        """Return the epochs of a stream since the server was started, in order."""
         if boot_id == self.live.info.boot_id:
             return tuple(self.live.begun)
         return self._begun.get(boot_id, ())
 
     def use_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
-        """Estimate with a calibration of the server's choice from the next frame on.
+        """Assign a calibration, used from the next frame on.
 
-        What is being recorded keeps the one that it began with.
+        Sessions that are being recorded keep theirs.
 
         Args:
-            calibration: which; None: the node's own again.
+            calibration: calibration to use; None: the node's own again.
             t_ns: the server's UTC.
 
         Raises:
-            StorageError: that cannot be kept; nothing has changed then.
+            StorageError: that cannot be stored; nothing has changed then.
         """
         if calibration is None:
             self.assignment.take_back(t_ns)
@@ -110,18 +113,21 @@ class NodeEstimates:
             self._go_without(error)
 
     def greet(self, hello: Hello) -> None:
-        """The node has connected; estimates begin anew with another stream or calibration."""
-        known, self._hello = self._hello, hello
-        if known.array_info.boot_id != hello.array_info.boot_id:
-            self._begun[known.array_info.boot_id] = tuple(self.live.begun)
+        """Restart the estimator if hello has another stream or calibration."""
+        previous, self._hello = self._hello, hello
+        if previous.array_info.boot_id != hello.array_info.boot_id:
+            self._begun[previous.array_info.boot_id] = tuple(self.live.begun)
             if len(self._begun) > _ENDED_MAX:
                 self._begun.popitem(last=False)
-        is_same = (known.array_info, known.calibration) == (hello.array_info, hello.calibration)
+        is_same = (previous.array_info, previous.calibration) == (
+            hello.array_info,
+            hello.calibration,
+        )
         if not is_same or self._has_failed:
             self._begin()
 
     def feed(self, frames: FrameBatch) -> list[Estimated]:
-        """Take the next frames of the present stream; return those whose estimates are due."""
+        """Add the next frames of the present stream; return those whose estimates are due."""
         try:
             return list(self.live.feed(frames))
         except Exception as error:
@@ -129,10 +135,10 @@ class NodeEstimates:
             return [(frames, {})]
 
     def look_for_tare(self, journal: Journal | None, may_come: Callable[[], Intervals]) -> None:
-        """Tare, if there is reason to, as `TareKeeper.look` says.
+        """Tare if there is reason to, as `TareController.update`.
 
         Raises:
-            StorageError: the tare cannot be kept; it is not in force then, and tried again.
+            StorageError: the tare cannot be stored; it is not in force then, and retried.
         """
         try:
             self.tare_keeper.look(journal, may_come)

@@ -1,4 +1,4 @@
-"""What a calibration says of an array's tiles: where each one's range ends, and its force there."""
+"""Calibrated ranges of an array's tiles: end of each range, and the force there."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from service.estimation.models.static import StaticCurves
 
 @dataclass(frozen=True)
 class Ranges:
-    """Of the tiles of an array; arrays are (tiles,), NaN for those that bear no load.
+    """Ranges of an array's tiles; arrays are (tiles,), NaN for tiles that bear no load.
 
     Attributes:
-        entries: what the calibration knows of each tile; None for bare ones.
+        entries: calibration of each tile; None for bare ones.
         end_kpa: end of each tile's calibrated range.
         full_scale_n: force at that end.
-        slope_n_per_kpa: newtons for a kilopascal near zero.
+        slope_n_per_kpa: slope near zero.
     """
 
     entries: tuple[TileCalibration | None, ...]
@@ -31,10 +31,10 @@ class Ranges:
 
     @classmethod
     def of(cls, info: ArrayInfo, calibration: Calibration) -> Self:
-        """By its curves, and by how the foot is mounted.
+        """Compute the ranges from the calibration's curves and mount gains.
 
         Raises:
-            CalibrationError: it does not have a tile that bears load.
+            CalibrationError: a tile that bears load is not in it.
         """
         serials = info.serials
         bearing = [i for i, tile in enumerate(info.tiles) if not tile.reference]

@@ -1,6 +1,6 @@
-"""Sees to it that a stream is tared: by its lead, in flight, by hand; and says what is wrong.
+"""Control of a stream's tares: from its lead, in flight, by hand; with warnings.
 
-One for each stream, fed after every message of frames; times are the frames' own.
+One controller per stream, updated after every message of frames; times are those of the frames.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from storage.intervals import Intervals
 from storage.journal.journal import Journal
 
 LOOK_EVERY_NS = 5_000_000_000
-"""A look at the last seconds costs some milliseconds."""
+"""Period of the search for a flight tare, which costs some milliseconds."""
 LEAD_WAIT_NS = 10_000_000_000
-"""Frames of a lead that are still missing this long after its end will not come."""
+"""Timeout for missing frames of a lead after its end."""
 _BY_HAND = "lift the foot, hold it still, and tare"
 
 AutoTare = Literal["on", "paused", "off"]
 
 
 class TareKeeper:
-    """The tares of one stream.
+    """Controller of the tares of one stream.
 
     Args:
-        info: the stream's array.
-        live: its estimates, which are told what is in force.
-        history: of the node's tares.
-        automatic: whether tares may be taken unasked.
+        info: array of the stream.
+        live: estimator that uses the tare in force.
+        history: history of the node's tares.
+        automatic: True: tares in flight are allowed.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class TareKeeper:
         self._live = live
         self._history = history
         self._automatic = automatic
-        self._lead_is_over = False  # and has been looked at
+        self._lead_is_over = False  # and evaluated
         self._has_seen_lead = False
         self._lead_over_t_ns: int | None = None
         self._lead_problem: str | None = None
@@ -58,14 +58,14 @@ class TareKeeper:
 
     @property
     def auto_tare(self) -> AutoTare:
-        """Does the baseline follow by itself? Not if the scene or an undo says so."""
+        """State of automatic tares: off by the scene, or paused by an undo."""
         if not self._automatic:
             return "off"
         return "paused" if self._history.is_automatic_paused(self._info) else "on"
 
     @property
     def problem(self) -> str | None:
-        """Why there is no tare, or why it is not this stream's own."""
+        """Reason why there is no tare, or why it is not of this stream."""
         if self._lead_problem is not None:
             return f"the lead gave no tare ({self._lead_problem}): {_BY_HAND}"
         if self._history.is_lost(self._info):
@@ -73,19 +73,19 @@ class TareKeeper:
         return f"not tared: {_BY_HAND}" if self._history.in_force(self._info) is None else None
 
     def warnings(self) -> list[str]:
-        """Why the tare in force may no longer fit, in words."""
+        """Return the reasons why the tare in force may no longer fit, as text."""
         tare, newest_t_ns = self._live.tare, self._live.newest_t_ns
         if tare is None or newest_t_ns is None:
             return []
-        said = []
+        texts = []
         age_ns = newest_t_ns - tare.t_ns
         if age_ns > TARE_OLD_NS:
-            said.append(f"tared {age_ns / 60e9:.0f} min ago: {_BY_HAND}")
+            texts.append(f"tared {age_ns / 60e9:.0f} min ago: {_BY_HAND}")
         if "temperature" not in self._info.models and (warmed := self._warmed(tare)) is not None:
-            said.append(warmed)
+            texts.append(warmed)
         if self._doubt is not None:
-            said.append(self._doubt)
-        return said
+            texts.append(self._doubt)
+        return texts
 
     def _warmed(self, tare: Tare) -> str | None:
         tadc = self._live.recent_tadc()
@@ -97,18 +97,18 @@ class TareKeeper:
         mean_k = float(warmer[tiles].mean())
         who = f"tile {self._info.serials[tiles[0]]} is" if len(tiles) == 1 else "the tiles are"
         shift_n = self._live.newtons(expected_shift_kpa(tare, warmer))
-        about = "" if shift_n is None else f", about {shift_n:+.1f} N on the foot"
+        effect = "" if shift_n is None else f", about {shift_n:+.1f} N on the foot"
         return (
             f"{who} {abs(mean_k):.1f} K {'warmer' if mean_k > 0 else 'colder'} than when tared"
-            f"{about}: {_BY_HAND}"
+            f"{effect}: {_BY_HAND}"
         )
 
     def by_hand(self, reason: str = "") -> RecordedTare:
-        """Tare from an unloaded interval of the last seconds, and put it in force.
+        """Tare from an unloaded interval of the last seconds, and put the tare in force.
 
         Raises:
             TareError: the foot was loaded, or there is nothing to tare.
-            StorageError: it cannot be kept.
+            StorageError: the tare cannot be stored.
         """
         recorded = self._history.add(self._live.tare_now(), self._info, reason)
         self._put_in_force(recorded)
@@ -125,14 +125,14 @@ class TareKeeper:
         self._live.use(self._history.to_use(self._info))
 
     def look(self, journal: Journal | None, may_come: Callable[[], Intervals]) -> None:
-        """After more frames: tare from a lead that is over, or in flight.
+        """Check new frames: tare from a lead that has ended, or in flight.
 
         Args:
-            journal: of this stream.
-            may_come: numbers that the node may still give, which takes a while to say.
+            journal: journal of the stream.
+            get_obtainable: returns the frames that the node can still send, which is slow.
 
         Raises:
-            StorageError: a tare cannot be kept; it is not in force then, and tried again.
+            StorageError: a tare cannot be stored; it is not in force then, and retried.
         """
         if self._live.calibration is None:
             return
@@ -146,7 +146,7 @@ class TareKeeper:
         if newest is None or newest.frame_status[-1] & FrameStatus.LEAD:
             self._has_seen_lead |= newest is not None
             return
-        # From the journal, not as frames come: after a break of the link they come in any order.
+        # From the journal: after a lost link frames come in any order.
         seq, t_ns = int(newest.seq[-1]), int(newest.t_ns[-1])
         self._lead_over_t_ns = self._lead_over_t_ns or t_ns
         lacks = journal.held.missing(min(may_come().first or 0, seq), seq)
@@ -170,10 +170,10 @@ class TareKeeper:
         except TareError as error:
             self._lead_is_over, self._lead_problem = True, error.what
             return
-        known = {(t.tare.source, t.tare.t_ns) for t in self._history.all}
-        # Known, or lost since: the server was restarted, and another one may have followed it.
+        keys = {(t.tare.source, t.tare.t_ns) for t in self._history.all}
+        # In the history, or lost: the server was restarted, and another tare may have followed.
         is_older = not self._has_seen_lead and self._history.may_have_held(tare.t_ns)
-        if ("lead", tare.t_ns) not in known and not is_older:
+        if ("lead", tare.t_ns) not in keys and not is_older:
             self._live.use(self._history.add(tare, self._info).tare)
         self._lead_is_over = True
 

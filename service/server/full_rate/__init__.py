@@ -1,1 +1,1 @@
-"""Every frame of a node, live, for programs: what is in memory, what comes next, as Arrow."""
+"""Live feed of every frame of a node, for programs."""

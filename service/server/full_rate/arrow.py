@@ -1,7 +1,7 @@
-"""Frames with their estimates as Arrow messages: columns of a sealed file, all or those asked for.
+"""Encoder of frames with their estimates as Arrow messages: columns of a sealed file, or some.
 
-Schema and batches, one behind the other, are an Arrow IPC stream. A piece of memory is encoded once
-for all who ask for the same columns.
+Schema and batches in sequence are an Arrow IPC stream. A buffered batch is encoded once for all
+readers of the same columns.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from service.server.full_rate.shared import Shared
 from storage.schema import ARRAY_INFO_KEY, ESTIMATES, FRAMES, Column, flat_column
 
 ROWS_MAX = 256
-"""Of one message: of 64 tiles it is half a megabyte."""
+"""Limit per message: half a megabyte for 64 tiles."""
 _ALWAYS = ("seq", "t_ns")
-"""By `seq` a stream is gone on with, and without an instant a number says little."""
+"""`seq` is needed to resume a stream, and a number without a time says little."""
 RECOMPUTED = pa.field(
     "recomputed",
     pa.bool_(),
@@ -32,14 +32,14 @@ _FRAMES = {column.name for column in FRAMES}
 
 
 class Encoder:
-    """Of one stream, for one choice of columns.
+    """Encoder for one stream and one selection of columns.
 
     Args:
-        info: the stream's array.
-        asked: names of quantities (`force_n`) or of one tile's (`force_n_0`); none: all.
+        info: array of the stream.
+        column_names: names of quantities (`force_n`) or of one tile's (`force_n_0`); none: all.
 
     Raises:
-        UsageError: there is no such column.
+        UsageError: no column has this name.
     """
 
     def __init__(self, info: ArrayInfo, asked: tuple[str, ...]) -> None:
@@ -54,15 +54,15 @@ class Encoder:
         self.schema = pa.schema([*fields, RECOMPUTED], metadata={ARRAY_INFO_KEY: text})
 
     def header(self) -> bytes:
-        """The schema's message."""
+        """Return the schema's message."""
         return self.schema.serialize().to_pybytes()
 
     def messages(self, rows: Rows, shared: Shared) -> Iterator[tuple[bytes, int]]:
-        """Frames as messages, `ROWS_MAX` at most in each, and the number after each.
+        """Yield frames as messages of at most `ROWS_MAX` rows, and the number after each.
 
         Args:
             rows: the frames.
-            shared: what was encoded of pieces of the same memory, for this reader and others.
+            cache: encoded messages of the same buffer, from this reader and others.
         """
         seq = rows.estimated[0].seq
         for begin in range(0, len(seq), ROWS_MAX):
@@ -81,7 +81,7 @@ class Encoder:
         for name, column, tile in self._chosen:
             values = getattr(frames, column.name) if column.name in _FRAMES else None
             values = columns.get(column.name) if values is None else values
-            if values is None:  # there is no calibration, no tare, or they are compiled just now
+            if values is None:  # no calibration, no tare, or still compiling
                 arrays.append(pa.array([None] * (end - begin), column.type))
                 continue
             values = values[begin:end] if tile is None else values[begin:end, tile]
@@ -92,7 +92,7 @@ class Encoder:
 
 
 def _chosen(tiles: int, asked: tuple[str, ...]) -> list[tuple[str, Column, int | None]]:
-    """Name, quantity and tile of each column, each once, in the order of `asked`."""
+    """Return name, quantity and tile of each column, each once, in the order of `column_names`."""
     by_name: dict[str, tuple[str, Column, int | None]] = {}
     by_quantity: dict[str, list[str]] = {}
     for column in _COLUMNS.values():
@@ -115,7 +115,7 @@ def _chosen(tiles: int, asked: tuple[str, ...]) -> list[tuple[str, Column, int |
 
 
 def check_columns(info: ArrayInfo, asked: tuple[str, ...]) -> None:
-    """Whether an array has these columns.
+    """Check that an array has these columns.
 
     Raises:
         UsageError: it lacks one.

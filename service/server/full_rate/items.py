@@ -1,4 +1,4 @@
-"""What a reader of every frame is given, one after the other: frames, and what is left out."""
+"""Events of the live feed: frames, gaps, stream starts."""
 
 from __future__ import annotations
 
@@ -9,51 +9,52 @@ from service.server.estimates.of_node import Estimated
 
 @dataclass(frozen=True)
 class Position:
-    """The frame of a stream that is wanted next."""
+    """Next frame of a reader."""
 
     boot_id: str
     seq: int
 
     def __str__(self) -> str:
-        """How to go on from there, as text that programs read."""
+        """Return the query to resume from here, as text that programs parse."""
         return f"resume with boot_id={self.boot_id}&from_seq={self.seq}"
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Frames with their estimates, which may be none; consecutive, of one stream."""
+    """Consecutive frames of one stream with their estimates, if any."""
 
     boot_id: str
     estimated: Estimated
     number: int | None = None
-    """Of the piece in memory, if it is all of it."""
+    """Number of the buffered batch, if these are all of its rows."""
     recomputed: bool = False
 
     @property
     def from_seq(self) -> int:
-        """Number of the first of them."""
+        """Number of the first frame."""
         return int(self.estimated[0].seq[0])
 
     @property
     def to_seq(self) -> int:
-        """Number of the last of them."""
+        """Number of the last frame."""
         return int(self.estimated[0].seq[-1])
 
 
 @dataclass(frozen=True)
 class Missing:
-    """Frames that are left out, ends included."""
+    """Frames that are left out, both ends included."""
 
     boot_id: str
     from_seq: int
     to_seq: int
     reason: str
-    """`slow`: this reader was; `late`: they were not here in time. Else why they are lost."""
+    """`slow`: the reader was too slow; `late`: the frames did not come in time. Else the loss
+    reason."""
 
 
 @dataclass(frozen=True)
 class Begins:
-    """What follows is of this stream."""
+    """Start of a stream: the next events are of this stream."""
 
     boot_id: str
     from_seq: int
@@ -63,7 +64,7 @@ Item = Rows | Missing | Begins
 
 
 def cut(estimated: Estimated, begin: int, end: int) -> Estimated:
-    """Rows `begin` to `end` - 1 of frames and their estimates; themselves, if that is all."""
+    """Return rows `begin` to `end` - 1 of frames and their estimates; unchanged if that is all."""
     frames, columns = estimated
     if begin <= 0 and end >= len(frames):
         return estimated

@@ -1,4 +1,4 @@
-"""What is known of a stream when somebody asks for its next frame."""
+"""Present state of a stream, for readers of the live feed."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from storage.intervals import NO_END, Intervals, Losses
 
 
 class Known(Protocol):
-    """A stream, as far as it is known now."""
+    """Present state of a stream."""
 
     @property
     def held(self) -> Intervals:
-        """Numbers in its journal."""
+        """Frames in its journal."""
 
     @property
     def lost(self) -> Losses:
-        """Numbers that will not come, and why."""
+        """Frames that will not come, by reason."""
 
     @property
     def is_over(self) -> bool:
-        """Does its node take another one by now?"""
+        """True if the node has another present stream."""
 
     @property
     def end(self) -> int:
-        """Number after the last frame that is known of."""
+        """Number after the last known frame."""
 
     @property
     def following(self) -> str | None:
-        """The stream that its node took after it; None: it is the present one."""
+        """Next stream of the node; None: this is the present one."""
 
     def to_come(self) -> Intervals:
-        """Numbers that are not here and that its node may still send."""
+        """Return the frames that are not stored and that the node can still send."""
 
 
 class KnownStream:
-    """A stream of a node of this server.
+    """State of a stream of this server.
 
     Args:
         node: the node.
-        boot_id: name of the stream.
-        stream: what is kept of it; None: nothing yet.
-        needed: which numbers sessions need of the node, by stream.
+        boot_id: id of the stream.
+        stream: stored stream; None: nothing yet.
+        needed_frames: returns the frames that sessions need of the node, by stream id.
     """
 
     def __init__(
@@ -62,42 +62,42 @@ class KnownStream:
     def of(
         cls, node: ServerNode, boot_id: str, needed: Callable[[], Mapping[str, Intervals]]
     ) -> KnownStream | None:
-        """A stream by its name; None if it is not known, or not any more."""
+        """Return the view of a stream by its id; None: unknown, or no longer known."""
         stream = node.streams.get(boot_id)
-        # After a restart of the server nothing is there of one of which nothing has come.
+        # After a restart of the server a stream without stored frames has no folder.
         if stream is None and (node.has_spoken or boot_id not in node.order):
             return None
         return cls(node, boot_id, stream, needed)
 
     @property
     def held(self) -> Intervals:
-        """As `Known.held`."""
+        """See `StreamView.stored`."""
         return Intervals() if self._stream is None else self._stream.held
 
     @property
     def lost(self) -> Losses:
-        """As `Known.lost`."""
+        """See `StreamView.lost`."""
         return Losses() if self._stream is None else self._stream.lost
 
     @property
     def is_over(self) -> bool:
-        """As `Known.is_over`."""
+        """See `StreamView.has_ended`."""
         return self._boot_id != self._node.boot_id
 
     @property
     def end(self) -> int:
-        """As `Known.end`."""
-        said = None if self._stream is None else self._stream.notes.next_seq
-        known = [last + 1 for last in (self.held.last, self.lost.all.last) if last is not None]
-        return max([said or 0, *known])
+        """See `StreamView.end_seq`."""
+        announced = None if self._stream is None else self._stream.notes.next_seq
+        ends = [last + 1 for last in (self.held.last, self.lost.all.last) if last is not None]
+        return max([announced or 0, *ends])
 
     @property
     def following(self) -> str | None:
-        """As `Known.following`."""
+        """See `StreamView.next_stream`."""
         node, order = self._node, self._node.order
         if self._boot_id in order:
             return (*order, None)[order.index(self._boot_id) + 1]
-        # The node has forgotten it: the next is the first that it began later, by its own clock.
+        # Hello no longer lists it: the next one is the first that began later, by the node's clock.
         journal = None if self._stream is None else self._stream.journal
         last_t_ns = None if journal is None else journal.t_ns_near(NO_END, newest=True)
         if last_t_ns is not None:
@@ -107,11 +107,11 @@ class KnownStream:
         return node.boot_id
 
     def to_come(self) -> Intervals:
-        """As `Known.to_come`."""
+        """Return the frames as in `StreamView.compute_obtainable`."""
         stream = self._stream
         if stream is None:
             return Intervals([(0, NO_END)])
-        if stream.node_has is None:  # it has not spoken since the server was started
+        if stream.node_has is None:  # no hello since the server was started
             return stream.may_come - stream.held
         needed = self._needed().get(self._boot_id, Intervals())
         return stream.lacks(needed, all_of_it=not self.is_over)

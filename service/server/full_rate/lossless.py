@@ -1,7 +1,7 @@
-"""What comes next for one who is to have every frame once, in order: a rule without any I/O.
+"""Position of a reader that receives every frame once, in order; no I/O.
 
-What is still to come is waited for; what will not come is said. Who has fallen out of memory by his
-own slowness is told the position to resume from.
+The reader waits for frames that may still come; lost ones are reported. A reader too slow for the
+buffer is disconnected with the position to resume from.
 """
 
 from __future__ import annotations
@@ -16,33 +16,37 @@ from service.server.full_rate.memory import NodeMemory, Piece
 from storage.intervals import NO_END, Intervals
 
 NOT_KEPT = "not_kept"
-"""Why a frame is lost that this server has had, or could have had, and nobody has reserved."""
+"""Loss reason of frames that this server did not keep, since no session needs them."""
 
 
 @dataclass(frozen=True)
 class Again:
-    """Frames to be estimated again from the journal, whose next one is held.
+    """Request to estimate frames again from the journal, which has the next one.
 
     Attributes:
-        at: the first of them.
-        last: the greatest number that is held.
-        ends: will no more frames of this stream come?
-        until: from this number on memory has them; None: it has none.
+        position: first frame.
+        last_seq: greatest stored number.
+        is_final: True: no more frames of this stream will come.
+        until_seq: first number in the buffer; None: the buffer has none.
     """
 
     at: Position
+    """first frame."""
     last: int
+    """greatest stored number."""
     ends: bool
+    """True: no more frames of this stream will come."""
     until: int | None
+    """first number in the buffer; None: the buffer has none."""
 
 
 class Lossless:
-    """A reader's position.
+    """Position of a reader that receives every frame.
 
     Args:
-        memory: of the node.
-        look: what is known of a stream; None: nothing, or not any more.
-        position: the frame that is wanted first; None: the next that comes.
+        buffer: buffer of the node.
+        find_stream: returns the present state of a stream; None: unknown, or no longer known.
+        position: first frame to send; None: the next one.
     """
 
     def __init__(
@@ -55,46 +59,46 @@ class Lossless:
         self._memory = memory
         self._look = look
         self._number: int | None = memory.next_number if position is None else None
-        """Of the piece that comes next, for one who reads from memory."""
+        """Number of the next batch, while the reader is served from the buffer."""
 
     def next(self) -> Item | Again | None:
-        """What comes next; None: nothing yet.
+        """Return the next event; None: nothing yet.
 
         Raises:
-            HangUp: it cannot go on; the reason says from where to resume.
+            HangUp: the reader cannot go on; the reason has the position to resume from.
         """
         memory = self._memory
-        if (at := self.position) is None:
+        if (position := self.position) is None:
             if self._number is None or self._number >= memory.next_number:
                 return None
             self._number = max(self._number, memory.oldest)
             piece = memory[self._number]
-            at = self.position = Position(piece.boot_id, piece.first)
-        if (found := self._piece(at)) is not None:
+            position = self.position = Position(piece.boot_id, piece.first)
+        if (found := self._piece(position)) is not None:
             self._number = found.number + 1
-            self.position = Position(at.boot_id, found.last + 1)
-            begin = at.seq - found.first
+            self.position = Position(position.boot_id, found.last + 1)
+            begin = position.seq - found.first
             rows = cut((found.frames, found.columns), begin, len(found.frames))
-            return Rows(at.boot_id, rows, found.number if begin == 0 else None)
-        stream = self._look(at.boot_id)
+            return Rows(position.boot_id, rows, found.number if begin == 0 else None)
+        stream = self._look(position.boot_id)
         if stream is None:
-            raise HangUp(Close.NO_STREAM, f"not kept any more: stream {at.boot_id}")
-        ahead = memory.after(at.boot_id, at.seq)
-        held = stream.held
-        if held.within(at.seq, at.seq):
-            # Frames that wait for their look-ahead come from the live estimates, in a moment.
-            if ahead is None and not stream.is_over and memory.last(at.boot_id) is not None:
+            raise HangUp(Close.NO_STREAM, f"no longer stored: stream {position.boot_id}")
+        ahead = memory.after(position.boot_id, position.seq)
+        stored = stream.held
+        if stored.within(position.seq, position.seq):
+            # The live estimator still holds these frames for their look-ahead.
+            if ahead is None and not stream.is_over and memory.last(position.boot_id) is not None:
                 return None
             until = None if ahead is None else ahead.first
-            return Again(at, held.last or at.seq, stream.is_over, until)
-        return self._gap(at, stream, ahead)
+            return Again(position, stored.last or position.seq, stream.is_over, until)
+        return self._gap(position, stream, ahead)
 
     def had(self, rows: Rows) -> None:
-        """Frames that were estimated again have been given."""
+        """Move the position behind recomputed frames."""
         self.position = Position(rows.boot_id, rows.to_seq + 1)
 
     def _piece(self, at: Position) -> Piece | None:
-        """The piece in memory with this frame, if there is one."""
+        """Return the buffered batch with this frame, if there is one."""
         memory, number = self._memory, self._number
         if number is None:
             return memory.find(at.boot_id, at.seq)
@@ -104,16 +108,18 @@ class Lossless:
             piece = memory[number]
             if piece.boot_id == at.boot_id and piece.first <= at.seq:
                 return piece
-            self._number = None  # frames are missing between
+            self._number = None  # frames between are missing
         return None
 
     def _gap(self, at: Position, stream: Known, ahead: Piece | None) -> Item | None:
-        """The frame is not here: is it still to come, lost, or behind the stream's end?"""
+        """Return the event for a frame that is not stored: none yet, a gap, or the next stream."""
         comes = stream.to_come().within(at.seq, NO_END).first
         if comes == at.seq:
             return None
-        held = stream.held.within(at.seq, NO_END).first
-        here = [n for n in (None if ahead is None else ahead.first, held, comes) if n is not None]
+        next_stored = stream.held.within(at.seq, NO_END).first
+        here = [
+            n for n in (None if ahead is None else ahead.first, next_stored, comes) if n is not None
+        ]
         if not here and stream.is_over:
             here = [max(at.seq, stream.end)]
         to_seq = min(here, default=at.seq) - 1
@@ -132,11 +138,11 @@ class Lossless:
 
 
 def _reason(stream: Known, first: int, last: int) -> tuple[str, int]:
-    """Why frames are lost, and up to which of them that is the reason."""
-    known = stream.lost.within(Intervals([(first, last)]))
-    for reason, numbers in known.items():
+    """Return the reason why frames are lost, and the last frame with this reason."""
+    by_reason = stream.lost.within(Intervals([(first, last)]))
+    for reason, numbers in by_reason.items():
         for begin, end in numbers:
             if begin == first:
                 return reason, end
-    begins = [begin for numbers in known.values() for begin, _ in numbers]
+    begins = [begin for numbers in by_reason.values() for begin, _ in numbers]
     return NOT_KEPT, min([last, *(begin - 1 for begin in begins)])

@@ -1,7 +1,7 @@
-"""What a node's live estimates gave lately, piece by piece, for all who take every frame.
+"""Buffer of a node's newest live estimates, batch by batch, for all readers of every frame.
 
-Pieces are kept as they were made, and nothing is copied or encoded before somebody asks. Memory is
-bounded whatever comes, and a node that nobody has asked for costs none.
+Batches are stored without copying, and encoded only on request. Memory is bounded, and a node
+without readers costs none.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from service.server.node import ServerNode
 from service.sessions.pipeline import Columns
 
 BYTES_MAX = 8 << 20
-"""Of one node: some 20 s of 8 tiles at 544 Hz, more of fewer."""
+"""Limit per node: some 20 s of 8 tiles at 544 Hz, more of fewer."""
 _PIECE_BYTES = 3000
-"""What a piece takes beside its numbers: objects of numpy, some forty."""
+"""Size of a batch beside its numbers: some forty numpy objects."""
 _LOOK_AGAIN_S = 1.0
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Consecutive frames of one stream, as the live estimates gave them."""
+    """Consecutive frames of one stream with their live estimates."""
 
     number: int
-    """Of the piece, counted since the node was first asked for."""
+    """Number of the batch, counted since the node's first reader."""
     boot_id: str
     frames: FrameBatch
     columns: Columns
@@ -47,17 +47,18 @@ class Piece:
 
 
 class NodeMemory:
-    """The newest pieces of one node, and those who wait for the next.
+    """Newest batches of one node, and the readers that wait for the next.
 
     Args:
-        turn: to compute something again: one at a time, so that the live picture has a core.
-        bytes_max: of all that is kept.
+        recompute_turn: semaphore: one reader recomputes at a time, so that live estimation has a
+            core.
+        bytes_max: size limit.
     """
 
     def __init__(self, turn: asyncio.Semaphore, bytes_max: int = BYTES_MAX) -> None:
         self.turn = turn
         self.shared = Shared()
-        """What was encoded of the pieces, for others who ask for the same."""
+        """Encoded messages of the batches."""
         self._pieces: deque[Piece] = deque()
         self._bytes_max = bytes_max
         self._bytes = 0
@@ -66,21 +67,21 @@ class NodeMemory:
 
     @property
     def oldest(self) -> int:
-        """Number of the oldest piece that is kept, or of the next, if there is none."""
+        """Number of the oldest batch, or of the next one if the buffer is empty."""
         return self._next_number - len(self._pieces)
 
     @property
     def watchers(self) -> int:
-        """How many read it now."""
+        """Number of present readers."""
         return len(self._waiting)
 
     @property
     def next_number(self) -> int:
-        """Number of the piece that comes next."""
+        """Number of the next batch."""
         return self._next_number
 
     def add(self, boot_id: str, due: list[Estimated]) -> None:
-        """What the live estimates have given; it may be nothing, and that is told as well."""
+        """Add due batches, which may be none, and wake all readers."""
         for frames, columns in due:
             if not len(frames):
                 continue
@@ -88,25 +89,25 @@ class NodeMemory:
             self._next_number += 1
             self._bytes += _bytes_of(frames, columns)
         while self._bytes > self._bytes_max and len(self._pieces) > 1:
-            gone = self._pieces.popleft()
-            self._bytes -= _bytes_of(gone.frames, gone.columns)
+            oldest = self._pieces.popleft()
+            self._bytes -= _bytes_of(oldest.frames, oldest.columns)
         self.wake()
 
     def wake(self) -> None:
-        """Have all who wait look again."""
+        """Wake all readers that wait."""
         for each in self._waiting:
             each.set()
 
     def __getitem__(self, number: int) -> Piece:
-        """The piece of this number, which is kept."""
+        """Return the batch of this number, which is in the buffer."""
         return self._pieces[number - self.oldest]
 
     def find(self, boot_id: str, seq: int) -> Piece | None:
-        """The piece with this frame; None if it is not kept."""
+        """Return the batch with this frame; None if it is not in the buffer."""
         return next((p for p in self._of(boot_id) if p.first <= seq <= p.last), None)
 
     def after(self, boot_id: str, seq: int) -> Piece | None:
-        """The oldest kept piece of a stream that begins after this frame; None if none does."""
+        """Return the oldest batch of a stream that begins after this frame; None without one."""
         found = None
         for piece in self._of(boot_id):
             if piece.first <= seq:
@@ -115,17 +116,17 @@ class NodeMemory:
         return found
 
     def last(self, boot_id: str) -> int | None:
-        """Number of the newest frame of this stream that is kept; None if none is."""
+        """Return the newest number of this stream in the buffer; None if there is none."""
         piece = next(self._of(boot_id), None)
         return None if piece is None else piece.last
 
     def _of(self, boot_id: str) -> Iterator[Piece]:
-        """Pieces of a stream, the newest first: who asks is mostly near the end."""
+        """Yield batches of a stream, the newest first: readers are mostly near the end."""
         return (piece for piece in reversed(self._pieces) if piece.boot_id == boot_id)
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[asyncio.Event]:
-        """An event that is set whenever something has come."""
+        """Context manager: an event that is set whenever frames have come."""
         news = asyncio.Event()
         self._waiting.add(news)
         try:
@@ -135,7 +136,7 @@ class NodeMemory:
 
 
 async def wait_for(news: asyncio.Event) -> None:
-    """Wait until something has come, or for a second: not all that changes is told."""
+    """Wait for new frames, at most a second: not every change sets the event."""
     try:
         async with asyncio.timeout(_LOOK_AGAIN_S):
             await news.wait()
@@ -144,18 +145,18 @@ async def wait_for(news: asyncio.Event) -> None:
 
 
 class Memories:
-    """Memories of the nodes that were asked for."""
+    """Buffers of the nodes with readers."""
 
     def __init__(self) -> None:
         self._of: dict[str, NodeMemory] = {}
         self._turn = asyncio.Semaphore(1)
 
     def of(self, node: str) -> NodeMemory:
-        """The memory of a node, which begins now if nobody has asked for it before."""
+        """Return the buffer of a node, created for its first reader."""
         return self._of.setdefault(node, NodeMemory(self._turn))
 
     def publish(self, node: ServerNode, due: list[Estimated]) -> None:
-        """Frames of a node's present stream with their estimates; cheap if nobody asked."""
+        """Add estimated frames of a node's present stream; cheap without readers."""
         memory = self._of.get(node.name)
         if memory is not None:
             memory.add(node.boot_id, due)

@@ -1,10 +1,10 @@
-"""What comes next for one who would rather have what is new than everything: without any I/O.
+"""Position of a reader that prefers new frames over all frames; no I/O.
 
-- `drop_oldest`: what is older than `QUEUE_NS` when its turn comes is left out.
-- `latest`: of what has come, the newest piece only.
+- `drop_oldest`: frames older than `QUEUE_NS` at their turn are dropped.
+- `latest`: of the buffered batches, only the newest is sent.
 
-Nothing is waited for, and all that is left out is said: from a reader's first frame on, what he had
-and what he was told add up to every frame that is known of.
+The reader waits for nothing, and every dropped frame is reported: from a reader's first frame on,
+frames sent and frames reported add up to every known frame.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from service.server.full_rate.known import Known
 from service.server.full_rate.memory import NodeMemory, Piece
 
 QUEUE_NS = 2_000_000_000
-"""Frames that `drop_oldest` lets wait, as time."""
+"""Age limit of waiting frames for `drop_oldest`."""
 SLOW, LATE = "slow", "late"
 
 
 class Newest:
-    """A reader's position.
+    """Position of a reader that drops old frames.
 
     Args:
-        memory: of the node.
-        look: what is known of a stream; None: nothing, or not any more.
-        position: the frame that is wanted first; None: the next that comes.
-        queue_ns: frames that may wait, as time; None: none but the newest piece.
+        buffer: buffer of the node.
+        find_stream: returns the present state of a stream; None: unknown, or no longer known.
+        position: first frame to send; None: the next one.
+        queue_ns: age limit of waiting frames; None: only the newest batch is sent.
     """
 
     def __init__(
@@ -42,39 +42,39 @@ class Newest:
         self._look = look
         self._queue_ns = queue_ns
         self._number = memory.next_number
-        """Of the piece that comes next."""
+        """Number of the next batch to send."""
         if position is not None:
-            at = position.boot_id, position.seq
-            found = memory.find(*at) or memory.after(*at)
+            key = position.boot_id, position.seq
+            found = memory.find(*key) or memory.after(*key)
             self._number = self._number if found is None else found.number
 
     def next(self) -> Item | None:
-        """What comes next; None: nothing yet."""
+        """Return the next event; None: nothing yet."""
         while self._number < self._memory.next_number:
-            piece, at = self._wanted(), self.position
+            piece, position = self._wanted(), self.position
             reason = SLOW if piece.number > self._number else LATE
-            if at is not None and at.boot_id != piece.boot_id:
-                end = self._end(at.boot_id)
-                self.position = Position(self._onward(at.boot_id, piece.boot_id), 0)
-                if at.seq < end:
-                    return Missing(at.boot_id, at.seq, end - 1, reason)
-            elif at is not None and at.seq < piece.first:
-                self.position = Position(at.boot_id, piece.first)
-                return Missing(at.boot_id, at.seq, piece.first - 1, reason)
+            if position is not None and position.boot_id != piece.boot_id:
+                end = self._end(position.boot_id)
+                self.position = Position(self._onward(position.boot_id, piece.boot_id), 0)
+                if position.seq < end:
+                    return Missing(position.boot_id, position.seq, end - 1, reason)
+            elif position is not None and position.seq < piece.first:
+                self.position = Position(position.boot_id, piece.first)
+                return Missing(position.boot_id, position.seq, piece.first - 1, reason)
             else:
                 self._number = piece.number + 1
-                begin = 0 if at is None else at.seq - piece.first
-                if begin < len(piece.frames):  # else it was had before the server was restarted
+                begin = 0 if position is None else position.seq - piece.first
+                if begin < len(piece.frames):
                     self.position = Position(piece.boot_id, piece.last + 1)
                     rows = cut((piece.frames, piece.columns), begin, len(piece.frames))
                     return Rows(piece.boot_id, rows, piece.number if begin == 0 else None)
         return None
 
     def had(self, rows: Rows) -> None:
-        """Nothing is estimated again for this reader."""
+        """Ignore recomputed frames: this reader never gets any."""
 
     def _wanted(self) -> Piece:
-        """The oldest piece that is not to be left out."""
+        """Return the oldest batch that is not to be dropped."""
         memory = self._memory
         newest = memory[memory.next_number - 1]
         if self._queue_ns is None:
@@ -86,20 +86,20 @@ class Newest:
         return memory[number]
 
     def _end(self, boot_id: str) -> int:
-        """Number after the last frame that is known of a stream which is over."""
+        """Return the number after the last known frame of an ended stream."""
         stream, last = self._look(boot_id), self._memory.last(boot_id)
         return max(0 if stream is None else stream.end, 0 if last is None else last + 1)
 
     def _onward(self, boot_id: str, aim: str) -> str:
-        """The stream after this one, on the way to that of a piece."""
+        """Return the stream after this one, on the way to the stream of a batch."""
         first, seen = aim, {boot_id}
-        at: str | None = boot_id
-        while at is not None and at != aim:
-            stream = self._look(at)
-            at = None if stream is None else stream.following
-            if at in seen:
+        current: str | None = boot_id
+        while current is not None and current != aim:
+            stream = self._look(current)
+            current = None if stream is None else stream.following
+            if current in seen:
                 return aim
-            if at is not None and len(seen) == 1:
-                first = at
-            seen.add(at or "")
-        return first if at == aim else aim
+            if current is not None and len(seen) == 1:
+                first = current
+            seen.add(current or "")
+        return first if current == aim else aim

@@ -1,8 +1,8 @@
-"""A reader of every frame: what comes next by its policy, from memory or from the journal.
+"""Reader of the live feed: next events by its policy, from the buffer or the journal.
 
-A reader is a position, not a queue: whoever reads slowly, or not at all, is written nothing and
-costs nothing. What comes next is decided in `lossless` and `newest`; here it is waited for, and
-what has to be estimated again is estimated in a thread, one reader after the other.
+A reader is a position, not a queue: a slow reader costs no memory. The next event is decided in
+`lossless_cursor` and `lossy_cursor`; this module waits for it, and recomputes frames in a thread,
+one reader after the other.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 
 def first_position(node: ServerNode, boot_id: str | None, from_seq: int | None) -> Position | None:
-    """From which frame on somebody wants to read; None: from the next that comes.
+    """Return the first frame for a reader; None: the next one that comes.
 
     Raises:
-        HangUp: there is no such stream.
+        HangUp: no stream has this id.
     """
     if boot_id is None and from_seq is None:
         return None
@@ -50,15 +50,15 @@ def first_position(node: ServerNode, boot_id: str | None, from_seq: int | None) 
 
 
 class Reader:
-    """One who takes frames of one node.
+    """Reader of one node's frames.
 
     Args:
         node: the node.
-        memory: of the node.
-        policy: what is left out.
-        position: the frame that is wanted first; None: the next that comes.
-        needed: which numbers sessions need of the node, by stream.
-        drop_damaged: told of frames that are damaged on disk, so that they are held no longer.
+        buffer: buffer of the node.
+        policy: rule for dropping frames.
+        position: first frame to send; None: the next one.
+        needed_frames: returns the frames that sessions need of the node, by stream id.
+        invalidate_damaged: called with frames that are damaged on disk.
     """
 
     def __init__(
@@ -83,17 +83,17 @@ class Reader:
             self._course = Newest(memory, self._look, position, queue_ns)
         self._recomputed: Recomputed | None = None
         self._asked: Again | None = None
-        """What `_recomputed` was begun for."""
+        """Request for which `_recomputed` was created."""
         self._not_due: Again | None = None
-        """For what nothing was due."""
+        """Last request for which no frame was due."""
 
     async def items(self) -> AsyncGenerator[Item, None]:
-        """What comes next, without end.
+        """Yield events without end.
 
         Raises:
-            HangUp: it cannot go on.
+            HangUp: the reader cannot go on.
         """
-        said: str | None = None
+        announced_id: str | None = None
         async with self._memory.watched() as news:
             while True:
                 news.clear()
@@ -101,26 +101,26 @@ class Reader:
                 if item is None:
                     await wait_for(news)
                     continue
-                if not isinstance(item, Begins) and item.boot_id != said:
+                if not isinstance(item, Begins) and item.boot_id != announced_id:
                     yield Begins(item.boot_id, item.from_seq)
-                said = item.boot_id
+                announced_id = item.boot_id
                 yield item
 
     async def next(self) -> Item | None:
-        """What comes next; None: nothing yet.
+        """Return the next event; None: nothing yet.
 
         Raises:
-            HangUp: it cannot go on.
+            HangUp: the reader cannot go on.
         """
         while True:
             step = self._course.next()
             if not isinstance(step, Again):
                 return step
-            # While it warms up it would compile here. What is not due waits for its look-ahead.
+            # During warm-up this would compile here. Frames not due wait for their look-ahead.
             if is_warming() or step == self._not_due:
                 return None
             async with self._memory.turn:
-                step = self._course.next()  # meanwhile frames may have come, or gone
+                step = self._course.next()  # frames may have come or gone meanwhile
                 if not isinstance(step, Again):
                     return step
                 rows = await self._estimated_again(step)
@@ -133,41 +133,41 @@ class Reader:
         return KnownStream.of(self._node, boot_id, self._needed)
 
     async def _estimated_again(self, step: Again) -> Rows | None:
-        """The next rows from there on; None: look again, something has changed or none is due."""
-        at, stream = step.at, self._node.streams[step.at.boot_id]
-        begins = self._recomputed is None or self._recomputed.position != at
+        """Return the next recomputed rows; None: the state has changed, or no frame is due."""
+        position, stream = step.at, self._node.streams[step.at.boot_id]
+        begins = self._recomputed is None or self._recomputed.position != position
         try:
             if self._recomputed is None or begins:
-                self._recomputed = Recomputed(self._node, stream, at, ends=step.ends)
+                self._recomputed = Recomputed(self._node, stream, position, ends=step.ends)
                 self._asked = step
             found = await asyncio.to_thread(self._recomputed.next_rows)
         except DamagedFramesError as error:
             self._recomputed = None
             self._drop_damaged(error)
             if stream.held & Intervals([(error.seq_first, error.seq_last)]):
-                raise self._unreadable(at, error) from error
+                raise self._unreadable(position, error) from error
             return None
         except StorageError as error:
             log.warning("node %s, for a live client: %s", self._node.name, error)
-            raise HangUp(Close.TRY_LATER, f"frames cannot be read now; {at}") from error
+            raise HangUp(Close.TRY_LATER, f"frames cannot be read now; {position}") from error
         except FootTileError as error:
-            raise self._unreadable(at, error) from error
-        if found is None:  # up to where the journal went when it was begun
+            raise self._unreadable(position, error) from error
+        if found is None:  # the journal's end at creation is reached
             self._recomputed, self._not_due = None, self._asked
             return None
         first, last = int(found[0].seq[0]), int(found[0].seq[-1])
-        if first > at.seq:
+        if first > position.seq:
             self._recomputed = None
-            if begins and stream.held.within(at.seq, at.seq):
-                raise self._unreadable(at, "a frame that is held is not in its journal")
+            if begins and stream.held.within(position.seq, position.seq):
+                raise self._unreadable(position, "a stored frame is not in its journal")
             return None
-        if step.until is not None and last >= step.until:  # memory has the rest, as it came
+        if step.until is not None and last >= step.until:  # the buffer has the rest
             found = cut(found, 0, step.until - first)
-        rows = Rows(at.boot_id, found, recomputed=True)
+        rows = Rows(position.boot_id, found, recomputed=True)
         self._course.had(rows)
         return rows
 
     def _unreadable(self, at: Position, why: object) -> HangUp:
         log.warning("node %s, for a live client: %s", self._node.name, why)
-        reason = f"frame {at.seq} cannot be given, see the server's log; {at}"
+        reason = f"frame {at.seq} cannot be read, see the server's log; {at}"
         return HangUp(Close.UNREADABLE, reason)

@@ -1,9 +1,9 @@
-"""Frames that are not in memory any more, from the journal: estimated again as they were live.
+"""Frames that are no longer buffered, estimated again from the journal as they were live.
 
-With the live look-ahead, and the tare that was in force. What this server has estimated itself is
-begun anew where it was begun then, so that the bits are the same, if the frames before were there
-then, too. For the time before the server was started the history of tares says which was in force,
-by the frames' own instants; models run before the first frame for as long as they remember.
+With the live look-ahead, and the tare that was in force. The recorded epochs of the server's own
+estimates are repeated, so that the bits are the same, if the frames before were there then, too.
+For the time before the server was started the history of tares says which tare was in force, by the
+frames' times; models start so many frames earlier that their initial state is forgotten.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ ROWS_AT_ONCE = 1024
 
 @dataclass(frozen=True)
 class Change:
-    """Estimates are begun anew here; without calibration or tare there are none from here on.
+    """Change of calibration or tare; without both, frames are not estimated.
 
     Attributes:
-        calibration: in use from here on.
-        tare: in force from here on.
-        seq: from this frame on.
-        t_ns: or after this instant of the node's UTC.
+        calibration: calibration in use from here on.
+        tare: tare in force from here on.
+        seq: first frame of the change.
+        t_ns: or time after which it is in force, node's UTC.
     """
 
     calibration: Calibration | None
@@ -47,7 +47,7 @@ class Change:
     t_ns: int | None = None
 
     def rows_before(self, frames: FrameBatch) -> int:
-        """How many of these frames come before it."""
+        """Return the number of frames before the change."""
         if self.seq is not None:
             return int(np.searchsorted(frames.seq, self.seq, side="left"))
         return 0 if self.t_ns is None else int(np.searchsorted(frames.t_ns, self.t_ns, "right"))
@@ -60,22 +60,24 @@ def estimated(
     *,
     ends: bool,
 ) -> Iterator[Estimated]:
-    """Frames with their estimates, each once, in order.
+    """Yield frames with their estimates, each once, in order.
 
     Args:
         batches: frames of one stream, in order.
-        info: its array.
-        changes: of calibration and tare, in order; before the first there are no estimates.
-        ends: no more frames will come; else those that wait for their look-ahead are left out.
+        info: array of the stream.
+        changes: changes of calibration and tare, in order; frames before the first are not
+            estimated.
+        is_final: True: no more frames will come; else frames that wait for their look-ahead are
+            left out.
     """
     run: EstimateRun | None = None
     to_come = deque(changes)
     for frames in batches:
         rest = frames
-        while to_come and (at := to_come[0].rows_before(rest)) < len(rest):
-            if at:
-                yield from _fed(run, rest.rows(0, at))
-                rest = rest.rows(at, len(rest))
+        while to_come and (count := to_come[0].rows_before(rest)) < len(rest):
+            if count:
+                yield from _fed(run, rest.rows(0, count))
+                rest = rest.rows(count, len(rest))
             if run is not None:
                 yield from run.finish()
             run = _run(info, to_come.popleft())
@@ -101,15 +103,15 @@ def _fed(run: EstimateRun | None, frames: FrameBatch) -> Iterator[Estimated]:
 
 
 class Recomputed:
-    """Frames of one stream from one number on, as far as the journal goes now.
+    """Recomputed frames of one stream from one number on, up to the journal's present end.
 
-    Made in the server's loop; `next_rows` may run in another thread.
+    Created on the event loop; `next_rows` may run in another thread.
 
     Args:
-        node: whose stream it is.
-        stream: the stream, which has a journal.
-        position: the first frame that is wanted.
-        ends: will no more frames of this stream come?
+        node: node of the stream.
+        stream: stream with a journal.
+        position: first frame.
+        is_final: True: no more frames of this stream will come.
 
     Raises:
         StorageError: the journal cannot be read.
@@ -121,7 +123,7 @@ class Recomputed:
         assert stream.journal is not None  # noqa: S101  # the caller holds a frame of it
         self._journal: Journal = stream.journal
         self.position = position
-        """The frame that is wanted next."""
+        """Next frame."""
         calibration = node.estimates.live.calibration
         if calibration is not None and not _fits(calibration, stream.info, node.info):
             calibration = None
@@ -138,7 +140,7 @@ class Recomputed:
     def _begin(
         self, node: ServerNode, stream: ServerStream, calibration: Calibration | None, seq: int
     ) -> int:
-        """Number of the frame with which models begin."""
+        """Return the number of the frame with which models start."""
         t_ns = self._journal.t_ns_near(seq, newest=False)
         tare = node.estimates.tares.to_use(stream.info)
         if calibration is None or tare is None or t_ns is None:
@@ -150,11 +152,11 @@ class Recomputed:
         return seq if since is None else min(seq, since)
 
     def next_rows(self) -> Estimated | None:
-        """The next frames that are due, `ROWS_AT_ONCE` at most; None: no more are for now.
+        """Return the next due frames, at most `ROWS_AT_ONCE`; None: no more for now.
 
         Raises:
-            DamagedFramesError: frames are damaged; which, it says.
-            FileFormatError: what it holds are no frames of this stream.
+            DamagedFramesError: frames are damaged; the error has their numbers.
+            FileFormatError: the journal has no frames of this stream.
             StorageError: it cannot be read.
         """
         while True:
@@ -164,7 +166,7 @@ class Recomputed:
                 return None
             begin = int(np.searchsorted(frames.seq, self.position.seq))
             end = min(len(frames), begin + ROWS_AT_ONCE)
-            # Only frames that follow one another leave together.
+            # Return consecutive frames only.
             steps = np.flatnonzero(np.diff(frames.seq[begin:end]) != 1)
             if len(steps):
                 end = begin + int(steps[0]) + 1
@@ -176,10 +178,10 @@ class Recomputed:
 
 
 def _fits(calibration: Calibration, info: ArrayInfo, present: ArrayInfo) -> bool:
-    """Can a stream be estimated with the calibration of the node's present one?"""
+    """Return whether a stream can be estimated with the calibration of the node's present one."""
     if not info.has_same_tiles_as(present):
         return False
-    try:  # its scene may have asked for other models
+    try:  # its scene may name other models
         EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
     except FootTileError:
         return False
@@ -193,21 +195,21 @@ def _changes(
     begin: int,
     last: int,
 ) -> list[Change]:
-    """Where the estimates of these frames began anew, in order."""
-    own = [
+    """Return the changes of calibration and tare within these frames, in order."""
+    recorded = [
         Change(each.calibration, each.tare, seq=each.seq)
         for each in node.estimates.begun(stream.boot_id)
     ]
-    before = [change for change in own if change.seq is not None and change.seq <= begin]
-    if before:  # all of it is this server's own
-        return own[len(before) - 1 :]
+    before = [change for change in recorded if change.seq is not None and change.seq <= begin]
+    if before:  # this server has estimated all of these frames
+        return recorded[len(before) - 1 :]
     journal = stream.journal
     if journal is None:
-        return own
-    until = last if not own or own[0].seq is None else max(begin, own[0].seq - 1)
+        return recorded
+    until = last if not recorded or recorded[0].seq is None else max(begin, recorded[0].seq - 1)
     t_ns = journal.t_ns_near(begin, newest=False)
     until_ns = journal.t_ns_near(until, newest=True)
     if t_ns is None or until_ns is None:
-        return own
+        return recorded
     tares = node.estimates.tares.during(stream.info, t_ns, until_ns)
-    return [*(Change(calibration, tare, t_ns=tare.t_ns) for tare in tares), *own]
+    return [*(Change(calibration, tare, t_ns=tare.t_ns) for tare in tares), *recorded]

@@ -1,1 +1,1 @@
-"""What is shown of a server: live, to all screens that watch, and in the answers of its API."""
+"""Broadcast of summaries to the live page's subscribers, and the JSON shapes of the API."""

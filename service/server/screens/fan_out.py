@@ -1,8 +1,9 @@
-"""Who watches: screens that are told the same at the same pace share one feed, and one text.
+"""Broadcast of summaries to the subscribers of the live page.
 
-What they are told is summed up, encoded and framed once a tick, however many they are; for each of
-them there is one write, which never waits. A screen that has not read what it was given is given
-nothing more: it is summed up for on its own until it reads, or is let go. Others do not feel it.
+Subscribers of the same nodes at the same rate share a rate group: its update is summarized, encoded
+and framed once per tick, and written to each without waiting. A subscriber that has not read the
+last update gets nothing more: its updates are merged until it reads, or until it is disconnected.
+Others are not affected.
 """
 
 from __future__ import annotations
@@ -23,36 +24,36 @@ from service.server.screens.spans import span_of
 from service.server_clock import utc_ns
 
 RATES_HZ = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0)
-"""How often a screen may be told; what is asked for is rounded down to one of them."""
+"""Update rates; a requested rate is rounded down."""
 TOO_SLOW_S = 10.0
-"""A screen that does not read for so long is let go; it may come back."""
+"""Timeout of a subscriber that does not read; it may reconnect."""
 _AT_A_TIME = 64
-"""Screens that are written to before others of the loop's tasks have their turn."""
+"""Subscribers written to before other tasks of the event loop run."""
 
 
 class Outlet(Protocol):
-    """A websocket that is written to without waiting."""
+    """Websocket with writes that do not wait."""
 
     @property
     def is_ready(self) -> bool:
-        """Has what was written before gone, but for what a transport holds (64 KiB)?"""
+        """True if all earlier writes are sent, up to the transport buffer (64 KiB)."""
 
     def write(self, framed: bytes) -> None:
-        """Write whole frames of the websocket protocol; nothing, if it is closed."""
+        """Write whole frames of the websocket protocol; nothing if it is closed."""
 
 
 class Viewer:
-    """One screen."""
+    """One subscriber."""
 
     def __init__(self, outlet: Outlet) -> None:
         self.over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        """Holds why it has to go, as an exception, once it has to."""
+        """Future with the reason, as an exception, once it has to be disconnected."""
         self._outlet = outlet
         self._missed: Summary | None = None
         self._behind_since_s = 0.0
 
     def tell(self, told: Told, now_s: float) -> None:
-        """Write it, with all that it has missed; or keep it for later."""
+        """Write the update with the backlog, or add it to the backlog."""
         is_ready = self._outlet.is_ready
         if self._missed is None:
             if is_ready:
@@ -67,13 +68,13 @@ class Viewer:
             self.end(HangUp(Close.TOO_SLOW, "this client does not read"))
 
     def end(self, reason: Exception) -> None:
-        """It has to go."""
+        """Request that the subscriber is disconnected."""
         if not self.over.done():
             self.over.set_exception(reason)
 
 
 class Told:
-    """What all screens of a feed are told at a tick."""
+    """Update for all subscribers of a rate group, encoded once."""
 
     def __init__(self, summary: Summary, ages_ms: Mapping[str, float]) -> None:
         self.news, self.ages_ms = summary.take(), ages_ms
@@ -81,7 +82,7 @@ class Told:
 
 
 class Feed:
-    """Screens that watch the same at the same rate."""
+    """Subscribers of the same nodes at the same rate."""
 
     def __init__(self, only: str | None, rate_hz: float, nodes: Mapping[str, ServerNode]) -> None:
         self.viewers: set[Viewer] = set()
@@ -91,12 +92,12 @@ class Feed:
         self._nodes = nodes
 
     def change(self) -> Summary:
-        """What is to be told at the next tick, to be added to."""
+        """Return the content of the next tick, for additions, and schedule the tick."""
         self._news.set()
         return self._summary
 
     async def run(self) -> None:
-        """Tell at the feed's rate what there is, until cancelled."""
+        """Send updates at the group's rate until cancelled."""
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while True:
@@ -106,45 +107,45 @@ class Feed:
             try:
                 await self.tick(loop.time())
             except Exception as error:
-                # A text that cannot be made is one feed's fault: its screens may come again.
+                # An encoding error affects one group only: its subscribers may reconnect.
                 for viewer in self.viewers:
                     viewer.end(error)
             await asyncio.sleep(due_s - loop.time())
 
     async def tick(self, now_s: float) -> None:
-        """Tell everybody what there is."""
+        """Send the pending update to all subscribers."""
         if not self._summary:
             return
-        told = Told(self._summary, _ages_ms(self._nodes.values()))
-        for at, viewer in enumerate(tuple(self.viewers), 1):
-            if viewer in self.viewers:  # it may have left while others had their turn
-                viewer.tell(told, now_s)
-            if at % _AT_A_TIME == 0:
+        tick = Told(self._summary, _ages_ms(self._nodes.values()))
+        for count, viewer in enumerate(tuple(self.viewers), 1):
+            if viewer in self.viewers:  # it may have left meanwhile
+                viewer.tell(tick, now_s)
+            if count % _AT_A_TIME == 0:
                 await asyncio.sleep(0)
 
 
 class Hub:
-    """All screens of a server; used from its loop."""
+    """All subscribers of a server, and the last minute of each node; used from one event loop."""
 
     def __init__(self) -> None:
         self._feeds: dict[tuple[str | None, float], tuple[Feed, asyncio.Task[None]]] = {}
         self._nodes: dict[str, ServerNode] = {}
-        """Those that have sent frames."""
+        """Nodes that have sent frames."""
         self._recent: dict[str, Recent] = {}
         self._recent_tiles: dict[str, RecentTiles] = {}
 
     @property
     def subscribers(self) -> int:
-        """How many screens there are."""
+        """Number of subscribers."""
         return sum(len(feed.viewers) for feed, _ in self._feeds.values())
 
     def join(self, outlet: Outlet, rate_hz: float, only: str | None = None) -> Viewer:
-        """A screen that is told what happens from now on, on all nodes or `only` one.
+        """Add a subscriber to events from now on, of all nodes or one.
 
         Args:
-            outlet: where it is written to.
-            rate_hz: how often at most, 1 to 60.
-            only: the node it wants to see.
+            socket: websocket of the subscriber.
+            rate_hz: greatest update rate, 1 to 60.
+            node_filter: node of interest; None: all.
         """
         key = only, max(rate for rate in RATES_HZ if rate <= rate_hz)
         if key not in self._feeds:
@@ -155,7 +156,7 @@ class Hub:
         return viewer
 
     def leave(self, viewer: Viewer) -> None:
-        """Forget a screen."""
+        """Remove a subscriber."""
         for key, (feed, task) in list(self._feeds.items()):
             feed.viewers.discard(viewer)
             if not feed.viewers:
@@ -163,19 +164,19 @@ class Hub:
                 del self._feeds[key]
 
     def notice(self, message: Mapping[str, Any]) -> None:
-        """Tell everybody."""
+        """Send a message to all subscribers with the next update."""
         if self._feeds:
             text = dumps(message)
             for summary in self._changing():
                 summary.notice(text)
 
     def count(self, node: str, counted: Mapping[str, Mapping[str, Any]]) -> None:
-        """Tell everybody what sessions of a node have come to, by id."""
+        """Send the progress of sessions of a node to all subscribers, by id."""
         for summary in self._changing():
             summary.count(node, counted)
 
     def publish(self, node: ServerNode, due: list[Estimated]) -> None:
-        """Frames of a node with their estimates."""
+        """Add estimated frames of a node to its history and to the next updates."""
         self._nodes[node.name] = node
         for frames, columns in due:
             node.shown_t_ns = int(frames.t_ns[-1])
@@ -188,12 +189,12 @@ class Hub:
                     summary.add(node.name, piece)
 
     def recent(self, node: ServerNode) -> Recent:
-        """What was told of its present stream."""
+        """Return the force history of a node's present stream."""
         recent = self._recent.get(node.name)
         return recent if recent is not None and recent.boot_id == node.boot_id else Recent()
 
     def recent_tiles(self, node: ServerNode) -> RecentTiles:
-        """The same of each of its tiles."""
+        """Return the tile history of a node's present stream."""
         return self._of_tiles(node, len(node.info.tiles))
 
     def _of_tiles(self, node: ServerNode, tiles: int) -> RecentTiles:
@@ -203,16 +204,16 @@ class Hub:
         return recent
 
     def age_ms(self, node: ServerNode) -> float | None:
-        """How old the newest frame of its present stream is; None where that is not known."""
-        known = node.last_seq is not None
-        return _ages_ms([node]).get(node.name) if known else None
+        """Return the age of the newest frame of a node's present stream; None if unknown."""
+        has_frames = node.last_seq is not None
+        return _ages_ms([node]).get(node.name) if has_frames else None
 
     def _changing(self) -> list[Summary]:
         return [feed.change() for feed, _ in self._feeds.values()]
 
 
 def framed(texts: Iterable[str]) -> bytes:
-    """Text messages as a server sends them on a websocket (RFC 6455), one behind the other."""
+    """Encode texts as websocket messages of a server (RFC 6455), one behind the other."""
     return b"".join(
         Frame(Opcode.TEXT, text.encode()).serialize(mask=False, extensions=()) for text in texts
     )

@@ -1,8 +1,7 @@
-"""What screens are told: the newest frame of each node, the peaks of all since, and what was not.
+"""Summaries of frames for subscribers: newest frame and extremes per node, and drops.
 
-Until it is told, everything is summed up in one piece per node: who is told rarely, or never, costs
-no more than who is told often. Minimum and maximum of what was skipped go with every message, so
-that no peak hides.
+Frames between two ticks are merged into one summary per node, so a slow subscriber costs no more
+than a fast one. Minimum and maximum of skipped frames are in every message, so that no peak hides.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from service.server.screens.spans import Span
 from storage.intervals import Intervals
 
 SUMMARY_NS = 1_000_000_000
-"""A message sums up a second at most; older frames are reported as dropped."""
+"""Longest time in a summary; older frames are reported as dropped."""
 _NOTICES_MAX = 256
 
-# Digits that are finer than what is measured, and no more.
+# Decimal places: finer than the measurement.
 _DIGITS = {"kpa": 4, "n": 4, "m": 6, "rad": 5}
 _PER_TILE = (("gauge_kpa", "kpa"), ("force_n", "n"), ("force_sigma_n", "n"))
 _PER_FRAME = (
@@ -40,15 +39,15 @@ _PER_FRAME = (
     ("cop_sigma_y_m", "m"),
     ("angle_rad", "rad"),
 )
-# Made once: `json.dumps` would make one for each message.
+# Created once: `json.dumps` would create one per message.
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some consecutive frames of one stream, summed up once for all screens.
+    """Summary of consecutive frames of one stream.
 
-    Arrays are over tiles; NaN where nothing is known.
+    Arrays are (tiles,); NaN where unknown.
     """
 
     boot_id: str
@@ -60,7 +59,7 @@ class Piece:
     force_max_n: Floats
 
     def joined(self, later: Piece) -> Piece:
-        """This piece and a later one as one."""
+        """Return this summary and a later one as one."""
         return Piece(
             boot_id=self.boot_id,
             span=self.span.joined(later.span),
@@ -74,7 +73,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class News:
-    """What is to be told at one time."""
+    """Content of one tick."""
 
     notices: tuple[str, ...]
     counted: Mapping[str, Mapping[str, Any]]
@@ -82,13 +81,13 @@ class News:
     pieces: Mapping[str, Piece]
 
     def texts(self, ages_ms: Mapping[str, float]) -> list[str]:
-        """As messages.
+        """Encode the update as messages.
 
         Args:
-            ages_ms: how old the newest frame is, by node, where that is known.
+            ages_ms: age of the newest frame, by node, where known.
         """
         texts = []
-        if self.counted:  # before a session is told as sealed, with its final numbers
+        if self.counted:  # before the notice of a sealed session with its final numbers
             texts.append(dumps({"type": "counted", "sessions": self.counted}))
         texts += self.notices
         for node, dropped in self.dropped.items():
@@ -101,10 +100,10 @@ class News:
 
 
 class Summary:
-    """What is still to be told; it does not grow with time.
+    """Content that is still to be sent; its size does not grow with time.
 
     Args:
-        only: the node that is of interest; None: all.
+        node_filter: node of interest; None: all.
     """
 
     def __init__(self, only: str | None = None) -> None:
@@ -116,15 +115,15 @@ class Summary:
         self._counted: dict[str, Mapping[str, Any]] = {}
 
     def __bool__(self) -> bool:
-        """Is there anything?"""
+        """Return whether there is anything to send."""
         return bool(self._pieces or self._notices or self._counted or self._dropped)
 
     def notice(self, message: str) -> None:
-        """A message for everybody; the oldest are forgotten if nobody takes them."""
+        """Add a message for all; the oldest are dropped if they are not sent."""
         self._notices.append(message)
 
     def add(self, node: str, piece: Piece) -> None:
-        """More frames of a node."""
+        """Add the summary of newer frames of a node."""
         if self._only not in (None, node):
             return
         span = piece.span
@@ -142,19 +141,19 @@ class Summary:
         self._pieces[node] = piece
 
     def count(self, node: str, counted: Mapping[str, Mapping[str, Any]]) -> None:
-        """What sessions of a node have come to, by id; of each only the newest word is told."""
+        """Add the progress of sessions of a node, by id; only the newest per session is sent."""
         if self._only in (None, node):
             self._counted |= counted
 
     def take(self) -> News:
-        """All there is, which is then told."""
+        """Remove and return the content."""
         news = News(tuple(self._notices), self._counted, self._dropped, self._pieces)
         self._notices.clear()
         self._counted, self._dropped, self._pieces = {}, {}, {}
         return news
 
     def join(self, news: News) -> None:
-        """What was taken, and could not be told."""
+        """Put back an update that could not be sent."""
         self._notices.extend(news.notices)
         self._counted |= news.counted
         for node, dropped in news.dropped.items():
@@ -164,7 +163,7 @@ class Summary:
             self.add(node, piece)
 
     def _drop(self, node: str, seq_first: int, seq_last: int) -> None:
-        # What a screen misses for hours is one interval, not a list that grows.
+        # Frames missed for hours are one interval, not a growing list.
         self._dropped.setdefault(node, Intervals()).add(seq_first, seq_last)
 
 
@@ -194,11 +193,11 @@ def sum_up(
     frames: FrameBatch,
     columns: Mapping[str, npt.NDArray[Any]],
 ) -> Piece:
-    """Frames and their estimates, which may be none, as a piece.
+    """Return frames and their estimates, which may be none, as a summary.
 
     Args:
-        boot_id: the stream that they are of.
-        span: of the same frames.
+        boot_id: stream of the frames.
+        span: GRF over the same frames.
         frames: n frames.
         columns: their estimates by name.
     """
@@ -235,17 +234,17 @@ def sum_up(
 
 
 def rounded(values: npt.NDArray[Any], unit: str) -> list[float | None]:
-    """Numbers for a screen; what is not finite is null."""
+    """Round numbers for JSON; non-finite values become None."""
     return [
         number if math.isfinite(number) else None for number in values.round(_DIGITS[unit]).tolist()
     ]
 
 
 def one(value: float, unit: str) -> float | None:
-    """One number for a screen; what is not finite is null."""
+    """Round a number for JSON; a non-finite value becomes None."""
     return round(value, _DIGITS[unit]) if math.isfinite(value) else None
 
 
 def dumps(message: Mapping[str, Any]) -> str:
-    """Compact JSON; NaN has no place in it."""
+    """Encode compact JSON; NaN is an error."""
     return _ENCODER.encode(message)

@@ -1,8 +1,8 @@
-"""What screens were told of a node's force in its last minute, for one that is opened now.
+"""GRF of a node over the last minute, for a page that is opened now.
 
-Spans of frames with least and greatest, so that no peak hides. The newest are kept piece by piece
-as they were told, so that what a screen is told next goes on where they end, by number; older ones
-are joined. Memory is bounded whatever comes: 130 kB, and 50 kB more for what was told last.
+Spans with minimum and maximum, so that no peak hides. The newest ones are kept as they were
+published, so that live messages continue them without a seam; older ones are merged. Memory is
+bounded: 130 kB, and 50 kB for the newest.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from service.server.screens.spans import Span
 
 SECONDS_MAX = 60.0
 APART_NS = 1_000_000_000 // 30
-"""Older spans begin so far apart at least: no picture of a minute is finer."""
+"""Least distance between the begins of merged spans: no plot of a minute is finer."""
 _AS_TOLD_NS = 2_000_000_000
 _AS_TOLD_MAX = 128
 _OLDER_MAX = int(SECONDS_MAX * 1e9) // APART_NS + 2
@@ -29,22 +29,22 @@ _ROW = np.dtype(
 
 
 class Recent:
-    """The last minute of a node's present stream."""
+    """GRF over the last minute of a node's present stream."""
 
     def __init__(self) -> None:
         self.boot_id = ""
         self._as_told: deque[Span] = deque()
         self._joined: Span | None = None
-        """The newest of the older ones, to which more may be joined."""
+        """Newest merged span, to which more may be added."""
         self._older = np.zeros(_OLDER_MAX, _ROW)
         self._count = 0
-        """How many were ever written to `_older`, which is a ring."""
+        """Number of spans ever written to the ring `_merged`."""
 
     def add(self, boot_id: str, span: Span) -> None:
-        """Frames that are told now.
+        """Add frames that are published now.
 
         Args:
-            boot_id: the stream that they are of; a new one begins anew.
+            boot_id: stream of the frames; another one clears the history.
             span: newer than those before.
         """
         if boot_id != self.boot_id:
@@ -55,7 +55,7 @@ class Recent:
             self._join(self._as_told.popleft())
 
     def rows(self, seconds: float, before_seq: int | None = None) -> npt.NDArray[np.void]:
-        """The newest seconds, with the fields of `Span`, oldest first.
+        """Return the newest seconds, with the fields of `ForceSpan`, oldest first.
 
         Args:
             seconds: counted back from the newest frame.

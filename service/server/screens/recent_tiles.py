@@ -1,7 +1,7 @@
-"""Each tile over the last minute, for a screen that is opened now, by tenths of a second.
+"""Force and pressure of each tile over the last minute, per tenth of a second.
 
-Least and greatest of each, so that no peak hides; in half precision, to 0.05 % of the value, which
-no picture shows: 5 kB a tile and 20 kB for the numbers of the frames, whatever comes.
+Minimum and maximum, so that no peak hides; in half precision, to 0.05 % of the value, which no plot
+shows. Memory: 5 kB per tile and 20 kB for the frames' numbers.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Halves = npt.NDArray[np.float16]
 
 
 class RecentTiles:
-    """The last minute of a node's tiles.
+    """Tile extremes over the last minute of a node.
 
     Args:
-        boot_id: the stream that they are of.
-        tiles: how many there are.
+        boot_id: stream of the frames.
+        tile_count: number of tiles.
     """
 
     def __init__(self, boot_id: str, tiles: int) -> None:
@@ -37,46 +37,46 @@ class RecentTiles:
         self._rows = np.zeros(_MOST, _ROW)
         self._extremes: Halves = np.zeros((_MOST, 2, len(UNITS), tiles), np.float16)
         self._count = 0
-        """How many were ever begun; both are rings."""
+        """Number of spans ever started in the two rings."""
         self._begun_ns = 0
 
     def add(self, span: Span, columns: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Frames that are told now, newer than those before, with their estimates."""
+        """Merge published frames into each tile's minimum and maximum."""
         unknown = np.full((1, self.tiles), np.nan)
-        given = [columns.get(unit, unknown).clip(-_GREATEST, _GREATEST) for unit in UNITS]
+        quantities = [columns.get(unit, unknown).clip(-_GREATEST, _GREATEST) for unit in UNITS]
         least, greatest = (
-            np.array([pick.reduce(values, axis=0) for values in given], np.float16)
+            np.array([pick.reduce(values, axis=0) for values in quantities], np.float16)
             for pick in (np.fmin, np.fmax)
         )
         if self._count and span.t_ns_first - self._begun_ns < APART_NS:
-            at = (self._count - 1) % _MOST
-            row, kept = self._rows[at], self._extremes[at]
+            index = (self._count - 1) % _MOST
+            row, extremes = self._rows[index], self._extremes[index]
             row["seq"], row["n"], row["t_ns"] = span.seq, row["n"] + span.n, span.t_ns
-            np.fmin(kept[0], least, out=kept[0])
-            np.fmax(kept[1], greatest, out=kept[1])
+            np.fmin(extremes[0], least, out=extremes[0])
+            np.fmax(extremes[1], greatest, out=extremes[1])
             return
-        at, self._begun_ns = self._count % _MOST, span.t_ns_first
-        self._rows[at] = span.seq_first, span.seq, span.n, span.t_ns
-        self._extremes[at] = least, greatest
+        index, self._begun_ns = self._count % _MOST, span.t_ns_first
+        self._rows[index] = span.seq_first, span.seq, span.n, span.t_ns
+        self._extremes[index] = least, greatest
         self._count += 1
 
     def rows(
         self, seconds: float, unit: str, before_seq: int | None = None
     ) -> tuple[npt.NDArray[np.void], Halves, Halves]:
-        """The newest seconds, oldest first.
+        """Return the newest seconds, oldest first.
 
         Args:
             seconds: counted back from the newest frame.
-            unit: of `UNITS`.
+            unit: one of `UNITS`.
             before_seq: only spans that begin before this number.
 
         Returns:
-            Numbers (n,) with the fields of `Span`, least and greatest (n, tiles).
+            Numbers (n,) with the fields of `ForceSpan`, minimum and maximum (n, tiles).
         """
-        at = np.arange(max(0, self._count - _MOST), self._count) % _MOST
-        rows = self._rows[at]
+        indices = np.arange(max(0, self._count - _MOST), self._count) % _MOST
+        rows = self._rows[indices]
         keep = rows["seq_first"] < (np.iinfo(np.int64).max if before_seq is None else before_seq)
         if keep.any():
             keep &= rows["t_ns"] > rows["t_ns"][keep][-1] - int(seconds * 1e9)
-        least, greatest = self._extremes[at[keep], :, UNITS.index(unit)].swapaxes(0, 1)
+        least, greatest = self._extremes[indices[keep], :, UNITS.index(unit)].swapaxes(0, 1)
         return rows[keep], least, greatest

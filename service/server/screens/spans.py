@@ -1,4 +1,4 @@
-"""Consecutive frames of one stream, as far as the force on the whole foot goes."""
+"""Whole-foot force over consecutive frames of one stream."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from devices.frames import FrameBatch
 
 
 class Span(NamedTuple):
-    """Some consecutive frames; forces are NaN where they are not known."""
+    """GRF over consecutive frames; forces are NaN where unknown."""
 
     seq_first: int
     seq: int
     n: int
-    """Less than the numbers from first to last where some are missing."""
+    """Number of frames; less than the range of numbers where some are missing."""
     t_ns_first: int
     t_ns: int
-    """Of the newest frame, in the node's UTC."""
+    """Time of the newest frame, node's UTC."""
     grf_n: float
-    """Of the newest frame."""
+    """GRF of the newest frame."""
     grf_min_n: float
     grf_max_n: float
     grf_at_least_max_n: float
-    """Greatest lower bound of the frames whose GRF is not known."""
+    """Greatest lower bound among the frames without a GRF."""
 
     def joined(self, later: Span) -> Span:
-        """This span and a later one as one."""
+        """Return this span and a later one as one."""
         return Span(
             self.seq_first,
             later.seq,
@@ -45,7 +45,7 @@ class Span(NamedTuple):
 
 
 def span_of(frames: FrameBatch, columns: Mapping[str, npt.NDArray[Any]]) -> Span:
-    """Frames and their estimates by name, which may be none, as a span."""
+    """Return frames and their estimates, which may be none, as a span."""
     grf_n = columns.get("grf_n", _UNKNOWN)
     is_unknown = np.isnan(grf_n)
     bounds_n = columns.get("grf_at_least_n", _UNKNOWN)
@@ -69,10 +69,10 @@ _UNKNOWN = np.full(1, math.nan)
 
 
 def min_of(a: float, b: float) -> float:
-    """The smaller of two numbers; NaN does not count as a number."""
+    """Return the smaller of two numbers; NaN counts as missing."""
     return b if math.isnan(a) else a if math.isnan(b) else min(a, b)
 
 
 def max_of(a: float, b: float) -> float:
-    """The greater of two numbers; NaN does not count as a number."""
+    """Return the greater of two numbers; NaN counts as missing."""
     return -min_of(-a, -b)

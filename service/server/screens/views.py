@@ -1,4 +1,4 @@
-"""What the API says of nodes, tares and sessions: the JSON shapes, with their descriptions."""
+"""JSON shapes of nodes, tares and sessions in the API, with their descriptions."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ CalibrationSource = Literal["node", "server"]
 
 
 class View(BaseModel):
-    """Base of all answers; what is not known is null, and never a NaN that JSON cannot write."""
+    """Base of all answers; unknown values are null, never NaN."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
 class Page(View, Generic[T]):
-    """A part of a list."""
+    """Page of a list."""
 
     items: list[T]
     next_cursor: str | None = Field(
-        default=None, description="Ask again with `?cursor=` this for more; null: that was all."
+        default=None, description="Value of `?cursor=` for the next page; null: this is the last."
     )
 
 
 class TileView(View):
-    """One tile of an array."""
+    """Tile of an array."""
 
     serial: str = Field(examples=["T01"])
     mux: int = Field(description="I2C address of its multiplexer.", examples=[112])
@@ -58,7 +58,7 @@ class TileView(View):
 
 
 class CalibrationView(View):
-    """Which calibration is in use."""
+    """Calibration in use."""
 
     id: str
     name: str
@@ -66,16 +66,16 @@ class CalibrationView(View):
 
 
 class TareView(View):
-    """One tare."""
+    """Tare."""
 
     id: str
-    t_ns: int = Field(description="End of the interval it was taken from, node's UTC.")
+    t_ns: int = Field(description="End of the interval of the tare, node's UTC.")
     source: TakenFrom = Field(
         description="unloaded: by hand; flight: automatic; lead: of an emulation."
     )
-    reason: str = Field(description="Why, in words.")
-    frames: int = Field(description="How many frames it was taken from.")
-    baseline_kpa: list[float] = Field(description="Absolute pressure unloaded, by tile.")
+    reason: str = Field(description="Reason, as text.")
+    frames: int = Field(description="Number of frames in the interval.")
+    baseline_kpa: list[float] = Field(description="Absolute unloaded pressure, by tile.")
     baseline_sigma_kpa: list[float] = Field(description="Its standard uncertainty.")
     noise_kpa: list[float] = Field(description="Standard deviation of one reading.")
     tadc_counts: list[float | None] = Field(
@@ -85,7 +85,7 @@ class TareView(View):
 
     @classmethod
     def of(cls, recorded: RecordedTare) -> TareView:
-        """From the history."""
+        """Return the view of a tare of the history."""
         content = recorded.tare.as_dict()
         return cls(
             id=recorded.id,
@@ -96,37 +96,37 @@ class TareView(View):
 
 
 class DriftView(View):
-    """How baselines move. Lists are by tile; null is what is not determined."""
+    """Drift of the baselines. Lists are by tile; null where undetermined."""
 
     kpa_per_hour: list[float | None] = Field(
-        description="Straight line through the baselines of the last six hours; null until they "
-        "span ten minutes."
+        description="Slope of the baselines over the last six hours; null under ten minutes."
     )
     sigma_kpa_per_hour: list[float | None] = Field(description="Its standard uncertainty.")
     n_per_hour: list[float | None] = Field(
-        description="The same in newtons, near zero load; null without a calibration."
+        description="The same as force, near zero load; null without a calibration."
     )
     grf_n_per_hour: float | None = Field(description="Sum over the tiles that bear load.")
     kelvin_per_hour: list[float | None] = Field(
-        description="Of the chips, by the temperatures of the same tares."
+        description="Temperature drift of the chips, from the same tares."
     )
     kelvin_since_tare: list[float | None] = Field(
-        description="How much warmer the chips are now than at the tare, by `tadc`."
+        description="Warming of the chips since the tare, by temperature counts."
     )
     kpa_since_tare: list[float | None] = Field(
-        description="What a sealed bubble's baseline has moved by then, as far as that explains it."
+        description="Expected shift of the baseline since the tare, from the warming of a sealed "
+        "bubble."
     )
-    grf_n_since_tare: float | None = Field(description="What that makes of the GRF.")
+    grf_n_since_tare: float | None = Field(description="The same as a shift of the GRF.")
 
     @classmethod
     def of(cls, node: ServerNode) -> DriftView:
-        """Of a node as it is now."""
+        """Return the present drift of a node."""
         live, tiles = node.estimates.live, len(node.info.tiles)
         line = trend(node.estimates.tares.valid(node.info), tiles=tiles)
-        none = np.full(tiles, np.nan)
-        slope = none if live.ranges is None else live.ranges.slope_n_per_kpa
-        warmer_by_k = none if live.tare is None else warmer_k(live.tare, live.recent_tadc())
-        since_kpa = none if live.tare is None else expected_shift_kpa(live.tare, warmer_by_k)
+        unknown = np.full(tiles, np.nan)
+        slope = unknown if live.ranges is None else live.ranges.slope_n_per_kpa
+        warmer_by_k = unknown if live.tare is None else warmer_k(live.tare, live.recent_tadc())
+        since_kpa = unknown if live.tare is None else expected_shift_kpa(live.tare, warmer_by_k)
         # A bare tile has no sealed gas.
         since_kpa = np.where([tile.reference for tile in node.info.tiles], np.nan, since_kpa)
         return cls(
@@ -142,39 +142,43 @@ class DriftView(View):
 
 
 class TaresPage(Page[TareView]):
-    """The history of a node's tares, and where its baselines are going."""
+    """History of a node's tares, and the drift of its baselines."""
 
     drift: DriftView
 
 
 class ClockView(View):
-    """Offset of the clocks, measured by the best of eight probes."""
+    """Offset of the clocks, from the best of eight probes."""
 
     server_minus_node_ns: int
     uncertainty_ns: int = Field(description="Half the round trip of that probe.")
 
 
 class ReplacementView(View):
-    """A machine that asked to connect under the name of this node, and was refused."""
+    """Machine that was refused because another one has the name of this node."""
 
     fingerprint: str = Field(
-        description="The machine prints the same one.", examples=["3f2a-91bc-0d4e-77a1"]
+        description="Fingerprint, as the machine itself prints it.",
+        examples=["3f2a-91bc-0d4e-77a1"],
     )
-    address: str = Field(description="Where it connected from; behind a proxy the proxy's.")
+    address: str = Field(description="Peer address; behind a proxy the proxy's.")
     asked_t_ns: int = Field(description="Server's UTC.")
 
     @classmethod
     def of(cls, replacement: Replacement) -> ReplacementView:
-        """Return it without its secret."""
+        """Return the view, without the secret."""
         return cls(**{name: getattr(replacement, name) for name in cls.model_fields})
 
 
 class NodeView(View):
-    """One node, connected or remembered."""
+    """Node, connected or remembered."""
 
     node: str = Field(examples=["demo"])
     connected: bool
-    boot_id: str = Field(description="Name of its present stream; a new one at each start.")
+    boot_id: str = Field(
+        description="Id of its present stream; a new one begins when the node or a "
+        "replaced part restarts."
+    )
     scene: str
     emulated: bool
     tiles: list[TileView]
@@ -183,50 +187,48 @@ class NodeView(View):
     nominal_rate_hz: float
     calibration: CalibrationView | None
     calibration_source: CalibrationSource = Field(
-        description="Who says which: the node itself, or the server, where one was assigned."
+        description="Origin: the node itself, or the server, where one was assigned."
     )
-    calibration_problem: ShownText | None = Field(description="Why there is no calibration.")
+    calibration_problem: ShownText | None = Field(description="Reason why there is no calibration.")
     tare: TareView | None = Field(description="The tare in force.")
     tare_problem: ShownText | None = Field(
-        description="Why there is none, or why the one in force is not this stream's own."
+        description="Reason why there is none, or why the one in force is of another stream."
     )
     tare_warnings: list[str] = Field(
-        description="Why the tare in force may no longer fit, in words: old, another temperature, "
-        "a baseline that does not fit the foot in the air."
+        description="Reasons why the tare in force may no longer fit, as text: age, temperature, "
+        "or a baseline that does not fit the foot in the air."
     )
     auto_tare: AutoTare = Field(
-        description="Whether the baseline follows by itself in flight. paused: an automatic tare "
-        "was undone, and nobody has tared since; off: the scene says `auto_tare = false`."
+        description="State of automatic tares in flight. paused: one was undone, and there was no "
+        "tare by hand since; off: the scene has `auto_tare = false`."
     )
     drift: DriftView
-    storage_problem: ShownText | None = Field(description="Why frames are not being kept.")
+    storage_problem: ShownText | None = Field(description="Reason why frames cannot be stored.")
     clock: ClockView | None = Field(description="Null: not measured yet.")
-    clock_set: bool = Field(description="Whether anything had set the node's date.")
-    rate_hz: float | None = Field(description="Frames a second over the last second.")
-    lost_frames: int = Field(description="Frames of this stream that are missing for good.")
+    clock_set: bool = Field(description="True if the node's date had been set.")
+    rate_hz: float | None = Field(description="Frames per second over the last second.")
+    lost_frames: int = Field(description="Lost frames of this stream.")
     lost: dict[str, int] = Field(description="The same by reason.", examples=[{"evicted": 12}])
     backlog_frames: int = Field(
-        description="Frames of this stream that the node still has, and sends behind the newest."
+        description="Frames of this stream that the node still has, sent behind the newest."
     )
     missed_slots: int = Field(description="Slots that were not sampled in its present stream.")
-    troubles: list[str] = Field(
-        description="What is wrong with its array, or its disk, now, in words."
-    )
+    troubles: list[str] = Field(description="Present faults of its array or disk, as text.")
     fault_counts: dict[str, dict[str, int]] = Field(
-        description="How often what went wrong in this stream, by serial and reason."
+        description="Faults of this stream, counted by serial and reason."
     )
     last_seq: int | None
     last_t_ns: int | None
-    last_seen_t_ns: int | None = Field(description="When its last frame came, server's UTC.")
+    last_seen_t_ns: int | None = Field(description="Arrival time of its last frame, server's UTC.")
     recording: list[str] = Field(description="Ids of sessions that are being recorded.")
     replacement: ReplacementView | None = Field(
-        description="Another machine that asks to connect under this name. A person accepts it "
-        "with `accept-replacement`, or leaves it refused."
+        description="Machine that was refused because another one has this name. A person may "
+        "accept it with `accept-replacement`."
     )
 
     @classmethod
     def of(cls, node: ServerNode, recorder: Recorder, replacement: Replacement | None) -> NodeView:
-        """Of a node as it is now."""
+        """Return the present state of a node."""
         info, estimates = node.info, node.estimates
         live, keeper = estimates.live, estimates.tare_keeper
         calibration = live.calibration
@@ -281,16 +283,16 @@ class NodeView(View):
 
 
 class SessionView(View):
-    """One recorded session."""
+    """Recorded session."""
 
     id: str = Field(examples=["20261121T101500Z-1a2b3c"])
     name: str
     node: str
     state: Literal["recording", "pending", "sealing", "sealed"] = Field(
-        description="pending: what `waits_for` says is still with the node; it completes by itself."
+        description="pending: waits for the node (`waits_for`), and completes by itself."
     )
     complete: bool | Literal["lossy"] = Field(
-        description="true: every frame is in it; 'lossy': some never will be."
+        description="true: it has every frame; 'lossy': some frames are lost."
     )
     started_t_ns: int = Field(description="Server's UTC.")
     stopped_t_ns: int | None
@@ -298,44 +300,42 @@ class SessionView(View):
     frames: int
     pending_frames: int = Field(description="Still with the node.")
     waits_for: Literal["frames", "end"] | None = Field(
-        description="frames: `pending_frames` are still with the node; end: none is missing up "
-        "to the newest, but what the node took last, until the stop, has not come; null: nothing."
+        description="frames: `pending_frames` are still with the node; end: the last frames "
+        "before the stop have not come; null: not pending."
     )
-    lost: dict[str, int] = Field(
-        description="Frames that will never be in it, by reason.", examples=[{"evicted": 12}]
-    )
+    lost: dict[str, int] = Field(description="Lost frames, by reason.", examples=[{"evicted": 12}])
     tail_frames_max: int = Field(
-        description="How many more there may have been at an end that the node could not tell: its "
-        "power failed, or it was given up."
+        description="Upper bound of lost frames at an unknown end: the node lost power, or its "
+        "frames were abandoned."
     )
     missed_slots: int = Field(
-        description="Slots that the node did not sample, since it was late: no frame was there."
+        description="Slots that the node did not sample because it was late: no frame exists."
     )
-    marks: int = Field(description="Events that were marked in it.")
+    marks: int = Field(description="Number of its markers.")
     bytes: int | None = Field(description="Size of the sealed file.")
     sha256: str | None = Field(description="Hash of the sealed file.")
-    parts: list[Part] = Field(description="Intervals of streams, ends included.")
+    parts: list[Part] = Field(description="Intervals of streams, both ends included.")
     subject: str
     notes: str
     tags: list[str]
     take: str | None = Field(
-        description="The take in which it was recorded together with other nodes."
+        description="Id of the take, if it was recorded together with other nodes."
     )
     scene: str
     calibration_id: str | None
     calibration_source: CalibrationSource = Field(
-        description="Who said which calibration: the node, or the server, where one was assigned."
+        description="Origin of the calibration: the node, or the server, where one was assigned."
     )
     absolute_scale: Literal["measured", "assumed"] | None
-    problem: ShownText | None = Field(description="What a person should know of it.")
+    problem: ShownText | None = Field(description="User-visible problem, if any.")
     said: str = Field(
-        description="Hash of name, subject, notes and tags; as `If-Match` it has a change refused "
-        "(412) if somebody else was quicker."
+        description="Revision of name, subject, notes and tags: with another one in `If-Match` a "
+        "change is refused (412)."
     )
 
     @classmethod
     def of(cls, session: Session, recorder: Recorder) -> SessionView:
-        """Of a session as it is now."""
+        """Return the present state of a session."""
         ledger = recorder.ledger_of(session)
         made = {"frames", "pending_frames", "lost", "tail_frames_max", "duration_s", "problem"}
         made |= {"marks", "missed_slots", "waits_for", "said"}
@@ -356,7 +356,7 @@ class SessionView(View):
 
 
 class Counted(View):
-    """How far a session has come that is not sealed yet; the fields are those of `SessionView`."""
+    """Progress of an unsealed session; the fields are those of `SessionView`."""
 
     frames: int
     pending_frames: int
@@ -366,7 +366,7 @@ class Counted(View):
 
     @classmethod
     def of(cls, session: Session, recorder: Recorder) -> Counted:
-        """By the ledger, as of now."""
+        """Return the present progress, from the ledger."""
         ledger = recorder.ledger_of(session)
         return cls(
             frames=ledger.recorded,
@@ -378,24 +378,24 @@ class Counted(View):
 
 
 class EventView(View):
-    """Something that was marked in a session."""
+    """Marker of a session."""
 
     id: str
     label: str
     t_ns: int = Field(description="Server's UTC.")
-    said: str = Field(description="Its hash, as that of a session: for `If-Match`.")
+    said: str = Field(description="Its revision, for `If-Match`.")
 
     @classmethod
     def of(cls, event: Event) -> EventView:
-        """As it is now."""
+        """Return the view of a marker."""
         return cls(**event.model_dump(), said=mark_of(event))
 
 
 def tiles_of(info: ArrayInfo, ranges: Ranges | None) -> list[TileView]:
-    """Tiles of an array; without a calibration their ranges are not known."""
-    none = [None] * len(info.tiles)
-    full_scales = none if ranges is None else _known(ranges.full_scale_n)
-    entries = none if ranges is None else ranges.entries
+    """Return the tiles of an array; without a calibration their ranges are null."""
+    nones = [None] * len(info.tiles)
+    full_scales = nones if ranges is None else _known(ranges.full_scale_n)
+    entries = nones if ranges is None else ranges.entries
     placed = {"serial", "mux", "channel", "x_m", "y_m", "z_m", "reference"}
     return [
         TileView(
@@ -412,6 +412,6 @@ def _known(values: npt.NDArray[np.float64]) -> list[float | None]:
 
 
 def scale_of(ranges: Ranges) -> Literal["measured", "assumed"]:
-    """Are newtons of these tiles measured, or is the scale of one of them assumed?"""
+    """Return `assumed` if the scale of any of these tiles is an assumption."""
     assumed = any(e is not None and e.absolute_scale == "assumed" for e in ranges.entries)
     return "assumed" if assumed else "measured"

@@ -1,1 +1,1 @@
-"""Tables of forces that other programs write: one module a format, one registry of all."""
+"""Readers of force tables of other programs: one module a format, one registry of all."""

@@ -1,7 +1,7 @@
-"""Kistler BioWare's text export: facts of each device, a line of names, one of units, numbers.
+"""Reader of Kistler BioWare's text export: facts of each device, names, units, numbers.
 
-Each column has its device in the line `Device:`. Forces are those on the plate, positive under
-load. `Ax` and `Ay` are the centre of pressure on its surface, from its middle, in its own axes.
+The line `Device:` has the device of each column. Forces act on the plate and are positive under
+load. `Ax` and `Ay` are the centre of pressure on the surface, from its middle, in the plate's axes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3}
 
 
 def is_bioware(head: str) -> bool:
-    """Tell whether a text is an export of BioWare."""
+    """Return whether a text is an export of BioWare."""
     return re.match(r"\s*\"?bioware\b", head, re.IGNORECASE) is not None
 
 
@@ -36,7 +36,7 @@ def read_bioware(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -
     """Read the vertical force and centre of pressure of each plate.
 
     Raises:
-        FileFormatError: it has no line of names or no force plate, or numbers do not fit them.
+        FileFormatError: names or force plates are missing, or numbers do not fit the names.
     """
     found = _NAMES.search(text)
     if found is None:

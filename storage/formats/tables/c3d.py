@@ -1,8 +1,8 @@
-"""C3D files: their parameters, and their analog samples as physical numbers.
+"""Reader of C3D files: parameters, and analog samples in physical units.
 
-After the C3D user guide (Motion Lab Systems). Numbers are those of Intel, DEC or SGI processors.
-Counts that are meant to be without a sign (frames, samples, offsets) are read so. Nothing is
-believed that the size of the file does not bear out.
+Source: C3D user guide (Motion Lab Systems). Numbers are of Intel, DEC or SGI processors. Counts of
+frames and samples, and offsets, are read as unsigned. Stated counts are checked against the size of
+the file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BLOCK = 512
 KEY = 0x50
 INTEL, DEC, SGI = 84, 85, 86
 RATE_TOLERANCE = 1e-4
-"""Rates that differ by less are one: more than a clock, and what rounding makes."""
+"""Relative difference up to which two rates are equal: above clock error and rounding."""
 Value = npt.NDArray[Any] | list[str]
 Parameters = Mapping[str, Mapping[str, Value]]
 Raw = npt.NDArray[Any]
@@ -34,16 +34,16 @@ Raw = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class C3dFile:
-    """A file, whose samples are made numbers when they are asked for.
+    """Content of a C3D file; samples are scaled on request.
 
     Attributes:
         where: path of the file.
-        parameters: by group and name; the first dimension is that which changes fastest.
-        rate_hz: of analog samples.
+        parameters: parameters by group and name; the first dimension changes fastest.
+        rate_hz: rate of analog samples.
         samples_a_frame: analog samples in a frame of points.
-        notes: remarks for the user.
-        channels: how many channels there are.
+        channels: number of analog channels.
         raw: (samples, channels), as stored.
+        notes: remarks for the user.
     """
 
     where: str
@@ -55,25 +55,25 @@ class C3dFile:
     notes: tuple[str, ...] = ()
 
     def texts(self, group: str, name: str) -> list[str]:
-        """Return a parameter of texts; empty if there is none."""
+        """Return a parameter that is a list of texts; empty if it is missing."""
         value = self.parameters.get(group, {}).get(name)
         return value if isinstance(value, list) else []
 
     def numbers(self, group: str, name: str) -> Raw:
-        """Return a parameter of numbers; empty if there is none."""
+        """Return a parameter that is an array of numbers; empty if it is missing."""
         value = self.parameters.get(group, {}).get(name)
         return np.empty(0) if value is None or isinstance(value, list) else value
 
     def of_channels(self, name: str) -> list[str]:
-        """Return texts of ANALOG, one a channel; those beyond 255 stand in NAME2 and so on."""
+        """Return a text parameter of ANALOG, one a channel; beyond 255 from NAME2 and so on."""
         more = (f"{name}{number}" for number in range(2, 2 + self.channels // 255))
         return [text for one in (name, *more) for text in self.texts("ANALOG", one)]
 
     def samples(self, channels: Sequence[int]) -> Floats:
-        """Return the samples of some channels, (len(channels), n), in the unit of each.
+        """Return the scaled samples of channels, (len(channels), n), each in its unit.
 
         Raises:
-            FileFormatError: the file states no scale for one of them.
+            FileFormatError: the file states no scale for a channel.
         """
         scale, offset = self._of_channels("SCALE"), self.offsets()
         general = float(np.ravel(self.numbers("ANALOG", "GEN_SCALE"))[:1].sum() or 1.0)
@@ -90,7 +90,7 @@ class C3dFile:
         return np.asarray((raw - offset[at, None]) * (scale[at, None] * general), dtype=np.float64)
 
     def offsets(self) -> Floats:
-        """Return what is stored for zero, of each channel."""
+        """Return the stored value of zero, for each channel."""
         offset = self._of_channels("OFFSET")
         return offset % 65536 if self._is_unsigned() else offset
 
@@ -107,7 +107,7 @@ def read_c3d(path: Path) -> C3dFile:
     """Read a C3D file.
 
     Raises:
-        FileFormatError: it cannot be read, is no C3D file, or ends before its samples do.
+        FileFormatError: the file cannot be read, is no C3D file, or is truncated.
     """
     where = str(path)
     try:
@@ -150,7 +150,7 @@ def _parse(content: bytes, where: str) -> C3dFile:
         by_rates = analog_hz / point_hz if point_hz > 0.0 else 0.0
         if measures != channels or abs(by_rates - samples_a_frame) > 1e-3:
             samples_a_frame = measures // channels
-        # Some programs write the channels where their samples in a frame should be.
+        # Some programs store the number of channels in place of the samples in a frame.
         measures = channels * samples_a_frame
     elif measures:
         raise FileFormatError(
@@ -176,7 +176,7 @@ def _parse(content: bytes, where: str) -> C3dFile:
     if analog_hz > 0.0 and abs(rate_hz - analog_hz) > RATE_TOLERANCE * rate_hz:
         notes.append(
             f"ANALOG:RATE states {analog_hz:g} Hz, and {samples_a_frame} samples in each frame at "
-            f"{point_hz:g} Hz are {rate_hz:g} Hz, which is taken"
+            f"{point_hz:g} Hz are {rate_hz:g} Hz: this rate is used"
         )
     return C3dFile(
         where,
@@ -190,9 +190,9 @@ def _parse(content: bytes, where: str) -> C3dFile:
 
 
 def _frames(parameters: Parameters, stated: int, size: int, width: int, where: str) -> int:
-    """Return how many frames of `width` bytes there are.
+    """Return the number of frames of `width` bytes.
 
-    The header counts 65535 at most; longer files state more in one of several parameters.
+    The header's count is 65535 at most; longer files state it in one of several parameters.
     """
     if width == 0:
         return 0
@@ -201,24 +201,24 @@ def _frames(parameters: Parameters, stated: int, size: int, width: int, where: s
     ends = [_words(trial.get(f"ACTUAL_{name}_FIELD")) for name in ("START", "END")]
     if all(ends):
         counts.add(ends[1] - ends[0] + 1)
-    there = size // width
-    held = [count for count in counts if 0 < count <= there]
-    if not held:
+    stored = size // width
+    possible = [count for count in counts if 0 < count <= stored]
+    if not possible:
         raise FileFormatError(
-            f"it ends after {there} frames of {max(counts)}", where=where, expected=FORM
+            f"it ends after {stored} frames of {max(counts)}", where=where, expected=FORM
         )
-    # A count of 65535 may stand for more.
-    return there if max(held) == 65535 else max(held)
+    # 65535 may mean that the count does not fit.
+    return stored if max(possible) == 65535 else max(possible)
 
 
 def _count(value: Value | None) -> int:
-    """Return a count, which is stored without a sign if as an integer."""
+    """Return a count; a negative 16-bit integer is read as unsigned."""
     number = _number(value)
     return int(number) % 65536 if -32768 <= number < 0 else max(0, int(number))
 
 
 def _words(value: Value | None) -> int:
-    """Return a number of two words of 16 bits without a sign, the lower one first."""
+    """Return a number stored as two unsigned words of 16 bits, the lower word first."""
     if value is None or isinstance(value, list) or np.size(value) == 0:
         return 0
     words = [int(word) % 65536 for word in np.ravel(value)[:2]]
@@ -226,7 +226,7 @@ def _words(value: Value | None) -> int:
 
 
 def _number(value: Value | None) -> float:
-    """Return the first number of a parameter; 0 if there is none."""
+    """Return the first number of a parameter; 0 if it is missing or not finite."""
     if value is None or isinstance(value, list) or np.size(value) == 0:
         return 0.0
     number = float(np.ravel(value)[0])
@@ -236,7 +236,7 @@ def _number(value: Value | None) -> float:
 def _parameters(
     content: bytes, at: int, order: str, *, is_dec: bool
 ) -> dict[str, dict[str, Value]]:
-    """Return all parameters by group and name; groups may be named behind their parameters."""
+    """Return all parameters by group and name; a group's name may follow its parameters."""
     names: dict[int, str] = {}
     found: list[tuple[int, str, Value]] = []
     while at + 2 <= len(content):
@@ -269,7 +269,7 @@ def _value(content: bytes, at: int, order: str, *, is_dec: bool) -> Value:
     if kind == -1:
         width = shape[0] if shape else 1
         text = data.decode("latin-1")
-        # A text of no dimension is one letter.
+        # A text without dimensions is one letter.
         return [text[i : i + width].rstrip(" \0") for i in range(0, len(text), max(1, width))]
     if kind == 4:
         numbers = _floats(data, order, is_dec=is_dec)
@@ -279,7 +279,7 @@ def _value(content: bytes, at: int, order: str, *, is_dec: bool) -> Value:
 
 
 def _floats(content: bytes, order: str, *, is_dec: bool) -> Raw:
-    """Return numbers of single precision; those of DEC have halves swapped, and are fourfold."""
+    """Return float32 numbers; DEC's have swapped halves and are four times as large."""
     if not is_dec:
         return np.frombuffer(content, np.dtype(f"{order}f4"))
     words = np.frombuffer(content, "<u2").reshape(-1, 2)[:, ::-1]

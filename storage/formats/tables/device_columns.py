@@ -1,4 +1,4 @@
-"""Columns of force plates in texts that name a device, a quantity and a unit for each column."""
+"""Force plates in texts that state device, quantity and unit of each column."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from storage.formats.tables.text import Layout, parse_columns, split_cells, spli
 FORCE_UNITS = {"n": "N", "kn": "kN"}
 LENGTH_UNITS = frozenset(("m", "cm", "mm"))
 COP_NAMES = (("ax", "ay"), ("cx", "cy"))
-"""Coordinates of the centre of pressure, in lower case, as programs name them."""
+"""Names of the centre of pressure's coordinates in programs' texts, in lower case."""
 
 
 @dataclass(frozen=True)
 class DeviceColumn:
-    """What stands above a column of numbers.
+    """Head of a column of numbers.
 
     Attributes:
-        device: name of the plate; empty for times and numbers of frames.
-        name: of the quantity, such as `Fz`.
-        unit: as the file states it; empty if it does not.
+        device: name of the plate; empty for times and frame numbers.
+        name: name of the quantity, such as `Fz`.
+        unit: stated unit; empty if the file states none.
     """
 
     device: str
@@ -35,12 +35,12 @@ class DeviceColumn:
 
 
 def group_by_plate(columns: Sequence[DeviceColumn], where: str) -> list[dict[str, int]]:
-    """Return the columns of each device that has a vertical force: indices by name in lower case.
+    """Return the columns of each device with a vertical force: indices by lower-case name.
 
-    Devices may share a name. Then a quantity that comes again belongs to the next one of them.
+    Devices may share a name: a repeated quantity then begins the next device.
 
     Raises:
-        FileFormatError: there is none, or which columns belong to one device is not clear.
+        FileFormatError: no device has a vertical force, or the grouping is ambiguous.
     """
     groups: dict[str, list[dict[str, int]]] = {}
     for i, column in enumerate(columns):
@@ -56,7 +56,7 @@ def group_by_plate(columns: Sequence[DeviceColumn], where: str) -> list[dict[str
     for device, found in groups.items():
         if any(one.keys() != found[0].keys() for one in found):
             raise FileFormatError(
-                f"which of the columns of {device!r} belong together is not clear",
+                f"the columns of {device!r} cannot be assigned to devices",
                 where=where,
                 expected="a name of its own for each device, or the same columns for all",
             )
@@ -80,21 +80,21 @@ def read_columns(
     numbers_max: int,
     where: str,
 ) -> dict[int, Floats]:
-    """Return the numbers of some columns by index.
+    """Return the numbers of the given columns by index.
 
     Raises:
-        FileFormatError: more numbers than names stand in a line, a cell is no number, or there are
-            no lines.
+        FileFormatError: a line has more numbers than names, a cell is no number, or there are no
+            lines.
     """
     first = rows.partition("\n")[0]
     if not first.strip():
         raise FileFormatError(
-            "no lines of numbers stand below its names", where=where, expected="a whole file"
+            "there are no numbers below the names", where=where, expected="a whole file"
         )
     width = len(split_line(first, delimiter))
     if len(split_cells(first, delimiter)) > len(columns) or width <= max(indices):
         raise FileFormatError(
-            f"{len(columns)} names stand over {width} columns of numbers",
+            f"there are {len(columns)} names for {width} columns of numbers",
             where=where,
             expected="a name over each column",
         )
@@ -118,7 +118,7 @@ def make_plate(
     *,
     is_positive: bool = False,
 ) -> Plate:
-    """Return a plate of its columns, with a note of its name in the file."""
+    """Return a plate made of its columns, with a note about its name in the file."""
     head = columns[plate["fz"]]
     cop = _cop_of(plate)
     lengths = {columns[i].unit.lower() for i in cop}

@@ -1,14 +1,13 @@
-"""Force platforms of a C3D file, types 1 to 4.
+"""Reader of force platforms of a C3D file, types 1 to 4.
 
-A platform's own z axis points down, into it (C3D user guide, FORCE_PLATFORM). `plate1_fz` is the
-force along it as the file holds it: that of the foot on the plate, which is positive, in some
-files, and that of the plate on the foot, which is negative, in most. The reader of the table tells
-which from the load. What a plate reads without load is not taken off.
+A platform's z axis points down, into it (C3D user guide, FORCE_PLATFORM). `plate1_fz` is the force
+along z as stored: in some files the positive force of the foot on the plate, in most the negative
+force of the plate on the foot. `storage.formats.reference` infers the sign from the load. The
+offset without load is not subtracted.
 
-Centres of pressure are in the plane of the plate, from the origin of the laboratory. Where the
-laboratory has z up, and the plate lies flat, they are its x and y. Another axis may point up, or
-the plate may be tilted: then the laboratory is turned, the shortest way, until z is the plate's
-normal.
+Centres of pressure are in the plane of the plate, from the origin of the laboratory. If the
+laboratory has z up and the plate lies flat, they are its x and y. If another axis points up, or the
+plate is tilted, the laboratory is rotated by the smallest angle until z is the plate's normal.
 """
 
 from __future__ import annotations
@@ -35,22 +34,22 @@ from storage.formats.tables.table import IsNeeded, Table, check_size
 
 FORM = "force platforms of types 1 to 4"
 _CHANNELS = {1: 6, 2: 6, 3: 8, 4: 6}
-"""Channels by type."""
+"""Number of channels by type."""
 _FORCES = {1: range(2, 3), 2: range(2, 3), 3: range(4, 8)}
-"""Channels of vertical forces, by type. Those of type 4 are volts, or anything: in which units its
-matrix makes forces of them the file does not state."""
+"""Channels of vertical forces by type. Channels of type 4 have any unit, such as volts: the file
+does not state the unit of the forces that its matrix computes."""
 _POLYNOMIAL = 12
-"""Coefficients of FPCOPPOLY for a plate."""
+"""Number of coefficients of a plate's FPCOPPOLY."""
 FILLED_OFFSET = 1000.0
-"""Samples without a sign have their zero at such an OFFSET or beyond: stored zeros are none."""
+"""Lowest OFFSET of unsigned samples, for which a stored zero means that nothing was recorded."""
 OFF_PLATE = 5.0
-"""So many times as far as the edge is a wrong unit, not a wrong ORIGIN."""
+"""Distance from the middle, relative to the edge, that means a wrong unit, not a wrong ORIGIN."""
 OFF_PART = 0.05
-"""Part of the loaded samples off the plate that is said."""
+"""Fraction of loaded samples off the plate from which a note is added."""
 BEARS_N = 10.0
-"""A plate that never bears so much has no centre of pressure to speak of."""
+"""Lowest peak force of a plate whose centre of pressure is checked."""
 AT_MIDDLE = 2e-3
-"""Nearer to the middle, the edge being 1, a foot's centre of pressure does not stay."""
+"""Distance from the middle, relative to the edge, that a foot's centre of pressure exceeds."""
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _FORCE_UNITS = {"n": "N", "newton": "N", "newtons": "N", "kn": "kN"}
 _MOMENT = re.compile(r"(k?N)[ .*·-]?(mm|cm|m)", re.IGNORECASE)
@@ -59,11 +58,11 @@ _MOMENT = re.compile(r"(k?N)[ .*·-]?(mm|cm|m)", re.IGNORECASE)
 def read_force_platforms(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
     """Read force and centre of pressure of each plate, at the rate of analog samples.
 
-    Columns are `plate1_fz`, `plate1_cop_x`, `plate1_cop_y` and so on, as the file has them. A
+    Columns are `plate1_fz`, `plate1_cop_x`, `plate1_cop_y` and so on, in the file's units. A
     single plate has the names `grf_n`, `cop_x_m` and `cop_y_m` as well, if the file states units.
 
     Raises:
-        FileFormatError: it cannot be read, or has no plate that can.
+        FileFormatError: the file cannot be read, or has no readable plate.
     """
     file = read_c3d(path)
     count = min(int(file.numbers("FORCE_PLATFORM", "USED").sum()), 255)
@@ -99,8 +98,8 @@ def _zero_notes(file: C3dFile, plates: list[Plate]) -> list[str]:
     read = [plate.fz[window] for plate in plates]
     means = ", ".join(f"{fz.mean():.3f}" for fz in read if len(fz))
     return [
-        f"frames {first} to {last} are to be its zero, in which plates read {means}: nothing is "
-        "taken off"
+        f"ZERO states frames {first} to {last}, in which plates read {means}: no offset is "
+        "subtracted"
     ]
 
 
@@ -108,7 +107,7 @@ def _plate(file: C3dFile, i: int, numbers_max: int) -> Plate:
     """Compute a plate's force and centre of pressure.
 
     Raises:
-        FileFormatError: its type is not known, or it has no channels.
+        FileFormatError: the type is not supported, or channels are missing.
     """
     kinds = np.ravel(file.numbers("FORCE_PLATFORM", "TYPE")).astype(int)
     kind = int(kinds[i]) if i < len(kinds) else 0
@@ -136,7 +135,7 @@ def _plate(file: C3dFile, i: int, numbers_max: int) -> Plate:
     if kind == 4:
         channels = _matrix(file, i) @ channels
     elif kind in (1, 2) and length is not None:
-        # Levers come in the unit of positions, which the corners have.
+        # Convert levers to the unit of positions and corners.
         lever = _same({_lever(unit, force if kind == 2 else None) for unit in units[3:5]})
         factor = 1.0 if lever is None else _METRES[lever] / _METRES[length]
         length = None if lever is None else length
@@ -165,7 +164,7 @@ def _plate(file: C3dFile, i: int, numbers_max: int) -> Plate:
 
 
 def _drop_filled(file: C3dFile, numbers: list[int], channels: Floats) -> Iterator[str]:
-    """Set to NaN what was not recorded: stored as zeros in all channels, where zero is no zero."""
+    """Set samples to NaN that were not recorded: zero in all channels although OFFSET is not."""
     filled = ~file.raw[:, [n - 1 for n in numbers]].any(axis=1)
     offsets = file.offsets()[[n - 1 for n in numbers]]
     if filled.any() and np.abs(offsets).max() >= FILLED_OFFSET:
@@ -174,14 +173,14 @@ def _drop_filled(file: C3dFile, numbers: list[int], channels: Floats) -> Iterato
 
 
 def _is_other_unit(fz: Floats, local: Floats, other: Floats, pose: Pose) -> bool:
-    """Tell whether a centre of pressure is on the plate only in the unit of the corners.
+    """Return whether the centre of pressure is on the plate only in the unit of the corners.
 
     Args:
         fz: force, (n,).
-        local: place in the unit that the file states.
-        other: place in the unit of the corners. Where that is the smaller one, both are on the
-            plate: one of them at its very middle.
-        pose: of the plate.
+        local: centre of pressure in the unit that the file states.
+        other: centre of pressure in the unit of the corners. If this unit is the smaller one, both
+            are on the plate, one very near to its middle.
+        pose: pose of the plate.
     """
     off, off_other = (
         float(np.median(far)) if len(far := off_middle(place, fz, pose.half)) else 0.0
@@ -193,7 +192,7 @@ def _is_other_unit(fz: Floats, local: Floats, other: Floats, pose: Pose) -> bool
 def _without_bending(
     file: C3dFile, i: int, local: Floats, length: str | None
 ) -> tuple[Floats, str]:
-    """Correct the centre of pressure by the polynomial of the plate, if the file has one."""
+    """Correct the centre of pressure by the plate's polynomial, if any; return a note as well."""
     polynomial = _of_plate(file, "FPCOPPOLY", i, (_POLYNOMIAL,))
     if polynomial is None or not polynomial.any():
         return local, ""
@@ -215,12 +214,12 @@ def _off_notes(local: Floats, fz: Floats, pose: Pose) -> Iterator[str]:
 
 
 def _same(units: set[str | None]) -> str | None:
-    """Return the unit that all have; None if they differ, or one has none."""
+    """Return the only unit of a set; None if units differ or one is missing."""
     return units.pop() if len(units) == 1 else None
 
 
 def _lever(unit: str, force: str | None) -> str | None:
-    """Return the length in a unit of moments, or of lengths; None if it is another unit."""
+    """Return the length unit of a moment's or a length's unit; None for another unit."""
     if force is None:
         return unit.lower() if unit.lower() in _METRES else None
     match = _MOMENT.fullmatch(unit)
@@ -231,7 +230,7 @@ def _matrix(file: C3dFile, i: int) -> Floats:
     """Return the calibration matrix of a plate of type 4.
 
     Raises:
-        FileFormatError: there is none, or it is of another size.
+        FileFormatError: the matrix is missing, or has another size.
     """
     stored = file.numbers("FORCE_PLATFORM", "CAL_MATRIX").astype(np.float64)
     stored = stored.reshape((*stored.shape, 1, 1, 1)[:3], order="F")
@@ -246,7 +245,7 @@ def _matrix(file: C3dFile, i: int) -> Floats:
 
 
 def _of_plate(file: C3dFile, name: str, i: int, shape: tuple[int, ...]) -> Floats | None:
-    """Return what a parameter states of a plate; None if it states nothing."""
+    """Return a plate's values of a parameter; None if they are missing."""
     value = file.numbers("FORCE_PLATFORM", name).astype(np.float64)
     size = int(np.prod(shape))
     flat = np.ravel(value, order="F")[i * size : (i + 1) * size]
@@ -256,11 +255,11 @@ def _of_plate(file: C3dFile, name: str, i: int, shape: tuple[int, ...]) -> Float
 
 
 def _origin(file: C3dFile, i: int, kind: int) -> Floats:
-    """Return the place of the surface's centre in the plate's axes; zero if nothing is stated.
+    """Return the centre of the surface in the plate's axes; zero if it is not stated.
 
-    z points down and the surface lies above, so its z is negative. Some programs store the reverse:
-    from the centre to the origin. Type 3 has distances from sensor to axis for x and y, whose sign
-    is no matter of direction.
+    z points down and the surface lies above the origin, so its z is negative. Some programs store
+    the vector from the centre to the origin. For type 3, x and y are distances from sensor to axis,
+    whose sign has no meaning.
     """
     origin = _of_plate(file, "ORIGIN", i, (3,))
     if origin is None:

@@ -1,8 +1,8 @@
-"""Novel's Loadsol and Loadpad, as their app saves them as text.
+"""Reader of the text export of Novel's Loadsol and Loadpad app.
 
-A line of soles, `PGV247-L::heel` or `PGV247-L`, stands over a line of quantities, `Time[secs]` and
-`Force[N]`. Each sole has a column of times of its own, forces of its regions if it has any, and
-their sum. A packet that did not arrive is -1 in each region, and 0 in the sum.
+A line of soles, `PGV247-L::heel` or `PGV247-L`, precedes a line of quantities, `Time[secs]` and
+`Force[N]`. Each sole has a column of times, forces of its regions if any, and their sum. A lost
+packet is -1 in each region, and 0 in the sum.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from storage.formats.tables.text import Layout, parse_columns
 FORM = "a line of soles over a line of Time[secs] and Force[N], over lines of numbers"
 HEAD_LINES = 10
 LOST = -1.0
-"""Force of a packet that did not arrive."""
+"""Force of a lost packet."""
 _TIME = re.compile(r"Time\s*\[(s|secs?|ms)\]", re.IGNORECASE)
 _FORCE = re.compile(r"Force\s*\[(\w+)\]", re.IGNORECASE)
 _SIDE = re.compile(r"[-_ ]([LR])$")
 _SIDES = {"L": "left", "R": "right"}
 _PACKETS = 1.5
-"""Times of two soles in one line differ by the rounding to a packet, or are not those of one."""
+"""Largest difference of two soles' times in one line, in packets: rounding to a packet."""
 
 
 def is_loadsol(head: str) -> bool:
-    """Tell whether a text is one of Novel's Loadsol app."""
+    """Return whether a text is an export of Novel's Loadsol app."""
     return _find_names(head) is not None
 
 
@@ -39,7 +39,7 @@ def read_loadsol(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -
     """Read the force of each sole as `left_fz`, `right_fz`, with the times of the needed one.
 
     Raises:
-        FileFormatError: a cell is no number, or the needed soles have times of their own.
+        FileFormatError: a cell is no number, or the needed soles differ in their times.
     """
     lines = text.split("\n", HEAD_LINES + 1)
     found = _find_names(text)
@@ -98,7 +98,7 @@ def read_loadsol(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -
 def _time_of(
     plates: Sequence[Plate], times_s: Sequence[Floats], is_needed: IsNeeded, where: str
 ) -> Floats:
-    """Return the times of the sole that is needed; of several the first's, if they agree."""
+    """Return the times of the needed sole; of several soles the first one's, if they agree."""
     needed = [
         time_s
         for plate, time_s in zip(plates, times_s, strict=True)
@@ -120,7 +120,7 @@ def _time_of(
 
 
 def _find_names(text: str) -> tuple[int, str] | None:
-    """Return the line of quantities, and what parts its cells; None: it is no such text."""
+    """Return the number of the line of quantities, and its delimiter; None for another text."""
     lines = text.split("\n", HEAD_LINES)[:HEAD_LINES]
     for at in range(1, len(lines)):
         for delimiter in "\t;,":

@@ -1,11 +1,11 @@
-"""Moticon's OpenGo insoles, as its software saves them as text.
+"""Reader of the text export of Moticon's OpenGo insoles.
 
-Facts stand behind `#`, the last such line has the names: `left total force[N]`, `left center of
-pressure X[-0.5...+0.5]`. X is a part of the sole's length, towards the toes, Y of its width. What
-its Y points to the software does not state: in its own recordings the roll-over passes below zero
-in mid-stance and ends above it on both feet, and sensors 9 to 12 in a row across the ball are above
-zero where the first metatarsal is. So it is positive medially. Where next to nothing bears, the
-software writes (0, 0).
+Lines of facts begin with `#`; the last one has the names: `left total force[N]`, `left center of
+pressure X[-0.5...+0.5]`. X is a fraction of the sole's length, towards the toes, Y of its width.
+The software does not state the direction of Y. In its recordings the roll-over passes below zero in
+mid-stance and ends above zero on both feet, and of sensors 9 to 12 in a row across the ball those
+at the first metatarsal are above zero: Y is positive medially. Almost without load, the software
+writes (0, 0).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from storage.formats.tables.text import Layout, parse_columns
 FORM = "facts behind #, a line of names that begins with # time, lines of numbers"
 HEAD_LINES = 50
 PARTS = "-0.5...+0.5"
-"""What stands for the unit of a centre of pressure that is a part of the sole."""
+"""Unit of a centre of pressure given as fractions of the sole."""
 SECONDS_MAX = 0.5
-"""Insoles take 10 to 100 samples a second: steps beyond it are milliseconds."""
+"""Largest step of times in s; larger steps are ms, as insoles sample at 10 to 100 Hz."""
 _NAMES = re.compile(r"#\s*time\t.*total force\[", re.IGNORECASE)
 _FORCE = re.compile(r"(left|right) total force\[(.*)\]", re.IGNORECASE)
 _COP = re.compile(r"(left|right) center of pressure ([XY])\[(.*)\]", re.IGNORECASE)
@@ -33,7 +33,7 @@ _DURATION = re.compile(r"^#\s*Duration:\s*(?:(\d+):)?(\d+):(\d+(?:\.\d+)?)\s*$",
 
 
 def is_moticon(head: str) -> bool:
-    """Tell whether a text is one of Moticon's OpenGo software."""
+    """Return whether a text is an export of Moticon's OpenGo software."""
     return _find_names(head) is not None
 
 
@@ -75,10 +75,10 @@ def read_moticon(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -
 
 
 def _seconds(time: Column, text: str, where: str) -> Floats:
-    """Return times in seconds, which the file has in seconds or milliseconds.
+    """Return times in seconds; the file has seconds or milliseconds.
 
     Raises:
-        FileFormatError: they are longer than the recording that the file states.
+        FileFormatError: the times exceed the duration that the file states.
     """
     if not len(time):
         return np.empty(0)
@@ -98,6 +98,6 @@ def _seconds(time: Column, text: str, where: str) -> Floats:
 
 
 def _find_names(text: str) -> int | None:
-    """Return the line of names; None: it is no such text."""
+    """Return the number of the line of names; None for another text."""
     lines = text.split("\n", HEAD_LINES)[:HEAD_LINES]
     return next((at for at, line in enumerate(lines) if _NAMES.match(line)), None)

@@ -1,7 +1,7 @@
-"""AMTI NetForce's text: six numbers a line and plate, parted by commas, without a head.
+"""Reader of AMTI NetForce's text: six numbers a line and plate, separated by commas, no head.
 
-They are Fx, Fy, Fz, Mx, My and Mz. Neither times nor units are in it, nor how far the surface lies
-above the origin of the moments.
+The numbers are Fx, Fy, Fz, Mx, My and Mz. The file states neither times nor units, nor the height
+of the surface above the origin of the moments.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from storage.formats.tables.text import FORM, is_number, read_text_table, split_
 
 _CHANNELS = 6
 _LINES = 20
-"""So many lines tell whether a text is one."""
+"""Number of lines by which the format is recognised."""
 
 
 def is_netforce(head: str) -> bool:
-    """Tell whether a text is an export of NetForce.
+    """Return whether a text is an export of NetForce.
 
-    A first column that rises from line to line is a time, and so no force.
+    A first column that rises from line to line is a time, not a force.
     """
     lines = islice((line for line in head.split("\n") if line.strip()), _LINES)
     rows = [split_cells(line, ",") for line in lines]
     if len(rows) == _LINES or not head.endswith("\n"):
-        rows = rows[:-1]  # the head may end within a line
+        rows = rows[:-1]  # the last line may be truncated
     width = len(rows[0]) if rows else 0
     if len(rows) < 2 or not width or width % _CHANNELS:
         return False

@@ -1,9 +1,9 @@
-"""Vicon Nexus's ASCII export: sections of devices, joints and trajectories, one below another.
+"""Reader of Vicon Nexus's ASCII export: sections of devices, joints and trajectories.
 
-A section has its title, its rate, a line of devices, one of names (`Frame`, `Sub Frame`, ...), one
-of units, and lines of numbers down to an empty line. A force plate is three devices there, such as
+A section has a title, a rate, a line of devices, a line of names (`Frame`, `Sub Frame`, ...), a
+line of units, and lines of numbers up to an empty line. A force plate is three devices, such as
 `AMTI #1 - Force`, `AMTI #1 - Moment` and `AMTI #1 - CoP`, in the axes of the laboratory, z up. The
-load tells the sign of the force, as in C3D.
+sign of the force is inferred from the load, as in C3D.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ FORM = "a section Devices: its rate, lines of devices, names and units, lines of
 _NAMES = re.compile(r"^\"?Frame\"?(?P<delimiter>[,;\t])\"?Sub ?Frame\"?", re.I | re.M)
 _KIND = re.compile(r"(?P<device>.*?)[ -]*\b(force|moment|cop)", re.IGNORECASE)
 _COMBINED = "combined"
-"""A device that Nexus adds: the sum of all plates."""
+"""Device that Nexus adds: the sum of all plates."""
 
 
 def is_nexus(head: str) -> bool:
-    """Tell whether a text is an ASCII export of Nexus."""
+    """Return whether a text is an ASCII export of Nexus."""
     return _NAMES.search(head) is not None
 
 
@@ -77,13 +77,13 @@ def read_nexus(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -> 
 
 
 def _columns(devices: list[str], names: list[str], units: list[str]) -> list[DeviceColumn]:
-    """Return what stands above each column; a device's name stands above its first one only."""
+    """Return the head of each column; only the first column of a device has its name."""
     columns, device = [], ""
     for i, name in enumerate(names):
         device = devices[i] if i < len(devices) and devices[i] else device
         kind = _KIND.fullmatch(device)
         unit = units[i] if i < len(units) else ""
-        # An electrode's or a joint's channel may be called Fz as well.
+        # Channels of electrodes or joints may be named Fz as well.
         is_force = name.lower() != "fz" or unit.lower() in FORCE_UNITS
         of_plate = i > 1 and is_force
         plate = kind["device"] or "plate" if kind and of_plate else ""
@@ -109,7 +109,7 @@ def _forces(group: dict[str, int]) -> list[int]:
 
 
 def _times_s(frames: Floats, parts: Floats, rate_hz: float, where: str) -> Floats:
-    """Return the times of samples by their numbers: frames, and parts of a frame from 0."""
+    """Return the times of samples, computed from frame numbers and subframe numbers from 0."""
     numbers = frames * (np.nanmax(parts, initial=0.0) + 1.0) + parts
     if len(numbers) == 0 or not (np.diff(numbers) > 0.0).all():
         raise FileFormatError(
@@ -128,7 +128,7 @@ def _plate(
     """Return a plate.
 
     Raises:
-        FileFormatError: another axis than z is the vertical one.
+        FileFormatError: z is not the vertical axis.
     """
     plate = make_plate(f"plate{number}", group, columns, numbers)
     peak = np.max(np.abs(plate.fz), initial=0.0, where=np.isfinite(plate.fz))

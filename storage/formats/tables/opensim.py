@@ -1,7 +1,8 @@
-"""OpenSim's `.mot` and `.sto`: a header to the line `endheader`, a line of names, lines of numbers.
+"""Reader of OpenSim's `.mot` and `.sto` files.
 
-Times are seconds, forces newtons, positions metres, and y points up. Cells of three numbers
-(`DataType=Vec3`) become three columns: `ground_force_v` becomes `ground_force_vx` and so on.
+A header ends with the line `endheader`; a line of names and lines of numbers follow. Times are in
+s, forces in N, positions in m, and y points up. Cells of three numbers (`DataType=Vec3`) become
+three columns: `ground_force_v` becomes `ground_force_vx` and so on.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ def read_opensim(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
     """Read a `.mot` or `.sto` file.
 
     Raises:
-        FileFormatError: it cannot be read, has no header or no names, or numbers do not fit them.
+        FileFormatError: unreadable, header or names are missing, or numbers do not fit the names.
     """
     where = str(path)
     text = read_table_text(path)
@@ -50,7 +51,7 @@ def read_opensim(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
         names = [*names[:1], *(f"{name}{axis}" for name in vectors for axis in "xyz")]
     if len(names) < 2 or (first and len(first) != len(names)):
         raise FileFormatError(
-            f"{len(names)} names stand over {len(first)} columns of numbers",
+            f"there are {len(names)} names for {len(first)} columns of numbers",
             where=where,
             expected=FORM,
         )
@@ -62,7 +63,7 @@ def read_opensim(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
     padded = (*names, *[""] * (width - len(names)))
     columns = parse_columns(rows, Layout(padded, delimiter, 0, {}), needed, numbers_max, where)
     for ours, name in alone.items():
-        if name in wanted:  # z points to the right, y of the foot to the left
+        if name in wanted:  # OpenSim's z points right, the foot's y points left
             columns[ours] = -columns[name] if ours == "cop_y_m" else columns[name]
     for name in times:
         columns["time_s"] = columns[name]
@@ -73,7 +74,7 @@ def read_opensim(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
 
 
 def _names_of_one_force(names: Sequence[str]) -> dict[str, str]:
-    """Return the columns of the only force of a file by our names; empty: there are several."""
+    """Return the columns of a file's only force by standard name; empty for several forces."""
     forces = [name for name in names if name.endswith("_vy")]
     if len(forces) != 1:
         return {}

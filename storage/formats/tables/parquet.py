@@ -1,4 +1,4 @@
-"""Parquet files of columns, of other programs or exported sessions of ours."""
+"""Reader of Parquet files of other programs or of exported FootTile sessions."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def read_parquet(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
     """Read a Parquet file.
 
     Raises:
-        FileFormatError: it cannot be read, is too large, or a needed column is not numeric.
-        DamagedFileError: it is a session whose bytes are not those that were sealed.
+        FileFormatError: the file cannot be read, is too large, or a needed column is not numeric.
+        DamagedFileError: the file is a session whose bytes differ from the sealed ones.
     """
     where = str(path)
     try:

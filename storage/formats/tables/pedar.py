@@ -1,7 +1,7 @@
-"""Novel's pedar insoles, whose pressures are refused: force needs the area of each sensor.
+"""Refusal of Novel's pedar insoles: a force needs the area of each sensor.
 
-The areas differ from sensor to sensor and from size to size, and stand in the insole's own file,
-not in the `.asc` that the software saves.
+The areas differ by sensor and by size. They are in the insole's file, not in the `.asc` file that
+the software saves.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _NAMES = re.compile(r"^time\[secs\][ \t]+1[ \t].*$", re.MULTILINE)
 
 
 def is_pedar(head: str) -> bool:
-    """Tell whether a text has the pressures of pedar's sensors."""
+    """Return whether a text has the pressures of pedar's sensors."""
     return _HEAD.search(head) is not None and _NAMES.search(head) is not None
 
 

@@ -1,6 +1,6 @@
-"""Force and centre of pressure of a plate from its channels, and its place in the laboratory.
+"""Force and centre of pressure of a plate from its channels, and its pose in the laboratory.
 
-Types are those of the C3D user guide (FORCE_PLATFORM:TYPE).
+Plate types: C3D user guide, FORCE_PLATFORM:TYPE.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import numpy as np
 from devices.arrays import Floats
 
 LOADED = 0.2
-"""Of its greatest force: above that a plate is loaded."""
+"""Load threshold of a plate relative to its peak force."""
 FLAT_COS = 0.9999
-"""A plate whose normal is nearer to an axis of the laboratory, within 0.8 degrees, lies flat."""
+"""Cosine of the largest tilt of a flat plate against an axis of the laboratory, 0.8 degrees."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Place of a plate in the laboratory, from its corners.
+    """Position, orientation and size of a plate in the laboratory.
 
     Attributes:
-        middle: (3,), of its surface.
-        axes: (3, 3), its x, y and z as columns.
+        middle: (3,), centre of its surface.
+        axes: (3, 3), its x, y and z axes as columns.
         half: (2,), half its lengths along x and y.
     """
 
@@ -33,7 +33,7 @@ class Pose:
 
 
 def pose_of(corners: Floats | None) -> Pose | None:
-    """Return the pose by the corners, (3, 4); None if they state none."""
+    """Return the pose for corners (3, 4); None if they are missing or degenerate."""
     if corners is None:
         return None
     x = corners[:, 0] + corners[:, 3] - corners[:, 1] - corners[:, 2]
@@ -49,15 +49,15 @@ def pose_of(corners: Floats | None) -> Pose | None:
 def force_and_place(
     kind: int, channels: Floats, origin: Floats, factor: float = 1.0
 ) -> tuple[Floats, Floats | None]:
-    """Return the force along z, (n,), and its place on the surface from the middle, (2, n).
+    """Return the force along z, (n,), and the centre of pressure from the middle, (2, n).
 
-    There is no place where the origin does not state where the sensors are.
+    The centre of pressure is None for type 3 if the origin does not state where its sensors are.
 
     Args:
         kind: type of the plate.
-        channels: as the type has them.
-        origin: (3,), from the plate's origin to the middle of its surface, in its own axes.
-        factor: on levers or places of the channels, to be in the unit of the origin.
+        channels: channels of this type.
+        origin: (3,), from the plate's origin to the middle of its surface, in the plate's axes.
+        factor: factor from the channels' length unit to the unit of the origin.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if kind == 1:
@@ -83,10 +83,10 @@ def force_and_place(
 
 
 def correct_place(place: Floats, polynomial: Floats) -> Floats:
-    """Return a place in mm without what the bending of a plate with four sensors adds.
+    """Return the centre of pressure in mm, corrected for bending of a plate with four sensors.
 
     Args:
-        place: (2, n), from the middle.
+        place: (2, n), centre of pressure from the middle, in mm.
         polynomial: (12,), Kistler's six coefficients for x, then for y (FPCOPPOLY).
     """
     x, y = place
@@ -99,25 +99,31 @@ def correct_place(place: Floats, polynomial: Floats) -> Floats:
 
 
 def off_middle(place: Floats, fz: Floats, half: Floats) -> Floats:
-    """Return how far off the middle each place under load is, 1 being the edge."""
+    """Return the relative distance from the middle of each centre of pressure under load.
+
+    1 is the edge of the plate; `half` is half its lengths along x and y.
+    """
     size = np.where(np.isfinite(place).all(axis=0) & np.isfinite(fz), np.abs(fz), 0.0)
     loaded = size > LOADED * np.max(size, initial=0.0)
     return np.asarray(np.max(np.abs(place[:, loaded]) / half[:, None], axis=0))
 
 
 def in_plane(place: Floats, pose: Pose) -> tuple[Floats, str]:
-    """Return a place in the plane of the plate from the laboratory's origin, and a note."""
+    """Return the centre of pressure (2, n) from the laboratory's origin, in the plate's plane.
+
+    Also return a note about the axes used; empty if z is up and the plate lies flat.
+    """
     normal, notes = -pose.axes[:, 2], []
     axis = int(np.argmax(np.abs(normal)))
     if axis == 2 and normal[2] < 0.0:
-        # No plate hangs from the ceiling: its corners run the other way round.
+        # A plate never faces down: its corners are listed in reverse order.
         normal = -normal
         notes.append("its CORNERS run counterclockwise: it is taken to face up")
     at = pose.middle[:, None] + pose.axes[:, :2] @ place
     up = np.zeros(3)
     up[axis] = np.sign(normal[axis])
     cos = float(up @ normal)
-    # The axes of the laboratory that become x and y when `up` becomes z, the shortest way.
+    # Axes of the laboratory that become x and y if `up` is rotated to z by the smallest angle.
     to_z = _shortest_turn(up, np.array([0.0, 0.0, 1.0]))
     turn = np.eye(3) if cos > FLAT_COS else _shortest_turn(normal, up)
     if axis != 2:
@@ -139,7 +145,7 @@ def in_plane(place: Floats, pose: Pose) -> tuple[Floats, str]:
 
 
 def _shortest_turn(begin: Floats, end: Floats) -> Floats:
-    """Return the rotation by the smallest angle that takes one unit vector to another."""
+    """Return the rotation by the smallest angle from one unit vector to another."""
     v = np.cross(begin, end)
     cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + float(begin @ end)))

@@ -1,4 +1,4 @@
-"""A table of what force plates, load cells or soles measure, one or several of them."""
+"""Signals of one or several force plates, load cells or soles, and their table."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from storage.formats.tables.table import SOLE, SOLE_UNITS, Table
 
 @dataclass(frozen=True)
 class Plate:
-    """What one plate or sole measures, in the units of the file; n samples.
+    """Signals of one plate or sole in the units of the file; n samples.
 
     Attributes:
-        name: of its columns, as `plate1` or `left`: `plate1_fz`, `plate1_cop_x`, `plate1_cop_y`.
-        fz: (n,), along the plate's normal.
-        cop: (2, n), NaN where it is not known; None if nothing states where it is. Where nothing
-            presses it is no one's, whatever the file holds.
+        name: prefix of its columns, such as `plate1` or `left`: `plate1_fz`, `plate1_cop_x`.
+        fz: (n,), force along the plate's normal.
+        cop: (2, n), centre of pressure, NaN where unknown; None if the file has none. Its values
+            without load are ignored.
         force: unit of the force; None if the file does not state it.
-        length: unit of the centre of pressure, or `SOLE`; None likewise.
-        is_positive: is the force positive under load? Else the load tells its sign.
+        length: unit of the centre of pressure, or `SOLE`; None if the file does not state it.
+        is_positive: True if the force is positive under load; else the load tells its sign.
         notes: remarks for the user.
     """
 
@@ -38,12 +38,12 @@ class Plate:
 def make_plate_table(
     where: str, time_s: Floats, plates: Sequence[Plate], notes: Sequence[str] = ()
 ) -> Table:
-    """Return a table of plates; a single one has our names as well, where the file states units."""
+    """Return a table of plates; a single plate with units gets the standard names as well."""
     columns: dict[str, Floats] = {}
     units = {"time_s": "s"}
-    said = [*notes]
+    all_notes = [*notes]
     for plate in plates:
-        said += [f"{plate.name}: {note}" for note in plate.notes]
+        all_notes += [f"{plate.name}: {note}" for note in plate.notes]
         columns[f"{plate.name}_fz"] = plate.fz
         if plate.force is not None:
             units[f"{plate.name}_fz"] = plate.force
@@ -64,7 +64,7 @@ def make_plate_table(
         (positive if plate.is_positive else signed_by_load).add("grf_n")
     else:
         names = ", ".join(plate.name for plate in plates)
-        said.append(f"there are {len(plates)} plates or soles ({names}): --map says which one")
+        all_notes.append(f"there are {len(plates)} plates or soles ({names}): --map says which one")
     columns["time_s"] = time_s
     return Table(
         where,
@@ -73,5 +73,5 @@ def make_plate_table(
         units,
         positive=frozenset(positive),
         plates=frozenset(signed_by_load),
-        notes=tuple(said),
+        notes=tuple(all_notes),
     )

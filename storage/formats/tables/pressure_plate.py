@@ -1,9 +1,8 @@
-"""A pressure plate's frames over time, reduced to force and centre of pressure.
+"""Reader of a pressure plate's frames, reduced to force and centre of pressure.
 
-Numpy's `.npz`, whose arrays say what they are by their names: `time_s` (n,); `force_n` or
-`pressure_kpa` (n, cells along x, cells along y); `pitch_m` (2,), from cell to cell along x and y;
-and `origin_m` (2,), where the middle of the first cell is, zero if absent. x is forward and y to
-the left, as of the foot.
+Arrays of numpy's `.npz` file: `time_s` (n,); `force_n` or `pressure_kpa` (n, cells along x, cells
+along y); `pitch_m` (2,), distance of cells along x and y; and `origin_m` (2,), centre of the first
+cell, zero if absent. x is forward and y to the left, as in the foot frame.
 """
 
 from __future__ import annotations
@@ -19,11 +18,13 @@ from devices.inputs import check_file
 from storage.formats.tables.table import IsNeeded, Table, make_table
 
 _CELLS = {"force_n": 1.0, "pressure_kpa": 1e3}
-"""What a cell reads, in newtons or in pascals."""
+"""Factor of cells to newtons or to pascals, by name of the array."""
 
 
 def read_pressure_plate(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
-    """Force and centre of pressure of every frame; NaN where a cell is, or nothing bears.
+    """Read force and centre of pressure of every frame; NaN if a cell is NaN.
+
+    The centre of pressure is NaN without load.
 
     Raises:
         FileFormatError: unreadable, too large, or arrays are missing or do not fit one another.
@@ -49,7 +50,7 @@ def read_pressure_plate(path: Path, is_needed: IsNeeded, numbers_max: int) -> Ta
     is_placed = pitch_m is not None and pitch_m.shape == origin_m.shape == (2,)
     if pitch_m is None or not is_placed or not (np.isfinite(pitch_m) & (pitch_m > 0.0)).all():
         raise FileFormatError(
-            "nothing says where its cells are",
+            "the positions of its cells are missing",
             where=where,
             expected="pitch_m with two numbers above 0, and origin_m with two or not at all",
         )
@@ -64,12 +65,12 @@ def read_pressure_plate(path: Path, is_needed: IsNeeded, numbers_max: int) -> Ta
 
 
 def add_cells(force_n: Floats, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-    """Add the forces of cells up to a force (n,) and its centre of pressure (2, n).
+    """Return the total force (n,) and its centre of pressure (2, n) in m.
 
     Args:
-        force_n: (n, cells along x, cells along y), of each cell.
-        x_m: (cells along x,), places of the cells.
-        y_m: (cells along y,), likewise.
+        force_n: (n, cells along x, cells along y), force of each cell.
+        x_m: (cells along x,), positions of the cells.
+        y_m: (cells along y,), positions of the cells.
     """
     total_n = force_n.sum(axis=(1, 2))
     moments = np.stack([force_n.sum(axis=2) @ x_m, force_n.sum(axis=1) @ y_m])
@@ -84,7 +85,7 @@ def _arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
             size = sum(member.file_size for member in archive.infolist())
         if size > bytes_max:
             raise FileFormatError(
-                f"{size} bytes are too many to be held in memory",
+                f"{size} bytes are too many for memory",
                 where=where,
                 expected=f"up to {bytes_max}",
             )
@@ -92,7 +93,7 @@ def _arrays(path: Path, bytes_max: int) -> dict[str, Floats]:
             return {name: np.asarray(file[name], dtype=np.float64) for name in file.files}
     except (
         *(OSError, ValueError, EOFError, KeyError, TypeError),
-        *(zipfile.BadZipFile, MemoryError),  # of a header that says more than is there
+        *(zipfile.BadZipFile, MemoryError),  # a header that states more than the file has
     ) as error:
         raise FileFormatError(
             f"no arrays of numpy: {error}", where=where, expected="a file that numpy.savez wrote"

@@ -1,4 +1,4 @@
-"""All formats of tables; a new one is a line here, and its module."""
+"""Registry of all table formats; a new format is a module and a line here."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from storage.formats.tables.text import HEAD_CHARACTERS, read_table_text, read_t
 
 @dataclass(frozen=True)
 class SavedText:
-    """Texts of a measuring program, told by their own head, whatever the ending.
+    """Text format of a measuring program, recognised by its head and not by the file's ending.
 
     Attributes:
-        is_one: tells by the first `HEAD_CHARACTERS` of a text whether it is one.
-        read: reads the needed columns of a text, of this path, up to so many numbers.
+        is_one: predicate of the first `HEAD_CHARACTERS` of a text.
+        read: function (text, path, column filter, limit of numbers) that returns the table.
     """
 
     is_one: Callable[[str], bool]
@@ -44,17 +44,17 @@ SAVED_TEXTS: tuple[SavedText, ...] = (
     SavedText(is_moticon, read_moticon),
     SavedText(is_tekscan, read_tekscan),
     SavedText(is_pedar, refuse_pedar),
-    SavedText(is_netforce, read_netforce),  # last: it has no head of its own
+    SavedText(is_netforce, read_netforce),  # last: the format has no head
 )
 
 
 @dataclass(frozen=True)
 class TableFormat:
-    """A format of tables.
+    """Table format.
 
     Attributes:
-        endings: of its files, in lower case.
-        read: reads the needed columns of a file, up to so many numbers.
+        endings: endings of its files, in lower case.
+        read: function (path, column filter, limit of numbers) that returns the table.
     """
 
     endings: tuple[str, ...]
@@ -91,11 +91,11 @@ def read_table(
     numbers_max: int = NUMBERS_MAX,
     stated: StatedText | None = None,
 ) -> Table:
-    """Read the needed columns of a file; its ending tells the format, and any other is text.
+    """Read the needed columns of a file; the format follows from the ending, default text.
 
     Raises:
         FileFormatError: the file cannot be read.
-        UsageError: how its text is laid out is stated, and it is none.
+        UsageError: a text layout is stated, and the file is no text.
     """
     ending = path.suffix.lower()
     chosen = next((one for one in FORMATS if ending in one.endings), TEXT)
@@ -115,14 +115,14 @@ def read_table(
 
 
 def check_nothing_stated(path: Path, stated: StatedText | None) -> None:
-    """Refuse what is stated of a text for a file that is none.
+    """Refuse text options for a file that is no text.
 
     Raises:
-        UsageError: something is stated.
+        UsageError: an option is set.
     """
     if stated is not None and stated != StatedText():
         raise UsageError(
-            "--skip-rows, --units-row, --decimal and --encoding go with tables in text",
+            "--skip-rows, --units-row, --decimal and --encoding apply only to text tables",
             where=str(path),
             remedy="Leave them out",
         )

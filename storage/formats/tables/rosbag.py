@@ -1,10 +1,10 @@
-"""ROS bags and MCAP: `geometry_msgs/WrenchStamped` of force sensors, ROS 1 and ROS 2.
+"""Reader of ROS bags and MCAP: `geometry_msgs/WrenchStamped` of force sensors, ROS 1 and ROS 2.
 
-ROS has newtons, newton metres and metres (REP 103). Each topic is a sensor: `/left/wrench` becomes
-`left_wrench_fx`, `_fy`, `_fz`, along the axes of its frame, and `_cop_x`, `_cop_y`, in the plane
-z = 0 of its frame: x = -torque.y / force.z, y = torque.x / force.z. How far the ground is from that
-plane a bag does not state, so a centre of pressure has to be asked for. Times are those of the
-headers, in the order in which they were taken.
+ROS uses N, N m and m (REP 103). Each topic is a sensor: `/left/wrench` becomes `left_wrench_fx`,
+`_fy`, `_fz`, along the axes of its frame, and `_cop_x`, `_cop_y`, in the plane z = 0 of its frame:
+x = -torque.y / force.z, y = torque.x / force.z. A bag does not state the distance of the ground
+from this plane, so a centre of pressure is read only if the user maps it. Times are the headers'
+stamps, sorted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FORM = "a ROS bag or an MCAP file with topics of geometry_msgs/WrenchStamped"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 WRENCHES = (WRENCH, "geometry_msgs/WrenchStamped")
 YEAR_2000_NS = 946_684_800_000_000_000
-"""Stamps before it are of a simulation, or of a clock that was never set."""
+"""Year 2000; earlier stamps are from a simulation or from a clock that was never set."""
 _COLUMNS = ("fz", "fx", "fy", "cop_x", "cop_y")
 _Message = tuple[str, int, Any]
 """Topic, time of recording in ns, and the decoded message."""
@@ -34,32 +34,32 @@ _Message = tuple[str, int, Any]
 
 @dataclass(frozen=True)
 class _Bag:
-    """Topics of wrenches in a bag, and the messages of some of them."""
+    """Topics of wrenches in a bag, and a function that reads the messages of given topics."""
 
     topics: list[str]
     messages: Callable[[list[str]], Iterator[_Message]]
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Tell whether a folder is one of ROS 2's bags."""
+    """Return whether a path is the folder of a ROS 2 bag."""
     try:
         return (path / "metadata.yaml").is_file()
-    except OSError:  # a name that is too long
+    except OSError:  # name too long
         return False
 
 
 @needs_extra("mcap", "To read ROS bags and MCAP")
 def read_bag(path: Path, is_needed: IsNeeded, numbers_max: int) -> Table:
-    """Read the wrenches of the needed topic; if a bag has one topic, it needs no mapping.
+    """Read the wrenches of the needed topics; the only topic of a bag needs no mapping.
 
     Raises:
-        FileFormatError: it cannot be read, has no wrenches, or two needed topics differ in time.
+        FileFormatError: unreadable, no wrenches, or two needed topics differ in their times.
     """
     where = str(path)
     try:
         for file in path.iterdir() if path.is_dir() else (path,):
             if not file.is_dir():
-                check_file(file)  # the libraries would wait for a pipe, and read a device for ever
+                check_file(file)  # the libraries would block on a pipe or a device
         bag = _open_mcap(path) if path.suffix.lower() == ".mcap" else _open_rosbag(path)
         return _table(bag, where, is_needed, numbers_max)
     except (FootTileError, ModuleNotFoundError):
@@ -132,10 +132,10 @@ class _Sensor:
 
 
 def _sensors(bag: _Bag, topics: list[str], where: str, numbers_max: int) -> dict[str, _Sensor]:
-    """Return what was measured, by topic.
+    """Return stamps and wrenches by topic.
 
     Raises:
-        FileFormatError: a topic has no messages, too many, or those of two frames.
+        FileFormatError: a topic has no messages, too many messages, or messages in two frames.
     """
     rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics}
     stamps: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
@@ -161,7 +161,7 @@ def _sensors(bag: _Bag, topics: list[str], where: str, numbers_max: int) -> dict
         notes = [f"forces are along the axes of its frame {frame!r}, COP in the plane z = 0 of it"]
         stamp_ns, logged_ns = np.array(stamps[topic], dtype=np.int64).T
         if not stamp_ns.any():
-            notes.append("its headers have no stamps: times are those of recording")
+            notes.append("its headers have no stamps: recording times are used")
             stamp_ns = logged_ns
         order = np.argsort(stamp_ns, kind="stable")
         wrench = np.array(rows[topic], dtype=np.float64).T[:, order]

@@ -1,4 +1,4 @@
-"""A sealed session of ours as a table, on its own clock."""
+"""Reader of a sealed FootTile session as a table, on the session's clock."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ SESSION_KEY = b"foottile.format"
 
 
 def read_session(path: Path, named: Collection[str]) -> Table | None:
-    """Read a sealed session of ours; return None for another kind of file.
+    """Read a sealed FootTile session; return None for another kind of file.
 
     Raises:
-        FileFormatError: it is damaged, or has no such column.
+        FileFormatError: the session is damaged, or has no frames.
     """
     where = str(path)
     if not is_session(path):
@@ -46,10 +46,10 @@ def read_session(path: Path, named: Collection[str]) -> Table | None:
 
 
 def read_axis(path: Path) -> TimeAxis:
-    """Return the time axis of a sealed session; of another file, that of its node's date.
+    """Return the time axis of a sealed session; for another file the node's axis, not shifted.
 
     Raises:
-        FileFormatError: it is damaged.
+        FileFormatError: the session is damaged.
     """
     if not is_session(path):
         return NODE_AXIS
@@ -58,10 +58,10 @@ def read_axis(path: Path) -> TimeAxis:
 
 
 def is_session(path: Path) -> bool:
-    """Tell whether a file is a sealed session of ours.
+    """Return whether a file is a sealed FootTile session.
 
     Raises:
-        FileFormatError: it ends with .parquet, and cannot be read as that.
+        FileFormatError: the file ends with .parquet and cannot be read as Parquet.
     """
     if path.suffix.lower() != ".parquet":
         return False

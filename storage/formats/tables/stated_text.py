@@ -1,4 +1,4 @@
-"""How a text of columns is laid out, where a user states it."""
+"""User's options for the layout of a text of columns."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ DECIMALS = {
     ",": re.compile(r"[+-]?([1-9]\d{0,2}(\.\d{3})+|\d*)(,\d*)?([eE][+-]?\d+)?"),
     ".": re.compile(r"[+-]?([1-9]\d{0,2}(,\d{3})+|\d*)(\.\d*)?([eE][+-]?\d+)?"),
 }
-"""Numbers by the mark of their decimals; the other one may part thousands."""
+"""Patterns of numbers by decimal mark; the other mark may separate thousands."""
 
 
 @dataclass(frozen=True)
 class StatedText:
-    """What a user states of a text; what they do not is found out.
+    """Layout of a text as stated by the user; None: detected.
 
     Attributes:
-        skip_rows: lines above the line of names, or above the numbers if no line names them.
-        units_row: number of the line of units, the first line of the file being 1.
-        decimal: mark of decimals, "," or "."; the other one may part thousands.
-        encoding: name of the encoding, as Python has it.
+        skip_rows: number of lines above the line of names, or above the numbers without names.
+        units_row: number of the line of units; the first line of the file is 1.
+        decimal: decimal mark, "," or "."; the other mark may separate thousands.
+        encoding: Python's name of the encoding.
     """
 
     skip_rows: int | None = None
@@ -51,5 +51,5 @@ class StatedText:
 
     @property
     def is_plain(self) -> bool:
-        """Tell whether the text is stated to be a plain table, whatever its head looks like."""
+        """True if an option declares a plain table; the head is then not inspected."""
         return any(one is not None for one in (self.skip_rows, self.units_row, self.decimal))

@@ -1,4 +1,4 @@
-"""Columns of numbers of a file of any format, with what the file states of them."""
+"""Table of number columns of a file of any format, with the units that the file states."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from devices.errors import FileFormatError
 Column = npt.NDArray[np.float64] | npt.NDArray[np.int64]
 """(n,), float64 with NaN in empty cells; int64 for instants in nanoseconds."""
 IsNeeded = Callable[[str], bool]
-"""Tells by a column's name whether its numbers are needed; others are not read."""
+"""Predicate of column names; only columns for which it is true are read."""
 
 TEXT_BYTES_MAX = 256 << 20
 NUMBERS_MAX = 50_000_000
-"""Rows times columns that are read: 400 MB in memory."""
+"""Limit of rows times columns: 400 MB in memory."""
 OURS: Mapping[str, str] = {"time_s": "s", "grf_n": "N", "fz_n": "N", "cop_x_m": "m", "cop_y_m": "m"}
-"""Names that state the unit and the sign of their column, in any case, with the unit."""
+"""Units of the standard column names, which state unit and sign, in upper or lower case."""
 SOLE = "sole"
-"""Unit of a centre of pressure that is a part of the sole, along it and across."""
+"""Unit of a centre of pressure given as fractions of the sole's length and width."""
 SOLE_UNITS = ("sole lengths", "sole widths")
-"""Units of its coordinates, x and y."""
+"""Units of the coordinates x and y of such a centre of pressure."""
 INSTANTS = "t_ns"
-"""Name of a session's column of instants, whose numbers need all 64 bits."""
+"""Name of a session's column of instants, which need all 64 bits."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a file, in the units of the file.
+    """Table of a file's columns, in the units of the file.
 
     Attributes:
         where: path of the file.
         names: names of all columns of the file.
         columns: the needed columns by name.
         units: unit of each column whose unit the file states.
-        positive: names of the forces that the file states to be positive under load.
-        plates: names of the forces of plates, whose sign follows from the load that they bear.
+        positive: names of forces that the file states to be positive under load.
+        plates: names of plates' forces, whose sign is inferred from the load.
         epoch_ns: UTC of time zero; None if the file does not state it.
         notes: remarks for the user.
-        form: form that was expected of the file, for errors; empty if files differ in nothing.
-        schema: Arrow's schema of a Parquet file.
+        form: expected form of the file, for errors; empty for binary formats.
+        schema: Arrow schema of a Parquet file.
     """
 
     where: str
@@ -68,12 +68,12 @@ def make_table(
     form: str = "",
     schema: pa.Schema | None = None,
 ) -> Table:
-    """Return a table in which columns with one of our names have that name and its unit.
+    """Return a table; columns with a standard name in any case get that name and its unit.
 
     `fz_n` is `grf_n` as well, if the file has no `grf_n`.
 
     Raises:
-        FileFormatError: two names differ in their case only.
+        FileFormatError: two names differ only in case.
     """
     found = dict(columns)
     for name in columns:
@@ -102,7 +102,7 @@ def needed_names(names: Collection[str], is_needed: IsNeeded, where: str) -> lis
     """Return the names of the columns to read.
 
     Raises:
-        FileFormatError: one of them stands for two columns.
+        FileFormatError: two columns have one of these names.
     """
     needed = [name for name in names if name and is_needed(name)]
     if twice := sorted({name for name in needed if needed.count(name) > 1}):
@@ -111,7 +111,7 @@ def needed_names(names: Collection[str], is_needed: IsNeeded, where: str) -> lis
 
 
 def repeated_name(names: Collection[str], where: str) -> FileFormatError:
-    """Return the error for names that stand for two columns each."""
+    """Return the error for names that two columns have."""
     return FileFormatError(
         f"column {', '.join(names)} is there twice",
         where=where,
@@ -123,11 +123,11 @@ def check_size(rows: int, columns: int, numbers_max: int, where: str) -> None:
     """Refuse a table that is too large for memory.
 
     Raises:
-        FileFormatError: it has more than `numbers_max` numbers.
+        FileFormatError: rows times columns exceed `numbers_max`.
     """
     if rows * columns > numbers_max:
         raise FileFormatError(
-            f"{rows} rows of {columns} columns are too many to be held in memory",
+            f"{rows} rows of {columns} columns are too many for memory",
             where=where,
             expected=f"up to {numbers_max} numbers",
             remedy="Cut out the part that is needed",

@@ -1,8 +1,8 @@
-"""Frames of a Tekscan sensor as its software saves them as ASCII (`.asf`, `.csv`).
+"""Reader of the ASCII export of Tekscan sensors (`.asf`, `.csv`).
 
-Facts, `NAME value`, stand above `ASCII_DATA @@`; below it each frame has a line `Frame N`, and a
-line of cells for each row. `B` is a cell outside the sensor. The first row is at the toes of an
-F-Scan insole, and it is seen from above: the first column is on the left.
+Facts, `NAME value`, precede `ASCII_DATA @@`. Each frame has a line `Frame N`, and a line of cells
+for each row. `B` is a cell outside of the sensor. The first row is at the toes of an F-Scan insole,
+seen from above: the first column is on the left.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "inch": 0.0254, "inch
 
 
 def is_tekscan(head: str) -> bool:
-    """Tell whether a text has frames of a Tekscan sensor."""
+    """Return whether a text is an ASCII export of a Tekscan sensor."""
     return _BEGIN.search(head) is not None
 
 
 def read_tekscan(text: str, where: str, is_needed: IsNeeded, numbers_max: int) -> Table:
-    """Read force and centre of pressure of all cells, from the middle of the sensor.
+    """Read total force and centre of pressure, from the middle of the sensor.
 
     Raises:
-        FileFormatError: a fact is not there, frames are cut off, or a cell is no number.
+        FileFormatError: a fact is missing, frames are truncated, or a cell is no number.
     """
     head, _, body = text.partition("ASCII_DATA @@")
     facts = {match[1]: match[2] for match in _FACT.finditer(head)}
@@ -87,7 +87,7 @@ def _frames(
     """Return the numbers of the frames (n,), and their cells (n, rows, columns).
 
     Raises:
-        FileFormatError: a frame has other cells, or frames do not rise.
+        FileFormatError: a frame has another number of cells, or frame numbers do not rise.
     """
     parts = _FRAME.split(body.partition("@@")[0].lstrip(" ,"))
     numbers = np.array([float(number) for number in parts[1::2]])
@@ -120,7 +120,7 @@ def _frames(
 
 
 def _saturated(facts: Mapping[str, str], unit: str, pressure: Floats) -> list[str]:
-    """Return a note of the frames in which a cell reads as much as it can."""
+    """Return a note about frames with a saturated cell; empty if there are none."""
     match = _QUANTITY.match(facts.get("SATURATION_PRESSURE", ""))
     if match is None or match[2].lower() != unit.lower():
         return []

@@ -1,10 +1,10 @@
-"""Text files of columns, as measuring programs and spreadsheets save them.
+"""Reader of text files of columns from measuring programs and spreadsheets.
 
-The names stand in a line above the numbers. Above it there may be blank lines, comments, a title,
-or Excel's `sep=`; below it a line of units. Cells stand between commas, semicolons, tabs or blanks,
-with a decimal point or a decimal comma. The text is UTF-8, UTF-16, or else Windows-1252. What is
-found out otherwise than it is meant, or not at all, the user states (`StatedText`). Columns that no
-line names are numbered: `column1`, `column2` and so on.
+A line of names precedes the numbers. Blank lines, comments, a title or Excel's `sep=` may precede
+it; a line of units may follow it. Commas, semicolons, tabs or blanks separate cells. Numbers have a
+decimal point or a decimal comma. The text is UTF-8, UTF-16, or else Windows-1252. If detection
+fails, the user states the layout (`TextOptions`). Columns without names are numbered: `column1`,
+`column2` and so on.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ FORM = (
     "a file that ends in .parquet, .c3d, .mot, .sto or .npz"
 )
 HEAD_LINES = 200
-"""The line of names is one of the first so many."""
+"""Number of lines in which the line of names is searched."""
 HEAD_CHARACTERS = 1 << 20
 COMMENT = re.compile(r"^\s*(#|%|//)+\s*")
-"""Beginning of a line that is a comment."""
+"""Beginning of a comment line."""
 BLANKS = " "
-"""Delimiter of columns that any number of blanks parts."""
+"""Delimiter of columns that any number of blanks separates."""
 DELIMITERS = ("\t", ";", ",", BLANKS)
 KNOWN_UNITS = frozenset(
     (
@@ -60,25 +60,25 @@ KNOWN_UNITS = frozenset(
 NO_NUMBER = (
     r"(?i)^[+-]?nan(\((ind|snan)\))?\d*$|^[+-]?1\.?#(ind|qnan|snan)0*$|^#?n/?a!?$|^null$|^none$|^$"
 )
-"""Cells without a number: empty, or NaN as programs of Windows, C, Python and R write it."""
+"""Pattern of cells without a number: empty, or NaN as Windows, C, Python and R write it."""
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
 _IN_BRACKETS = re.compile(r"[\[(]\s*([^\[\]()\s]+)\s*[\])]$")
 _GROUPED = r"^[+-]?[1-9]\d{0,2},\d{3}$"
-"""A cell whose comma may be a decimal comma, or part thousands."""
+"""Pattern of ambiguous cells: decimal comma, or comma between thousands."""
 DECIMAL_REMEDY = "State the mark of decimals: --decimal , or --decimal ."
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the columns of a text stand.
+    """Layout of the columns of a text.
 
     Attributes:
-        names: of the columns; empty for a column without a name.
-        delimiter: between cells; `BLANKS` for any number of blanks.
+        names: names of the columns; empty for a column without a name.
+        delimiter: separator of cells; `BLANKS` for any number of blanks.
         line: index of the first line of numbers.
-        units: as the file states them, by name.
-        score: numbers less other cells in the first line of numbers.
-        is_named: does a line name the columns? Else they are numbered.
+        units: units that the file states, by name.
+        score: count of numbers minus count of other cells in the first line of numbers.
+        is_named: True if a line names the columns; else they are numbered.
     """
 
     names: tuple[str, ...]
@@ -99,8 +99,8 @@ def read_text_table(
     """Read the columns of a text.
 
     Raises:
-        FileFormatError: it is too large, has no columns of numbers, or a cell of a needed column is
-            no number.
+        FileFormatError: the text is too large, has no columns of numbers, or a cell of a needed
+            column is no number.
     """
     stated = stated or StatedText()
     units, skip = None, stated.skip_rows or 0
@@ -111,7 +111,7 @@ def read_text_table(
         skip -= stated.units_row <= skip
     text = text[_begin_of_line(text, skip) :]
     if skip and not text.strip():
-        raise FileFormatError(f"nothing stands below {stated.skip_rows} lines", where=where)
+        raise FileFormatError(f"there is no text below {stated.skip_rows} lines", where=where)
     layout = find_layout(text, where, stated)
     if units is not None:
         cells = split_cells(units, layout.delimiter)
@@ -123,10 +123,10 @@ def read_text_table(
 
 
 def read_table_text(path: Path, encoding: str | None = None) -> str:
-    r"""Read a text in the encoding that it has, or is stated, with `\n` at the end of each line.
+    r"""Read and decode a text in the given or detected encoding; line ends become `\n`.
 
     Raises:
-        FileFormatError: it cannot be read, or is too large.
+        FileFormatError: the file cannot be read, is too large, or is no text.
     """
     try:
         content = read_bytes(path, bytes_max=TEXT_BYTES_MAX)
@@ -139,7 +139,7 @@ def read_table_text(path: Path, encoding: str | None = None) -> str:
             raise FileFormatError(
                 f"it is no text in {encoding}", where=str(path), remedy="State another --encoding"
             ) from error
-        # Names and titles of older programs; numbers are the same in every such encoding.
+        # Names and titles of older programs; numbers are equal in all such encodings.
         text = content.decode("cp1252", errors="replace")
     if "\0" in text[:HEAD_CHARACTERS]:
         raise FileFormatError(
@@ -152,10 +152,10 @@ def read_table_text(path: Path, encoding: str | None = None) -> str:
 
 
 def find_layout(text: str, where: str, stated: StatedText | None = None) -> Layout:
-    """Find the line of names, if there is one, and how columns are parted.
+    """Detect the line of names, if any, and the delimiter of columns.
 
     Raises:
-        FileFormatError: it has no columns of numbers, or they can be parted in two ways.
+        FileFormatError: there are no columns of numbers, or two delimiters are possible.
     """
     stated = stated or StatedText()
     lines = list(islice(_lines(text[:HEAD_CHARACTERS]), HEAD_LINES))
@@ -180,10 +180,10 @@ def find_layout(text: str, where: str, stated: StatedText | None = None) -> Layo
     ]
     if not found:
         raise FileFormatError(
-            "no line of names stands above lines of numbers",
+            "no line of names precedes the numbers",
             where=where,
             expected=FORM,
-            remedy="State how many lines stand above it: --skip-rows N",
+            remedy="State the number of lines above it: --skip-rows N",
         )
     best = max(found, key=lambda layout: layout.score)
     if stated.decimal is None and best.delimiter == "," and best.score > 1 and len(found) > 1:
@@ -204,13 +204,13 @@ def parse_columns(
     where: str,
     decimal: str | None = None,
 ) -> dict[str, Column]:
-    """Return the numbers of the needed columns, without empty lines at the end.
+    """Return the numbers of the needed columns, without trailing empty lines.
 
-    The mark of decimals is found out if it is not stated.
+    The decimal mark is detected if `decimal` is None.
 
     Raises:
-        FileFormatError: a line has more or fewer cells than the first, a cell is no number, or
-            there are too many numbers.
+        FileFormatError: lines differ in their number of cells, a cell is no number, or there are
+            too many numbers.
     """
     body = _body(text, layout)
     check_size(body.count("\n"), len(needed), numbers_max, where)
@@ -260,7 +260,7 @@ def _lines(text: str) -> Iterator[str]:
 
 
 def _begin_of_line(text: str, number: int) -> int:
-    """Return where a line begins, the first being 0; the end of the text if it has fewer."""
+    """Return the offset of line `number`, from 0; the length of the text if it has fewer lines."""
     begin = 0
     for _ in range(number):
         begin = text.find("\n", begin) + 1
@@ -270,17 +270,17 @@ def _begin_of_line(text: str, number: int) -> int:
 
 
 def _take_line(text: str, number: int) -> tuple[str, str]:
-    """Return a line of a text, and the text without it."""
+    """Return line `number` of a text, and the text without this line."""
     begin = _begin_of_line(text, number)
     line, end, rest = text[begin:].partition("\n")
     return line, text[:begin] + rest if end else text[:begin]
 
 
 def _layout(lines: Sequence[str], delimiter: str, *, is_first: bool) -> Layout | None:
-    """Return the layout of a text whose cells this delimiter parts; None: it parts none.
+    """Return the layout with this delimiter; None if no line of names matches.
 
-    Of several lines that may be the names the one with most numbers below is taken: lines above it
-    state single values, such as a rate. The first line is taken if it is stated to be the one.
+    Of several candidates for the line of names, the one with most numbers below wins: other lines
+    state single values, such as a rate. With `is_first` the first line has the names.
     """
     rows = [(number, split_cells(line, delimiter)) for number, line in enumerate(lines)]
     rows = [(number, cells) for number, cells in rows if any(cells)]
@@ -305,7 +305,7 @@ def _layout(lines: Sequence[str], delimiter: str, *, is_first: bool) -> Layout |
 
 
 def _nameless(lines: Sequence[str], delimiter: str, *, is_first: bool) -> Layout | None:
-    """Return the layout of numbers that no line names; None: this delimiter does not part them."""
+    """Return the layout of numbers without a line of names; None if the delimiter does not fit."""
     for number, line in enumerate(lines):
         cells = split_cells(line, delimiter)
         if not any(cells) or COMMENT.match(line):
@@ -334,7 +334,7 @@ def _units_of(names: Sequence[str], units: Sequence[str]) -> dict[str, str]:
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line as they are."""
+    """Return the cells of a line, unchanged."""
     if delimiter == BLANKS:
         return line.split()
     try:
@@ -344,7 +344,7 @@ def split_line(line: str, delimiter: str) -> list[str]:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line, without those that are empty at its end."""
+    """Return the cells of a line with normalised blanks, without trailing empty cells."""
     cells = [" ".join(cell.split()) for cell in split_line(line, delimiter)]
     while cells and not cells[-1]:
         cells.pop()
@@ -352,7 +352,7 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def is_number(cell: str) -> bool:
-    """Tell whether a cell holds a number, with a decimal point or a decimal comma."""
+    """Return whether a cell is a number, with a decimal point or a decimal comma."""
     return _NUMBER.fullmatch(cell) is not None
 
 
@@ -375,10 +375,10 @@ def _body(text: str, layout: Layout) -> str:
 
 
 def _has_decimal_comma(columns: Sequence[pa.Array[Any]], where: str) -> bool:
-    """Tell whether numbers have a decimal comma.
+    """Return whether numbers have a decimal comma.
 
     Raises:
-        FileFormatError: some have a comma and some a point, or commas may part thousands.
+        FileFormatError: commas and points are mixed, or commas may separate thousands.
     """
     commas = [pc.filter(cells, pc.match_substring(cells, ",")) for cells in columns]
     first = next((cells[0].as_py() for cells in commas if len(cells)), None)
@@ -407,10 +407,10 @@ def _has_decimal_comma(columns: Sequence[pa.Array[Any]], where: str) -> bool:
 
 
 def _with_points(cells: pa.Array[Any], name: str, decimal: str, where: str) -> pa.Array[Any]:
-    """Return numbers with a decimal point, of numbers whose mark of decimals is stated.
+    """Return numbers with the stated decimal mark as numbers with a decimal point.
 
     Raises:
-        FileFormatError: a cell is no such number.
+        FileFormatError: a cell does not fit the stated decimal mark.
     """
     other = "." if decimal == "," else ","
     marked = pc.or_(pc.match_substring(cells, ","), pc.match_substring(cells, "."))
@@ -433,7 +433,7 @@ def _numbers(cells: pa.Array[Any], name: str, where: str, *, has_comma: bool) ->
         try:
             return np.asarray(cells.cast(pa.int64()).to_numpy(), dtype=np.int64)
         except pa.ArrowException:
-            pass  # no instants, which the reader of the table finds
+            pass  # not int64: the reader of the table refuses it
     plain = pc.replace_substring(cells, ",", ".") if has_comma else cells
     try:
         return as_floats(plain.cast(pa.float64()))
@@ -447,7 +447,7 @@ def _numbers(cells: pa.Array[Any], name: str, where: str, *, has_comma: bool) ->
 
 
 def as_floats(column: pa.Array[Any]) -> Floats:
-    """Return Arrow's numbers with NaN for null."""
+    """Return an Arrow column as float64, NaN for null."""
     return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 

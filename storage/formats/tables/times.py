@@ -1,4 +1,4 @@
-"""Times of samples, where a device has rounded them."""
+"""Sample times that a device has rounded."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from devices.arrays import Floats
 
 SAMPLES_MIN = 10
 WITHIN_STEPS = 1.5
-"""Stamps lie within so many of their smallest steps of an even line, or are not of an even rate."""
+"""Largest deviation from a constant rate, in smallest steps of the times."""
 
 
 def spread_even(time_s: Floats) -> tuple[Floats, str]:
-    """Spread stamps evenly that are rounded, so that some repeat; else return them as they are.
+    """Replace rounded times with repetitions by times at a constant rate.
 
-    That is done only where the rate is plain: no stamp falls, and all lie on an even line, but for
-    the rounding.
+    Times are returned unchanged unless the rate is clear: no time falls, and all deviate from a
+    constant rate by rounding only.
 
     Returns:
-        The times, and a note of what was done; empty: nothing.
+        The times, and a note about the change; empty: unchanged.
     """
     steps_s = np.diff(time_s)
     repeated = int((steps_s == 0.0).sum())

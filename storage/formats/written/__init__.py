@@ -1,15 +1,17 @@
-"""What sessions are written in: a module for each format, named in one registry.
+"""Writers of export formats: one module a format, one registry of all.
 
-A module makes a `Format` (`storage.formats.written.format`) of a generator that gets an `Export`
-and yields the file's bytes, and `storage.formats.written.registry` names it. REST, `foottile
-export`, `foottile pull` and the page's menu follow from that. The generator
+A module defines an `ExportFormat` (`storage.formats.writers.format`) with a generator that gets an
+`Export` and yields the file's bytes, and `storage.formats.writers.registry` lists it. REST,
+`foottile export`, `foottile pull` and the page's menu use the registry. The generator
 
-- takes frames from `Export.pieces`, numpy columns of some thousand rows, or `Export.tables`, the
-  same as Arrow, and yields what it made of one before it takes the next, so that memory stays
-  bounded; a format that cannot do so takes `Export.whole`, which refuses more than `frames_max`;
-- raises before its first chunk what can be known by then, since that is still an answer, and later
-  errors break a download off; it never ends a file that lacks something as if it were whole;
-- states in the file what `Export.about` and `Export.all_notes` say, the time base, axes, and what
-  it resampled, filled or left out;
-- imports packages that are heavy, or of an extra, inside of it; `Format.extra` names the extra.
+- reads frames from `Export.read_chunks`, numpy columns of some thousand rows, or
+  `Export.read_tables`, the same as Arrow, and yields the bytes of one chunk before it reads the
+  next, so that memory is bounded; a format that needs all frames uses `Export.read_all`, which
+  refuses more than `frames_max`;
+- raises as many errors as possible before its first chunk: a client then gets an error response,
+  while later errors abort a download; it never completes an incomplete file;
+- writes `Export.metadata` and `Export.full_notes` into the file, with time base, axes, and facts
+  about resampled, filled or omitted data;
+- imports heavy packages, and packages of an extra, inside of itself; `ExportFormat.extra` names the
+  extra.
 """

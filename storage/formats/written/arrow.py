@@ -1,4 +1,4 @@
-"""Arrow: an IPC file of record batches (Feather version 2), without compression."""
+"""Arrow writer: an IPC file of record batches (Feather version 2), without compression."""
 
 from __future__ import annotations
 

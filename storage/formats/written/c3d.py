@@ -1,12 +1,13 @@
-"""C3D: the foot as a force platform of type 2, in its own frame, written by ezc3d.
+"""C3D writer: the foot as a force platform of type 2, in the foot frame, written by ezc3d.
 
-The laboratory's axes are those of the foot frame, in mm. The platform's own z points down, as the
-C3D manual wants it (FORCE_PLATFORM), so its y is the foot's turned. Its channels are the reaction
-on the foot, as Vicon, Qualisys and most others write it, and as readers expect it: Fz is the GRF
-less than zero, Mx and My are Fz times the centre of pressure. While the foot is known to bear
-nothing they are 0, and there is no centre of pressure; where something is not known, it is NaN.
+The laboratory has the axes of the foot frame, in mm. The platform's z points down, as the C3D
+manual requires (FORCE_PLATFORM), so its y is opposite to the foot's. Its channels are the reaction
+on the foot, as Vicon, Qualisys and most others write it: Fz is the negative GRF, Mx and My are Fz
+times the centre of pressure. Known to be without contact they are 0, and there is no centre of
+pressure; unknown numbers are NaN.
 
-Integers have to be integers: ezc3d makes floats of a list of them, and then does not read the file.
+Integers have to be integer arrays: ezc3d writes a list of integers as floats, and then cannot read
+the file.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ from storage.formats.written.reaction import FURTHER, Reaction, reactions_of
 from storage.schema import KNOWN
 
 FRAMES_MAX = 2_000_000
-"""An hour at 544 Hz."""
+"""Limit of frames: an hour at 544 Hz."""
 NUMBERS_MAX = 50_000_000
-"""Samples times channels that are kept in memory, at some 40 bytes each."""
+"""Limit of samples times channels in memory, at some 40 bytes each."""
 C3D_FRAMES_MAX = 32_767
-"""Older readers know no more; several samples make one frame then."""
+"""Limit of C3D frames in older readers; more samples are grouped into frames."""
 EVENTS_MAX = 255
-"""Entries of a list in C3D."""
+"""Limit of entries of a list in C3D."""
 MARGIN_MM = 10.0
-"""By which the platform is larger than the rectangle of the tiles' places."""
+"""Margin of the platform around the rectangle of the tiles' positions."""
 
 _WRENCH = {
     "Fx": ("N", "not measured, 0"),
@@ -50,11 +51,11 @@ _WRENCH = {
 }
 _UNCERTAINTY = "t_server_uncertainty_s"
 _SIDES = {"left": "Left", "right": "Right"}
-"""Contexts of events as the manual has them, of nodes that are called so."""
+"""Contexts of events after the C3D manual, by name of the node."""
 _PIECE = 1 << 20
 _TEXT = 100
 _ONE_AT_A_TIME = Semaphore()
-"""Each takes a gigabyte for an hour."""
+"""Lock of the writer: an hour of frames needs a gigabyte of memory."""
 
 Groups = Mapping[str, Mapping[str, Any]]
 Channel = tuple[str, str, str, Floats]
@@ -66,7 +67,7 @@ def _write(export: Export) -> Iterator[bytes]:
 
 
 def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
-    import ezc3d  # noqa: F401  # if it is not installed, that is said before anything is read
+    import ezc3d  # noqa: F401  # fails before anything is read if it is not installed
 
     try:
         with tempfile.TemporaryDirectory(prefix="foottile-") as folder:
@@ -83,7 +84,7 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
             "there is not enough memory to write it",
             remedy="Lift the limit (ulimit -v), or ask for a slice",
         ) from error
-    except (RuntimeError, ValueError) as error:  # in words of ezc3d, which are not for the user
+    except (RuntimeError, ValueError) as error:  # messages of ezc3d do not help the user
         raise StorageError(
             "ezc3d cannot write it", remedy="Ask for a slice, or for another format"
         ) from error
@@ -106,14 +107,14 @@ def _read(exports: Sequence[Export]) -> tuple[Groups, Floats]:
 def c3d_content(
     found: Sequence[Reaction], exports: Sequence[Export]
 ) -> tuple[dict[str, dict[str, Any]], Floats]:
-    """Parameters by group and name, and analog samples, (channels, n).
+    """Return parameters by group and name, and analog samples, (channels, n).
 
-    Integers, floats and texts are arrays or lists of these; the last dimension is that which
-    changes slowest in the file, as in the manual.
+    Values are arrays or lists of integers, floats or texts; the last dimension changes slowest in
+    the file, as in the manual.
 
     Args:
-        found: what the platforms feel, on one axis; one for each of
-        exports: the sessions.
+        found: ground reactions on one time axis, one for each export.
+        exports: exports of the sessions.
     """
     platforms = [_platform(export) for export in exports]
     channels: list[Channel] = []
@@ -162,8 +163,8 @@ def c3d_content(
         },
     }
     for number, (reaction, export) in enumerate(zip(found, exports, strict=True), 1):
-        said = _said(reaction, export, filling, sum(len(each.events) for each in found))
-        wrapped = {name: textwrap.wrap(text, _TEXT) or [" "] for name, text in said.items()}
+        texts = _said(reaction, export, filling, sum(len(each.events) for each in found))
+        wrapped = {name: textwrap.wrap(text, _TEXT) or [" "] for name, text in texts.items()}
         groups["FOOTTILE" + (str(number) if len(found) > 1 else "")] = wrapped
     return groups, analog
 
@@ -175,7 +176,7 @@ def _said(found: Reaction, export: Export, filling: int, events: int) -> dict[st
             f"; the last {events - EVENTS_MAX} are left out, {EVENTS_MAX} being the most: see "
             "channel contact"
         )
-    said = {
+    texts = {
         **described(export, found.steady.begin_ns),
         "AXES": "the foot frame: x forward, y to the left, z up the segment, origin at the ankle; "
         "the platform moves with the foot",
@@ -189,7 +190,7 @@ def _said(found: Reaction, export: Export, filling: int, events: int) -> dict[st
         "SHEAR": "not measured: Fx, Fy and Mz are 0",
         "EVENTS": text,
     }
-    return said | ({} if found.uncertainty_s is None else clock_bound(found.uncertainty_s))
+    return texts | ({} if found.uncertainty_s is None else clock_bound(found.uncertainty_s))
 
 
 def _further(found: Reaction, export: Export) -> Iterator[Channel]:
@@ -217,26 +218,26 @@ def _events(found: Sequence[Reaction], exports: Sequence[Export]) -> dict[str, A
         events = [(at_s, context, label) for at_s, label in reaction.events]
         marks += events[: reaction.marks]
         contacts += events[reaction.marks :]
-    kept = [*sorted(marks), *sorted(contacts)][:EVENTS_MAX]
+    written = [*sorted(marks), *sorted(contacts)][:EVENTS_MAX]
     return {
-        "USED": np.array([len(kept)]),
-        "CONTEXTS": [context or "General" for _, context, _ in kept],
-        "LABELS": [ascii_of(label)[:_TEXT] or "mark" for _, _, label in kept],
-        "DESCRIPTIONS": [" "] * len(kept),
-        "TIMES": np.array([divmod(at_s, 60.0) for at_s, *_ in kept]).reshape(-1, 2).T,
+        "USED": np.array([len(written)]),
+        "CONTEXTS": [context or "General" for _, context, _ in written],
+        "LABELS": [ascii_of(label)[:_TEXT] or "mark" for _, _, label in written],
+        "DESCRIPTIONS": [" "] * len(written),
+        "TIMES": np.array([divmod(at_s, 60.0) for at_s, *_ in written]).reshape(-1, 2).T,
     }
 
 
 def _loaded(export: Export) -> dict[int, TileInfo]:
-    """Tiles that bear load, by their number."""
+    """Return the load-bearing tiles by number."""
     return {i: tile for i, tile in enumerate(export.info.tiles) if not tile.reference}
 
 
 def _platform(export: Export) -> tuple[Floats, Floats]:
-    """Its centre in the foot frame, (3,) in m, and its corners, (4, 3) in mm.
+    """Return the platform's centre in the foot frame, (3,) in m, and its corners, (4, 3) in mm.
 
-    In the order of the manual: the quadrants +x +y, -x +y, -x -y, +x -y of its own axes, of which y
-    and z are the foot's turned.
+    Corners are in the order of the manual: quadrants +x +y, -x +y, -x -y, +x -y of the platform's
+    axes; its y and z are opposite to the foot's.
     """
     places = np.array([(t.x_m, t.y_m, t.z_m) for t in _loaded(export).values()])
     low, high = places.min(axis=0) * 1e3 - MARGIN_MM, places.max(axis=0) * 1e3 + MARGIN_MM
@@ -253,12 +254,12 @@ def _platform(export: Export) -> tuple[Floats, Floats]:
 
 
 def _wrench(found: Reaction, centre_m: Floats) -> Iterator[Floats]:
-    """Yield the reaction on the foot in the platform's axes: N and N mm, (n,) each."""
+    """Yield Fx, Fy, Fz, Mx, My and Mz on the foot in the platform's axes, (n,) in N and N mm."""
     fz_n = 0.0 - found.grf_n
     fz = found.steady.between(fz_n)
     nothing = np.where(np.isnan(fz), np.nan, 0.0)
     yield from (nothing, nothing, fz)
-    for at in (1, 0):  # r x F, the platform's y being the foot's turned
+    for at in (1, 0):  # r x F; the platform's y is opposite to the foot's
         along_m = found.columns[f"cop_{'xy'[at]}_m"].astype(np.float64) - centre_m[at]
         moment = np.where(found.is_unloaded, 0.0, -1e3 * along_m * fz_n)
         yield found.steady.between(moment)
@@ -266,7 +267,7 @@ def _wrench(found: Reaction, centre_m: Floats) -> Iterator[Floats]:
 
 
 def _save(path: Path, groups: Groups, analog: Floats) -> None:
-    """Have it written, and see to it that it is whole: ezc3d does not say if the disk was full."""
+    """Write the file and check its size: ezc3d does not report a full disk."""
     import ezc3d
 
     file = ezc3d.c3d()

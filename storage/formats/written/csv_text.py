@@ -1,7 +1,7 @@
-"""CSV, in which no text is a spreadsheet's formula.
+"""CSV writer that escapes text which spreadsheets would run as formulas.
 
-It has no place for what a file says of itself, so that is the first cell of a column, `about`, that
-is empty elsewhere: every reader of tables takes that.
+CSV has no metadata: the first cell of the column `about` has them as JSON, its other cells are
+empty. Every reader of tables accepts this.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from storage.formats.written.sink import in_pieces
 from storage.sessions.file import EXPORT_COLUMN
 
 _FORMULA = r"^([=+\-@'\t\r\n\x{ff0b}\x{ff0d}\x{ff1d}\x{ff20}])"
-"""What a spreadsheet takes for the beginning of a formula, and the sign that says it is none."""
+"""Pattern of the beginning of a spreadsheet's formula, and of the apostrophe that escapes it."""
 
 
 def write_csv(sink: BinaryIO, table: pa.Table) -> None:
-    """A table as CSV, in which no text is a spreadsheet's formula."""
+    """Write a table as CSV, with text escaped against spreadsheets' formulas."""
     with _Writer(sink, table.schema) as writer:
         writer.write_table(table)
 
 
 class _Writer(pacsv.CSVWriter):
-    """Text that begins like a formula gets an apostrophe before it, and so does one with one."""
+    """CSV writer that puts an apostrophe before text that begins like a formula or with one."""
 
     def write_table(self, table: pa.Table, max_chunksize: int | None = None) -> None:
         """Append rows."""
@@ -40,7 +40,7 @@ class _Writer(pacsv.CSVWriter):
 class _CommaWriter:
     """Writer for Excel where numbers have a decimal comma, with semicolons between columns.
 
-    Without a byte order mark Excel takes the text for Windows-1252.
+    Without a byte order mark Excel decodes the text as Windows-1252.
     """
 
     def __init__(self, sink: BinaryIO, schema: pa.Schema) -> None:
@@ -56,7 +56,7 @@ class _CommaWriter:
             self._sink.write("".join(f"{line}\n" for line in lines.to_pylist()).encode())
 
     def close(self) -> None:
-        """Nothing is left to write."""
+        """Return at once: all rows are written already."""
 
 
 def _cells(column: pa.Array[Any]) -> pa.Array[Any]:
@@ -86,7 +86,7 @@ def _without_formulas(table: pa.Table) -> pa.Table:
 
 
 def _with_about(tables: Iterator[pa.Table], about: str) -> Iterator[pa.Table]:
-    """Tables with a column more: this text in the first row of all, and nothing in the others."""
+    """Append a column that has `about` in the first row of the first table, else null."""
     for table in tables:
         cells = pa.nulls(len(table), pa.string())
         if about and len(table):

@@ -1,4 +1,4 @@
-"""What a file says of itself where its format has room for lines of text only."""
+"""Metadata as lines of text, for formats without structured metadata."""
 
 from __future__ import annotations
 
@@ -11,20 +11,23 @@ import numpy as np
 from devices.arrays import Floats
 from storage.formats.export import Export
 from storage.formats.facts import completeness
+from storage.formats.written.row_place import row_facts
 
 
 def described(export: Export, begin_ns: int) -> dict[str, str]:
-    """Facts of an export by name, as text in ASCII; who resamples or fills says so in its place.
+    """Return the metadata of an export by name, as ASCII text.
+
+    A format that resamples or fills replaces the entries concerned.
 
     Args:
-        export: what is written.
-        begin_ns: instant of its first sample, on the clock that was asked for.
+        export: the export.
+        begin_ns: instant of its first sample, on the requested clock.
     """
     about, notes = export.about, export.notes
     seconds, rest = divmod(begin_ns, 1_000_000_000)
     begin = datetime.fromtimestamp(seconds, tz=UTC).strftime("%Y-%m-%dT%H:%M:%S")
     clock = "the node's" if export.clock is None else "the server's"
-    said = {
+    texts = {
         "SESSION": str(about.get("session") or "none: simulated or estimated by itself"),
         "NODE": export.info.node,
         "COMPLETE": _in_words(notes, export.source),
@@ -42,17 +45,18 @@ def described(export: Export, begin_ns: int) -> dict[str, str]:
         "CALIBRATION": _calibration(notes),
         "SCALE": str(notes.get("absolute_scale") or "not known"),
         "SOFTWARE": export.info.software,
+        **row_facts(export.info),
     }
-    return {name: ascii_of(text) for name, text in said.items()}
+    return {name: ascii_of(text) for name, text in texts.items()}
 
 
 def _in_words(notes: Mapping[str, object], source: Mapping[str, object]) -> str:
     complete, lost = completeness(notes, source)
     if complete is None:
         return "not known: there is no ledger"
-    said = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
+    losses = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
     if complete == "lossy":
-        text = f"lossy: {said or 'frames are missing'}"
+        text = f"lossy: {losses or 'frames are missing'}"
     else:
         text = "complete" if complete else f"not complete: it is {source.get('state', 'pending')}"
     ledger = notes.get("ledger")
@@ -61,10 +65,10 @@ def _in_words(notes: Mapping[str, object], source: Mapping[str, object]) -> str:
 
 
 def clock_bound(uncertainty_s: Floats) -> dict[str, str]:
-    """How far a session's frames may be from the axis of the server's time.
+    """Return the metadata entry with the largest bound of the server's time.
 
     Args:
-        uncertainty_s: bound of each sample; NaN where there is no frame.
+        uncertainty_s: bound of each sample; NaN for samples without frames.
     """
     return {
         "CLOCK_UNCERTAINTY": f"the truth is within {np.nanmax(uncertainty_s) * 1e3:.3f} ms of the "
@@ -73,11 +77,11 @@ def clock_bound(uncertainty_s: Floats) -> dict[str, str]:
 
 
 def ascii_of(text: str) -> str:
-    """Letters without their accents; what ASCII has nothing for is its code point, as U+1F600."""
+    """Return text without accents, other characters outside ASCII as code points (U+1F600)."""
     line = " ".join(text.split())
     plain = unicodedata.normalize("NFKD", line)
-    kept = (c for c in plain if not unicodedata.combining(c))
-    return "".join(c if c.isascii() and c.isprintable() else f"U+{ord(c):04X}" for c in kept)
+    letters = (c for c in plain if not unicodedata.combining(c))
+    return "".join(c if c.isascii() and c.isprintable() else f"U+{ord(c):04X}" for c in letters)
 
 
 def _calibration(notes: Mapping[str, object]) -> str:

@@ -1,4 +1,4 @@
-"""What a format is: what it is called, what it can do, and how it is written."""
+"""Description of an export format: names, capabilities, encoder."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from devices.errors import Extra, UsageError, needs_extra
 from storage.formats.export import Export
 
 TABLE_OPTIONS = ("names", "times")
-"""What every format knows that writes `Export.tables`."""
+"""Options of every format that writes `Export.read_tables`."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format that sessions are written in.
+    """Export format of sessions.
 
     Attributes:
-        name: as people ask for it.
-        title: as menus call it.
-        opened_by: some programs that open it, for people who have to choose.
-        media_type: as HTTP calls it.
-        write: gives the file in chunks; see the package.
-        write_together: writes several sessions on one axis of time; None: it knows one only.
-        suffix: of its files, without the dot; empty: the name.
-        options: names of the fields of `FormatOptions` that it knows.
-        takes_columns: can columns be chosen? Else it has those that it has.
-        needs_forces: is there nothing to write in it of a session without estimates?
-        needs_sealed: is it made of sealed sessions only?
-        is_marked: are marks in it, unless they are left out?
-        frames_max: more it does not take; None: any number.
-        extra: what has to be installed for it; None: nothing.
-        packages: modules of that extra by which it is seen whether it is.
+        name: name in requests and commands.
+        title: name in menus.
+        opened_by: some programs that open it.
+        media_type: media type of HTTP.
+        write: generator of the file's chunks; see the package.
+        write_together: generator for several sessions on one time axis; None: one session only.
+        suffix: ending of its files, without the dot; empty: the name.
+        options: names of the supported fields of `FormatOptions`.
+        takes_columns: True if columns can be selected; else they are fixed.
+        needs_forces: True if a session without estimates cannot be written.
+        needs_sealed: True if only sealed sessions can be written.
+        is_marked: True if markers are included by default.
+        frames_max: limit of frames; None: no limit.
+        extra: extra that has to be installed; None: none.
+        packages: modules of the extra that tell whether it is installed.
     """
 
     name: str
@@ -54,32 +54,32 @@ class Format:
 
     @property
     def ending(self) -> str:
-        """Of its files' names, without the dot."""
+        """Ending of its files, without the dot."""
         return self.suffix or self.name
 
     @property
     def missing(self) -> str | None:
-        """The extra that is not installed; None: it can be written here."""
+        """Extra that has to be installed; None if the format can be written here."""
         is_here = all(find_spec(package) is not None for package in self.packages)
         return None if is_here else self.extra
 
     def written(self, export: Export) -> Iterator[bytes]:
-        """The file, in chunks.
+        """Yield the file of one session in chunks.
 
         Raises:
-            UsageError: it cannot have what is asked for: a column, an option, too many frames,
-                a slice behind the session's end; before the first chunk.
+            UsageError: a column or option is not supported, there are too many frames, or the
+                slice begins after the session's end; raised before the first chunk.
         """
         self._check(export)
         with self._needed():
             yield from self.write(export)
 
     def written_together(self, exports: Sequence[Export]) -> Iterator[bytes]:
-        """One file of several sessions, on one axis of time, in chunks.
+        """Yield one file of several sessions on one time axis, in chunks.
 
         Raises:
-            UsageError: as for `written`, of any of them; it holds one session only, or one has no
-                time that the others share.
+            UsageError: as for `encode`, for any session; the format holds one session only, or a
+                session does not have the server's time.
         """
         if self.write_together is None:
             raise UsageError(f"{self.name} holds one session only")
@@ -94,7 +94,7 @@ class Format:
 
     @property
     def holds_several(self) -> bool:
-        """Can several sessions be in one file?"""
+        """True if one file can hold several sessions."""
         return self.write_together is not None
 
     def _needed(self) -> AbstractContextManager[None]:
@@ -112,7 +112,7 @@ class Format:
                 )
         if export.part.columns and not self.takes_columns:
             raise UsageError(
-                f"{self.name} has columns of its own, and none can be chosen",
+                f"{self.name} has fixed columns, and none can be selected",
                 remedy="Leave columns out, or ask for Parquet, Arrow or CSV",
             )
         if self.needs_forces and not export.has_forces:

@@ -1,7 +1,7 @@
-"""Parquet of a session or a slice, which readers of the last five years open.
+"""Parquet writer for readers of the last five years.
 
-Pages are plain or have a dictionary. A sealed file is smaller, and takes newer readers for it:
-docs/formats.md has them.
+Pages are plain or dictionary-encoded. A sealed file is smaller, and needs newer readers: see
+docs/formats.md.
 """
 
 from __future__ import annotations

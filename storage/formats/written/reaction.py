@@ -1,7 +1,7 @@
-"""What the ground does to the foot, at a constant rate, for formats of force and moment.
+"""Ground reaction of a session at a constant rate, for formats of force and moment.
 
-The foot frame: x forward, y to the left, z up the segment, origin at the ankle. A FootTile measures
-forces along its axis: nothing is known of shear and of the free moment, and both are written as 0.
+Foot frame: x forward, y to the left, z up the segment, origin at the ankle. Tiles measure forces
+along their axis only: shear and the free moment are unknown, and written as 0.
 """
 
 from __future__ import annotations
@@ -15,34 +15,36 @@ import numpy.typing as npt
 from devices.arrays import Floats, Times
 from devices.errors import UsageError
 from storage.formats.export import Export
+from storage.formats.written.row_place import NEEDED as POINT
+from storage.formats.written.row_place import with_row_place
 from storage.formats.written.steady import Steady, axis_of, steady
 from storage.formats.written.together import instants_of
 from storage.schema import SERVER_TIME, Array
 
-NEEDED = ("t_ns", "contact", "grf_n", "cop_x_m", "cop_y_m", "estimate_status")
-"""Columns that are needed, and in every session with estimates."""
+NEEDED = ("t_ns", "contact", *POINT)
+"""Required columns, which every session with estimates has."""
 FURTHER = (
     *("grf_sigma_n", "grf_at_least_n", "cop_sigma_x_m", "cop_sigma_y_m"),
     *("cop_ground_x_m", "cop_ground_y_m", "angle_rad"),
 )
-"""Columns that a session may have."""
+"""Optional columns of a session."""
 FLAGS = ("contact", "estimate_status", "grf_at_least_n")
-"""Columns of which nothing lies between two frames."""
+"""Columns that are not interpolated between two frames."""
 SERVER_NAMES = [column.name for column in SERVER_TIME]
 STRIKE, OFF = "Foot Strike", "Foot Off"
-"""As the C3D manual calls them."""
+"""Labels of contact events, after the C3D manual."""
 
 
 @dataclass(frozen=True)
 class Reaction:
-    """A session, or a slice of it, at a constant rate; n samples of m frames.
+    """Ground reaction of a session or slice: m frames, resampled to n samples.
 
     Attributes:
-        steady: between which frames each sample is.
-        columns: flat columns, (m,) each.
-        events: seconds after the first sample, and label: of marks, and then of contacts that
-            were seen to begin and to end.
-        marks: how many of them are marks.
+        steady: resampling of frames to samples.
+        columns: flat columns of frames, (m,) each; the COP `with_row_place`.
+        events: time in seconds after the first sample, and label: first the markers, then begins
+            and ends of contact.
+        marks: number of markers among the events.
     """
 
     steady: Steady
@@ -51,7 +53,7 @@ class Reaction:
     marks: int
 
     def at(self, name: str) -> Floats:
-        """A column at the samples, (n,); NaN where it is not known, or there are no frames."""
+        """Return a column at the samples, (n,); NaN where it is unknown or the sample is empty."""
         column = self.columns[name]
         if name in FLAGS:
             return self.steady.nearest(column)
@@ -59,43 +61,34 @@ class Reaction:
 
     @property
     def uncertainty_s(self) -> Floats | None:
-        """(n,), bound of the server's time of its frames; None: it is the node's own time."""
+        """Bound (n,) of the error of the server's time, in s; None if times are the node's."""
         name = "t_server_uncertainty_ns"
         return self.steady.nearest(self.columns[name]) * 1e-9 if name in self.columns else None
 
     @property
     def is_unloaded(self) -> npt.NDArray[np.bool_]:
-        """(m,), is it known that the foot bears nothing in a frame?"""
+        """Mask (m,) of the frames known to be without contact."""
         return np.asarray(self.columns["contact"] == 0)
 
     @property
     def grf_n(self) -> Floats:
-        """(m,), 0 where it is known that there is no contact."""
+        """GRF of the frames (m,) in N, 0 in frames known to be without contact."""
         return np.where(self.is_unloaded, 0.0, self.columns["grf_n"].astype(np.float64))
-
-
-def reaction_of(export: Export, further: Sequence[str], frames_max: int) -> Reaction:
-    """Read the frames of an export, and put them at a constant rate.
-
-    Args:
-        export: of a session with estimates.
-        further: columns that are wanted besides, where the session has them.
-        frames_max: more frames, or samples, are refused.
-
-    Raises:
-        UsageError: as for `Export.whole` and `axis_of`; there is no frame, or none has a force.
-    """
-    (found,) = reactions_of([export], further, frames_max)
-    return found
 
 
 def reactions_of(
     exports: Sequence[Export], further: Sequence[str], frames_max: int
 ) -> list[Reaction]:
-    """The same of several, on one axis of time.
+    """Read the frames of several exports, and resample them to one time axis.
+
+    Args:
+        exports: exports of sessions with estimates.
+        further: further columns, read if a session has them.
+        frames_max: limit of each session's frames, and of samples.
 
     Raises:
-        UsageError: as for `reaction_of`, of any of them.
+        UsageError: as for `Export.read_all` and `make_sample_axis`; a session has no frame, or no
+            frame with a force.
     """
     read = [_frames(export, further, frames_max) for export in exports]
     streams = [
@@ -115,7 +108,7 @@ def reactions_of(
 def _frames(
     export: Export, further: Sequence[str], frames_max: int
 ) -> tuple[Times, dict[str, Array]]:
-    """Instants of the frames, on the clock that was asked for, and their columns."""
+    """Return the instants of the frames on the export's clock, and their columns."""
     present = set(export.content.names)
     names = [*NEEDED, *(name for name in further if name in present)]
     names += SERVER_NAMES if export.clock is not None else []
@@ -135,7 +128,7 @@ def _frames(
             where=export.called,
             remedy="Ask for Parquet, Arrow or CSV: they have counts and bounds",
         )
-    return t_ns, columns
+    return t_ns, with_row_place(columns, export.info)
 
 
 def _marks(columns: Mapping[str, Array], since_s: Floats) -> list[tuple[float, str]]:
@@ -146,15 +139,15 @@ def _marks(columns: Mapping[str, Array], since_s: Floats) -> list[tuple[float, s
 
 
 def _contacts(columns: Mapping[str, Array], since_s: Floats) -> list[tuple[float, str]]:
-    """Where contact begins and ends, the frame before being there and known."""
+    """Return begins and ends of contact; the previous frame has to exist with known contact."""
     contact, seq = columns["contact"], columns["seq"]
     follows = seq[1:] == seq[:-1] + 1
     if "part" in columns:
         follows &= columns["part"][1:] == columns["part"][:-1]
-    begun = np.flatnonzero(follows & (contact[:-1] == 0) & (contact[1:] == 1)) + 1
-    ended = np.flatnonzero(follows & (contact[:-1] == 1) & (contact[1:] == 0)) + 1
-    events = [(float(since_s[i]), STRIKE) for i in begun]
-    events += [(float(since_s[i]), OFF) for i in ended]
+    begins = np.flatnonzero(follows & (contact[:-1] == 0) & (contact[1:] == 1)) + 1
+    ends = np.flatnonzero(follows & (contact[:-1] == 1) & (contact[1:] == 0)) + 1
+    events = [(float(since_s[i]), STRIKE) for i in begins]
+    events += [(float(since_s[i]), OFF) for i in ends]
     return sorted(events)
 
 

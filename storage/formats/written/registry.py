@@ -1,4 +1,4 @@
-"""All formats that sessions are written in; a new one is a line here, and its module."""
+"""Registry of all export formats; a new format is a module and a line here."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ FORMATS: Mapping[str, Format] = {
 
 
 SEVERAL = tuple(known.name for known in FORMATS.values() if known.holds_several)
-"""Those that several sessions can be in."""
+"""Names of the formats that hold several sessions in one file."""
 
 
 def format_named(name: str) -> Format:
-    """The format that people call so.
+    """Return the format of this name.
 
     Raises:
-        UsageError: there is none.
+        UsageError: no format has this name.
     """
     if name not in FORMATS:
         raise UsageError(f"no format {name[:80]!r}", expected="one of " + ", ".join(FORMATS))
@@ -49,10 +49,10 @@ def format_named(name: str) -> Format:
 
 
 def together_named(name: str) -> Format:
-    """The same, of several sessions in one file.
+    """Return the format of this name, which holds several sessions in one file.
 
     Raises:
-        UsageError: there is none, or it holds one session only.
+        UsageError: no format has this name, or it holds one session only.
     """
     found = format_named(name)
     if not found.holds_several:
@@ -73,4 +73,4 @@ def _known(name: str) -> str:
 FormatName = Annotated[
     str, AfterValidator(_known), WithJsonSchema({"type": "string", "enum": list(FORMATS)})
 ]
-"""In models: the name of a format."""
+"""Type of a format's name in pydantic models."""

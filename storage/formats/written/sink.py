@@ -1,4 +1,4 @@
-"""A file in memory that is handed on in pieces while it is written."""
+"""File in memory whose content is drained in chunks while it is written."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import pyarrow as pa
 
 
 class Sink(io.BytesIO):
-    """Keeps what was written until it is taken; nobody can go back in it."""
+    """Buffer of written bytes until they are drained; not seekable."""
 
     def __init__(self) -> None:
         super().__init__()
         self._given = 0
 
     def seekable(self) -> bool:
-        """Not in what was handed on."""
+        """Return False: drained bytes are gone."""
         return False
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Nobody can; zip files ask so, not by `seekable`."""
+        """Raise UnsupportedOperation: zipfile tries `seek` instead of `seekable`."""
         raise io.UnsupportedOperation("seek")
 
     def tell(self) -> int:
-        """Position in the whole file, of which only the end is kept here."""
+        """Return the position in the whole file, drained bytes included."""
         return self._given + super().tell()
 
     def taken(self) -> bytes:
-        """What was written since."""
+        """Remove and return the bytes written since the last call."""
         piece = self.getvalue()
         self._given += len(piece)
         super().seek(0)
@@ -40,11 +40,11 @@ class Sink(io.BytesIO):
 def in_pieces(
     tables: Iterator[pa.Table], opened: Callable[[Sink, pa.Schema], Any]
 ) -> Iterator[bytes]:
-    """A file of tables, in as many chunks, and its end.
+    """Yield a file of tables: a chunk for each table, and a last chunk for the file's end.
 
     Args:
-        tables: one at least, all with one schema.
-        opened: gives a writer with `write_table` and `close`.
+        tables: at least one table; all have one schema.
+        opened: function that returns a writer with `write_table` and `close`.
     """
     first = next(tables)
     sink = Sink()

@@ -1,8 +1,7 @@
-"""Frames at a constant rate, for formats that know no instants.
+"""Resampling of frames to a constant rate, for formats without instants.
 
-Between two frames that follow upon each other a sample is on the straight line between them; no
-line is drawn over frames that were lost or not taken, nor from a part of a session to the next:
-there samples are empty.
+Samples between two successive frames are interpolated linearly. Samples in gaps of lost or not
+sampled frames, and between two parts of a session, are empty.
 """
 
 from __future__ import annotations
@@ -18,26 +17,26 @@ from devices.errors import UsageError
 from storage.schema import Array
 
 BRIDGED_PERIODS = 2.5
-"""No line is drawn over more: in one slot a frame may be late, or not taken."""
+"""Longest interpolated interval, in periods: a frame may be late, or one may not be sampled."""
 SAME_PERIODS = 1e-3
-"""A sample that is so near to a frame is that frame, whatever comes before and behind it."""
+"""Distance, in periods, up to which a sample has exactly a frame's values."""
 _NOMINAL_WITHIN = 0.01
-"""Frames whose rate is so near the nominal one, relative, have that."""
+"""Relative difference of the median rate up to which frames have the nominal rate."""
 
 Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Steady:
-    """n samples at a constant rate, of m frames.
+    """Linear resampling of m frames to n samples at a constant rate.
 
     Attributes:
-        rate_hz: as a number of single precision has it, as C3D does.
-        begin_ns: instant of the first.
-        before: (n,), the last frame that is not behind the sample.
-        after: (n,), the one behind it, or the same.
-        part: (n,), of the way from one to the other, 0 to 1.
-        is_there: (n,), bool; else it is empty.
+        rate_hz: rate, exact in float32 as C3D stores it.
+        begin_ns: instant of the first sample.
+        before: (n,), index of the last frame not after the sample.
+        after: (n,), index of the next frame, or the same index at the end.
+        part: (n,), fraction of the interval from `before` to `after`, 0 to 1.
+        is_there: (n,), bool; False: the sample is empty.
     """
 
     rate_hz: float
@@ -52,16 +51,16 @@ class Steady:
 
     @property
     def time_s(self) -> Floats:
-        """(n,), seconds since the first sample."""
+        """Times of the samples (n,), in seconds since the first."""
         return np.arange(len(self)) / self.rate_hz
 
     @property
     def empty(self) -> int:
-        """Samples without frames."""
+        """Number of empty samples."""
         return int((~self.is_there).sum())
 
     def between(self, column: Floats) -> Floats:
-        """A column of m numbers at the samples; NaN where one of the two frames has none."""
+        """Return a column of m numbers interpolated linearly, (n,); NaN if a frame has NaN."""
         begin, end = column[self.before], column[self.after]
         with np.errstate(invalid="ignore"):
             values = begin + self.part * (end - begin)
@@ -69,12 +68,12 @@ class Steady:
         return np.where(self.is_there, values, np.nan)
 
     def nearest(self, column: Array) -> Floats:
-        """A column of flags: those of the nearer frame."""
+        """Return a column of m numbers or flags of the nearer frames, (n,); NaN if empty."""
         values = column[np.where(self.part <= 0.5, self.before, self.after)]
         return np.where(self.is_there, values.astype(np.float64), np.nan)
 
     def says(self) -> str:
-        """In words, for the file."""
+        """Return a description of the resampling, for the file."""
         text = (
             f"{len(self)} samples at {self.rate_hz:.9g} Hz, on straight lines between frames that "
             "follow upon each other; flags are the nearer frame's"
@@ -84,12 +83,12 @@ class Steady:
 
 @dataclass(frozen=True)
 class Axis:
-    """One time axis of samples at a constant rate.
+    """Time axis of samples at a constant rate.
 
     Attributes:
-        rate_hz: as a number of single precision has it, as C3D does.
-        begin_ns: instant of the first.
-        count: how many there are.
+        rate_hz: rate, exact in float32 as C3D stores it.
+        begin_ns: instant of the first sample.
+        count: number of samples.
     """
 
     rate_hz: float
@@ -98,15 +97,15 @@ class Axis:
 
 
 def axis_of(streams: Sequence[tuple[Times, float]], samples_max: int) -> Axis:
-    """The axis of some streams of frames: from the first frame of any to the last of any.
+    """Return the time axis from the earliest to the latest frame of all streams.
 
     Args:
-        streams: instants of the frames of each, one at least, and its nominal rate. Where frames
-            come at another one, it is the median's. The axis has the highest.
-        samples_max: more are refused.
+        streams: instants and nominal rate of each stream, one frame at least. The median rate
+            counts if it differs from the nominal one. The axis has the highest rate.
+        samples_max: limit of samples.
 
     Raises:
-        UsageError: instants run back, or there were too many samples.
+        UsageError: instants run back, or there are too many samples.
     """
     for t_ns, _ in streams:
         _check_instants(t_ns)
@@ -117,21 +116,21 @@ def axis_of(streams: Sequence[tuple[Times, float]], samples_max: int) -> Axis:
     count = int((end_ns - begin_ns) * 1e-9 * rate_hz + SAME_PERIODS) + 1
     if count > samples_max:
         raise UsageError(
-            f"from the first frame to the last there are {count} samples at {rate_hz:.6g} Hz, with "
-            f"what lies between; the limit here is {samples_max}",
+            f"from the first frame to the last there are {count} samples at {rate_hz:.6g} Hz, "
+            f"gaps included; the limit is {samples_max}",
             expected=f"a slice of {(samples_max - 1) / rate_hz:.3f} s at most",
         )
     return Axis(rate_hz, begin_ns, count)
 
 
 def steady(axis: Axis, t_ns: Times, seq: Array, part: Array | None) -> Steady:
-    """Frames on an axis.
+    """Return the resampling of frames to a time axis.
 
     Args:
-        axis: made of these instants, and others if there are.
-        t_ns: (m,), their instants, rising; m > 0.
-        seq: (m,), their numbers.
-        part: (m,), of the session; None: all are of one.
+        axis: time axis that covers the frames.
+        t_ns: (m,), instants of the frames, rising; m > 0.
+        seq: (m,), numbers of the frames.
+        part: (m,), parts of the session; None: a single part.
     """
     period_ns = 1e9 / axis.rate_hz
     since_ns = (t_ns - axis.begin_ns).astype(np.float64)

@@ -1,4 +1,4 @@
-"""What formats share that put several sessions on one axis of time: names that differ, instants."""
+"""Unique names and instants for formats that put several sessions on one time axis."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from storage.schema import NO_INSTANT, Array
 
 
 def distinct(names: Sequence[str]) -> list[str]:
-    """These names; one that is there already ends in a number, as `left_2`."""
-    found: list[str] = []
+    """Return the names with a number appended to repeated ones, such as `left_2`."""
+    unique: list[str] = []
     for name in names:
-        number, differs = 1, name
-        while differs in found:
+        number, candidate = 1, name
+        while candidate in unique:
             number += 1
-            differs = f"{name}_{number}"
-        found.append(differs)
-    return found
+            candidate = f"{name}_{number}"
+        unique.append(candidate)
+    return unique
 
 
 def instants_of(export: Export, columns: Mapping[str, Array]) -> Times:
-    """Instants of frames on the clock that was asked for, int64[n].
+    """Return the instants of frames on the export's clock, int64[n].
 
     Args:
-        export: whose frames they are.
-        columns: `t_ns`, `part` if it has parts, `t_server_ns` if the server's clock was asked for.
+        export: export of the frames.
+        columns: `t_ns`, `part` if the session has parts, `t_server_ns` with the server's clock.
 
     Raises:
-        UsageError: it was, and of some frames the server's time is not known.
+        UsageError: the server's time of some frames is unknown.
     """
     t_ns: Times = export.at_ns(columns) if export.clock is None else columns["t_server_ns"]
     unknown = int((t_ns == NO_INSTANT).sum())
     if unknown:
         raise UsageError(
-            f"of {unknown} frames the server's time is not known",
+            f"the server's time is not known for {unknown} frames",
             where=export.called,
             remedy="Ask for the node's clock, or a slice of a part whose clock was compared",
         )

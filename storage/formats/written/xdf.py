@@ -1,13 +1,12 @@
-"""XDF, the file of LabStreamingLayer: streams of samples, each with its instant, and marks.
+"""XDF writer (LabStreamingLayer): streams of samples with their instants, and markers.
 
-The layout is that of https://github.com/sccn/xdf/wiki/Specifications. Of each part of a session
-there is a stream of 32-bit floats, with all estimates and counts, and one of 64-bit floats, with
-numbers that need them; of all together a stream of marks. Instants are the node's, in seconds since
-1970, and with the server's clock every few seconds a clock offset leads from them to the server's,
-as LSL's own recorder has it. No rate is stated, so that readers leave every instant as it is; with
-the option `rate` samples are at a constant rate that is stated, in one stream for all parts.
-Several sessions are one after the other, with streams of their own; readers join them by the
-offsets.
+Layout: https://github.com/sccn/xdf/wiki/Specifications. Each part of a session has a stream of
+32-bit floats, with estimates and counts, and a stream of 64-bit floats, for numbers that need them;
+the session has a stream of markers. Instants are the node's, in seconds since 1970. With the
+server's clock, clock offsets to the server's time follow every few seconds, as in LSL's recorder.
+No rate is stated, so that readers keep the instants. With the option `rate`, samples have a stated
+constant rate, in one stream for all parts. Several sessions follow one another with separate
+streams; readers align them by the offsets.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ from storage.schema import KNOWN, NO_INSTANT, SERVER_TIME, Array
 _MAGIC = b"XDF:"
 _FILE_HEADER, _STREAM_HEADER, _SAMPLES, _CLOCK_OFFSET, _STREAM_FOOTER = 1, 2, 3, 4, 6
 _OFFSET_EVERY_NS = 5_000_000_000
-"""As LSL's recorder does."""
+"""Interval of clock offsets, as in LSL's recorder."""
 _COUNTERS = ("seq", "servo_counts", "servo_age_us")
-"""Beyond what 32-bit floats count exactly."""
+"""Integers beyond the exact range of 32-bit floats."""
 _TIMES = ("time_s", "time_utc", "t_ns", "t_mono_ns", "t_server_ns")
-"""Every sample has its instant."""
+"""Columns that are no channels: every sample has its instant."""
 _SAMPLES_MAX = 5_000_000
-"""At a constant rate, which is worked out in memory: hours of four tiles."""
+"""Limit of samples at a constant rate, computed in memory: hours of four tiles."""
 _BOUND = SERVER_TIME[1].name
-"""Of each sample's time by the server's clock: a channel, whatever columns were chosen."""
+"""Bound of the server's time; with the server's clock always a channel."""
 
 
 @dataclass
 class _Stream:
-    """One stream, and what its footer will say."""
+    """Stream of the file, with the numbers for its footer."""
 
     number: int
     columns: Sequence[str]
@@ -56,21 +55,21 @@ class _Stream:
     offsets: list[tuple[float, float]] = field(default_factory=list)
 
     def count(self, at_s: Array) -> None:
-        """Of further samples."""
+        """Add samples to the numbers of the footer."""
         if len(at_s):
             self.first_s = self.first_s if self.samples else float(at_s[0])
             self.last_s = float(at_s[-1])
             self.samples += len(at_s)
 
     def chunk(self, tag: int, content: bytes) -> bytes:
-        """A chunk of this stream."""
+        """Return an encoded chunk of this stream."""
         return _chunk(tag, struct.pack("<I", self.number) + content)
 
     def footer(self) -> bytes:
-        """Its last chunk."""
+        """Return the encoded footer, the stream's last chunk."""
         info = Element("info")
-        said = {"first_timestamp": repr(self.first_s), "last_timestamp": repr(self.last_s)}
-        _texts(info, {**said, "sample_count": str(self.samples)})
+        span = {"first_timestamp": repr(self.first_s), "last_timestamp": repr(self.last_s)}
+        _texts(info, {**span, "sample_count": str(self.samples)})
         offsets = SubElement(info, "clock_offsets")
         for at_s, value_s in self.offsets:
             _texts(SubElement(offsets, "offset"), {"time": repr(at_s), "value": repr(value_s)})
@@ -86,7 +85,7 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
     names = distinct([export.info.node for export in exports])
     sessions = [_Session(*each, numbers) for each in zip(exports, names, strict=True)]
     pieces = [session.pieces(is_alone=len(exports) == 1) for session in sessions]
-    firsts = [next(each) for each in pieces]  # what is wrong is said before anything is given away
+    firsts = [next(each) for each in pieces]  # errors are raised before the first chunk
     yield _MAGIC + _header(exports)
     for session, first, further in zip(sessions, firsts, pieces, strict=True):
         yield session.begin()
@@ -96,7 +95,7 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
 
 
 def _header(exports: Sequence[Export]) -> bytes:
-    """What comes first, with what the file says of itself, or of each session in it."""
+    """Return the file header, with the metadata of each session."""
     info = Element("info")
     _texts(info, {"version": "1.0", "software": exports[0].info.software})
     several = SubElement(info, "sessions") if len(exports) > 1 else None
@@ -107,12 +106,12 @@ def _header(exports: Sequence[Export]) -> bytes:
 
 
 class _Session:
-    """The streams of a session, as far as they are written.
+    """Encoder of a session's streams.
 
     Args:
-        export: the session.
-        name: with which those of its streams begin.
-        numbers: of streams, in all the file.
+        export: export of the session.
+        name: prefix of its streams' names.
+        numbers: iterator of unique stream numbers of the file.
     """
 
     def __init__(self, export: Export, name: str, numbers: Iterator[int]) -> None:
@@ -129,11 +128,11 @@ class _Session:
         self._marks: _Stream | None = None
         self._next_offset_ns: dict[int, int] = {}
         self._rate_hz = 0.0
-        """Of its samples; 0: each has its own instant."""
+        """Constant rate of the samples; 0: each has its own instant."""
         self._marked_rows: Mapping[str, Array] | None = None
 
     def pieces(self, *, is_alone: bool) -> Iterator[Mapping[str, Array]]:
-        """Its frames. Beside others it has to have the server's time: it is all they share."""
+        """Read the frames in chunks; beside other sessions they need the server's time."""
         export = self._export
         asked = [*self._chosen, "t_ns"]
         asked += ["part"] if "part" in export.content.names else []
@@ -148,7 +147,10 @@ class _Session:
             yield piece
 
     def _at_constant_rate(self, asked: Sequence[str], *, is_alone: bool) -> Mapping[str, Array]:
-        """All of it as samples: numbers between frames, counts and flags of the nearer one."""
+        """Read all frames as samples at a constant rate.
+
+        Numbers are interpolated; counts and flags are those of the nearer frame.
+        """
         export = self._export
         flat = export.whole(list(dict.fromkeys([*asked, "seq"])), frames_max=_SAMPLES_MAX)
         if not is_alone:
@@ -173,10 +175,10 @@ class _Session:
         if "t_server_ns" in flat:
             is_known = flat["t_server_ns"] != NO_INSTANT
             offset_ns = placed.nearest(np.where(is_known, flat["t_server_ns"] - t_ns, np.nan))
-            known = np.isfinite(offset_ns)
+            is_finite = np.isfinite(offset_ns)
             samples["t_server_ns"] = np.where(
-                known,
-                samples["t_ns"] + np.where(known, offset_ns, 0.0).astype(np.int64),
+                is_finite,
+                samples["t_ns"] + np.where(is_finite, offset_ns, 0.0).astype(np.int64),
                 NO_INSTANT,
             )
         if self._export.marks is not None:
@@ -184,26 +186,26 @@ class _Session:
         return samples
 
     def begin(self) -> bytes:
-        """The header of its marks."""
+        """Return the header of the stream of markers; empty without markers."""
         if self._export.marks is None:
             return b""
         self._marks, header = self._opened("marks", "Markers", ["label"], "string")
         return header
 
     def piece(self, piece: Mapping[str, Array]) -> bytes:
-        """Chunks of some frames."""
+        """Return the encoded chunks of a chunk of frames."""
         content = bytearray()
         parts = np.zeros(len(piece["t_ns"]), dtype=np.uint16)
         if not self._rate_hz:
             parts = piece.get("part", parts)
-        # A stream for what has no frame, too, so that its channels are said.
+        # Without frames there is an empty stream as well, which states the channels.
         for part in np.unique(parts).tolist() or [0]:
             rows = parts == part
             content += self._of_part(part, {name: v[rows] for name, v in piece.items()})
         return bytes(content)
 
     def footers(self) -> bytes:
-        """What comes last: without it a stream is not at its end."""
+        """Return the footers of all streams; a stream without a footer is incomplete."""
         return b"".join(stream.footer() for stream in self._streams)
 
     def _of_part(self, part: int, flat: Mapping[str, Array]) -> bytes:
@@ -232,7 +234,7 @@ class _Session:
         return bytes(content)
 
     def _at_ns(self, flat: Mapping[str, Array]) -> Array:
-        """(n,), on the session's time axis; samples at a constant rate are there already."""
+        """Return the instants (n,) on the session's time axis; resampled ones already are."""
         return flat["t_ns"] if self._rate_hz else self._export.at_ns(flat)
 
     def _samples(self, stream: _Stream, at_s: Array, flat: Mapping[str, Array]) -> bytes:
@@ -252,7 +254,7 @@ class _Session:
         if not len(t_ns):
             return b""
         begin_ns = self._next_offset_ns.get(part, int(t_ns[0]))
-        # How many are due by each frame: a pause of days has no more than one behind it.
+        # Offsets due by each frame: after a pause of days only one is written.
         count = np.maximum(0, (t_ns - begin_ns) // _OFFSET_EVERY_NS + 1)
         for row in np.flatnonzero(np.diff(count, prepend=0) > 0):
             pair = float(t_ns[row]) * 1e-9, float(t_server_ns[row] - t_ns[row]) * 1e-9
@@ -276,17 +278,17 @@ class _Session:
     def _opened(
         self, name: str, kind: str, columns: Sequence[str], format_: str
     ) -> tuple[_Stream, bytes]:
-        """A further stream, and its header."""
+        """Add a stream; return it and its encoded header."""
         dtype = {"float32": "<f4", "double64": "<f8", "string": ""}[format_]
         stream = _Stream(next(self._numbers), columns, dtype)
         self._streams.append(stream)
         node = self._export.info.node
         info = Element("info")
-        said = {"name": f"{self._name} {name}", "type": kind, "channel_count": str(len(columns))}
+        texts = {"name": f"{self._name} {name}", "type": kind, "channel_count": str(len(columns))}
         rate = repr(self._rate_hz) if self._rate_hz and format_ != "string" else "0"
-        said |= {"nominal_srate": rate, "channel_format": format_}
+        texts |= {"nominal_srate": rate, "channel_format": format_}
         source = f"{node} {self._export.about.get('session') or ''} {name}"
-        _texts(info, {**said, "source_id": source, "version": "1.1", "hostname": node})
+        _texts(info, {**texts, "source_id": source, "version": "1.1", "hostname": node})
         desc = SubElement(info, "desc")
         _texts(desc, {"nominal_rate_hz": repr(self._export.info.nominal_rate_hz)})
         channels = SubElement(desc, "channels")
@@ -302,7 +304,7 @@ class _Session:
 
 
 def _numbers(values: Array, column: str) -> Array:
-    """A column as numbers; NaN where there is none."""
+    """Return a column as float64, NaN where unknown."""
     missing = KNOWN[column].missing
     numbers = values.astype(np.float64)
     if missing is not None:

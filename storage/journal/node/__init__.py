@@ -1,5 +1,5 @@
-"""A node's journals: frames that wait in memory or are in flight, what is dropped, what is wanted.
+"""A node's journals: frames in memory and in flight, retention, and servers' retention requests.
 
-`journal` is all of it, `stream` one stream; what they stand on has a module for each thing. A
-server has none of this.
+`journal` is all of it, `stream` one stream; the modules under them have one task each. A server has
+none of this.
 """

@@ -1,4 +1,4 @@
-"""Batches that wait in memory, and how much of it they take."""
+"""Queue of batches that wait in memory, with its size."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from storage.wire import EncodedBatch
 
 
 class BatchQueue:
-    """Batches, oldest first, and what they take in memory."""
+    """Queue of batches, oldest first, with its size in bytes."""
 
     def __init__(self) -> None:
         self.batches: deque[EncodedBatch] = deque()
@@ -17,22 +17,22 @@ class BatchQueue:
 
     @property
     def frames(self) -> int:
-        """How many frames there are in them."""
+        """Number of frames in the queue."""
         return sum(batch.seq_last - batch.seq_first + 1 for batch in self.batches)
 
     def append(self, batch: EncodedBatch) -> None:
-        """Add the newest one."""
+        """Append the newest batch."""
         self.batches.append(batch)
         self.size_bytes += len(batch.payload)
 
     def popleft(self) -> EncodedBatch:
-        """Take out the oldest one."""
+        """Remove and return the oldest batch."""
         batch = self.batches.popleft()
         self.size_bytes -= len(batch.payload)
         return batch
 
     def give_back(self, batches: Iterable[EncodedBatch]) -> None:
-        """Put back what was taken out, before all others."""
+        """Put removed batches back, before all others."""
         given = list(batches)
         self.batches.extendleft(reversed(given))
         self.size_bytes += sum(len(batch.payload) for batch in given)

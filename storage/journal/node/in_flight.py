@@ -1,9 +1,8 @@
-"""Frames in flight: taken, perhaps not yet in the journal, kept where SIGKILL cannot reach them.
+"""File of frames in flight: acquired, perhaps not yet in the journal, and safe from SIGKILL.
 
-A file of fixed rows, mapped into memory, one row a frame, the oldest overwritten. It is never
-synced: the kernel keeps it when a process is killed, and a power cut loses it, which is why it
-names the start of the machine it belongs to. Each row carries its CRC-32, so a row that was being
-written, or is of another time, is seen.
+It has fixed rows, mapped into memory, one per frame, and overwrites the oldest. It is never synced:
+the kernel keeps it when a process is killed, but a power cut loses it, so it states the kernel's
+boot id. Each row has its CRC-32, by which an incomplete or outdated row is recognised.
 """
 
 from __future__ import annotations
@@ -24,23 +23,23 @@ from storage.durable import make_folder, read_whole, storage_errors
 
 IN_FLIGHT_FILE = "in_flight"
 ROWS = 8192
-"""Rows for 15 s at full rate: frames may wait that long for a slow card."""
+"""Rows for 15 s at full rate, the longest wait for a slow card."""
 _MAGIC = b"FootTile in flight 1\n"
 _HEAD = struct.Struct("<21sHII36sI")
-"""Magic, tiles, rows, length of the description, kernel's boot id, CRC-32 of all that follows."""
+"""Magic, tiles, rows, length of the description, kernel's boot id, CRC-32 of the two before."""
 _ORDER = FrameRow._fields
 _CODES = {"uint64": "Q", "int64": "q", "int32": "i", "float32": "f", "uint16": "H", "uint8": "B"}
 
 
 class InFlight:
-    """Writes frames of one stream to its file. For the process that takes them.
+    """Writer of one stream's frames in flight, for the acquisition process.
 
     Args:
-        folder: the stream's own; made if absent.
+        folder: the stream's own; created if absent.
         info: description of the stream's array.
 
     Raises:
-        StorageError: there is no room for it; acquisition does without it then.
+        StorageError: the disk has no room for the file; acquisition runs without it then.
     """
 
     def __init__(self, folder: Path, info: ArrayInfo) -> None:
@@ -69,7 +68,7 @@ class InFlight:
         self._map[: self._begin] = head + description
 
     def put(self, frame: FrameRow) -> None:
-        """Keep one frame, as it was taken."""
+        """Write one frame to its row."""
         seq, t_mono_ns, t_ns, counts, age_us, force_n, flags, padc, tadc, offset_us, status = frame
         row = self._row.pack(
             *(seq, t_mono_ns, t_ns, counts, age_us, force_n, flags),
@@ -82,18 +81,18 @@ class InFlight:
         self._map[at : at + self._size] = row + zlib.crc32(row).to_bytes(4, "little")
 
     def close(self) -> None:
-        """Let go of the file; it stays."""
+        """Close the file without deleting it."""
         self._map.close()
 
 
 def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
-    """What a killed process left, in order; None if there is nothing that can be trusted.
+    """Read the frames that a killed process left, in order; None if no file can be trusted.
 
-    After a restart of the machine nothing can be trusted: the file was never synced. Counted back
-    from the newest frame, the frames end where the first one is missing.
+    After a reboot it cannot: the file was never synced. Counted back from the newest frame, the
+    result ends at the first missing one.
 
     Raises:
-        DamagedFileError: it is not what was written.
+        DamagedFileError: its content is not what was written.
         StorageError: it cannot be read now.
     """
     path = folder / IN_FLIGHT_FILE
@@ -137,10 +136,10 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
 
 
 def read_in_flight_from(folder: Path, seq: int) -> FrameBatch | None:
-    """What a killed process left from frame `seq` on; None if there is no such frame.
+    """Read the frames that a killed process left from number `seq` on; None if there are none.
 
     Raises:
-        DamagedFileError: it is not what was written.
+        DamagedFileError: its content is not what was written.
         StorageError: it cannot be read now.
     """
     left = read_in_flight(folder)
@@ -157,7 +156,7 @@ def delete_in_flight(folder: Path) -> None:
 
 
 def open_in_flight(folder: Path | None, info: ArrayInfo) -> InFlight | None:
-    """A place for frames in flight; None if the disk has no room for it, or none is wanted."""
+    """Create a writer of frames in flight; None without a folder, or if the disk has no room."""
     if folder is None:
         return None
     try:
@@ -175,7 +174,7 @@ def _codes(tiles: int) -> str:
 
 
 def _described(content: bytes, *, where: str) -> ArrayInfo | None:
-    """The array of a file of this start of the machine; None of an earlier one, or a file begun."""
+    """Return the array description; None if the file is of an earlier boot, or just created."""
     if not any(content[: _HEAD.size]):
         return None
     damage = DamagedFileError("its head is not what was written", where=where)
@@ -207,7 +206,7 @@ BOOT_ID_FILE = Path("/proc/sys/kernel/random/boot_id")
 
 
 def kernel_boot_id() -> str | None:
-    """The kernel's name of its present start; None where there is no such thing."""
+    """Return the kernel's id of the current boot; None where there is none."""
     try:
         return BOOT_ID_FILE.read_text(encoding="ascii").strip() or None
     except (OSError, ValueError):

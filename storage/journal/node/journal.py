@@ -1,8 +1,8 @@
-"""What a node keeps on its disk: every frame, always, with or without a server.
+"""Journal of a node: every frame on its disk, with or without a server.
 
-A thread writes, so that a slow card delays nothing else; what it could not write waits in memory as
-long as there is room, and what does not fit is counted under its reason. Frames that a session
-needs stay until a server has them on its disk; others are a ring of ten minutes.
+A thread writes, so that a slow card delays no other work. Unwritten frames wait in memory as long
+as there is room, and dropped ones are counted by reason. Frames that a session needs stay until a
+server has them on its disk; others are a ring of ten minutes.
 """
 
 from __future__ import annotations
@@ -32,31 +32,33 @@ from storage.wire import EncodedBatch
 log = logging.getLogger("foottile.journal")
 
 WAITING_BYTES = 32 << 20
-"""What may wait in memory for the disk: some minutes."""
+"""Upper limit of bytes that wait in memory for the disk: some minutes."""
 SYNC_S = 0.2
-"""Between two syncs, before which all is written that has come. Less than half of `PROMISE_S`: what
-just missed one is on the disk with the next."""
+"""Interval between two syncs, each after a write of all waiting batches.
+
+Less than half of `MAX_UNSYNCED_S`: a frame that just misses one sync is on the disk with the next.
+"""
 _TIDY_S = 2.0
-"""Between two looks at what can be dropped, which is minutes old."""
+"""Interval between two deletions of expired frames, which are minutes old."""
 _AGAIN_S = 1.0
-"""Between attempts at a disk that takes nothing."""
+"""Interval between two attempts to write to a disk that refuses."""
 _CLOSE_S = 10.0
-"""A node that is stopped waits no longer for its disk."""
+"""Timeout of the disk when a node is stopped."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""What a full disk, a quota and a limit of file sizes say: making room helps."""
+"""Errors of a full disk, a quota and a limit of file sizes: deleting frames helps."""
 
 
 class NodeJournal:
-    """All streams of a node.
+    """Journals of all streams of a node, with the thread that writes them.
 
     Args:
         root: the node's folder.
         node: its name.
-        budget_bytes: what its journals may take.
-        is_recovery: nothing is dropped, and the caller holds the folder's locks already.
+        budget_bytes: most bytes of its journals.
+        is_recovery: no frame is deleted, and the caller holds the folder's locks already.
 
     Raises:
-        StorageError: another process uses it.
+        StorageError: another process uses the folder.
     """
 
     def __init__(
@@ -70,9 +72,9 @@ class NodeJournal:
         self.folder = root / "journal" / node
         self._locks = ExitStack()
         self._changing = threading.Lock()
-        """Held while `streams` is replaced; a list that was read before does not change."""
+        """Lock for replacing `streams`; a list that was read before does not change."""
         self._trouble: tuple[str, str] | None = None
-        """Reason and words, while the disk takes nothing."""
+        """Reason and message, while the disk refuses frames."""
         self._tried_s = -math.inf
         self._tidied_s = self._synced_s = -math.inf
         self._wants_changed = False
@@ -87,7 +89,7 @@ class NodeJournal:
             self.wanted = Wanted(self.folder / "wanted.json")
             self._wants_changed = not self.wanted.is_proven
             self.problems = list(self.wanted.problems)
-            """What was found damaged, and what became of it, in words."""
+            """Damage found, and how it was handled, as messages."""
             self._retention = Retention(
                 self.folder, self.wanted, budget_bytes=budget_bytes, may_drop=not is_recovery
             )
@@ -97,11 +99,11 @@ class NodeJournal:
             raise
 
     def start(self) -> None:
-        """Begin to write."""
+        """Start the writer thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """Write what waits, as far as the disk takes it, and end."""
+        """Write the waiting batches if the disk accepts them, and stop the writer thread."""
         self._stopping.set()
         self._wake.set()
         if self._thread.is_alive():
@@ -110,7 +112,7 @@ class NodeJournal:
 
     @property
     def troubles(self) -> tuple[str, ...]:
-        """What is wrong with keeping frames, in words."""
+        """Warnings about storage, as messages."""
         trouble = self._trouble
         if trouble is None:
             return ()
@@ -118,7 +120,7 @@ class NodeJournal:
         return (f"{trouble[1]}; {waiting_s:.0f} s of frames wait in memory",)
 
     def begin(self, info: ArrayInfo) -> NodeStream:
-        """A new stream; those before have ended."""
+        """Start a new stream and mark earlier ones as ended."""
         with self._changing:
             for stream in self.streams:
                 stream.end()
@@ -130,30 +132,30 @@ class NodeJournal:
         return stream
 
     def put(self, stream: NodeStream, batch: EncodedBatch, missed_slots: int = 0) -> None:
-        """Keep the newest frames; returns at once."""
+        """Queue the newest frames for the writer; drop the oldest beyond a limit."""
         stream.put(batch, missed_slots)
-        # The writer is not woken: what comes until its next sync is written with that.
+        # The writer is not woken: it writes all batches at its next sync.
         while sum(each.waiting_bytes for each in self.streams) > WAITING_BYTES:
-            if not self._drop_oldest():  # the writer has taken them meanwhile
+            if not self._drop_oldest():  # the writer has written them meanwhile
                 break
 
     def want(self, server_id: str, wants: ServerWants) -> None:
-        """A server has said what its sessions need."""
+        """Update a server's retention request."""
         if self.wanted.say(server_id, wants):
             self._wants_changed = True
             self._wake.set()
 
     def damaged(self, stream: NodeStream, numbers: Intervals) -> None:
-        """Frames on disk turned out not to be what was written."""
+        """Report frames that are damaged on disk; the writer invalidates them."""
         self._damaged.append((stream, numbers))
         self._wake.set()
 
     def undelivered(self, stream: NodeStream) -> Intervals:
-        """Held numbers of a stream that sessions need and no server has yet."""
+        """Return the available numbers of a stream that sessions need and no server has yet."""
         return stream.undelivered(self.wanted)
 
     def settle(self, timeout_s: float = _CLOSE_S) -> bool:
-        """Wait until every ended stream is whole on disk; False if that did not happen in time."""
+        """Wait until every ended stream is complete on disk; False after a timeout."""
         end_s = time.monotonic() + timeout_s
         while not all(stream.is_settled for stream in self.streams if stream.has_ended):
             if time.monotonic() > end_s or not self._thread.is_alive():
@@ -163,21 +165,21 @@ class NodeJournal:
         return True
 
     def settle_here(self) -> None:
-        """The same without the thread, for recovery.
+        """Write all frames to disk in the caller's thread, for recovery.
 
         Raises:
-            StorageError: the disk does not take what was in flight.
+            StorageError: the disk refuses the frames in flight.
         """
         self._work(at_once=True)
         if not all(stream.is_settled for stream in self.streams):
             raise StorageError(
-                "what was in flight cannot be written: " + "; ".join(self.troubles),
+                "the frames in flight cannot be written: " + "; ".join(self.troubles),
                 where=str(self.folder),
                 remedy="Free space on the disk, and run it again",
             )
 
     def _drop_oldest(self) -> bool:
-        """Give up the batch that has waited longest; False if only the newest is left."""
+        """Drop the batch that has waited longest; False if only the newest is left."""
         trouble = self._trouble
         reason = trouble[0] if trouble is not None else DISK_SLOW
         newest = self.streams[-1]
@@ -257,7 +259,7 @@ class NodeJournal:
         with self._changing:
             self.streams = [stream for stream in self.streams if stream not in dropped]
 
-    # --- what was there ---------------------------------------------------------------------------
+    # --- recovery ---------------------------------------------------------------------------------
 
     def _found(self) -> list[NodeStream]:
         streams = []
@@ -268,7 +270,7 @@ class NodeJournal:
                 try:
                     stream = recover_stream(folder, self.problems)
                 except (FileFormatError, StorageError) as error:
-                    self.problems.append(f"a stream is left out: {error}")
+                    self.problems.append(f"a stream is skipped: {error}")
                     continue
                 if stream is not None:
                     streams.append(stream)
@@ -292,15 +294,15 @@ class NodeJournal:
         try:
             self._locks.enter_context(lock)
         except StorageError as error:
-            if error.errno is None:  # a disk that takes nothing has no second user either
+            if error.errno is None:  # a disk that refuses writes has no second user either
                 raise
 
 
 def _in_order(found: Iterable[NodeStream]) -> list[NodeStream]:
-    """Streams by their numbers, oldest first.
+    """Sort streams by their numbers, oldest first.
 
-    One that was killed before its notes were written has none: it is the newest. One whose notes
-    are damaged has frames, whose instants say where it belongs.
+    A stream that was killed before its notes were written has no number: it is the newest. A stream
+    with damaged notes has frames, whose times give its place.
     """
     order: list[NodeStream] = []
     for stream in sorted(found, key=lambda stream: stream.notes.number or math.inf):
@@ -318,13 +320,13 @@ def _begin_t_ns(stream: NodeStream) -> float:
 
 
 def settle_left_over(root: Path) -> None:
-    """Write what killed nodes left in flight to their journals; note where their streams ended.
+    """Write frames that killed nodes left in flight to their journals; record the streams' ends.
 
     Args:
         root: the nodes' folder, whose lock the caller holds.
 
     Raises:
-        StorageError: it cannot be read, or not written to its end.
+        StorageError: it cannot be read, or not written completely.
     """
     for folder in sorted(path for path in (root / "journal").glob("*") if path.is_dir()):
         journal = NodeJournal(root, folder.name, is_recovery=True)

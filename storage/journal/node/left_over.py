@@ -1,4 +1,4 @@
-"""A stream that an earlier process left: what it had on disk, and what it had in flight."""
+"""Crash recovery of a stream: its journal and notes, and its frames in flight."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from storage.wire import messages_of
 
 
 def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
-    """A stream that an earlier process left, with what it had in flight; None if nothing is left.
+    """Open an earlier process's stream with its frames in flight; None if there is none.
 
-    What is damaged is set aside, and `problems` is told.
+    Damaged files are set aside, with a message in `problems`.
 
-    If the machine itself went down, the frames in flight are lost. The notes say how many there may
-    have been: those taken since the last sync, by the slowest sync of this disk.
+    After a reboot the frames in flight are lost. The notes get an upper limit of their number:
+    those since the last sync, by the slowest sync of this disk.
 
     Raises:
         FileFormatError: another version wrote its notes.
@@ -36,7 +36,7 @@ def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     if stream is None:
         if left is None:
             return None
-        # A file in flight is read only in the start of the machine in which it was written.
+        # Frames in flight are read only in the boot in which they were written.
         notes = StreamNotes(array_info=left[0], kernel_boot_id=kernel_boot_id())
         stream = NodeStream(folder, notes, None)
     if stream.has_ended:
@@ -48,9 +48,9 @@ def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     frames = left[1]
     if frames is not None:
         held, first = stream.stored, int(frames.seq[0])
-        # Frames older than all that are held were evicted, not lost in flight.
+        # Frames older than all stored ones were evicted, not lost in flight.
         for a, b in held.missing(max(first, held.first or 0), int(frames.seq[-1])):
-            # If there is a gap before them, more waited for the disk than was in flight.
+            # A gap before them: more frames waited for the disk than the file has rows.
             for batch in messages_of(frames.rows(a - first, b + 1 - first), stream.info):
                 stream.put(batch, gap=DISK_SLOW)
     stream.end(unsynced_tail_max=0)
@@ -58,7 +58,7 @@ def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
 
 
 def _open(folder: Path, problems: list[str]) -> NodeStream | None:
-    """Open a stream that is on disk; None if nothing of it can be read.
+    """Open a stream on disk; None if none of it can be read.
 
     Raises:
         FileFormatError: another version wrote its notes.
@@ -69,6 +69,6 @@ def _open(folder: Path, problems: list[str]) -> NodeStream | None:
     with suppress(FileFormatError):
         journal = Journal.open(folder)
         problems += journal.problems
-    if notes is None and journal is not None:  # its segments still say which array they are of
+    if notes is None and journal is not None:  # the segments have the array's description, too
         notes = StreamNotes(array_info=journal.info)
     return None if notes is None else NodeStream(folder, notes, journal)

@@ -1,4 +1,4 @@
-"""How long a node keeps frames: as long as sessions need them, else a ring, within a budget."""
+"""Retention on a node: frames that sessions need stay, others are a ring, within a budget."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from storage.journal.node.stream import NodeStream
 from storage.journal.node.wanted import Wanted
 
 BUDGET_BYTES = 4 << 30
-"""A day and a half of four tiles at full rate."""
+"""Default budget: a day and a half of four tiles at full rate."""
 _WEIGH_S = 1.0
-"""Between two looks at what all segments take."""
+"""Interval between two sums of the segments' sizes."""
 _NEVER_NS = 2**62
-"""Later than every frame."""
+"""Instant after every frame."""
 
 
 class Retention:
-    """Deletes what no session needs, oldest first.
+    """Deletion of frames that no session needs, oldest first.
 
     Args:
         folder: the node's journals.
-        wanted: what sessions need.
-        budget_bytes: what the journals may take.
-        may_drop: False: nothing is deleted.
+        wanted: retention requests.
+        budget_bytes: most bytes of all journals.
+        may_drop: False: no frame is deleted.
     """
 
     def __init__(
@@ -43,14 +43,14 @@ class Retention:
         self._weighed_s = -math.inf
 
     def keep_to_budget(self, streams: Sequence[NodeStream], *, at_once: bool) -> None:
-        """Make room if the journals take more than they may.
+        """Delete the oldest segments while the journals exceed their budget.
 
         Args:
-            streams: all of the node, oldest first.
-            at_once: look, even if that was done a moment ago.
+            streams: all streams of the node, oldest first.
+            at_once: check even if the last check was a moment ago.
 
         Raises:
-            StorageError: they take more, and all of it is needed.
+            StorageError: they exceed it, and sessions need every frame.
         """
         now_s = time.monotonic()
         if now_s - self._weighed_s < _WEIGH_S and not at_once:
@@ -59,28 +59,28 @@ class Retention:
         while sum(s.journal.size_bytes for s in streams if s.journal) > self._budget_bytes:
             if not self.evict(streams):
                 raise StorageError(
-                    f"the journal has its {self._budget_bytes} bytes, all of frames that sessions "
-                    "need",
+                    f"the journal's {self._budget_bytes} bytes are used up, and sessions need "
+                    "every frame",
                     where=str(self._folder),
                     errno=errno.ENOSPC,
                 )
 
     def evict(self, streams: Sequence[NodeStream]) -> bool:
-        """Make room: delete the oldest frames that no session needs; False if there were none."""
+        """Delete the oldest segment that no session needs; return whether there was one."""
         return self._may_drop and any(stream.evict(self._wanted) for stream in streams)
 
     def tidy(self, streams: Sequence[NodeStream]) -> list[NodeStream]:
-        """Delete frames that are older than the ring; return the streams that have none left."""
+        """Delete frames that are older than the ring; return the streams that are gone."""
         return [stream for stream in streams if self._may_drop and self._tidy(stream)]
 
     def _tidy(self, stream: NodeStream) -> bool:
-        """Delete frames that are older than the ring; is the stream empty and not wanted?"""
+        """Delete a stream's expired frames; return whether the stream is deleted completely."""
         journal = stream.journal
         if journal is None:
             return False
         past_ring = self._is_past_ring(stream)
         newest = stream.recent(max(0, stream.next_seq - 1))
-        if self._wanted.may_be_all:  # until there is no room
+        if self._wanted.may_be_all:  # only a full budget deletes then
             stream.save_losses()
             return False
         with suppress(StorageError):
@@ -96,7 +96,7 @@ class Retention:
         return False
 
     def _is_past_ring(self, stream: NodeStream) -> bool:
-        """Did a stream end longer ago than the ring, in this process or by the age of its files?"""
+        """Return whether a stream ended longer ago than the ring, by uptime or file times."""
         ring_s = RING_NS * 1e-9
         if time.monotonic() - self._began_s > ring_s:
             return True

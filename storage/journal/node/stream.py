@@ -1,8 +1,8 @@
-"""One stream as a node keeps it: its journal on disk, and what is not on the disk yet.
+"""One stream on a node: its journal on disk, and the batches in memory.
 
-A frame first waits in memory, then it is written, then synced. Its batch is let go only when a sync
-has succeeded: a kernel that could not write it may have forgotten it, and then it is written once
-more.
+A batch first waits in memory, then it is written, then synced. It is released from memory only
+after a successful sync: a kernel that could not write it may have dropped it, and then it is
+written once more.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ from storage.journal.stream_notes import PROMISE_S, StreamNotes, unsynced_tail_m
 from storage.wire import EncodedBatch, messages_of
 
 RECENT_BYTES = 4 << 20
-"""Newest frames that are kept in memory, for the live picture."""
+"""Memory for the newest frames, for the live picture."""
 
 
 class NodeStream:
-    """Frames of one stream, wherever they are.
+    """Frames of one stream, in memory or on disk.
 
-    Safe to use from several threads; its attributes are to be read. One thread writes: only it
-    calls the methods of the last section. The lock is never held while the disk works.
+    Thread-safe; attributes are read-only for callers. Only one thread, the writer, calls the
+    methods of the last section. The lock is never held during disk I/O.
 
     Args:
         folder: the stream's own.
-        notes: what is known of it.
-        journal: what is on disk already; None: nothing, it is begun when the disk lets it be.
+        notes: its notes.
+        journal: its journal; None: not created yet, since the disk refused it or is still to be
+            tried.
     """
 
     def __init__(self, folder: Path, notes: StreamNotes, journal: Journal | None) -> None:
@@ -46,46 +47,46 @@ class NodeStream:
         self.info = notes.array_info
         self.boot_id = self.info.boot_id
         self.notes = notes
-        """What is written down of it, or will be."""
+        """Notes in `stream.json`, or still to be written there."""
         self.journal = journal
-        """To read from; None as long as the disk does not let it be begun."""
+        """Journal to read from; None until the disk lets it be created."""
         self.missed_slots = notes.missed_slots
-        """Slots in which no frame was taken."""
+        """Slots without a frame."""
         self.has_ended = notes.has_ended
-        """Will no more frames come?"""
+        """True if no more frames will come."""
         self.is_settled = notes.has_ended
-        """Is all of it on disk, with a note of where it ended?"""
+        """True if all frames are on disk, with a note of where the stream ended."""
         self._lock = threading.Lock()
         self._noted_lost = notes.lost
         self._lost = Losses(notes.lost)
         self._acked_by: dict[str, Intervals] = {}
         self._waiting = BatchQueue()
-        """Not in the journal yet."""
+        """Batches that are not in the journal yet."""
         self._unsynced: list[EncodedBatch] = []
-        """In the journal, but perhaps not on the disk yet."""
+        """Batches in the journal that may not be on the disk yet."""
         self._waiting_since_s: float | None = None
-        """When the oldest frame came that may not be on the disk yet."""
+        """Arrival of the oldest batch that may not be on the disk yet."""
         self._recent = BatchQueue()
         if journal is not None:
             self._lost.found(journal.held)
             for reason, numbers in journal.lost.by_reason.items():
                 self._lost.add(numbers, reason)
         last = (self.stored | self._lost.all).last
-        known = 0 if last is None else last + 1
-        self.next_seq = known if notes.next_seq is None else notes.next_seq
-        """The number of the next frame to come."""
+        recovered_seq = 0 if last is None else last + 1
+        self.next_seq = recovered_seq if notes.next_seq is None else notes.next_seq
+        """Number of the next frame."""
 
-    # --- what is known of it ----------------------------------------------------------------------
+    # --- state ------------------------------------------------------------------------------------
 
     @property
     def is_synced(self) -> bool:
-        """Is everything that came on the disk?"""
+        """True if every batch is on the disk."""
         with self._lock:
             return not self._waiting.batches and not self._unsynced
 
     @property
     def waiting_bytes(self) -> int:
-        """What waits in memory to be written."""
+        """Bytes that wait in memory to be written."""
         return self._waiting.size_bytes
 
     @property
@@ -96,19 +97,19 @@ class NodeStream:
 
     @property
     def held(self) -> Intervals:
-        """Numbers that can be given away: on disk, or waiting for it."""
+        """Numbers that can be sent: on disk, or waiting for it."""
         with self._lock:
             waiting = Intervals((b.seq_first, b.seq_last) for b in self._waiting.batches)
             return self.stored | waiting
 
     @property
     def stored(self) -> Intervals:
-        """Numbers that are in the journal."""
+        """Numbers in the journal."""
         return Intervals(self.journal.held if self.journal is not None else ())
 
     @property
     def lost(self) -> Losses:
-        """Numbers that are not held any more, and that no server has, by reason."""
+        """Numbers that are neither here nor on a server, by reason."""
         with self._lock:
             return Losses(self._lost.by_reason)
 
@@ -119,27 +120,27 @@ class NodeStream:
             return self._acked()
 
     def undelivered(self, wanted: Wanted) -> Intervals:
-        """Held numbers that servers need and do not have yet."""
+        """Return the available numbers that servers need and have not acknowledged."""
         held = self.held
         with self._lock:
             return held & wanted.undelivered(self.boot_id, self._acked_by)
 
     def needed(self, wanted: Wanted) -> Intervals:
-        """What must not be deleted."""
+        """Return the numbers that must not be deleted."""
         with self._lock:
             return wanted.unmet(self.boot_id, self._acked_by)
 
-    # --- frames come and go -----------------------------------------------------------------------
+    # --- frames in and out ------------------------------------------------------------------------
 
     def put(
         self, batch: EncodedBatch, missed_slots: int | None = None, *, gap: str = NODE_BUSY
     ) -> None:
-        """Take in frames, the newest ones if they come as they are taken.
+        """Append a batch to the memory queue, in the order of acquisition.
 
         Args:
             batch: the frames.
-            missed_slots: since the stream began; None: as before.
-            gap: why frames between the newest one so far and these are lost.
+            missed_slots: count since the stream began; None: unchanged.
+            gap: reason of loss for skipped numbers before this batch.
         """
         with self._lock:
             if batch.seq_first > self.next_seq:
@@ -155,24 +156,24 @@ class NodeStream:
                 self.missed_slots = missed_slots
 
     def end(self, **known: object) -> None:
-        """No more frames come. What is known of that is noted, as in `StreamNotes`."""
+        """Mark the stream as ended, and update its notes."""
         with self._lock:
             self.has_ended = True
         self.note(**known)
 
     def acknowledge(self, server_id: str, seq_first: int, seq_last: int) -> None:
-        """These frames are on a server's disk."""
+        """Record that these frames are on a server's disk."""
         with self._lock:
             self._acked_by.setdefault(server_id, Intervals()).add(seq_first, seq_last)
             self._lost.found(Intervals([(seq_first, seq_last)]))
 
     def drop_oldest(self, reason: str, wanted: Wanted, *, at_least: int = 0) -> bool:
-        """Give up what has waited longest to be written; was there anything?
+        """Drop the oldest batch that waits to be written; return whether there was one.
 
         Args:
-            reason: why.
-            wanted: what sessions need.
-            at_least: so many batches stay.
+            reason: reason of the loss.
+            wanted: retention requests.
+            at_least: number of batches that stay.
         """
         with self._lock:
             if len(self._waiting.batches) <= at_least:
@@ -182,7 +183,7 @@ class NodeStream:
         return True
 
     def lose(self, numbers: Intervals, reason: str, wanted: Wanted) -> None:
-        """Note frames that are not kept any more.
+        """Record the loss of frames.
 
         Frames that a server has are not lost, except those that the node's own session needs.
         """
@@ -191,13 +192,13 @@ class NodeStream:
             self._lost.add(numbers - (self._acked() - needed_here), reason)
 
     def recent(self, seq: int) -> list[EncodedBatch]:
-        """The newest batches with frames from `seq` on, oldest first, as far as memory goes."""
+        """Return the newest batches in memory with frames from `seq` on, oldest first."""
         with self._lock:
             found = list(takewhile(lambda b: b.seq_last >= seq, reversed(self._recent.batches)))
         return found[::-1]
 
     def batches(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
-        """Batches with any of these frames, from disk and memory, in order.
+        """Yield batches with any of these frames, from disk and memory, in order.
 
         Raises:
             DamagedFramesError: a batch on disk is damaged.
@@ -210,8 +211,8 @@ class NodeStream:
                 for batch in self._waiting.batches
                 if batch.seq_first <= seq_last and batch.seq_last >= seq_first
             ]
-        asked = Intervals([(seq_first, seq_last)])
-        on_disk = asked - Intervals((batch.seq_first, batch.seq_last) for batch in memory)
+        requested = Intervals([(seq_first, seq_last)])
+        on_disk = requested - Intervals((batch.seq_first, batch.seq_last) for batch in memory)
         at = 0
         for first, last in on_disk:
             while at < len(memory) and memory[at].seq_first < first:
@@ -224,21 +225,21 @@ class NodeStream:
     # --- for the thread that writes ---------------------------------------------------------------
 
     def note(self, **changes: object) -> None:
-        """Change what is known of it; `save_notes` writes it down."""
+        """Change the notes in memory; `save_notes` writes them."""
         with self._lock:
             now = {"lost": self._lost.as_pairs(), "missed_slots": self.missed_slots, **changes}
             self.notes = self.notes.model_copy(update=now)
 
     def lose_in_flight(self) -> None:
-        """What was in flight cannot be known: note how many frames that may have been."""
+        """Set `unsynced_tail_max`, an upper limit of the frames that were lost in flight."""
         rate_hz, slowest_s = self.info.nominal_rate_hz, self.notes.sync_max_s
         self.note(unsynced_tail_max=unsynced_tail_max(rate_hz, slowest_s))
 
     def save_notes(self, **changes: object) -> None:
-        """Write down what is known of it.
+        """Change the notes and write them to disk.
 
         Raises:
-            StorageError: the disk is full or not writable; what is known stays in memory.
+            StorageError: the disk is full or not writable; the changes stay in memory.
         """
         self.note(**changes)
         notes = self.notes
@@ -246,16 +247,16 @@ class NodeStream:
         self._noted_lost = notes.lost
 
     def save_losses(self) -> None:
-        """Write down what was lost since the notes were written; if that fails, next time."""
+        """Write the notes if losses have changed; after an error the next call retries."""
         if self.lost.as_pairs() != self._noted_lost:
             with suppress(StorageError):
                 self.save_notes()
 
     def write_oldest(self) -> None:
-        """Write the batch that has waited longest to the journal, if there is one.
+        """Write the oldest waiting batch to the journal, if there is one.
 
         Raises:
-            StorageError: the disk does not take it; it goes on waiting.
+            StorageError: the disk refuses it; it goes on waiting.
         """
         journal = self.journal
         with self._lock:
@@ -264,16 +265,16 @@ class NodeStream:
             return
         journal.append_message(batch)
         with self._lock:
-            if self._waiting.batches and self._waiting.batches[0] is batch:  # not given up by now
+            if self._waiting.batches and self._waiting.batches[0] is batch:  # not dropped meanwhile
                 self._waiting.popleft()
             self._lost.found(batch.numbers)
             self._unsynced.append(batch)
 
     def begin_journal(self) -> None:
-        """Begin the journal, if there is none.
+        """Create the journal, if there is none.
 
         Raises:
-            StorageError: the disk does not let it be begun.
+            StorageError: the disk refuses it.
         """
         if self.journal is None and not self.is_settled:
             journal = Journal(self.folder, self.info)
@@ -282,13 +283,13 @@ class NodeStream:
                 self.journal = journal
 
     def sync(self) -> None:
-        """Sync what was written; what the disk refuses waits again."""
+        """Sync written batches; those that the disk refuses go back to the memory queue."""
         journal = self.journal
         if journal is None or not self._unsynced:
             return
         with self._lock:
             since_s = self._waiting_since_s
-            # What waits has come since the others were written.
+            # Waiting batches came after the written ones.
             self._waiting_since_s = time.monotonic() if self._waiting.batches else None
         try:
             journal.sync()
@@ -298,7 +299,7 @@ class NodeStream:
                 self._waiting.give_back(self._unsynced)
                 self._unsynced = []
                 self._waiting_since_s = since_s
-            journal.disown(refused)  # only now: until then they are in memory as well
+            journal.disown(refused)  # after the queue has them again, so no frame is missing
             return
         with self._lock:
             self._unsynced = []
@@ -308,20 +309,20 @@ class NodeStream:
                 self.save_notes(sync_max_s=took_s)
 
     def settle(self, wanted: Wanted, problems: list[str]) -> None:
-        """Note where it has ended, once all of it is on disk; if that fails, next time.
+        """Record the stream's end once all of it is on disk; the next call retries after an error.
 
         Args:
-            wanted: what sessions need.
-            problems: told what was found damaged and what became of it.
+            wanted: retention requests.
+            problems: messages of any damage are added here.
         """
         if self.is_settled or not self.has_ended or not self.is_synced:
             return
         try:
-            if self._take_over_in_flight(problems):  # it is written first
+            if self._take_over_in_flight(problems):  # these are written first
                 return
             if self.journal is not None:
                 self.journal.close()
-            # A stream that ended before its first frame is remembered if a server asks for it.
+            # A stream that ended before its first frame is kept if a server requests it.
             if self.next_seq or wanted.numbers(self.boot_id):
                 self.save_notes(next_seq=self.next_seq)
             elif self.folder.is_dir():
@@ -335,13 +336,13 @@ class NodeStream:
             self.is_settled = True
 
     def disown(self, damaged: Intervals, wanted: Wanted) -> None:
-        """Stop holding frames that turned out to be damaged on disk."""
+        """Remove frames that turned out to be damaged on disk, and record their loss."""
         if self.journal is not None:
             self.journal.disown(damaged)
             self.lose(damaged, CORRUPT, wanted)
 
     def prune(self, before_t_ns: int, wanted: Wanted) -> None:
-        """Delete segments that end before an instant, and hold nothing that is needed.
+        """Delete segments that end before an instant and have no needed frames.
 
         Raises:
             StorageError: a file cannot be deleted.
@@ -351,7 +352,7 @@ class NodeStream:
             self.lose(gone, EVICTED, wanted)
 
     def evict(self, wanted: Wanted) -> bool:
-        """Delete its oldest segment that holds nothing that is needed; is there any?
+        """Delete the oldest segment without needed frames; return whether there was one.
 
         Raises:
             StorageError: it cannot be deleted.
@@ -363,7 +364,7 @@ class NodeStream:
         return bool(gone)
 
     def _take_over_in_flight(self, problems: list[str]) -> bool:
-        """Take over the frames that acquisition had in flight when it was killed; False if none.
+        """Queue the frames that a killed acquisition left in flight; False if there are none.
 
         Raises:
             StorageError: they cannot be read now.

@@ -1,7 +1,7 @@
-"""What sessions need of a node's frames, as each server said last; it outlives the node's process.
+"""Retention requests: numbers of a node's frames that sessions need, by server, kept on disk.
 
-Until a server says otherwise its word holds: a laptop that went away with an open recording will
-ask for these frames when it is back.
+A request is valid until the server sends another one: a laptop that went away with an open
+recording will request these frames when it is back.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from storage.intervals import NO_END, Intervals, OpenPairs, closed, union
 
 
 class ServerWants(BaseModel):
-    """What one server needs.
+    """Retention request of one server.
 
     Attributes:
-        streams: numbers by boot_id; one without an end goes on with every frame to come.
-        recording: a stream that it has not heard of yet is recorded from its first frame on.
-        known: streams that it had heard of when it said this.
+        streams: numbers by stream_id; an interval without an end includes every frame to come.
+        recording: True: a stream that the server has not seen yet is needed from its first frame
+            on.
+        known: streams that the server had seen when it sent the request.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -33,7 +34,7 @@ class ServerWants(BaseModel):
     known: tuple[str, ...] = ()
 
     def numbers(self, boot_id: str) -> Intervals:
-        """What it needs of a stream."""
+        """Return the requested numbers of a stream."""
         if boot_id in self.streams:
             return closed(self.streams[boot_id])
         if self.recording and boot_id not in self.known:
@@ -48,13 +49,13 @@ class _File(BaseModel):
 
 
 class Wanted:
-    """All that is wanted of one node.
+    """Retention requests of all servers, and of the node's own session.
 
-    A damaged file is set aside. As long as it lies there, any server may want any frame; so it is
-    if the file cannot be read now, which is then not written before it was read.
+    A damaged file is set aside. As long as it lies there, any server may need any frame. The same
+    holds if the file cannot be read now: then it is read before it is written.
 
     Args:
-        path: where it is kept.
+        path: the file of the requests.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,9 +63,9 @@ class Wanted:
         self._local: dict[str, Intervals] = {}
         self._servers: dict[str, ServerWants] = {}
         self.is_proven = True
-        """Was its file written by a version that writes a hash?"""
+        """True if the file has a checksum; an older version wrote none."""
         self.problems: list[str] = []
-        """What was found damaged, and what became of it, in words."""
+        """Damage found, and how it was handled, as messages."""
         self._is_read = True
         try:
             self._servers = self._read()
@@ -73,15 +74,15 @@ class Wanted:
             self.problems.append(f"frames are kept as long as there is room: {error}")
         aside = sorted(each.name for each in path.parent.glob(path.name + ASIDE + "*"))
         self.may_be_all = bool(aside or self.problems)
-        """Is it not known what servers need? Then nothing is deleted for its age alone."""
+        """True if the servers' needs are unknown: then age alone deletes no frame."""
         if aside:
             self.problems.append(
-                f"what servers need was damaged, so frames are kept as long as there is room: "
-                f"delete {path.with_name(aside[-1])} when servers have all they need"
+                f"the servers' retention requests were damaged, so frames are kept as long as "
+                f"there is room. Delete {path.with_name(aside[-1])} when servers have all they need"
             )
 
     def _read(self) -> dict[str, ServerWants]:
-        """What is written down.
+        """Read the servers' requests from the file.
 
         Raises:
             StorageError: it cannot be read now.
@@ -94,35 +95,36 @@ class Wanted:
         except FileNotFoundError:
             pass
         except (DamagedFileError, ValidationError) as error:
-            damage = DamagedFileError(f"what servers need cannot be read: {error}", where=str(path))
+            what = f"retention requests cannot be read: {error}"
+            damage = DamagedFileError(what, where=str(path))
             self.problems.append(put_aside(path, damage))
         return {}
 
     def numbers(self, boot_id: str) -> Intervals:
-        """What servers and the node's own session need of a stream."""
+        """Return the numbers of a stream that servers or the node's own session need."""
         servers = list(self._servers.values())
         return self.local(boot_id) | union(server.numbers(boot_id) for server in servers)
 
     def unmet(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
-        """What is needed and not delivered: of each server by its own acknowledgements.
+        """Return the needed numbers without those that their own server has acknowledged.
 
-        What the node's own session needs is needed here even if a server has it as well.
+        Numbers of the node's own session stay included even if a server has them as well.
         """
         return self.local(boot_id) | self.undelivered(boot_id, acked_by)
 
     def local(self, boot_id: str) -> Intervals:
-        """What the node's own session needs of a stream."""
+        """Return the numbers of a stream that the node's own session needs."""
         return Intervals(self._local.get(boot_id, ()))
 
     def undelivered(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
-        """What servers need and do not have yet."""
+        """Return the numbers that servers need and have not acknowledged."""
         return union(
             server.numbers(boot_id) - acked_by.get(server_id, Intervals())
             for server_id, server in list(self._servers.items())
         )
 
     def say(self, server_id: str, wants: ServerWants) -> bool:
-        """Note what a server says it needs; return whether that changes anything."""
+        """Set a server's request; return whether it differs from the one before."""
         if self._servers.get(server_id, ServerWants()) == wants:
             return False
         self._servers = {**self._servers, server_id: wants}
@@ -131,14 +133,14 @@ class Wanted:
         return True
 
     def say_local(self, needed: Mapping[str, Intervals]) -> None:
-        """What a session that is recorded on the node itself needs; kept by that session."""
+        """Set the numbers that the node's own session needs; that session stores them."""
         self._local = dict(needed)
 
     def save(self) -> None:
-        """Write it down.
+        """Write the servers' requests to the file.
 
         Raises:
-            StorageError: the disk is full or not writable, or what is there could not be read yet.
+            StorageError: the disk is full or not writable, or the existing file cannot be read yet.
         """
         if not self._is_read:
             self._servers = {**self._read(), **self._servers}

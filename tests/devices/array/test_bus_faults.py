@@ -138,7 +138,7 @@ def test_an_adapter_that_is_away_is_opened_once_a_second_while_frames_go_on() ->
     assert len(wires.opened_ns) == 4
     assert min(b - a for a, b in pairwise(wires.opened_ns)) >= 1_000_000_000
     assert frames > 3.5 * 300, "the rate of frames is kept"
-    assert "away" in array.troubles()[""]
+    assert "missing" in array.troubles()[""]
     assert "ENOENT" in array.troubles()[""]
     wires.opens, wires.on_transaction = True, lambda _, __: None
     end_ns = wires.clock.now_ns() + 1_100_000_000

@@ -136,9 +136,9 @@ def test_true_is_no_number(key: str) -> None:
 
 def test_a_servo_of_protocol_1_has_one_id_more() -> None:
     old = refused(sections="[servo]\nprotocol = 1\nid = 254")
-    assert "servo.id = 254: 254 is no id of a servo with protocol 1, which are 0 to 253" in old
+    assert "servo.id = 254: 254 is no servo id of protocol 1; expected 0 to 253" in old
     new = refused(sections="[servo]\nid = 253")
-    assert "servo.id = 253: 253 is no id of a servo with protocol 2, which are 0 to 252" in new
+    assert "servo.id = 253: 253 is no servo id of protocol 2; expected 0 to 252" in new
     assert "servo.protocol = 3" in refused(sections="[servo]\nprotocol = 3\nid = 1")
 
 

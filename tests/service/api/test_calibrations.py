@@ -225,7 +225,7 @@ def test_a_node_without_a_calibration_of_its_own_gets_one(
     node.taken_in()
     assert running.node()["calibration_problem"] == "for this test"
     refused = assign(running, stiffer("T01", "T02"), **{"If-Match": NONE})
-    assert_refused(refused, 412, "changed by somebody else")
+    assert_refused(refused, 412, "changed by another client")
     view = assign(running, stiffer("T01", "T02"), **{"If-Match": "none"}).json()
     assert (view["problem"], view["own_id"]) == (None, None)
     node.send(20)
@@ -237,9 +237,9 @@ def test_two_people_do_not_overwrite_each_others_choice(running: Running, tared:
     first = stiffer("T01", "T02", name="first")
     assert assign(running, first, **{"If-Match": f'"{seen}"'}).status_code == 200
     second = assign(running, stiffer("T01", "T02", name="second"), **{"If-Match": seen})
-    assert_refused(second, 412, "changed by somebody else")
+    assert_refused(second, 412, "changed by another client")
     back = running.http.delete("/nodes/bench/calibration", headers={"If-Match": seen})
-    assert_refused(back, 412, "changed by somebody else")
+    assert_refused(back, 412, "changed by another client")
     assert running.node()["calibration"]["name"] == "first"
 
 
@@ -317,7 +317,7 @@ def test_a_bench_session_is_fitted_here_and_what_cannot_be_says_why(with_bench: 
     running.http.patch(url, json={"label": "T01 laod"})
     failed = ended(running, fit(running))
     assert failed["state"] == "failed"
-    assert "'T01 laod' says no step of a bench" in failed["problem"]
+    assert "'T01 laod' is no calibration step" in failed["problem"]
     assert len(listed(running)) == 1
     assert [one["state"] for one in running.http.get("/calibrations/fits").json()["items"]] == [
         "failed",

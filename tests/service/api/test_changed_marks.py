@@ -72,14 +72,14 @@ def test_who_changes_what_somebody_else_has_changed_meanwhile_is_told(session: R
     mine = {"If-Match": f'"{mark["said"]}"'}
     assert http.patch(url, json={"label": "water"}, headers=mine).status_code == 200
     late = http.patch(url, json={"label": "sand"}, headers=mine)
-    assert_refused(late, 412, "changed by somebody else")
-    assert_refused(http.delete(url, headers=mine), 412, "changed by somebody else")
+    assert_refused(late, 412, "changed by another client")
+    assert_refused(http.delete(url, headers=mine), 412, "changed by another client")
     assert set(marks(session)) == {"a stone", "water"}
 
     said = {"If-Match": session.now()["said"]}
     assert http.patch(session.url, json={"notes": "mine"}, headers=said).status_code == 200
     late = http.patch(session.url, json={"notes": "yours"}, headers=said)
-    assert_refused(late, 412, "changed by somebody else")
+    assert_refused(late, 412, "changed by another client")
     assert session.now()["notes"] == "mine"
     # A mark is another thing, and who does not care says nothing.
     now = {"If-Match": session.now()["said"]}
@@ -93,7 +93,7 @@ def test_a_session_that_somebody_else_has_renamed_is_not_deleted(session: Record
     http, seen = session.running.http, session.now()["said"]
     http.patch(session.url, json={"name": "the best one"})
     answer = http.delete(session.url, headers={"If-Match": f'"{seen}"'})
-    assert_refused(answer, 412, "changed by somebody else")
+    assert_refused(answer, 412, "changed by another client")
     assert session.now()["name"] == "the best one"
     assert http.delete(session.url, headers={"If-Match": session.now()["said"]}).status_code == 204
 
@@ -106,9 +106,9 @@ def test_a_tare_that_another_one_has_followed_is_neither_replaced_nor_undone_uns
     tared.deliver(200, alive=True)
     other = running.http.post(url, headers=matching)
     assert other.status_code == 201, other.text
-    assert_refused(running.http.post(url, headers=matching), 412, "changed by somebody else")
+    assert_refused(running.http.post(url, headers=matching), 412, "changed by another client")
     undo = f"/nodes/bench/tares/{other.json()['id']}"
-    assert_refused(running.http.delete(undo, headers=matching), 412, "changed by somebody else")
+    assert_refused(running.http.delete(undo, headers=matching), 412, "changed by another client")
     assert running.node()["tare"]["id"] == other.json()["id"]
     matching = {"If-Match": f'"{other.json()["id"]}"'}
     assert running.http.delete(undo, headers=matching).status_code == 204

@@ -166,7 +166,7 @@ def test_a_session_that_was_compared_with_nothing_has_none(tared: FakeNode) -> N
     session = tared.record()
     assert asked(session)["items"] == []
     refused = session.running.http.get(f"{session.url}/comparisons/plate")
-    assert_refused(refused, 404, "compared with nothing")
+    assert_refused(refused, 404, "a comparison: it has none")
     series = session.running.http.get(f"{session.url}/comparisons/plate/series")
     assert_refused(series, 409, "Stop it")
     tared.deliver(10)

@@ -77,7 +77,7 @@ def test_a_node_out_of_reach_is_away_five_seconds_after_its_last_word(
     assert node["rate_hz"] is None
     refused = running.http.post("/sessions", json={"node": "bench", "name": "late"})
     assert refused.status_code == 409
-    assert "is not sending" in refused.json()["detail"]
+    assert "sends no frames" in refused.json()["detail"]
 
 
 def test_a_node_that_takes_nothing_in_is_away_as_soon(

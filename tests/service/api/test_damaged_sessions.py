@@ -49,5 +49,5 @@ def test_of_a_sealed_one_it_is_made_again_and_can_be_downloaded(
     running.start()
     listed = running.http.get("/sessions").json()
     assert (listed["unreadable"], [one["id"] for one in listed["items"]]) == ({}, [session.id])
-    assert "was made again from frames.parquet" in listed["items"][0]["problem"]
+    assert "was rebuilt from frames.parquet" in listed["items"][0]["problem"]
     assert session.data().content == content

@@ -238,7 +238,7 @@ def test_files_of_motion_laboratories_are_of_sealed_and_of_recording_sessions(
         name = f'filename="trial_{session.id}.{ending}"'
         assert name in answer.headers["content-disposition"]
     for query, said in (
-        ({"columns": "grf_n"}, "columns of its own"),
+        ({"columns": "grf_n"}, "fixed columns"),
         ({"start_s": 100}, "starts at 100 s"),
         ({"decimal": "comma"}, "no option"),
     ):
@@ -287,6 +287,6 @@ def test_an_odd_id_is_not_found(sealed: Sealed) -> None:
 def test_a_file_that_was_taken_away_is_said_to_be(sealed: Sealed) -> None:
     path = sealed.session.folder / "frames.parquet"
     path.unlink()
-    assert_refused(sealed.get(), 404, "taken away")
+    assert_refused(sealed.get(), 404, "is missing")
     assert sealed.made(format="csv").status_code in (404, 500)
     assert sealed.running.http.get("/health").status_code == 200

@@ -21,6 +21,7 @@ from tests.waiting import PATIENCE_S, until
 _PAGES = (
     "/",
     "/nodes",
+    "/calibrate",
     "/sessions",
     "/docs",
     "/docs/swagger-ui.css",

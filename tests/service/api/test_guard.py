@@ -178,7 +178,11 @@ def test_a_change_without_the_token_is_refused(serve_with: ServeWith, given: str
 
 def test_a_wrong_token_is_not_called_a_missing_one(serve_with: ServeWith) -> None:
     running = serve_with(token=TOKEN)
-    for given, said in ((None, "is needed"), (TOKEN, "is needed"), ("Bearer x", "is not the")):
+    for given, said in (
+        (None, "needs the server's token"),
+        (TOKEN, "needs the server's token"),
+        ("Bearer x", "is not the"),
+    ):
         headers = {"Authorization": given} if given else {}
         answer = running.http.post("/nodes/bench/tare", headers=headers)
         assert said in answer.json()["detail"], given

@@ -147,7 +147,7 @@ def test_a_person_accepts_another_machine_which_then_is_the_node(
     stranger.deliver(10)
     node.open_with_hello()
     assert closed(node.socket)[0] == 4013
-    assert_refused(accept(running, asking["fingerprint"]), 409, "no other machine asks")
+    assert_refused(accept(running, asking["fingerprint"]), 409, "no other machine was refused")
 
 
 def test_screens_are_told_of_a_machine_that_asks_once(

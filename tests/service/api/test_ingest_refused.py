@@ -246,7 +246,7 @@ def test_a_second_hello_is_refused(healthy: FakeNode, node: FakeNode) -> None:
     node.connect()
     node.socket.send(node.hello().model_dump_json())
     code, reason = let_go(node, healthy)
-    assert (code, reason) == (4001, "hello was said before")
+    assert (code, reason) == (4001, "hello was sent before")
 
 
 def test_a_name_that_is_in_use_is_refused_by_name(

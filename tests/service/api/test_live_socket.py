@@ -72,6 +72,7 @@ def test_a_frame_has_what_the_contract_says(running: Running, tared: FakeNode) -
     assert frame["force_n"] == pytest.approx([20.0, 60.0], abs=0.05)
     assert frame["grf_n"] == pytest.approx(80.0, abs=0.1)
     assert frame["cop_x_m"] == pytest.approx(0.014 * 0.75, abs=1e-4)
+    assert frame["cop_y_m"] is frame["cop_sigma_y_m"] is None  # both tiles are in one row
     assert frame["gauge_kpa"] == pytest.approx([20 * 130 / 1023, 60 * 130 / 1023], abs=0.01)
     assert frame["status"] == [0, 0]
     assert frame["contact"] is True

@@ -79,7 +79,7 @@ def test_a_ticket_that_was_used_is_refused(guarded: Running) -> None:
     with browser(guarded) as first, browser(guarded) as second:
         assert first.post("/login", json={"ticket": one}).status_code == 200
         refused = second.post("/login", json={"ticket": one})
-        assert_refused(refused, 401, "good once", "foottile invite")
+        assert_refused(refused, 401, "valid once", "foottile invite")
         assert "set-cookie" not in refused.headers
         assert second.post("/sessions", json={"node": "x", "name": "x"}).status_code == 401
 
@@ -115,7 +115,7 @@ def test_a_viewer_looks_and_cannot_press(guarded: Running) -> None:
     with logged_in(guarded, "look") as viewer:
         for method, path in CHANGES:
             answer = viewer.request(method, path, json={})
-            assert_refused(answer, 403, "look and not press")
+            assert_refused(answer, 403, "may not change anything")
         assert viewer.get("/sessions").status_code == 200
 
 
@@ -177,7 +177,7 @@ def test_a_login_ends_with_the_server_and_it_says_so(guarded: Running) -> None:
         after = client.get("/login").json()
         assert after["ended"]
         assert after["may"] is None
-        assert_refused(client.post("/nodes/x/tare"), 401, "has ended", "started again")
+        assert_refused(client.post("/nodes/x/tare"), 401, "has expired", "restarted")
         assert client.get("/nodes").status_code == 200
 
 

@@ -172,7 +172,9 @@ def test_the_client_pulls_any_format_and_one_of_sealed_sessions_waits_for_that(
             pulled = pull_made(server, sealed.id, tmp_path, Slice(0.25, 0.5), format_named(name))
             assert Path(pulled["path"]).read_bytes().startswith(begin)
             assert Path(pulled["path"]).name == f"{sealed.id}_0.25s-0.5s.{name}"
-        with pytest.raises(foottile.ConflictError, match=r"MATLAB is made when it is sealed.*xdf"):
+        with pytest.raises(
+            foottile.ConflictError, match=r"MATLAB is available when it is sealed.*xdf"
+        ):
             pull_made(server, sealed.recording.id, tmp_path, Slice(), format_named("mat"))
 
 
@@ -204,7 +206,7 @@ def test_a_slice_that_is_damaged_on_its_way_is_refused(
     for to in ("parquet", "arrow"):
         with (
             foottile.connect(sealed.running.url) as server,
-            pytest.raises(foottile.DamagedError, match="did not come whole"),
+            pytest.raises(foottile.DamagedError, match="the slice is incomplete"),
         ):
             pull_made(server, sealed.id, out, Slice(0.25, 0.5), format_named(to))
     assert list(out.iterdir()) == []

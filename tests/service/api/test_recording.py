@@ -64,7 +64,7 @@ def test_a_stop_answers_sealed_while_the_node_streams(
 def test_a_node_that_is_away_cannot_be_recorded(running: Running, tared: FakeNode) -> None:
     tared.leave()
     answer = running.http.post("/sessions", json={"node": "bench", "name": "x"})
-    assert_refused(answer, 409, "not sending")
+    assert_refused(answer, 409, "sends no frames")
 
 
 def test_a_node_without_frames_cannot_be_recorded(running: Running, node: FakeNode) -> None:

@@ -76,7 +76,7 @@ def test_a_key_that_came_with_another_request_is_refused(running: Running, tared
         post(running, pre_roll_s=1.0),
         post(running, "/takes", name="trial"),
     ):
-        assert_refused(answer, 422, "came with another request", first["id"], "new key")
+        assert_refused(answer, 422, "used by another request", first["id"], "new key")
     assert len(running.sessions()) == 1
 
 
@@ -89,7 +89,7 @@ def test_a_key_that_is_none_is_refused(running: Running, tared: FakeNode, key: b
 
 def test_a_request_that_was_refused_is_tried_anew(running: Running, node: FakeNode) -> None:
     node.connect()
-    assert_refused(post(running), 409, "not sending")
+    assert_refused(post(running), 409, "sends no frames")
     node.tared()
     assert begun(post(running))["state"] == "recording"
 
@@ -129,7 +129,7 @@ def test_the_same_take_is_begun_once_with_what_was_said_of_the_others(
     assert after["id"] == first["id"]
     assert list(after["failed"]) == ["nobody"]
     assert len(running.sessions()) == 2
-    assert_refused(post(running, "/takes", name="both"), 422, "came with another request")
+    assert_refused(post(running, "/takes", name="both"), 422, "used by another request")
 
 
 def test_to_stop_twice_is_to_stop_once(running: Running, tared: FakeNode) -> None:

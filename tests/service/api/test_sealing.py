@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import time
 
@@ -69,6 +70,34 @@ def test_a_download_before_the_seal_has_the_rounded_estimates_of_the_sealed_file
         np.testing.assert_array_equal(whole, np.rint(whole), err_msg=name)
 
 
+def test_of_tiles_in_one_row_neither_file_nor_answer_has_a_number_across_it(
+    tared: FakeNode,
+) -> None:
+    session = tared.record()
+    tared.deliver(200, [20.0, 60.0])
+    tared.finish(session)
+    sealed = pq.ParquetFile(session.folder / "frames.parquet")
+    frames = sealed.read(["cop_x_m", "cop_y_m", "cop_sigma_y_m"])
+    assert np.isfinite(frames["cop_x_m"].to_numpy()).any()
+    for name in ("cop_y_m", "cop_sigma_y_m"):
+        assert not np.isfinite(frames[name].to_numpy()).any()
+    group = sealed.metadata.row_group(0)
+    (statistics,) = (
+        group.column(i).statistics
+        for i in range(group.num_columns)
+        if group.column(i).path_in_schema == "cop_y_m"
+    )
+    assert statistics is None or not statistics.has_min_max
+    rows = list(csv.DictReader(session.data(format="csv").text.splitlines()))
+    assert any(row["cop_x_m"] for row in rows)
+    assert {row["cop_y_m"] for row in rows} == {""}
+    get = session.running.http.get
+    bins = get(f"{session.url}/overview").json()["columns"]
+    assert any(value is not None for value in bins["cop_x_m_max"])
+    for name in ("cop_y_m_min", "cop_y_m_max", "cop_y_low_m_min", "cop_y_high_m_max"):
+        assert set(bins[name]) == {None}
+
+
 def test_a_server_that_is_told_so_seals_estimates_as_computed(
     serve_with: ServeWith, node_of: NodeOf
 ) -> None:
@@ -134,7 +163,7 @@ def test_tares_outlive_the_server(running: Running, tared: FakeNode) -> None:
 
 def test_a_node_that_is_away_is_not_tared(running: Running, tared: FakeNode) -> None:
     tared.leave()
-    assert_refused(running.http.post("/nodes/bench/tare", json={}), 409, "away")
+    assert_refused(running.http.post("/nodes/bench/tare", json={}), 409, "not connected")
 
 
 def test_a_tare_during_a_recording_serves_from_then_on(running: Running, tared: FakeNode) -> None:
@@ -272,7 +301,7 @@ def test_a_session_without_tare_is_sealed_raw_and_says_why(node: FakeNode) -> No
 def test_a_session_without_frames_says_so(tared: FakeNode) -> None:
     session = tared.record()
     sealed = tared.finish(session)
-    assert sealed["problem"] == "not one frame was recorded"
+    assert sealed["problem"] == "no frame was recorded"
     assert sealed["frames"] == 0
     assert sealed["complete"] is True
 

@@ -119,7 +119,7 @@ def test_a_disk_that_does_not_take_the_stances_holds_no_session_up(
         session = hopped(tared)
     sealed = session.now()
     assert (sealed["state"], sealed["complete"]) == ("sealed", True)
-    assert "stances.parquet was not written, and is made again" in sealed["problem"]
+    assert "stances.parquet was not written, and is rebuilt" in sealed["problem"]
     assert not (session.folder / "stances.parquet").exists()
     assert len(stances_over_rest(session).json()) == 2
 
@@ -151,7 +151,7 @@ def test_a_session_without_estimates_has_no_stances_and_says_why(
 
 def test_stances_are_counted_when_the_session_is_sealed(tared: FakeNode) -> None:
     session = tared.record()
-    assert_refused(stances_over_rest(session), 409, "counted when it is sealed")
+    assert_refused(stances_over_rest(session), 409, "available when it is sealed")
     assert_refused(
         session.running.http.get("/sessions/20200101T000000Z-00000a/stances"), 404, "no session"
     )

@@ -89,7 +89,7 @@ def test_a_node_that_cannot_be_recorded_says_why_and_the_others_are_recorded(
     made = take(running, nodes=["left", "right", "nobody", "left"])
     assert nodes_of(made) == ["left"]
     assert sorted(made["failed"]) == ["nobody", "right"]
-    assert "'right' is not sending" in made["failed"]["right"]
+    assert "'right' sends no frames" in made["failed"]["right"]
     assert "no node 'nobody'" in made["failed"]["nobody"]
 
 

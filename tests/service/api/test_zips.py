@@ -135,7 +135,7 @@ def test_what_has_no_whole_file_is_refused_before_anything_is_sent(
     running.http.delete(two[1].url)
     assert_refused(asked(running, two[0].id, two[1].id), 404, two[1].id, "trash")
     (two[0].folder / "frames.parquet").unlink()
-    assert_refused(asked(running, two[0].id), 404, "taken away")
+    assert_refused(asked(running, two[0].id), 404, "is missing")
 
 
 def taken(running: Running, *ids: str) -> bytes:

@@ -161,7 +161,7 @@ def test_ticket_without_the_token_says_what_is_lacking(
 ) -> None:
     running = serve_with(token=TOKEN)
     monkeypatch.delenv("FOOTTILE_TOKEN")
-    run("invite", "--server", running.url).fails(1, "token is needed", "FOOTTILE_TOKEN")
+    run("invite", "--server", running.url).fails(1, "needs the server's token", "FOOTTILE_TOKEN")
     run("invite", "--server", running.url, "--data", tmp_path).fails(2, "no token", "--data")
 
 

@@ -112,14 +112,14 @@ def test_what_is_of_another_plan_is_refused_before_compiled_code_reads_it() -> N
     estimator = Estimator(plan)
     estimator.step(wild_frames(50, 4, 1))
     kept = estimator.kept()
-    with pytest.raises(ValueError, match="tiles is uint8"):
+    with pytest.raises(ValueError, match="tile_states is uint8"):
         Estimator.going_on(wider, kept)
     with pytest.raises(ValueError, match="rows is uint8"):
         Estimator.going_on(plan, kept | {"rows": kept["rows"][:-1]})
-    scene = np.zeros_like(kept["scene"])
-    scene[:] = 0xFF
+    foot_state = np.zeros_like(kept["foot_state"])
+    foot_state[:] = 0xFF
     with pytest.raises(ValueError, match="its rows are -1"):
-        Estimator.going_on(plan, kept | {"scene": scene})
+        Estimator.going_on(plan, kept | {"foot_state": foot_state})
 
 
 # --- steps and states -----------------------------------------------------------------------------
@@ -266,7 +266,9 @@ def test_pressures_are_those_that_tare_and_calibration_work_with_to_the_bit(seed
     plan = newton_plan(array_at(SQUARE), models=("static",))
     kpa = plan.compensation.readable_kpa(hold_temperature(frames)[0])
     kpa[~(kpa >= PRESSURE_MIN_KPA)] = np.nan
-    gauge_kpa = estimate(replace(plan, watch=None), frames).gauge_kpa
+    gauge_kpa = estimate(
+        replace(plan, watch=None), frames
+    ).gauge_kpa  # ANY: fields of EstimationPlan
     assert gauge_kpa.tobytes() == (kpa - plan.tare.baseline_kpa).tobytes()
 
 

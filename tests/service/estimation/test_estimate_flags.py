@@ -173,7 +173,9 @@ def test_a_tare_at_another_temperature_is_flagged_like_an_old_one() -> None:
     assert np.flatnonzero(status & EstimateStatus.TARE_OLD).tolist() == [4, 6]
     none, tare = np.zeros(3), np.full(3, 480.0)
     model = Temperature(none, none, np.ones(3), none, tare, np.full(3, 100.0), step_s=0.002)
-    corrected = replace(plan, ladder=replace(plan.ladder, temperature=model))
+    corrected = replace(
+        plan, ladder=replace(plan.ladder, temperature=model)
+    )  # ANY: fields of EstimationPlan
     assert not (estimate(corrected, frames).estimate_status & EstimateStatus.TARE_OLD).any()
     unknown = replace(plan, tare=replace(plan.tare, tadc_counts=np.full(4, np.nan)))
     assert not (estimate(unknown, frames).estimate_status & EstimateStatus.TARE_OLD).any()

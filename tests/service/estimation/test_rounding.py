@@ -226,16 +226,20 @@ def test_with_next_to_no_noise_nothing_is_moved_that_shows(sigma_n: float) -> No
     same_bits(rounding.rounded(columns), columns)
 
 
-@pytest.mark.parametrize("positions", [SQUARE[:1], SQUARE[:2], [SQUARE[0], SQUARE[2]]])
-def test_a_line_of_tiles_and_a_single_one_have_steps_across_as_well(
-    positions: list[tuple[float, float, float]],
+@pytest.mark.parametrize(
+    ("positions", "measured"),
+    [(SQUARE, "xy"), (SQUARE[2:], "x"), ([SQUARE[1], SQUARE[3]], "y"), (SQUARE[3:], "")],
+)
+def test_the_centre_of_pressure_has_a_step_along_each_measured_axis(
+    positions: list[tuple[float, float, float]], measured: str
 ) -> None:
-    plan = newton_plan(array_at(positions))
-    steps = Rounding.of([plan]).by_column()
-    if len(positions) == 1:  # its place is its place
-        assert not any(name.startswith("cop") for name in steps)
-    else:
-        assert steps["cop_x_m"] == steps["cop_y_m"] > 0.0
+    steps = Rounding.of([newton_plan(array_at(positions))]).by_column()
+    assert {name for name in steps if name.startswith("cop") and name.endswith("_m")} == {
+        name
+        for axis in measured
+        for name in (f"cop_{axis}_m", f"cop_sigma_{axis}_m", f"cop_ground_{axis}_m")
+    }
+    if measured:  # an index counts tiles, also across a row
         assert steps["cop_index_x"] == steps["cop_index_y"] > 0.0
 
 

@@ -141,6 +141,21 @@ def test_masked_centres_are_counted_under_load_only() -> None:
     assert (a.cop_frames, a.cop_masked_frames) == (1, 1)
 
 
+def test_of_tiles_in_one_row_the_measured_coordinate_alone_is_scored() -> None:
+    nothing = [np.nan] * 3
+    in_y = accuracy_of(columns([10.0] * 3, cop_x_m=[0.003, np.nan, -0.001], cop_y_m=nothing))
+    assert (in_y.cop_frames, in_y.cop_masked_frames) == (2, 1)
+    assert in_y.cop_mean_m == pytest.approx(0.002)
+    assert in_y.cop_covered == Covered(2, 1)
+    sigma = {"cop_sigma_x_m": nothing}
+    in_x = accuracy_of(columns([10.0] * 3, cop_x_m=nothing, cop_y_m=[0.003] * 3, **sigma))
+    assert (in_x.cop_frames, in_x.cop_covered) == (3, Covered(0, 0))
+    assert in_x.cop_mean_m == pytest.approx(0.003)
+    neither = accuracy_of(columns([10.0] * 3, cop_x_m=nothing, cop_y_m=nothing, **sigma))
+    assert (neither.cop_frames, neither.cop_masked_frames) == (0, 3)
+    assert math.isnan(neither.cop_mean_m)
+
+
 def named_phases(true_n: list[float]) -> list[str]:
     t_ns = PERIOD_NS * np.arange(len(true_n), dtype=np.int64)
     return [PHASES[i] for i in phases_of(t_ns, np.array(true_n))]

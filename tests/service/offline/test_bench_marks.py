@@ -64,11 +64,11 @@ def test_nothing_is_under_the_spindle_in_a_soak_and_after_the_end(recorded: Path
 @pytest.mark.parametrize(
     ("label", "says"),
     [
-        ("T01 laod", "says no step of a bench"),
+        ("T01 laod", "is no calibration step"),
         ("T09 load", "of a tile of T01"),
         ("T01 500", "or a weight such as 500 g"),
-        ("load", "says no step of a bench"),
-        ("Soak", "says no step of a bench"),
+        ("load", "is no calibration step"),
+        ("Soak", "is no calibration step"),
     ],
 )
 def test_a_step_that_is_misspelt_is_refused_and_no_stroke_goes_on(

@@ -49,7 +49,7 @@ def test_verify_proves_it_and_a_folder_of_them(path: Path, tmp_path: Path) -> No
     _flipped(path)
     assert [verdict_of(verify(each)) for each in (path, tmp_path)] == ["damaged"] * 2
     path.write_text(CALIBRATION.to_json())
-    assert verify(path).as_dict()["unproven"] == ["toe.json: it states no hash of itself"]
+    assert verify(path).as_dict()["unproven"] == ["toe.json: it has no hash"]
 
 
 def test_one_of_an_older_version_is_proven_by_its_id(path: Path) -> None:
@@ -180,4 +180,4 @@ def test_a_cache_that_cannot_be_written_is_said_and_no_reason_to_fail(
     for _ in range(2):
         find_calibration("emulated-rig", ["A01"], cache=cache, progress=said.append)
     assert pressed == ["bench-A01"] * 2
-    assert any("is not kept" in line for line in said)
+    assert any("is not cached" in line for line in said)

@@ -229,7 +229,7 @@ def test_whatever_a_file_is_called_everybody_can_be_told_of_it(
     running.start()
     said = problems(running)
     assert "it is not a file" in said
-    assert "not what this node said last" in said
+    assert "not this node's last hello" in said
     assert said.isprintable()
     with running.socket("/api/v1/live") as live:
         assert json.loads(live.recv(timeout=PATIENCE_S))["problems"]

@@ -93,7 +93,7 @@ def _stream(folder: Path) -> None:
         assert (stream / IN_FLIGHT_FILE).exists()
     journal = NodeJournal(folder, "bench")
     try:
-        assert journal.problems == [] or "It is left as it is" in journal.problems[0]
+        assert journal.problems == [] or "The file is unchanged" in journal.problems[0]
         assert bool(journal.problems) is not bool(journal.streams)
     finally:
         journal.close()
@@ -110,7 +110,7 @@ def test_a_file_that_cannot_be_read_stays_as_it_is(
         if use is _stream:
             use(tmp_path)
         else:
-            with pytest.raises(StorageError, match="let this user read it, or try again") as caught:
+            with pytest.raises(StorageError, match="Let this user read it, or try again") as caught:
                 use(tmp_path)
             assert caught.value.errno == number
     assert contents(tmp_path) == before

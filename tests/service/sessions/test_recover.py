@@ -149,7 +149,7 @@ def test_a_session_of_which_nothing_reached_the_disk_is_sealed_as_that(tmp_path:
     one, ledger = recovered(tmp_path)
     assert one.outcome == "sealed"
     assert ledger.parts[0].unsynced_tail_max == unsynced_tail_max(1000.0)
-    assert (loaded(tmp_path).frames, loaded(tmp_path).problem) == (0, "not one frame was recorded")
+    assert (loaded(tmp_path).frames, loaded(tmp_path).problem) == (0, "no frame was recorded")
     assert recover(tmp_path).is_nothing
 
 
@@ -309,7 +309,7 @@ def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
     monkeypatch.setattr(recover_module, "seal", careless)
     (one,) = recover(tmp_path).sessions
     assert one.outcome == "failed"
-    assert "not those that were sealed" in one.problem
+    assert "changed since it was sealed" in one.problem
     assert loaded(tmp_path).state == "sealing"
     monkeypatch.undo()
     assert outcomes(recover(tmp_path)) == ["sealed"]

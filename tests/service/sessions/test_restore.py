@@ -63,7 +63,7 @@ def test_of_a_sealed_session_it_is_made_again_from_the_files_beside_it(data: Pat
         assert recover(data).is_nothing
     made = assert_made_again(data, before)
     assert made.problem == (
-        "its session.json was damaged and was made again from frames.parquet; lost are subject, "
+        "its session.json was damaged and was rebuilt from frames.parquet; lost are subject, "
         "notes and tags"
     )
     assert (path.parent / "session.json.damaged-1").read_bytes() == damaged

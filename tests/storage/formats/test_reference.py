@@ -235,7 +235,7 @@ def test_samples_are_numbered_at_a_stated_rate(
 
 
 def test_a_rate_beside_times_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--rate-hz goes with numbers of samples"):
+    with pytest.raises(UsageError, match="--rate-hz needs sample numbers"):
         read(tmp_path, GOOD, Stated(LAB.columns, LAB.units, "+", rate_hz=100.0))
 
 

@@ -263,7 +263,7 @@ def test_a_slice_reads_its_own_row_groups_and_columns_and_no_page_besides(tmp_pa
     assert table_of(path, part).equals(right)
     with pytest.raises(FileFormatError, match="row group 6 cannot be read"):
         table_of(path, Slice(4.2, 6.5, ("force_n_1",)))
-    with pytest.raises(FileFormatError, match="are not those that were sealed"):
+    with pytest.raises(FileFormatError, match="changed since it was sealed"):
         SessionReader(path)
 
 

@@ -104,6 +104,19 @@ def test_a_sum_with_its_centre_of_pressure_is_a_load_too(tmp_path: Path, to: str
     np.testing.assert_array_equal(np.isnan(trace.cop_m[:, 0]), np.arange(ROWS) % 4 == 0)
 
 
+@pytest.mark.parametrize("to", ["parquet", "csv"])
+def test_a_sum_of_tiles_in_one_row_has_a_constant_across_it(tmp_path: Path, to: str) -> None:
+    names = ("t_ns", "grf_n", "cop_x_m", "cop_y_m")
+    row = ESTIMATES | {"cop_y_m": np.full(ROWS, np.nan)}
+    trace = read_load_trace(exported(tmp_path, to, row, *names))
+    assert trace.cop_m is not None
+    np.testing.assert_array_equal(np.isnan(trace.cop_m[:, 0]), np.arange(ROWS) % 4 == 0)
+    np.testing.assert_array_equal(trace.cop_m[:, 1], 0.0)
+    neither = read_load_trace(exported(tmp_path, to, row | {"cop_x_m": row["cop_y_m"]}, *names))
+    assert neither.cop_m is not None
+    assert np.isnan(neither.cop_m).all()
+
+
 def test_rows_without_forces_are_left_out_at_the_ends_and_refused_in_between(
     tmp_path: Path,
 ) -> None:

@@ -64,6 +64,17 @@ def walk() -> dict[str, Array]:
     return {**columns, "force_n": force_n}
 
 
+ROW = make_array([*ARRAY.tiles[::2]])
+"""Two tiles in one row at y = 10 mm, and a bare one."""
+
+
+def row_walk() -> dict[str, Array]:
+    """The same walk on `ROW`, whose tiles do not measure y."""
+    columns = walk()
+    columns["force_n"] = columns["force_n"][:, ::2]
+    return {**columns, "cop_y_m": np.full(ROWS, np.nan)}
+
+
 def saturated(columns: dict[str, Array], rows: slice) -> dict[str, Array]:
     """The same with a tile beyond its range there."""
     changed = {name: values.copy() for name, values in columns.items()}

@@ -222,5 +222,5 @@ def test_a_footer_that_gives_a_column_the_name_of_another_is_not_read(tmp_path: 
     for changed in (swapped.replace(b"tadc_x", b"tadc_1"), whole.replace(b"padc_1", b"padc_0")):
         assert len(changed) == len(whole)
         path.write_bytes(changed)
-        with pytest.raises(FileFormatError, match="are not those that were sealed"):
+        with pytest.raises(FileFormatError, match="changed since it was sealed"):
             SessionReader(path)

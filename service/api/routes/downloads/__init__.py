@@ -1,1 +1,1 @@
-"""What was recorded, as files: in any format, a slice, a take, several at once."""
+"""Downloads: in any format, a slice, a take, several sessions."""

@@ -1,4 +1,4 @@
-"""A session's data: the sealed file as it is stored, or what is asked for made on request."""
+"""Data of a session: the sealed file as stored, or a file made on request."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
             "content": {media_type.split(";")[0]: {} for media_type in MEDIA_TYPES},
         },
         206: {"description": "A range of the stored file."},
-        304: {"description": "It is what If-None-Match names."},
+        304: {"description": "Unchanged."},
         **problems(
             _404="No such session, or nothing was recorded.",
-            _409="This format is there only when the session is sealed.",
+            _409="This format needs a sealed session.",
             _416="The range is outside the file.",
-            _422="No such format or column, or a slice that holds no time of the session.",
+            _422="No such format or column, or a slice outside the session.",
         ),
     },
 )
@@ -69,12 +69,12 @@ async def data(
     request: Request,
     server: ServerState,
 ) -> Response:
-    """A session in a format of your choice; `GET /formats` lists them.
+    """Return a session in a selected format; `GET /formats` lists them.
 
     Parquet without slice, columns, server's clock or marks is the stored file: with ranges, a
-    strong ETag that is its SHA-256, and a digest. Everything else is made on request and streamed;
-    while a session is recorded it is what there is so far. `Foottile-Complete` says whether frames
-    are missing, `Foottile-Marks` how many marks are in it and how many could not be placed.
+    strong ETag that is its SHA-256, and a digest. Any other file is made on request and streamed;
+    while a session is recorded it has the present frames. `Foottile-Complete` states whether frames
+    are missing, `Foottile-Marks` the number of markers in it and of markers left out.
     """
     session = known(server.sessions.get(session_id))
     ledger = server.recorder.ledger(session_id)
@@ -83,8 +83,8 @@ async def data(
     if session.state != "sealed" and query.to.needs_sealed:
         others = [each.name for each in FORMATS.values() if not each.needs_sealed]
         raise StateError(
-            f"session {session_id} is {session.state}, and {query.to.title} is made when it is "
-            "sealed",
+            f"session {session_id} is {session.state}, and {query.to.title} is available when it "
+            "is sealed",
             remedy=f"Stop it, or ask for format={' or '.join(others)}",
         )
     if session.sha256 is not None and query.is_stored:
@@ -108,7 +108,7 @@ def _stored(
     if wanted is not None:
         found = _SINGLE_RANGE.fullmatch(wanted.replace(" ", ""))
         if found is None or (found[2] and found[1] and int(found[2]) < int(found[1])):
-            # RFC 9110 14.2: what is not understood, or is several, is ignored.
+            # RFC 9110 14.2: an invalid range, or several, are ignored.
             del MutableHeaders(scope=request.scope)["range"]
         elif (found[1] and int(found[1]) >= size) or found[3] == "0":
             return problem(
@@ -163,12 +163,12 @@ def _chunks(session: Session, query: DataQuery, server: Server, marks: Marks | N
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
-        # Of all frames each is needed once, whatever is remembered of some.
+        # A whole session is estimated once: no cached preview is needed.
         is_some, so_fars = query.slice.is_some, server.so_fars
         so_far = so_fars.nearly(sources) if is_some else SoFar(sources, server.data)
         frames = FramesSoFar(so_far, sources, query.slice)
         source = {"session": session.id, "state": session.state}
-        content = frames.content()  # the first frames: then it is known how they are estimated
+        content = frames.content()  # reads the first frames, which sets `notes`
         yield from query.to.written(
             Export(
                 content,

@@ -1,4 +1,4 @@
-"""Which data are asked for, and how: of one session, or of all of a take."""
+"""Queries of downloads: of one session, or of a take."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from storage.formats.written.registry import SEVERAL, FormatName, format_named, 
 
 
 class MadeQuery(SecondsQuery, FormatOptions):
-    """What any data may be asked for with."""
+    """Query shared by all downloads."""
 
     format: FormatName
     columns: str | None = Field(
         default=None,
-        description="Names with commas between: of all tiles (`force_n`) or one (`force_n_0`).",
+        description="Names, comma-separated: of all tiles (`force_n`) or one (`force_n_0`).",
         examples=["t_ns,grf_n,force_n_0"],
     )
     marks: bool | None = Field(
         default=None,
-        description="Adds `event`: what people marked, at the frame nearest in time; null "
-        "elsewhere. Left out: true, but false for Parquet, which is then the sealed file.",
+        description="Adds `event`: the marker at the frame nearest in time; null elsewhere. "
+        "Default: true, but false for Parquet, which is then the sealed file.",
     )
 
     @property
     def to(self) -> Format:
-        """The format."""
+        """Format of the download."""
         return format_named(self.format)
 
     @property
     def has_marks(self) -> bool:
-        """Are marks wanted?"""
+        """True if markers are included."""
         return self.to.is_marked if self.marks is None else self.marks
 
     @property
     def options(self) -> FormatOptions:
-        """Of the format."""
+        """Options of the format."""
         return FormatOptions(**{name: getattr(self, name) for name in FormatOptions.model_fields})
 
     @property
@@ -51,12 +51,12 @@ class MadeQuery(SecondsQuery, FormatOptions):
 
     @property
     def clock_name(self) -> ClockName:
-        """Whose time goes with the frames."""
+        """Clock whose time is added to the frames."""
         return "server"
 
     @property
     def canonical(self) -> str:
-        """The same for queries that ask for the same."""
+        """Text that is equal for equivalent queries."""
         part = self.slice
         columns = ",".join(part.columns)
         rows = f"{part.start_s}|{part.end_s}"
@@ -65,37 +65,37 @@ class MadeQuery(SecondsQuery, FormatOptions):
 
 
 class DataQuery(MadeQuery):
-    """Data of one session."""
+    """Query for one session."""
 
     format: FormatName = PARQUET.name
     clock: ClockName = Field(
         default="node",
-        description="`server` adds `t_server_ns`, the frame's instant in the server's UTC, and its "
+        description="`server` adds `t_server_ns`, the frame's time in the server's UTC, and its "
         "bound `t_server_uncertainty_ns`; null where the clocks were not compared.",
     )
 
     @property
     def clock_name(self) -> ClockName:
-        """Whose time goes with the frames."""
+        """Clock whose time is added to the frames."""
         return self.clock
 
     @property
     def is_stored(self) -> bool:
-        """Is it the sealed file as it is?"""
+        """True if the answer is the sealed file as it is."""
         is_plain = self.clock == "node" and not self.has_marks and not self.options.set_names
         return self.to is PARQUET and self.slice.is_all and is_plain
 
 
 class TakeDataQuery(MadeQuery):
-    """Data of a take, on the server's axis of time."""
+    """Query for a take, on the server's time axis."""
 
     format: FormatName = Field(description="One that holds several: " + ", ".join(SEVERAL) + ".")
 
     @property
     def to(self) -> Format:
-        """The format.
+        """Format of the download.
 
         Raises:
-            UsageError: it holds one session only.
+            UsageError: it is for one session only.
         """
         return together_named(self.format)

@@ -1,4 +1,4 @@
-"""Data that are made while they are sent: what they depend on, and how they are sent."""
+"""Files made on request: entity tags, names, and streaming."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _NAME_LENGTH = 60
 
 
 def known(session: Session) -> Session:
-    """One whose frames can be read.
+    """Return the session if its frames can be read.
 
     Raises:
-        UnknownError: it was sealed without any, or its file is damaged.
+        UnknownError: it was sealed without frames, or its file is damaged.
     """
     if session.state == "sealed" and session.sha256 is None:
         raise UnknownError(f"session {session.id}: {session.problem}")
@@ -38,9 +38,9 @@ def known(session: Session) -> Session:
 
 
 async def tag_of_made(session: Session, query: MadeQuery, server: Server) -> str:
-    """What is made of a session is the same as long as this is."""
+    """Return an entity tag of everything that an export of a session depends on."""
     beside = ""
-    if query.clock_name == "server" or query.has_marks:  # marks are placed by the clocks
+    if query.clock_name == "server" or query.has_marks:  # markers are placed by the clocks
         beside = await run_in_threadpool(_clocks_hash, session, server)
     if query.has_marks:
         beside += "".join(event.model_dump_json() for event in session.events)
@@ -49,19 +49,19 @@ async def tag_of_made(session: Session, query: MadeQuery, server: Server) -> str
     else:
         recorded = server.recorder.ledger(session.id).recorded
         content = f"{session.id}|{session.state}|{recorded}"
-    about = f"{content}|{query.canonical}|{beside}|{SOFTWARE}"
-    return hashlib.sha256(about.encode()).hexdigest()
+    text = f"{content}|{query.canonical}|{beside}|{SOFTWARE}"
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def said_of_marks(marks: list[Marks]) -> dict[str, str]:
-    """The header that says how many marks are in it."""
+    """Return the header with the number of markers in the file."""
     total = sum(len(each.all) for each in marks)
     left_out = sum(len(each.left_out) for each in marks)
     return {"Foottile-Marks": f"placed={total - left_out}, left-out={left_out}"}
 
 
 def file_stem(name: str, id_: str, part: Slice) -> str:
-    """Return a file's name without its ending: the trial's name and id, and the seconds in it.
+    """Return a file's name without extension: the trial's name and id, and the seconds in it.
 
     Letters of the name that are not in every file system's alphabet are dashes.
     """
@@ -72,15 +72,15 @@ def file_stem(name: str, id_: str, part: Slice) -> str:
 
 
 async def made(chunks: Chunks, query: MadeQuery, stem: str, headers: dict[str, str]) -> Response:
-    """An answer of chunks, which are closed whoever goes away.
+    """Answer with chunks, which are closed even if the client disconnects.
 
     Args:
-        chunks: the file.
-        query: what was asked for.
-        stem: the file's name without its ending.
-        headers: that it has besides.
+        chunks: content of the file.
+        query: query of the request.
+        stem: file name without extension.
+        headers: further headers.
     """
-    # The first chunk now: what is wrong with the query is then an answer, not a broken download.
+    # The first chunk now: an invalid query is then an answer, not a broken download.
     first = await run_in_threadpool(next, chunks, None)
     if first is None:
         raise UsageError("the session has no frames")
@@ -89,7 +89,7 @@ async def made(chunks: Chunks, query: MadeQuery, stem: str, headers: dict[str, s
 
 
 async def sent(chunks: Chunks, first: bytes = b"") -> AsyncIterator[bytes]:
-    """Chunks as they are made; who asked may go away: no file is left open, and none behind."""
+    """Yield chunks as they are made, and close their generator even if the client disconnects."""
     try:
         if first:
             yield first

@@ -1,4 +1,4 @@
-"""All sessions of a take in one file, on one axis of time."""
+"""Data of a take: all sessions in one file, on one time axis."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ router = APIRouter(prefix="/takes", tags=["data"])
             "description": "The data.",
             "content": {FORMATS[name].media_type: {} for name in SEVERAL},
         },
-        304: {"description": "It is what If-None-Match names."},
+        304: {"description": "Unchanged."},
         **problems(
-            _404="There is no session of this take, or nothing was recorded in one.",
+            _404="No such take, or one of its sessions has no frames.",
             _409="One of its sessions is not sealed.",
-            _422="A format that holds one session only, or a session that cannot be in it.",
+            _422="A format for one session only, or a session that cannot be in it.",
         ),
     },
 )
 async def take_data(
     take_id: str, query: Annotated[TakeDataQuery, Query()], request: Request, server: ServerState
 ) -> Response:
-    """Its sessions on the server's axis of time, each with how far it may be from it.
+    """Return the sessions of a take on the server's time axis, each with its uncertainty.
 
-    They are in the order of their nodes; those in the trash are left out. Seconds count from each
-    session's own first frame. `Foottile-Complete` is `lossy` if one of them is.
+    They are in the order of their nodes, without those in the trash. Seconds count from each
+    session's first frame. `Foottile-Complete` is `lossy` if one of the sessions is.
     """
     to = query.to
     sessions = [known(session) for session in server.takes.get(take_id).sessions]
@@ -62,7 +62,7 @@ async def take_data(
         if session.sha256 is None:
             raise StateError(
                 f"session {session.id} of {session.node} is {session.state}, and {to.title} of a "
-                "take is made when all of it is sealed",
+                "take is available when all of it is sealed",
                 remedy="Stop it, or ask for each session by itself",
             )
     is_lossy = any(server.recorder.ledger(session.id).lossy for session in sessions)

@@ -1,4 +1,4 @@
-"""Several sealed sessions as one download."""
+"""Several sealed sessions as one zip file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from storage.sessions.folder import FRAMES_NAME, Session
 router = APIRouter(prefix="/sessions", tags=["data"])
 
 IDS_MAX = 1000
-"""As many as the head of a request has room for."""
+"""Limit of ids: the size of a request's headers."""
 
 
 @router.get(
@@ -42,10 +42,10 @@ async def zip_sessions(
     ],
     server: ServerState,
 ) -> StreamingResponse:
-    """Their files as they are, made while it is sent: a folder each, as `foottile verify` takes it.
+    """Stream the files of sessions as they are: a folder each, as for `foottile verify`.
 
-    A session that is damaged or deleted on the way breaks the download off; what was sent until
-    then opens as no zip file.
+    A session that is damaged or deleted meanwhile aborts the download; the partial file opens as no
+    zip file.
     """
     names = list(dict.fromkeys(name.strip() for name in ids.split(",") if name.strip()))
     if not 1 <= len(names) <= IDS_MAX:
@@ -59,7 +59,7 @@ async def zip_sessions(
         "Cache-Control": "private, no-store",
     }
     pieces = zipped(chosen)
-    # The first piece now: what is wrong with it is then an answer, not a broken download.
+    # The first chunk now: a damaged file is then an answer, not a broken download.
     first = await run_in_threadpool(next, pieces)
     return StreamingResponse(sent(pieces, first), headers=headers, media_type="application/zip")
 
@@ -67,7 +67,7 @@ async def zip_sessions(
 def _sealed(session: Session, folder: Path) -> Sealed:
     if session.state != "sealed":
         raise StateError(
-            f"session {session.id} is {session.state}, and a zip file is of sealed ones",
+            f"session {session.id} is {session.state}, and a zip file has sealed ones only",
             remedy="Stop it, or leave it out",
         )
     if session.sha256 is None:

@@ -1,1 +1,1 @@
-"""What was recorded, and what is known of it: sessions, takes, marks, pictures, proofs."""
+"""Routes of recorded data: sessions, takes, markers, plots, verification."""

@@ -1,4 +1,4 @@
-"""The array of a session: which tiles it was recorded with, and how its forces were estimated."""
+"""Route of a session's array: tiles, ranges, look-ahead."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 
 class ArrayView(View):
-    """Tiles of a session, and what is known of its estimates."""
+    """Array of a session, and facts of its estimates."""
 
     session_id: str
     node: str
@@ -31,10 +31,10 @@ class ArrayView(View):
     nominal_rate_hz: float
     calibration: CalibrationView | None
     lag_ms: float | None = Field(
-        description="Look-ahead of the estimates: for so long after a frame its estimate still "
-        "takes notice of what was read; null: there are none."
+        description="Look-ahead of the estimates: each uses readings up to this time after its "
+        "frame; null: no estimates."
     )
-    estimates_problem: ShownText | None = Field(description="Why there are no estimates.")
+    estimates_problem: ShownText | None = Field(description="Reason why there are no estimates.")
 
 
 @router.get(
@@ -44,7 +44,7 @@ class ArrayView(View):
     responses=problems(_404="No such session, or nothing was recorded.", _409="It is damaged."),
 )
 async def array(session_id: str, server: ServerState) -> ArrayView:
-    """Where its tiles are on the foot, their ranges, and the look-ahead of its estimates."""
+    """Return the tiles' positions and ranges, and the look-ahead of the estimates."""
     session = server.sessions.get(session_id)
     if session.state == "sealed" and session.sha256 is None:
         raise UnknownError(f"session {session_id}: {session.problem}")
@@ -60,8 +60,8 @@ def _sealed(session_id: str, server: Server) -> ArrayView:
     with server.sessions.frames(session_id, only_slices=True) as reader:
         info, notes, estimated = reader.info, reader.notes, reader.has("grf_n")
     if not estimated:
-        said = str(notes.get("estimates", "no estimates")).removeprefix("no estimates: ")
-        return _view(session_id, info, _calibration(notes), None, said)
+        reason = str(notes.get("estimates", "no estimates")).removeprefix("no estimates: ")
+        return _view(session_id, info, _calibration(notes), None, reason)
     lag_ms = notes.get("lag_ms")
     known_ms = float(lag_ms) if isinstance(lag_ms, int | float) else None
     return _view(session_id, info, _calibration(notes), known_ms, None)
@@ -83,19 +83,21 @@ def _view(
 ) -> ArrayView:
     try:
         ranges = None if calibration is None else Ranges.of(info, calibration)
-    except FootTileError:  # it is of other tiles: then there are no estimates by it either
+    except FootTileError:  # it is of other tiles
         ranges = None
-    said = None
+    calibration_view = None
     if calibration is not None and ranges is not None:
         scale = scale_of(ranges)
-        said = CalibrationView(id=calibration.id, name=calibration.name, absolute_scale=scale)
+        calibration_view = CalibrationView(
+            id=calibration.id, name=calibration.name, absolute_scale=scale
+        )
     return ArrayView(
         session_id=session_id,
         node=info.node,
         tiles=tiles_of(info, ranges),
         servo=info.servo,
         nominal_rate_hz=info.nominal_rate_hz,
-        calibration=said,
+        calibration=calibration_view,
         lag_ms=lag_ms,
         estimates_problem=problem,
     )

@@ -1,4 +1,4 @@
-"""How the clocks of a session go against the server's: drift, steps, and what is unknown."""
+"""Route of a session's clocks: offset, drift and steps against the server's clock."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _PARQUET = PARQUET.media_type
     summary="Clocks",
     response_model=ClockSummary,
     responses={
-        200: {"description": "The summary, or the stored table.", "content": {_PARQUET: {}}},
+        200: {"description": "Summary, or the stored table.", "content": {_PARQUET: {}}},
         **problems(
-            _404="No such session, or its clock table has been taken away.",
+            _404="No such session, or its clock table is missing.",
             _409="The table is written when the session is sealed.",
         ),
     },
@@ -38,9 +38,9 @@ async def clock(
     server: ServerState,
     format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
 ) -> ClockSummary | Response:
-    """Stretches between steps with offset and drift of every stream; while recording, so far.
+    """Return offset and drift of every stream between steps; up to now while recording.
 
-    `format=parquet` is `clock.parquet`, the measurements themselves, as they lie beside the frames.
+    `format=parquet` is `clock.parquet`, the stored measurements.
     """
     session = server.sessions.get(session_id)
     if format == "parquet":

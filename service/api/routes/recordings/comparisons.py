@@ -1,4 +1,4 @@
-"""What `foottile compare` found of a session: figures, and the reference at any zoom."""
+"""Routes of comparisons made by `foottile compare`: figures, and the reference at any zoom."""
 
 from __future__ import annotations
 
@@ -32,65 +32,67 @@ router = APIRouter(prefix="/sessions", tags=["sessions"])
 T = TypeVar("T")
 
 _ONE_AT_A_TIME = CapacityLimiter(1)
-"""A series is read whole once: of several that are asked for one after the other is."""
+"""One thread: a series is read whole once."""
 _PROBLEMS = problems(
     _404="No such session or comparison, or nothing was recorded.",
-    _409="A session is compared when it is sealed.",
-    _422="The comparison's files are damaged, or the slice ends before it begins.",
+    _409="The session is not sealed.",
+    _422="Damaged files of the comparison, or a slice that ends before it begins.",
 )
 
 
 class ComparisonView(BaseModel):
-    """One comparison in the list."""
+    """Comparison in the list."""
 
-    name: str = Field(description="Of its reference.")
-    problem: ShownText | None = Field(description="Why it cannot be read; null: it can.")
+    name: str = Field(description="Name of its reference.")
+    problem: ShownText | None = Field(description="Reason why it cannot be read; null: it can.")
     is_of_these_frames: bool | None = Field(
-        description="False: the session's frames were others then; null: it does not say."
+        description="False: the session's frames were different then; null: unknown."
     )
-    missed: list[str] = Field(description="Limits that were missed, in words.")
+    missed: list[str] = Field(description="Missed limits, as text.")
 
 
 class ComparisonsView(BaseModel):
-    """What a session was compared with."""
+    """Comparisons of a session."""
 
     items: list[ComparisonView]
 
 
 class ReportView(ComparisonView):
-    """What a comparison found (docs/compare.md)."""
+    """Results of a comparison (docs/compare.md)."""
 
-    is_proven: bool = Field(description="False: an older version wrote it, without a hash.")
-    has_series: bool = Field(description="There is what was compared, frame by frame.")
-    report: dict[str, Any] = Field(description="The content of `compare.json`.")
+    is_proven: bool = Field(description="False: written by an older version, without a hash.")
+    has_series: bool = Field(description="True: the compared values are there, frame by frame.")
+    report: dict[str, Any] = Field(description="Content of `compare.json`.")
 
 
 class SeriesQuery(SecondsQuery):
-    """Which time, and how finely."""
+    """Time interval and resolution."""
 
     points: Annotated[int, Field(ge=1, le=POINTS_MAX)] = Field(
-        default=1000, description="Bins at least, if there are as many frames; four times at most."
+        default=1000,
+        description="Least number of bins, if there are as many frames; at most four times as "
+        "many.",
     )
 
 
 class SeriesView(BaseModel):
-    """The reference in bins of consecutive frames, as overviews are; what is not known is null."""
+    """Reference in bins of consecutive frames, as overviews are; unknown values are null."""
 
     session_id: str
-    begin_t_ns: int = Field(description="t_ns of the first frame of the session.")
+    begin_t_ns: int = Field(description="`t_ns` of the session's first frame.")
     duration_s: float = Field(description="From its first frame to its last.")
-    frames_in_bin: int = Field(description="1: each bin is a frame.")
+    frames_in_bin: int = Field(description="Frames per bin; 1: each bin is a frame.")
     columns: dict[str, list[float | int | None]]
 
 
 @router.get(
     "/{session_id}/comparisons",
     operation_id="listComparisons",
-    summary="What it was compared with",
+    summary="Comparisons",
     responses=problems(_404="No such session.", _409="Its files are damaged."),
 )
 async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsView:
-    """Comparisons that `foottile compare` has kept with the session, by name."""
+    """Return the session's comparisons, made by `foottile compare`, by name."""
     session = server.sessions.get(session_id)
     return ComparisonsView(items=await run_in_threadpool(_listed, session, server))
 
@@ -102,7 +104,7 @@ async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsV
     responses=_PROBLEMS,
 )
 async def comparison(session_id: str, name: str, server: ServerState) -> ReportView:
-    """Alignment, figures with their intervals, trials and limits."""
+    """Return alignment, figures with their intervals, trials and limits."""
     session = server.sessions.get(session_id)
     return await run_in_threadpool(_clear, partial(_report, session, name, server))
 
@@ -117,7 +119,7 @@ async def comparison(session_id: str, name: str, server: ServerState) -> ReportV
 async def series(
     session_id: str, name: str, query: Annotated[SeriesQuery, Query()], server: ServerState
 ) -> Response:
-    """Least and greatest of the reference, and of ours less that, aligned in time."""
+    """Return minimum and maximum of the reference, and of ours minus it, aligned in time."""
     session = server.sessions.get(session_id)
     if session.state != "sealed":
         raise StateError(f"session {session_id} is {session.state}", remedy="Stop it")
@@ -127,7 +129,7 @@ async def series(
 
 
 def _clear(make: Callable[[], T]) -> T:
-    """Files of people, which may be of any content: what is wrong with one is no fault of ours."""
+    """Run a function on user files; a damaged file is a usage error."""
     try:
         return make()
     except FileFormatError as error:
@@ -149,7 +151,7 @@ def _listed(session: Session, server: Server) -> list[ComparisonView]:
 
 
 def _frames_hash(session: Session, server: Server) -> object:
-    """As the frames state it now; None: there are none that can be read."""
+    """Return the hash that the frames state; None if they cannot be read."""
     try:
         with server.sessions.frames(session.id, only_slices=True) as reader:
             return reader.identity["file_sha256"]
@@ -158,12 +160,14 @@ def _frames_hash(session: Session, server: Server) -> object:
 
 
 def _view(frames: object, name: str, content: dict[str, Any]) -> ComparisonView:
-    of = content["session"].get("file_sha256")
+    compared_sha256 = content["session"].get("file_sha256")
     missed = content.get("missed")
     return ComparisonView(
         name=name,
         problem=None,
-        is_of_these_frames=of == frames if isinstance(of, str) and frames is not None else None,
+        is_of_these_frames=compared_sha256 == frames
+        if isinstance(compared_sha256, str) and frames is not None
+        else None,
         missed=[str(line) for line in missed] if isinstance(missed, list) else [],
     )
 
@@ -181,8 +185,8 @@ def _report(session: Session, name: str, server: Server) -> ReportView:
 
 
 def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> bytes:
-    kept = server.series.of(comparison_of(server.sessions.folder.path(session.id), name))
-    if kept is None:
+    cached = server.series.of(comparison_of(server.sessions.folder.path(session.id), name))
+    if cached is None:
         raise UnknownError(
             f"the comparison with {name!r} has no series",
             remedy="An older version made it, or it is too long: compare again",
@@ -190,16 +194,16 @@ def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> 
     with server.sessions.frames(session.id, only_slices=True) as reader:
         begin_ns, end_ns = reader.span_ns()
     part = Slice(query.start_s, query.end_s)
-    bins, size = kept.seen(begin_ns, part, query.points)
+    bins, size = cached.seen(begin_ns, part, query.points)
     columns = {column: values for column, values in bins.items() if column != "part"}
     times = {
         f"t_{which}_s": (columns.pop(f"t_{which}_ns") - begin_ns) * 1e-9
         for which in ("first", "last")
     }
-    about = {
+    metadata = {
         "session_id": session.id,
         "begin_t_ns": begin_ns,
         "duration_s": (end_ns - begin_ns) * 1e-9,
         "frames_in_bin": size,
     }
-    return numbers_as_json(about, times | columns)
+    return numbers_as_json(metadata, times | columns)

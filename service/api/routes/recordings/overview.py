@@ -1,4 +1,4 @@
-"""A session at any zoom: what a plot of it needs, whatever its length."""
+"""Route of a session's overview: bins for plots at any zoom."""
 
 from __future__ import annotations
 
@@ -32,63 +32,62 @@ from storage.sessions.time_axis import Basis
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 _ONE_AT_A_TIME = CapacityLimiter(1)
-"""Each thread that makes pictures keeps memory of them; and one picture waits for few others, which
-take milliseconds."""
+"""One thread: each thread that makes overviews keeps memory, and each takes milliseconds."""
 
 
 class OverviewQuery(SecondsQuery):
-    """Which time, and how finely."""
+    """Time interval, resolution and columns."""
 
     points: Annotated[int, Field(ge=1, le=POINTS_MAX)] = Field(
-        default=1000, description="Bins at least, if there are as many frames; four times at most."
+        default=1000,
+        description="Least number of bins, if there are as many frames; at most four times as "
+        "many.",
     )
     columns: str | None = Field(
         default=None,
-        description="Beginnings of names with commas between; `t_first_s` and `t_last_s` always.",
+        description="Prefixes of names, comma-separated; `t_first_s` and `t_last_s` always.",
         examples=["grf_n,force_n"],
     )
 
 
 class PartShift(BaseModel):
-    """Where a part of the session is on its time axis."""
+    """Shift of a part of the session on its time axis."""
 
     part: int
-    shift_ns: int = Field(description="To be added to `t_ns` of its frames.")
+    shift_ns: int = Field(description="Added to `t_ns` of its frames.")
     by: Basis = Field(
-        description="How that is known: `node`: the node's date was right; `server`: by the "
-        "server's clock; `joined`: not at all, the part begins where the one before it ends."
+        description="Basis: `node`: the node's date was right; `server`: the server's clock; "
+        "`joined`: unknown, the part begins at the end of the one before."
     )
 
 
 class OverviewView(BaseModel):
-    """Bins of consecutive frames (docs/api.md); what is not known is null."""
+    """Bins of consecutive frames (docs/api.md); unknown values are null."""
 
     session_id: str
-    begin_t_ns: int = Field(description="t_ns of the first frame of the session.")
+    begin_t_ns: int = Field(description="`t_ns` of the session's first frame.")
     duration_s: float = Field(description="From the first frame to the last.")
-    frames_in_bin: int = Field(description="1: each bin is a frame.")
+    frames_in_bin: int = Field(description="Frames per bin; 1: each bin is a frame.")
     time_axis: list[PartShift] = Field(
-        description="Of each part, one at least; all 0 unless the node's date was set between two."
+        description="Shift of each part; all 0 unless the node's date was set between two."
     )
-    serials: list[str] = Field(description="Of the tiles, in the order of the columns.")
-    provisional: bool = Field(
-        description="It is not sealed yet: frames may still come between these, and tares follow."
-    )
-    behind: bool = Field(description="There are more frames already: ask again.")
+    serials: list[str] = Field(description="Serials of the tiles, in the order of the columns.")
+    provisional: bool = Field(description="True: not sealed; frames and tares may still come.")
+    behind: bool = Field(description="True: there are more frames; request again.")
     columns: dict[str, list[float | int | None]]
 
 
 @router.get(
     "/{session_id}/overview",
     operation_id="getOverview",
-    summary="At any zoom",
+    summary="Time series at any zoom",
     response_model=OverviewView,
     responses={
         200: {"description": "Bins, in the order of the frames.", "content": {ARROW_STREAM: {}}},
-        304: {"description": "It is what If-None-Match names."},
+        304: {"description": "Unchanged."},
         **problems(
             _404="No such session, or nothing was recorded.",
-            _409="It has no frames yet, or they are damaged.",
+            _409="No frames yet, or damaged ones.",
             _422="No such column, or a slice that ends before it begins.",
         ),
     },
@@ -99,13 +98,13 @@ async def overview(
     request: Request,
     server: ServerState,
     accept: Annotated[str, Header(description="The Arrow media type for an Arrow stream.")] = "",
-    accept_encoding: Annotated[str, Header(description="JSON goes as gzip to who takes it.")] = "",
+    accept_encoding: Annotated[str, Header(description="With gzip, JSON is compressed.")] = "",
 ) -> Response:
-    """Least and greatest of every column in each of some bins, so that no peak hides.
+    """Return minimum and maximum of every column per bin, so that no peak hides.
 
-    At full zoom each bin is a frame. What it costs does not depend on the session's length. Of a
-    session that is not sealed it is what there is so far, `provisional`: some ten thousand bins,
-    of ever more frames the longer it is.
+    At full zoom each bin is a frame. The cost does not depend on the session's length. An unsealed
+    session has its present frames, `provisional`: some ten thousand bins, with more frames each the
+    longer it is.
     """
     session = server.sessions.get(session_id)
     if session.state == "sealed" and session.sha256 is None:
@@ -115,8 +114,8 @@ async def overview(
     if session.sha256 is None:
         return await _so_far(session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
     server.so_fars.forget(session_id)
-    asked = f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{as_gzip}|{SOFTWARE}"
-    tag = hashlib.sha256(asked.encode()).hexdigest()
+    etag_input = f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{as_gzip}|{SOFTWARE}"
+    tag = hashlib.sha256(etag_input.encode()).hexdigest()
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
     headers |= {"Vary": "Accept, Accept-Encoding"}
     if has_it(request, tag):
@@ -138,8 +137,8 @@ async def _so_far(
     def make() -> bytes:
         so_far = server.so_fars.taken(sources)
         seen, serials = so_far.seen(part, query.points), list(sources.info.serials)
-        said = {"provisional": True, "behind": so_far.is_behind}
-        return _written(session, seen, serials, said, query, as_arrow=as_arrow, as_gzip=as_gzip)
+        flags = {"provisional": True, "behind": so_far.is_behind}
+        return _written(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
 
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     headers = {"Cache-Control": "no-store"} | ({"Content-Encoding": "gzip"} if as_gzip else {})
@@ -156,8 +155,8 @@ def _content(
     with server.sessions.frames(session.id, only_slices=True) as reader:
         seen = overview_of_session(reader, part, query.points, frames_sha256=session.sha256)
         serials = list(reader.info.serials)
-    said = {"provisional": False, "behind": False}
-    return _written(session, seen, serials, said, query, as_arrow=as_arrow, as_gzip=as_gzip)
+    flags = {"provisional": False, "behind": False}
+    return _written(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
 
 
 def _written(
@@ -189,7 +188,7 @@ def _written(
 
 
 def _in_seconds(seen: Seen) -> dict[str, Array]:
-    """Bins with instants as seconds after the first frame: integers of that size JSON has not."""
+    """Convert times to seconds after the first frame: JSON has no integers of that size."""
     bins = dict(seen.bins)
     times = {
         f"t_{which}_s": (bins.pop(f"t_{which}_ns") - seen.begin_ns) * 1e-9

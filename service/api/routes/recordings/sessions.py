@@ -1,4 +1,4 @@
-"""Recorded sessions: start, stop, list, describe, mark."""
+"""Routes of sessions: start, stop, list, describe, mark."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from storage.sessions.folder import Ledger
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 SETTLE_S = 5.0
-"""How long a stop waits for the sealed file before it answers."""
+"""Time that a stop waits for the sealed file before it answers."""
 
 _UNKNOWN = problems(_404="No such session.", _409="Its files are damaged.")
 _NO_EVENT = problems(_404="No such session or event.", _409="Its files are damaged.")
@@ -56,21 +56,21 @@ class _Body(BaseModel):
 
 
 class SessionPage(Page[SessionView]):
-    """A page of sessions."""
+    """Page of sessions."""
 
     unreadable: dict[str, ShownText] = Field(
         default={},
-        description="By id, sessions whose files are damaged, and what is wrong with them. No "
-        "frames are dropped meanwhile; `foottile verify` says more.",
+        description="Sessions with damaged files, and the errors, by id. No frames are dropped "
+        "meanwhile; see `foottile verify`.",
     )
 
 
 class Describe(_Body):
-    """What people say of what is to be recorded."""
+    """User-written description of a recording."""
 
     name: Name = Field(examples=["mud, third trial"])
     pre_roll_s: Annotated[float, Field(ge=0, le=600, allow_inf_nan=False, strict=True)] = Field(
-        default=0.0, description="Begin so much earlier, as far as the server still has it."
+        default=0.0, description="Pre-roll, as long as the server still has the frames."
     )
     subject: Name | None = None
     notes: Text = ""
@@ -78,13 +78,13 @@ class Describe(_Body):
 
 
 class StartSession(Describe):
-    """What to record."""
+    """Request to record a node."""
 
     node: str = Field(examples=["demo"])
 
 
 class ChangeSession(_Body):
-    """What people say of a session; what is left out stays."""
+    """Changes of a session's description; omitted fields are unchanged."""
 
     name: Name | None = None
     subject: Annotated[Text, AfterValidator(check_new_name)] | None = None
@@ -93,19 +93,19 @@ class ChangeSession(_Body):
 
 
 class MarkEvent(_Body):
-    """An event."""
+    """New marker."""
 
     label: Name = Field(examples=["stepped on a stone"])
     t_ns: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None = Field(
-        default=None, description="Server's UTC; left out: now."
+        default=None, description="Server's UTC; default: now."
     )
     id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")] | None = Field(
-        default=None, description="Your own, so that what is sent twice is marked once."
+        default=None, description="Id of your choice, so that a repeated request adds one marker."
     )
 
 
 class ChangeEvent(_Body):
-    """What is changed of an event; what is left out stays."""
+    """Changes of a marker; omitted fields are unchanged."""
 
     label: Name | None = None
     t_ns: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None = Field(
@@ -121,8 +121,9 @@ class ChangeEvent(_Body):
     responses={
         **problems(
             _404="No such node.",
-            _409="It is away, or far behind; or what this request began is in the trash.",
-            _422="Not as described, or the Idempotency-Key came with another request.",
+            _409="The node is not connected, or far behind; or the session of this key is in "
+            "the trash.",
+            _422="Invalid body, or the Idempotency-Key came with another request.",
         ),
         **FULL,
     },
@@ -135,12 +136,12 @@ async def start(
 ) -> SessionView:
     """Record a node from its next frame on, or from `pre_roll_s` earlier.
 
-    Several sessions may be recorded on one node at a time; each is stopped by its own id.
+    Several sessions may be recorded on one node at a time; each is stopped by its id.
     """
-    asked = asked_with(idempotency_key, "session", body)
-    begun = server.sessions.begun_by(asked)
-    if begun:
-        session = begun[0]
+    record = asked_with(idempotency_key, "session", body)
+    earlier = server.sessions.begun_by(record)
+    if earlier:
+        session = earlier[0]
     else:
         session = server.recorder.start(
             body.node,
@@ -149,7 +150,7 @@ async def start(
             subject=body.subject or "",
             notes=body.notes,
             tags=body.tags,
-            asked=asked,
+            asked=record,
         )
         server.tell_node(server.nodes.get(body.node))
     response.headers["Location"] = f"/api/v1/sessions/{session.id}"
@@ -163,10 +164,10 @@ async def start(
     responses={**_UNKNOWN, **FULL},
 )
 async def stop(session_id: str, server: ServerState) -> SessionView:
-    """End a session now and seal it; answers when that is done, or after five seconds.
+    """Stop a session now and seal it; answers when it is sealed, or after five seconds.
 
-    One that was stopped before stays as it is: to stop twice is to stop once. If the node is away
-    the session is `pending`, and completes when the node has come back.
+    A stopped session is unchanged: stopping twice is the same. If the node is not connected the
+    session is `pending`, and completes when the node is back.
     """
     session = server.recorder.stop(session_id)
     node = server.nodes.find(session.node)  # its folder may be gone
@@ -184,9 +185,9 @@ async def stop(session_id: str, server: ServerState) -> SessionView:
     responses={**_UNKNOWN, **problems(_409="It is not pending."), **FULL},
 )
 async def seal(session_id: str, server: ServerState) -> SessionView:
-    """Give up what a pending session waits for, because its node never comes back.
+    """Seal a pending session without its missing frames, because its node never comes back.
 
-    It is sealed as lossy: frames that were still to come are lost, reason `given_up`.
+    It is sealed as lossy: the missing frames are lost, reason `given_up`.
     """
     server.recorder.give_up(session_id)
     session = await server.settling.settled(session_id, SETTLE_S)
@@ -196,39 +197,38 @@ async def seal(session_id: str, server: ServerState) -> SessionView:
 @router.get("", operation_id="listSessions", summary="Sessions, newest first")
 async def list_sessions(
     server: ServerState,
-    cursor: Annotated[str | None, Query(description="From the page before.")] = None,
+    cursor: Annotated[str | None, Query(description="Cursor of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=500)] = 50,
     q: Annotated[
-        str | None, Query(max_length=200, description="Text in name, subject, notes, tag or node.")
+        str | None,
+        Query(max_length=200, description="Search text in name, subject, notes, tags and node."),
     ] = None,
-    take: Annotated[
-        str | None, Query(max_length=100, description="Only those of this take.")
-    ] = None,
+    take: Annotated[str | None, Query(max_length=100, description="Filter by take.")] = None,
     node: Annotated[
-        tuple[str, ...], Query(max_length=100, description="Only those of these nodes.")
+        tuple[str, ...],
+        Query(max_length=100, description="Filter by node (repeat to allow several)."),
     ] = (),
     tag: Annotated[
-        tuple[str, ...], Query(max_length=50, description="Only those that have all of these tags.")
+        tuple[str, ...],
+        Query(max_length=50, description="Filter by tag (repeat to require several)."),
     ] = (),
     from_: Annotated[
         str | None,
         Query(
             alias="from",
             max_length=40,
-            description="Only those started at this instant or later: ISO 8601, UTC if it names no "
-            "offset, or nanoseconds since 1970.",
+            description="Started at this time or later: ISO 8601, UTC if without an offset, or "
+            "nanoseconds since 1970.",
             examples=["2026-11-24T08:00:00Z"],
         ),
     ] = None,
-    to: Annotated[
-        str | None, Query(max_length=40, description="Only those started before this instant.")
-    ] = None,
+    to: Annotated[str | None, Query(max_length=40, description="Started before this time.")] = None,
     complete: Annotated[
         Literal["true", "false", "lossy"] | None,
-        Query(description="Only those that are complete, may still become so, or never will be."),
+        Query(description="Filter by completeness: complete, pending, or lossy."),
     ] = None,
 ) -> SessionPage:
-    """A page of sessions; those that are asked for fulfil all that is said."""
+    """Return a page of the sessions that pass all filters."""
     choice = Choice(
         nodes=node,
         tags=tag,
@@ -244,8 +244,8 @@ async def list_sessions(
     since_t_ns = choice.from_t_ns or 0
     listed = server.sessions.newest_first(min(ends, default=None))
     recent = takewhile(lambda session: session.started_t_ns >= since_t_ns, listed)
-    of = server.recorder.completeness_of
-    found = (session for session in recent if choice.takes(session, of))
+    get_completeness = server.recorder.completeness_of
+    found = (session for session in recent if choice.takes(session, get_completeness))
     page = list(islice(found, limit))
     more = next(found, None) is not None
     return SessionPage(
@@ -258,11 +258,11 @@ async def list_sessions(
 @router.get(
     "/{session_id}",
     operation_id="getSession",
-    summary="A session",
+    summary="One session",
     responses=_UNKNOWN,
 )
 async def get_session(session_id: str, server: ServerState) -> SessionView:
-    """As it is now."""
+    """Return the present state of a session."""
     return SessionView.of(server.sessions.get(session_id), server.recorder)
 
 
@@ -295,7 +295,10 @@ async def change(
     },
 )
 async def delete(session_id: str, server: ServerState, if_match: IfMatch = None) -> None:
-    """It can be had back until the trash is emptied; its space is free only then."""
+    """Move a session to the trash, where it can be restored.
+
+    Only emptying the trash frees its space.
+    """
     server.recorder.discard(session_id, only_if=tag_of(if_match))
     server.hub.notice({"type": "deleted", "session_id": session_id})
 
@@ -303,12 +306,12 @@ async def delete(session_id: str, server: ServerState, if_match: IfMatch = None)
 @router.post(
     "/{session_id}/events",
     operation_id="markEvent",
-    summary="Mark an event",
+    summary="Add a marker",
     status_code=HTTPStatus.CREATED,
     responses={**_UNKNOWN, **FULL},
 )
 async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventView:
-    """Note that something happened, now or at an instant."""
+    """Add a marker, now or at a given time."""
     event = server.sessions.mark(session_id, body.label, body.t_ns, body.id)
     return EventView.of(event)
 
@@ -316,7 +319,7 @@ async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventVi
 @router.patch(
     "/{session_id}/events/{event_id}",
     operation_id="changeEvent",
-    summary="Rename or move a mark",
+    summary="Rename or move a marker",
     responses={**_NO_EVENT, **CHANGED, **FULL},
 )
 async def change_mark(
@@ -326,7 +329,7 @@ async def change_mark(
     server: ServerState,
     if_match: IfMatch = None,
 ) -> EventView:
-    """Change its label or its instant."""
+    """Change a marker's label or time."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
     only_if = tag_of(if_match)
     return EventView.of(
@@ -337,7 +340,7 @@ async def change_mark(
 @router.delete(
     "/{session_id}/events/{event_id}",
     operation_id="deleteEvent",
-    summary="Remove a mark",
+    summary="Delete a marker",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
     responses={**_NO_EVENT, **CHANGED, **FULL},
@@ -345,22 +348,22 @@ async def change_mark(
 async def remove_mark(
     session_id: str, event_id: str, server: ServerState, if_match: IfMatch = None
 ) -> None:
-    """It is gone for good; the same `id` can be marked again."""
+    """Delete a marker for good; its `id` can be used again."""
     server.sessions.remove_mark(session_id, event_id, only_if=tag_of(if_match))
 
 
 @router.get(
     "/{session_id}/events",
     operation_id="listEvents",
-    summary="Events",
+    summary="Markers",
     response_model=Page[EventView],
     responses={
         200: {
-            "description": "The list, or the stored table.",
+            "description": "List, or the stored table.",
             "content": {PARQUET.media_type: {}},
         },
         **problems(
-            _404="No such session, or its table has been taken away.",
+            _404="No such session, or its table is missing.",
             _409="The table is written when the session is sealed.",
         ),
     },
@@ -370,7 +373,7 @@ async def events(
     server: ServerState,
     format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
 ) -> Page[EventView] | Response:
-    """In order of time; `format=parquet` is `events.parquet`, as it lies beside the frames."""
+    """Return markers in order of time; `format=parquet` is the stored `events.parquet`."""
     session = server.sessions.get(session_id)
     if format == "parquet":
         return stored_table(session, server.sessions.folder.path(session_id) / EVENTS_NAME)
@@ -380,7 +383,7 @@ async def events(
 
 @router.get("/{session_id}/ledger", operation_id="getLedger", summary="Ledger", responses=_UNKNOWN)
 async def ledger(session_id: str, server: ServerState) -> Ledger:
-    """What became of every frame: recorded, lost for a reason, or still with the node."""
+    """Return the fate of every frame: recorded, lost for a reason, or still with the node."""
     return server.recorder.ledger(session_id)
 
 

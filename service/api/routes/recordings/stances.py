@@ -1,4 +1,4 @@
-"""Stances of a sealed session: when the foot stood, and how hard."""
+"""Routes of a sealed session's stances: list, and overlay."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from storage.sessions.folder import Session
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 _ONE_AT_A_TIME = CapacityLimiter(1)
-"""An overlay reads every frame under load: of several that are asked for one after the other is."""
+"""One thread: an overlay reads every loaded frame."""
 _DIGITS = 6
-"""Of SI units: micrometres and micronewtons."""
+"""Decimal places in SI units: micrometres and micronewtons."""
 
 
 class StanceView(BaseModel):
-    """One stance (docs/formats.md); what is not known is null."""
+    """Stance (docs/formats.md); unknown values are null."""
 
     number: int
     part: int
@@ -65,7 +65,7 @@ class StanceView(BaseModel):
     summary="Stances",
     response_model=list[StanceView],
     responses={
-        200: {"description": "All stances, in their order.", "content": {ARROW_STREAM: {}}},
+        200: {"description": "All stances, in order of time.", "content": {ARROW_STREAM: {}}},
         **problems(
             _404="No such session, nothing was recorded, or it has no estimates.",
             _409="Stances are counted when the session is sealed.",
@@ -77,9 +77,9 @@ async def stances(
     server: ServerState,
     accept: Annotated[str, Header(description="The Arrow media type for an Arrow stream.")] = "",
 ) -> Response | list[dict[str, Any]]:
-    """Stances as JSON, or as an Arrow stream if `Accept` names its media type.
+    """Return stances as JSON, or as an Arrow stream if `Accept` names its media type.
 
-    Of a session that was sealed before there were any they are made from its frames.
+    For sessions of versions without stances they are computed from the frames.
     """
     session = _sealed(session_id, server)
     folder = server.sessions.folder.path(session_id)
@@ -91,32 +91,30 @@ async def stances(
 
 
 class OverlayQuery(BaseModel):
-    """How finely, and how many one by one."""
+    """Resolution, and number of single curves."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     points: Annotated[int, Field(ge=2, le=1001)] = Field(
-        default=101, description="Percentages from 0 to 100, both included."
+        default=101, description="Number of percentages from 0 to 100, both included."
     )
     curves: Annotated[int, Field(ge=0, le=1000)] = Field(
         default=60,
-        description="Stances one by one at the most: if there are more, so many of them, evenly "
-        "over the session. Mean and spread are of all.",
+        description="Limit of single curves, evenly spread over the session. Mean and spread are "
+        "over all stances.",
     )
 
 
 class SpreadView(BaseModel):
-    """One quantity at every percentage; what is not known is null."""
+    """Mean and spread of one quantity at every percentage; unknown values are null."""
 
     mean: list[float | None]
-    sd: list[float | None] = Field(
-        description="Standard deviation over stances, their number less one."
-    )
-    count: list[int] = Field(description="Stances in which it is known there.")
+    sd: list[float | None] = Field(description="Standard deviation over stances, with n - 1.")
+    count: list[int] = Field(description="Number of stances with a value.")
 
 
 class CurveView(BaseModel):
-    """One stance at every percentage; what is not known is null."""
+    """Curve of one stance at every percentage; unknown values are null."""
 
     number: int
     grf_n: list[float | None]
@@ -125,27 +123,30 @@ class CurveView(BaseModel):
 
 
 class OverlayView(BaseModel):
-    """Stances one upon another, from 0 to 100 % of their duration."""
+    """Overlay of stances, from 0 to 100 % of their duration."""
 
     session_id: str
     points: int
-    whole: int = Field(description="Stances that can be overlaid.")
+    whole: int = Field(description="Number of stances that can be overlaid.")
     overlaid: int = Field(
-        description="Of so many are mean and spread: of all, or 4000 evenly over the session."
+        description="Number of stances in mean and spread: all, or 4000 evenly spread over the "
+        "session."
     )
-    not_whole: int = Field(description="Left out, since they were not seen whole.")
-    too_short: int = Field(description="Left out, since they are a single frame.")
-    spread: dict[str, SpreadView] = Field(description="Of grf_n, cop_x_m and cop_y_m.")
+    not_whole: int = Field(description="Number of stances left out as incomplete.")
+    too_short: int = Field(description="Number of stances left out as a single frame.")
+    spread: dict[str, SpreadView] = Field(
+        description="Mean and spread of `grf_n`, `cop_x_m` and `cop_y_m`."
+    )
     curves: list[CurveView]
 
 
 @router.get(
     "/{session_id}/stances/overlay",
     operation_id="getStancesOverlay",
-    summary="Stances one upon another",
+    summary="Overlay of stances",
     response_model=OverlayView,
     responses={
-        304: {"description": "It is what If-None-Match names."},
+        304: {"description": "Unchanged."},
         **problems(
             _404="No such session, nothing was recorded, or it has no estimates.",
             _409="Stances are counted when the session is sealed.",
@@ -157,16 +158,18 @@ async def stances_overlay(
     query: Annotated[OverlayQuery, Query()],
     request: Request,
     server: ServerState,
-    accept_encoding: Annotated[str, Header(description="It goes as gzip to who takes that.")] = "",
+    accept_encoding: Annotated[
+        str, Header(description="With gzip, the answer is compressed.")
+    ] = "",
 ) -> Response:
-    """GRF and COP of the whole stances, normalised to 0 to 100 % of their duration.
+    """Return GRF and COP of the whole stances, normalised to 0 to 100 % of their duration.
 
-    Between two frames they are on the straight line between them.
+    Values between two frames are interpolated linearly.
     """
     session = _sealed(session_id, server)
     as_gzip = takes_gzip(accept_encoding)
-    asked = f"{session.sha256}|{query.model_dump_json()}|{as_gzip}|{SOFTWARE}"
-    tag = hashlib.sha256(asked.encode()).hexdigest()
+    etag_input = f"{session.sha256}|{query.model_dump_json()}|{as_gzip}|{SOFTWARE}"
+    tag = hashlib.sha256(etag_input.encode()).hexdigest()
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
     if has_it(request, tag):
         return Response(status_code=304, headers=headers)
@@ -182,7 +185,7 @@ def _sealed(session_id: str, server: Server) -> Session:
     session = server.sessions.get(session_id)
     if session.state != "sealed":
         raise StateError(
-            f"session {session_id} is {session.state}, and its stances are counted when it is "
+            f"session {session_id} is {session.state}, and its stances are available when it is "
             "sealed",
             remedy="Stop it",
         )

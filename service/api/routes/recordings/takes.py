@@ -1,4 +1,4 @@
-"""Several nodes at once: recorded, marked and stopped together, one session each."""
+"""Routes of takes: several nodes recorded, marked and stopped together."""
 
 from __future__ import annotations
 
@@ -18,32 +18,34 @@ from service.server.takes import Take
 
 router = APIRouter(prefix="/takes", tags=["takes"])
 
-_UNKNOWN = problems(_404="There is no session of this take.")
+_UNKNOWN = problems(_404="No such take.")
 _FAILED = problems(_409="It failed on every node.")
-_OVER = problems(_409="None of its sessions is being recorded, or it failed on every node.")
+_OVER = problems(_409="No session is being recorded, or it failed on every node.")
 
 
 class StartTake(one.Describe):
-    """What to record."""
+    """Request to record several nodes."""
 
     nodes: Annotated[tuple[str, ...], Field(min_length=1, max_length=1000)] | None = Field(
-        default=None, description="Left out: all that are connected.", examples=[["left", "right"]]
+        default=None, description="Default: all connected nodes.", examples=[["left", "right"]]
     )
 
 
 class TakeView(View):
-    """A take, or what came of what was asked of all of it."""
+    """Take, or the result of a command on all of its sessions."""
 
     id: str = Field(examples=["1a2b3c4d5e6f"])
-    sessions: list[SessionView] = Field(description="Where it was done; of a take, all it has.")
+    sessions: list[SessionView] = Field(
+        description="Sessions on which the command succeeded; for a take, all."
+    )
     failed: dict[str, ShownText] = Field(
-        description="By node, why it was not done there. The others do not wait for that.",
-        examples=[{"left": "node 'left' is not sending. Record when it is connected"}],
+        description="Errors by node; the other nodes are not affected.",
+        examples=[{"left": "node 'left' sends no frames. Connect it and retry"}],
     )
 
     @classmethod
     def of(cls, take: Take, server: Server) -> TakeView:
-        """As it is now."""
+        """Return the present state of a take."""
         views = [SessionView.of(session, server.recorder) for session in take.sessions]
         return cls(id=take.id, sessions=views, failed=take.failed)
 
@@ -54,17 +56,17 @@ class TakeView(View):
     summary="Record several nodes together",
     status_code=HTTPStatus.CREATED,
     responses=problems(
-        _409="It can be recorded on no node; or what this request began is in the trash.",
-        _422="Not as described, or the Idempotency-Key came with another request.",
+        _409="No node can be recorded; or a session of this key is in the trash.",
+        _422="Invalid body, or the Idempotency-Key came with another request.",
     ),
 )
 async def start(
     body: StartTake, server: ServerState, response: Response, idempotency_key: IdempotencyKey = None
 ) -> TakeView:
-    """One session a node, with one name and one `take`.
+    """Start one session per node, with one name and one `take`.
 
-    A node that cannot be recorded is in `failed` with the reason, and the others are recorded. The
-    same request with the same key begins none of them later.
+    A node that cannot be recorded is in `failed` with the reason; the others are recorded. A
+    repeated request with the same key starts no session later.
     """
     take = server.takes.start(
         body.name,
@@ -80,9 +82,9 @@ async def start(
     return TakeView.of(take, server)
 
 
-@router.get("/{take_id}", operation_id="getTake", summary="A take", responses=_UNKNOWN)
+@router.get("/{take_id}", operation_id="getTake", summary="One take", responses=_UNKNOWN)
 async def get_take(take_id: str, server: ServerState) -> TakeView:
-    """Its sessions as they are now, but for those in the trash."""
+    """Return the present sessions of a take, without those in the trash."""
     return TakeView.of(server.takes.get(take_id), server)
 
 
@@ -93,17 +95,17 @@ async def get_take(take_id: str, server: ServerState) -> TakeView:
     responses={**_UNKNOWN, **_FAILED},
 )
 async def stop(take_id: str, server: ServerState) -> TakeView:
-    """End those of its sessions that are being recorded, as each is stopped by itself.
+    """Stop all sessions of a take that are being recorded.
 
-    Those that were stopped before stay as they are, and are in the answer, too.
+    Stopped ones are unchanged, and are in the answer, too.
     """
     take = server.takes.stop(take_id)
     _tell_nodes(server, take)
-    there = [node.name for node in server.nodes if node.connected]
+    connected = [node.name for node in server.nodes if node.connected]
     settled = [
         server.settling.settled(session.id, one.SETTLE_S)
         for session in take.sessions
-        if session.node in there
+        if session.node in connected
     ]
     await asyncio.gather(*settled)
     now = [server.sessions.get(session.id) for session in take.sessions]
@@ -113,12 +115,12 @@ async def stop(take_id: str, server: ServerState) -> TakeView:
 @router.post(
     "/{take_id}/events",
     operation_id="markTake",
-    summary="Mark an event in all of a take",
+    summary="Add a marker to all of a take",
     status_code=HTTPStatus.CREATED,
     responses={**_UNKNOWN, **_OVER},
 )
 async def mark(take_id: str, body: one.MarkEvent, server: ServerState) -> TakeView:
-    """In all of its sessions that are being recorded, at one instant and with one id."""
+    """Add a marker at one time and with one id to all sessions that are being recorded."""
     return TakeView.of(server.takes.mark(take_id, body.label, body.t_ns, body.id), server)
 
 

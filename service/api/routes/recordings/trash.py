@@ -1,4 +1,4 @@
-"""Sessions that were deleted."""
+"""Routes of the trash."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ router = APIRouter(prefix="/trash", tags=["trash"])
 
 
 class Emptied(View):
-    """What was deleted for good."""
+    """Result of emptying the trash."""
 
     sessions: int
-    bytes: int = Field(description="Of all their files.")
+    bytes: int = Field(description="Size of all their files.")
 
 
 @router.get("", operation_id="listTrash", summary="Deleted sessions, newest first")
 async def list_trash(server: ServerState) -> Page[SessionView]:
-    """Each can be had back."""
+    """Return deleted sessions, newest first; each can be restored."""
     deleted = server.sessions.trash.all()
     return Page(items=[SessionView.of(session, server.recorder) for session in deleted])
 
@@ -28,21 +28,21 @@ async def list_trash(server: ServerState) -> Page[SessionView]:
 @router.post(
     "/{session_id}/restore",
     operation_id="restoreSession",
-    summary="Have a session back",
+    summary="Restore a session",
     responses=problems(_404="No such session in the trash.", _507="The disk is full."),
 )
 async def restore(session_id: str, server: ServerState) -> SessionView:
-    """It is as it was; if it was pending, it completes when its node has returned."""
+    """Restore a session; a pending one completes when its node is back."""
     return SessionView.of(server.recorder.restore(session_id), server.recorder)
 
 
 @router.delete(
     "",
     operation_id="emptyTrash",
-    summary="Delete them for good",
+    summary="Empty the trash",
     responses=problems(_507="The data folder cannot be written."),
 )
 async def empty(server: ServerState) -> Emptied:
-    """Nothing brings them back."""
+    """Delete all sessions in the trash for good."""
     sessions, size_bytes = await server.empty_trash()
     return Emptied(sessions=sessions, bytes=size_bytes)

@@ -1,4 +1,4 @@
-"""What a sealed session's files prove of themselves, read again on the server."""
+"""Route that verifies the files of a sealed session."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from storage.verify.session import verify_session
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 _ONE_AT_A_TIME = CapacityLimiter(1)
-"""It reads every frame: of several that are asked for one after the other is."""
+"""One thread: verification reads every frame."""
 
 
 class VerificationView(Ledger):
-    """What `foottile verify --json` says: the ledger, and what was found."""
+    """Result of `foottile verify --json`: the ledger, and the problems found."""
 
     id: str | None
-    problems: list[ShownText] = Field(description="What is wrong; none: it is whole.")
+    problems: list[ShownText] = Field(description="Problems found; none: the files are intact.")
     sha256: str | None = Field(
-        description="Of the file of frames as it is now; null: there is none."
+        description="Present hash of the file of frames; null: there is none."
     )
-    unproven: list[str] = Field(description="What these files cannot show.")
+    unproven: list[str] = Field(description="Facts that these files cannot prove.")
 
 
 @router.get(
     "/{session_id}/verification",
     operation_id="getVerification",
-    summary="Is it what was sealed?",
+    summary="Verify files",
     response_model=VerificationView,
     responses=problems(
         _404="No such session.",
-        _409="It is not sealed yet: nothing of it is final.",
+        _409="The session is not sealed.",
     ),
 )
 async def verification(session_id: str, server: ServerState) -> dict[str, Any]:
-    """Read all files of a sealed session, and hold them against one another and their hashes.
+    """Read all files of a sealed session, and compare them with one another and their hashes.
 
-    What is found wrong is in `problems`, and changes nothing. It takes about a second for a
-    million frames, and one is read at a time. Whether the server itself is to be trusted it
-    cannot show: `foottile pull` and `foottile verify` do the same on another machine.
+    Errors are in `problems`; no file is changed. A million frames take about a second; requests run
+    one after the other. This proves nothing about the server itself: `foottile pull` and `foottile
+    verify` do the same on another machine.
     """
     session = server.sessions.get(session_id)
     if session.state != "sealed":

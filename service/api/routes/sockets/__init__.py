@@ -1,1 +1,1 @@
-"""What stays open: nodes that bring frames, screens and programs that take them."""
+"""Websockets: ingest from nodes, live data for pages and programs."""

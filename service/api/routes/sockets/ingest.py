@@ -1,4 +1,4 @@
-"""The server's end of the link: takes in what a node sends, and hangs up with a reason."""
+"""Server's end of the link to a node: receives its messages, and closes with a reason."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _Message = TypeVar("_Message", Identify, Proof, Hello)
 
 
 async def ingest(socket: WebSocket, server: Server) -> None:
-    """Serve one node's connection until it ends; whatever is said on it, nothing else ends."""
+    """Serve one node's connection until it ends; an error ends only this connection."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
     try:
@@ -63,15 +63,15 @@ async def ingest(socket: WebSocket, server: Server) -> None:
             await _serve(socket, server, link)
     except HangUp as end:
         await _close(socket, end)
-    except WebSocketDisconnect:  # it went away, perhaps while we were sending
+    except WebSocketDisconnect:  # it disconnected, perhaps while we were sending
         pass
     except Exception:
         log.exception("this is a bug; a node's connection ends, the server goes on")
-        await _close(socket, HangUp(Close.BUG, "the server has a bug; its log says which"))
+        await _close(socket, HangUp(Close.BUG, "bug in the server; see its log"))
 
 
 async def _challenge(socket: WebSocket, server: Server, offered: list[str]) -> Claim:
-    """Ask the machine that connects for a proof that it is the node that it names."""
+    """Request a proof that the connecting machine is the node that it names."""
     if SUBPROTOCOL not in offered:
         raise HangUp(
             Close.WRONG_VERSION,
@@ -79,7 +79,7 @@ async def _challenge(socket: WebSocket, server: Server, offered: list[str]) -> C
         )
     first = await _receive(socket)
     if (protocol := _protocol_of(first)) is not None and protocol != PROTOCOL:
-        # Before it is read: another version's first message has other fields.
+        # Before parsing: another version's first message has other fields.
         raise HangUp(
             Close.WRONG_VERSION,
             f"protocol {protocol}; this server speaks {PROTOCOL}: update the "
@@ -103,7 +103,7 @@ async def _receive_hello(socket: WebSocket, claim: Claim) -> Hello:
     if hello.array_info.node != claim.node:
         raise HangUp(
             Close.REFUSED,
-            f"node {claim.node!r} says hello as {hello.array_info.node[:80]!r}",
+            f"node {claim.node!r} sends hello as {hello.array_info.node[:80]!r}",
         )
     return hello
 
@@ -112,10 +112,10 @@ def _expect(kind: type[_Message], message: str | bytes) -> _Message:
     name = kind.model_fields["type"].default
     if isinstance(message, bytes):
         raise HangUp(Close.REFUSED, f"{name} was expected, in text")
-    said = _parse(message)
-    if not isinstance(said, kind):
-        raise HangUp(Close.REFUSED, f"{name} was expected, not {said.type}")
-    return said
+    parsed = _parse(message)
+    if not isinstance(parsed, kind):
+        raise HangUp(Close.REFUSED, f"{name} was expected, not {parsed.type}")
+    return parsed
 
 
 def _is_proven(server: Server, claim: Claim) -> bool:
@@ -125,7 +125,7 @@ def _is_proven(server: Server, claim: Claim) -> bool:
             return server.identities.is_proven(claim, utc_ns())
     except HangUp:
         asking, node = server.identities.replacements.get(claim.node), server.nodes.find(claim.node)
-        # It asks again and again: screens are told of each machine once.
+        # A refused machine retries for ever: notify subscribers once per machine.
         is_new = asking is not None and (before is None or before.secret != asking.secret)
         if node is not None and is_new:
             server.tell_node(node)
@@ -142,15 +142,15 @@ def _try_later() -> Iterator[None]:
 
 @contextmanager
 def _joined(server: Server, hello: Hello, claim: Claim) -> Iterator[Link]:
-    """A node's place among those that are connected, for as long as it is."""
+    """Context manager: register a node's connection while the block runs."""
     name, boot_id = hello.array_info.node, hello.array_info.boot_id
     is_proven = _is_proven(server, claim)
     other = server.links.get(name)
     if other is not None:
-        # A node that was switched off and on again knows the stream it had before. The ids of
-        # streams are public, so without a secret they prove nothing.
-        known = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
-        if not is_proven or other.node.boot_id not in known:
+        # A node that was restarted lists the stream it had before. The ids of streams are
+        # public, so without a secret they prove nothing.
+        known_ids = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
+        if not is_proven or other.node.boot_id not in known_ids:
             raise HangUp(
                 Close.NAME_TAKEN,
                 f"a node {name!r} is connected already; give this one another name (--name)",
@@ -214,8 +214,8 @@ async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
 async def _take(socket: WebSocket, server: Server, link: Link) -> None:
     node = link.node
     while True:
-        # What has come already is given without waiting: a node that brings home what it took on
-        # its way, or talks without end, would have all others wait until the last of it is done.
+        # Received messages are returned without waiting: without this line a node with a long
+        # backlog would block all others.
         await asyncio.sleep(0)
         message = await _receive(socket)
         if isinstance(message, bytes):
@@ -226,25 +226,26 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
                 raise HangUp(Close.REFUSED, str(error)) from error
             server.hub.publish(node, due)
             server.frames.publish(node, due)
+            server.weighings.push(node, due)
             if node.estimates.live.tare is not tare_before:
                 server.tell_node(node)
             continue
-        said = _parse(message)
-        match said:
+        parsed = _parse(message)
+        match parsed:
             case Probe(id=number):
                 await _answer(socket, Probe(id=number, server_t_ns=utc_ns()))
             case FramesOf(boot_id=boot_id):
                 link.stream = _announced(node, boot_id)
             case ClockRow():
-                server.recorder.note_clock(node, said, utc_ns())
+                server.recorder.note_clock(node, parsed, utc_ns())
             case Status():
-                node.present.missed_slots = said.missed_slots
-                node.troubles, node.fault_counts = said.troubles, said.counts
+                node.present.missed_slots = parsed.missed_slots
+                node.troubles, node.fault_counts = parsed.troubles, parsed.counts
                 server.tell_node(node)
             case Lost():
-                _announced(node, said.boot_id).note_losses(said.lost)
+                _announced(node, parsed.boot_id).note_losses(parsed.lost)
             case Identify() | Proof() | Hello():
-                raise HangUp(Close.REFUSED, f"{said.type} was said before")
+                raise HangUp(Close.REFUSED, f"{parsed.type} was sent before")
 
 
 def _announced(node: ServerNode, boot_id: str) -> ServerStream:
@@ -257,16 +258,16 @@ async def _answer(socket: WebSocket, probe: Probe) -> None:
     try:
         async with asyncio.timeout(SILENCE_S):
             await send(socket, say(probe))
-    except TimeoutError as error:  # else nobody would notice that nothing is heard either
+    except TimeoutError as error:  # else the silence of the node would go unnoticed
         raise HangUp(Close.SILENT, f"nothing was read for {SILENCE_S:g} s") from error
 
 
 async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
-    """Tell the node what is on the disk, and what sessions need whenever that changes."""
+    """Send acknowledgements, and the retention request whenever it changes."""
     while True:
         await link.news.wait()
         link.news.clear()
-        # What the node must keep goes first: it may forget frames once they are acknowledged.
+        # The retention request goes first: a node may drop frames once they are acknowledged.
         wanted = server.recorder.wanted(link.node.name)
         if wanted != link.wanted:
             link.wanted = wanted
@@ -282,7 +283,7 @@ async def _receive(socket: WebSocket) -> str | bytes:
         async with asyncio.timeout(SILENCE_S):
             message = await socket.receive()
     except TimeoutError as error:
-        raise HangUp(Close.SILENT, f"nothing was heard for {SILENCE_S:g} s") from error
+        raise HangUp(Close.SILENT, f"nothing was received for {SILENCE_S:g} s") from error
     if message["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(message.get("code", 1005))
     data: str | bytes | None = message.get("bytes")
@@ -312,21 +313,21 @@ def _frames(message: bytes) -> bytes:
 
 
 def _protocol_of(message: str | bytes) -> int | None:
-    """Return the protocol of a first message, whatever else it holds; None without one."""
+    """Return the protocol of a first message, whatever else it has; None without one."""
     try:
-        said = json.loads(message) if isinstance(message, str) else None
+        content = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):
         return None
     # Until protocol 2 the first message was hello.
-    if not isinstance(said, dict) or said.get("type") not in ("identify", "hello"):
+    if not isinstance(content, dict) or content.get("type") not in ("identify", "hello"):
         return None
-    protocol = said.get("protocol")
+    protocol = content.get("protocol")
     return protocol if isinstance(protocol, int) else None
 
 
 async def _close(socket: WebSocket, end: HangUp) -> None:
     reason = close_reason(end.reason)
-    log.warning("link closed: %s", printable(end.reason))  # with paths as they are here
+    log.warning("link closed: %s", printable(end.reason))  # with local paths
     if socket.application_state is not WebSocketState.DISCONNECTED:
         with suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(end.code, reason)

@@ -1,4 +1,4 @@
-"""The live websocket: for screens, and for programs that take every frame."""
+"""Live websocket: summaries for the page, every frame for programs."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from service.version import SOFTWARE
 log = logging.getLogger("foottile.live")
 
 PROTOCOL = 1
-"""Of this socket; the nodes' link counts its own."""
+"""Version of this socket's messages; the nodes' link has another one."""
 RATE_HZ = 30.0
 _PARAMETERS = {"node", "rate_hz", "format", "policy"}
 _TEXT_MAX = 1000
 
 
 async def live(socket: WebSocket, server: Server) -> None:
-    """Serve one screen, or one program, until it leaves."""
+    """Serve one page, or one program, until it disconnects."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
     outlet: Connection = socket.scope["extensions"][OUTLET]["outlet"]
@@ -44,7 +44,7 @@ async def live(socket: WebSocket, server: Server) -> None:
             await _show(socket, server, outlet)
     except HangUp as end:
         outlet.hang_up(end.code, close_reason(end.reason))
-    except WebSocketDisconnect:  # it went away, perhaps while we were sending
+    except WebSocketDisconnect:  # it disconnected, perhaps while we were sending
         pass
     except Exception:
         log.exception("this is a bug; one live connection ends, the server goes on")
@@ -61,7 +61,7 @@ async def _show(socket: WebSocket, server: Server, outlet: Connection) -> None:
 
 
 async def _first_of(*ends: Awaitable[None]) -> None:
-    """Wait for the first of these, which ends the others, and give its result."""
+    """Run until the first of these ends, cancel the others, and return its result."""
     tasks = [asyncio.ensure_future(end) for end in ends]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -75,21 +75,21 @@ async def _first_of(*ends: Awaitable[None]) -> None:
 
 
 def _query(socket: WebSocket, server: Server) -> tuple[str | None, float]:
-    given = socket.query_params
-    if unknown := set(given) - _PARAMETERS:
+    parameters = socket.query_params
+    if unknown := set(parameters) - _PARAMETERS:
         raise HangUp(Close.POLICY, f"unknown parameter {sorted(unknown)[0]!r}")
-    if (form := given.get("format", "json")) != "json":
+    if (form := parameters.get("format", "json")) != "json":
         raise HangUp(Close.POLICY, f"format={form[:40]!r} is not offered; 'json' and 'arrow' are")
-    if (policy := given.get("policy", "latest")) != "latest":
+    if (policy := parameters.get("policy", "latest")) != "latest":
         what = f"policy={policy[:40]!r} is not offered in JSON; 'latest' is, and with format=arrow"
         raise HangUp(Close.POLICY, what + " all are")
     try:
-        rate_hz = float(given.get("rate_hz", RATE_HZ))
+        rate_hz = float(parameters.get("rate_hz", RATE_HZ))
     except ValueError:
         rate_hz = float("nan")
     if not RATES_HZ[0] <= rate_hz <= RATES_HZ[-1]:
         raise HangUp(Close.POLICY, f"rate_hz has to be {RATES_HZ[0]:g} to {RATES_HZ[-1]:g}")
-    node = given.get("node")
+    node = parameters.get("node")
     if node is not None and all(known.name != node for known in server.nodes):
         raise HangUp(Close.POLICY, f"no node {node[:60]!r}")
     return node, rate_hz
@@ -122,13 +122,13 @@ async def _read(socket: WebSocket) -> None:
         if message["type"] == "websocket.disconnect":
             return
         text = message.get("text")
-        said = None
+        content = None
         if text is not None and len(text) <= _TEXT_MAX:
             with suppress(ValueError, RecursionError):
-                said = json.loads(text)
-        if not isinstance(said, dict) or said.get("type") != "ping":
-            raise HangUp(Close.POLICY, 'only {"type":"ping","t_ms":NUMBER} is understood here')
-        t_ms = said.get("t_ms")
+                content = json.loads(text)
+        if not isinstance(content, dict) or content.get("type") != "ping":
+            raise HangUp(Close.POLICY, 'only {"type":"ping","t_ms":NUMBER} is accepted here')
+        t_ms = content.get("t_ms")
         if isinstance(t_ms, bool) or not isinstance(t_ms, int | float) or not abs(t_ms) < 1e18:
             raise HangUp(Close.POLICY, "ping needs t_ms, a number")
         await send(socket, dumps({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()}))

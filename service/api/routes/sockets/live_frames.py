@@ -1,4 +1,4 @@
-"""The live websocket for programs: every frame of a node with its estimates, as Arrow."""
+"""Live websocket for programs: every frame of a node with its estimates, as Arrow."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ from service.version import SOFTWARE
 
 PARAMETERS = {"node", "format", "policy", "boot_id", "from_seq", "columns"}
 PROTOCOL = 1
-"""Of these messages."""
+"""Version of these messages."""
 _BOOT_ID = re.compile(r"[0-9a-f]{32}")
 _SEQ = re.compile(r"[0-9]{1,15}")
 
 
 class LiveFrames:
-    """What one connection has asked for.
+    """One connection of the live feed.
 
     Args:
-        socket: the connection.
-        server: of the nodes.
+        socket: websocket of the client.
+        server: server of the nodes.
 
     Raises:
-        HangUp: the query is none, or asks for what is not there.
+        HangUp: the query is invalid, or its stream or columns do not exist.
     """
 
     def __init__(self, socket: WebSocket, server: Server) -> None:
-        given = socket.query_params
-        if unknown := set(given) - PARAMETERS:
+        parameters = socket.query_params
+        if unknown := set(parameters) - PARAMETERS:
             raise HangUp(Close.POLICY, f"unknown parameter {sorted(unknown)[0][:60]!r}")
         self._socket = socket
-        self._node = _node(server, given.get("node"))
-        self._policy = _policy(given.get("policy", "lossless"))
-        names = [name.strip() for name in given.get("columns", "").split(",")]
+        self._node = _node(server, parameters.get("node"))
+        self._policy = _policy(parameters.get("policy", "lossless"))
+        names = [name.strip() for name in parameters.get("columns", "").split(",")]
         self._columns = tuple(name for name in names if name)
         try:
             check_columns(self._node.info, self._columns)
@@ -54,8 +54,8 @@ class LiveFrames:
             raise HangUp(Close.POLICY, error.what) from error
         position = first_position(
             self._node,
-            _matching(given.get("boot_id"), _BOOT_ID, "boot_id", "32 hex digits"),
-            _number(given.get("from_seq")),
+            _matching(parameters.get("boot_id"), _BOOT_ID, "boot_id", "32 hex digits"),
+            _number(parameters.get("from_seq")),
         )
         node, self._memory = self._node, server.frames.of(self._node.name)
         self._reader = Reader(
@@ -68,14 +68,14 @@ class LiveFrames:
         )
         self._encoder: Encoder | None = None
         self._at = position
-        """The first frame that was not sent."""
+        """First frame that was not sent."""
 
     async def run(self) -> None:
         """Send frames until the connection ends.
 
         Raises:
-            HangUp: it cannot go on; the reason says from where to resume.
-            WebSocketDisconnect: it has gone.
+            HangUp: it cannot go on; the reason has the position to resume from.
+            WebSocketDisconnect: the client has disconnected.
         """
         hello = {
             "type": "hello",
@@ -104,8 +104,8 @@ class LiveFrames:
                 await self._send(self._encoder.header())
             case Missing(boot_id=boot_id, from_seq=first, to_seq=last, reason=reason):
                 kind = "lost" if self._policy == "lossless" else "dropped"
-                said = {"boot_id": boot_id, "from_seq": first, "to_seq": last, "reason": reason}
-                await self._send(dumps({"type": kind, **said}))
+                fields = {"boot_id": boot_id, "from_seq": first, "to_seq": last, "reason": reason}
+                await self._send(dumps({"type": kind, **fields}))
                 self._at = Position(boot_id, last + 1)
             case _:
                 assert self._encoder is not None  # noqa: S101  # a stream has begun before
@@ -114,10 +114,10 @@ class LiveFrames:
                     self._at = Position(item.boot_id, following)
 
     async def _send(self, message: str | bytes) -> None:
-        """Send one message, and wait until there is room for the next.
+        """Send one message, once there is room for it.
 
         Raises:
-            HangUp: nothing was read for too long.
+            HangUp: the client has read nothing for too long.
         """
         try:
             async with asyncio.timeout(TOO_SLOW_S):
@@ -128,11 +128,11 @@ class LiveFrames:
 
 
 def _node(server: Server, name: str | None) -> ServerNode:
-    known = list(server.nodes)
+    all_nodes = list(server.nodes)
     if name is None:
-        if len(known) == 1:
-            return known[0]
-        names = ", ".join(node.name for node in known)
+        if len(all_nodes) == 1:
+            return all_nodes[0]
+        names = ", ".join(node.name for node in all_nodes)
         raise HangUp(Close.POLICY, f"node= is missing; nodes: {names or 'none so far'}"[:120])
     found = server.nodes.find(name)
     if found is None:

@@ -1,1 +1,1 @@
-"""What a bench recording says before and beside the fit: strokes, loadings, checks. No fit here."""
+"""Rig recordings before a fit: strokes, loadings, checks."""

@@ -1,7 +1,7 @@
-"""When a recording is no basis for a calibration: each refusal says why, and what to do.
+"""Checks of a recording before its calibration; each error has a reason and a remedy.
 
-Limits are stated here and in docs/method.md. They are wide: what is refused is not a poor tile but
-one whose curve would be wrong.
+Limits are stated here and in docs/method.md. They are wide: they reject wrong curves, not poor
+tiles.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from service.estimation.fitting.bench.settling import settling
 
 LOADED_N = 1.0  # less is as good as no load on a tile of 30 N
 LOADED_KPA = 3.0
-"""A fifth of what the chip has above a seal at 100 kPa, and 24 counts: less bears no cubic."""
+"""Least range for a cubic: a fifth of the chip's range above a seal at 100 kPa, or 24 counts."""
 REPEATS_MIN = 2  # one has to be predicted from the others
 R2_MIN = 0.9
 """The paper has 0.9999 for the mean of four; four loadings with its scatter of 0.03 have 0.97 to
@@ -34,20 +34,20 @@ GAIN_OFF_MAX = 0.3
 """The paper's scatter between loadings is 0.03 of the output, some 0.05 of the force where the
 curve is steep: six times that."""
 DRIFT_MAX_KPA = 0.4
-"""From the second repeat on, when the rubber is as crept as it will be: some 0.8 N."""
+"""Largest drift from the second repeat on, when creep is complete: some 0.8 N."""
 SETTLING_MAX_KPA = 1.0
-"""From the first repeat, before which nothing had pressed. More of both is no drift if it is seen
-to go back as creep does."""
+"""Largest drift from the first repeat, before which the dome was unloaded. Larger drifts pass if
+they recover as creep does."""
 _FLAT_PART = 0.01
-"""What stands still changes by less than this part of its range ..."""
+"""Change of a saturated signal, at most this part of its range ..."""
 _MOVING_PART = 0.15
-"""... while the other one changes by more than this part of its own."""
+"""... while the other signal changes by more than this part of its range."""
 _FLAT_NOISE = 0.6  # of the noise of a reading: block means scatter by less
 _RAIL_READINGS = 5  # fewer may be missing by chance
 
 
 def refuse_unloaded(blocks: Strokes, where: str) -> None:
-    """No load, a load of the wrong sign, too small a range, or a single repeat.
+    """Reject no load, a load of the wrong sign, too small a range, or a single repeat.
 
     Raises:
         CalibrationError: one of these.
@@ -88,7 +88,7 @@ def refuse_unloaded(blocks: Strokes, where: str) -> None:
 
 
 def refuse_saturated_reference(recordings: Sequence[Indentation], blocks: Strokes) -> None:
-    """The reference sensor was at its end while the tile was pressed further.
+    """Reject a reference sensor that saturates before the tile.
 
     Raises:
         CalibrationError: its readings stand still, or are missing, where pressure is highest.
@@ -129,7 +129,7 @@ def refuse_saturated_reference(recordings: Sequence[Indentation], blocks: Stroke
 def before_saturation(
     recordings: Sequence[Indentation], blocks: Strokes, noise_kpa: float
 ) -> tuple[Strokes, bool]:
-    """The blocks before the chip's reading goes no further, and whether it came to that."""
+    """Return the blocks before the chip saturates, and whether it does."""
     wrapped = any(
         bool(np.isinf(recording.kpa[begin:end]).any())
         for recording in recordings
@@ -151,10 +151,10 @@ def before_saturation(
 
 
 def baseline_drift_kpa(recordings: Sequence[Indentation]) -> float:
-    """Greatest change of the unloaded pressure between repeats of a file, from the second on.
+    """Compute the largest change of the unloaded pressure between repeats, from the second on.
 
     Raises:
-        CalibrationError: it, or the change from the first repeat, is too large, and more of it than
+        CalibrationError: it, or the change from the first repeat, is larger than the limit and than
             creep explains.
     """
     drift_kpa = 0.0
@@ -172,10 +172,10 @@ def baseline_drift_kpa(recordings: Sequence[Indentation]) -> float:
 
 
 def _refuse_unsettled(recording: Indentation, all_kpa: Floats, change_kpa: float) -> None:
-    """A drift that the recording does not show to be creep.
+    """Reject a drift that does not recover as creep does.
 
     Raises:
-        CalibrationError: it does not.
+        CalibrationError: it does not recover.
     """
     settled = settling(recording)
     left = ""
@@ -197,14 +197,14 @@ def _refuse_unsettled(recording: Indentation, all_kpa: Floats, change_kpa: float
 
 
 def refuse_contradictions(gains: Floats, where: str) -> None:
-    """Repeats that do not show the same tile.
+    """Reject repeats that contradict one another.
 
     Args:
-        gains: force of each repeat over that of the curve.
+        gains: force of each repeat over the curve's.
         where: file and tile.
 
     Raises:
-        CalibrationError: one of them is too far from the others.
+        CalibrationError: a repeat is too far from the others.
     """
     off = gains / np.median(gains) - 1.0
     worst = int(np.argmax(np.abs(off)))
@@ -219,7 +219,7 @@ def refuse_contradictions(gains: Floats, where: str) -> None:
 
 
 def refuse_poor_fit(r2: float, where: str) -> None:
-    """A cubic that does not describe the readings.
+    """Reject a cubic that does not describe the readings.
 
     Raises:
         CalibrationError: R2 is below `R2_MIN`.

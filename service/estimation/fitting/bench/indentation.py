@@ -1,8 +1,8 @@
-"""An indentation recording, reduced to what a curve is fitted to: averages along slow strokes.
+"""Indentation recording of one tile, and block averages along its slow strokes.
 
-Readings are averaged in short blocks of a stroke, because the noise of single readings is an error
-in the variable that is fitted over, and would flatten the curve. A stroke is a `load` that goes
-straight over into an `unload`; holds, releases and taps are left to the models of fast effects.
+Readings are averaged in short blocks of a stroke: noise of single readings is an error of the
+independent variable, and would flatten the fitted curve. A stroke is a `load` directly followed by
+an `unload`; holds, releases and taps are for the models of fast effects.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from devices.errors import CalibrationError
 
 BLOCKS_PER_STROKE = 60  # many for a cubic, and each averages many readings
 BASELINE_NS = 1_000_000_000  # before the first press
-BASELINE_READINGS_MIN = 10  # fewer do not tell the noise
-REST_NS = 500_000_000  # the end of a rest, when the rubber has recovered most
+BASELINE_READINGS_MIN = 10  # fewer do not determine the noise
+REST_NS = 500_000_000  # last part of a rest, when the rubber has recovered most
 
 
 @dataclass(frozen=True)
 class Indentation:
-    """One tile's part of a bench recording; arrays of n readings in the order of time.
+    """One tile's part of a rig recording; arrays of n readings in the order of time.
 
     Attributes:
         serial: of the tile.
-        where: file it came from, for messages.
+        where: file, for messages.
         t_ns: instants of the readings.
         kpa: absolute pressure; NaN where the tile was not readable, infinite where its chip's
             count had run past its end.
         reference_n: force of the reference sensor; NaN where the spindle was elsewhere.
-        phase: what the spindle did: "rest", "load", "unload", ...
-        under_spindle: whether it was this tile.
+        phase: phase of the indenter: "rest", "load", "unload", ...
+        under_spindle: True while the indenter is over this tile.
     """
 
     serial: str
@@ -45,7 +45,7 @@ class Indentation:
     phase: npt.NDArray[np.str_]
     under_spindle: Bools
     tadc: Floats
-    """Temperature in counts; NaN where it is not known."""
+    """Raw temperature in counts; NaN where unknown."""
 
 
 @dataclass(frozen=True)
@@ -65,29 +65,29 @@ class Strokes(Arrays):
     loading: Bools
 
     def by_repeat(self) -> list[Strokes]:
-        """The blocks of each repeat."""
+        """Split the blocks by repeat."""
         return [self.select(self.repeat == repeat) for repeat in np.unique(self.repeat)]
 
 
 @dataclass(frozen=True)
 class Unloaded:
-    """A tile and the reference just before the tile is first pressed."""
+    """State of tile and reference just before the first loading."""
 
     baseline_kpa: float
     noise_kpa: float
     reference_zero_n: float
     tadc_counts: float | None = None
-    """Mean temperature; None where it is not known."""
+    """Mean raw temperature; None where unknown."""
 
 
 @dataclass(frozen=True)
 class Soak:
-    """An unloaded tile while its surroundings warm up; arrays of n readings.
+    """Thermal soak of an unloaded tile; arrays of n readings.
 
     Attributes:
         t_s: instants.
         kpa: absolute pressures, NaN where there is none.
-        tadc: temperature in counts, NaN where there is none.
+        tadc: raw temperature in counts, NaN where there is none.
         noise_kpa: standard deviation of a reading.
     """
 
@@ -98,10 +98,10 @@ class Soak:
 
 
 def unloaded(recording: Indentation) -> Unloaded:
-    """Baseline and noise of the tile, and zero of the reference.
+    """Measure baseline and noise of the tile, and zero of the reference, before the first loading.
 
     Raises:
-        CalibrationError: the tile is never pressed, or there is too little before it is.
+        CalibrationError: the tile is never loaded, or has too few readings before.
     """
     where = place(recording)
     pressed = recording.under_spindle & (recording.phase != "rest")
@@ -133,13 +133,13 @@ def unloaded(recording: Indentation) -> Unloaded:
 
 
 def strokes(*recordings: Indentation) -> Strokes:
-    """Block averages of every slow stroke of a tile, in one file or several.
+    """Average every slow stroke of a tile in blocks, in one file or several.
 
-    Each file has its own baseline and its own zero of the reference. A file in which the tile is
-    only held or tapped has no stroke, which is fine as long as another file has.
+    Each file has its own baseline and its own zero of the reference. A file may have no stroke if
+    another one has.
 
     Raises:
-        CalibrationError: as for `unloaded`, or there is no slow stroke in any of them.
+        CalibrationError: as for `measure_unloaded`, or no file has a slow stroke.
     """
     blocks: list[_Block] = []
     count = 0
@@ -166,7 +166,7 @@ _Block = tuple[float, float, int, bool]
 
 
 def stroke_rows(recording: Indentation) -> list[tuple[int, int, int]]:
-    """For each slow stroke the rows of its first reading, its turning point, and past its end."""
+    """Return the rows of each slow stroke's first reading, turning point, and end (exclusive)."""
     label = np.where(recording.under_spindle, recording.phase, "")
     begins = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
     ends = np.append(begins[1:], len(label))
@@ -184,7 +184,7 @@ def _blocks(
     repeat: int,
     loading: bool,
 ) -> list[_Block]:
-    # Past the end of the chip's counts the stroke is over: noise would pick readings from there.
+    # The stroke ends where the chip saturates: noise would select readings beyond.
     past = np.flatnonzero(np.isinf(recording.kpa[rows]))
     if len(past):
         rows = rows[: past[0]] if loading else rows[past[-1] + 1 :]
@@ -202,7 +202,7 @@ def _blocks(
 
 
 def rests(recording: Indentation) -> Floats:
-    """Mean pressure in the last half second of rest before each slow stroke; NaN without rest."""
+    """Compute the mean pressure in the last half second of rest before each slow stroke, or NaN."""
     found = []
     for begin, _, _ in stroke_rows(recording):
         rest = np.arange(begin) >= _run_begin(recording.phase[:begin] == "rest")
@@ -214,18 +214,18 @@ def rests(recording: Indentation) -> Floats:
 
 
 def _run_begin(rows: Bools) -> int:
-    """Where the run of True that lasts to the end begins."""
+    """Return the start of the run of True that reaches the end."""
     off = np.flatnonzero(~rows)
     return int(off[-1]) + 1 if len(off) else 0
 
 
 def pressed_in(recordings: Sequence[Indentation]) -> list[Indentation]:
-    """Recordings that press the tile; the others are only a soak."""
+    """Return the recordings that load the tile; the others are only a soak."""
     return [recording for recording in recordings if recording.under_spindle.any()]
 
 
 def soak(recording: Indentation, noise_kpa: float) -> Soak:
-    """The part of the recording where nothing presses and the surroundings warm up."""
+    """Return the thermal soak of a recording, without any load."""
     rows = recording.phase == "soak"
     return Soak(
         t_s=(recording.t_ns[rows] - recording.t_ns[0]) * 1e-9,
@@ -236,5 +236,5 @@ def soak(recording: Indentation, noise_kpa: float) -> Soak:
 
 
 def place(recording: Indentation) -> str:
-    """File and tile, for messages."""
+    """Return file and tile, for messages."""
     return f"{recording.where}, tile {recording.serial}"

@@ -1,7 +1,7 @@
-"""Every loading of a tile on the bench, as one run of instants, forces and pressures.
+"""All loadings of a tile in the rig, as one sequence of instants, forces and pressures.
 
-Slow strokes are averaged in blocks, because nothing happens within a block that the average would
-hide; holds, releases and taps are kept reading by reading. Spikes are left out.
+Slow strokes are averaged in blocks; holds, releases and taps stay reading by reading. Outliers are
+removed.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from service.estimation.models.outliers import spikes
 
 BLOCK = 10  # readings: 20 ms of a stroke that lasts seconds
 _NOISE_MIN_KPA = 0.03
-"""Rounding to a count alone leaves this much."""
+"""Least noise: rounding to a count."""
 _APART_S = 600.0
-"""Time put between two recordings, for the rubber to forget."""
+"""Time inserted between two recordings, in which the rubber recovers."""
 
 
 @dataclass(frozen=True)
 class Presses(Arrays):
-    """m points in the order of time.
+    """Points of all loadings, m in the order of time.
 
     Attributes:
         t_s: instants, from 0.
         force_n: reference force above its zero.
-        kpa: absolute pressure; NaN where no reading is left.
+        kpa: absolute pressure; NaN without a reading.
         weight: square root of the number of readings averaged, over the noise, in 1/kPa.
-        loading: number of the loading it belongs to, from 0.
+        loading: number of the loading, from 0.
         fast: True for points of a hold, a release or a tap.
     """
 
@@ -44,37 +44,37 @@ class Presses(Arrays):
 
     @property
     def loadings(self) -> int:
-        """How often the tile was pressed."""
+        """Number of loadings."""
         return int(self.loading.max()) + 1
 
 
 def presses(recording: Indentation, zero: Unloaded) -> Presses:
-    """All that was done to a tile, ready to be fitted."""
+    """Reduce a recording to the points of its loadings."""
     rows = recording.under_spindle & np.isfinite(recording.reference_n)
     rows &= recording.phase != "soak"
     t_s = (recording.t_ns[rows] - recording.t_ns[rows][0]) * 1e-9
     force_n = recording.reference_n[rows] - zero.reference_zero_n
     phase = recording.phase[rows]
     kpa = np.where(np.isfinite(recording.kpa), recording.kpa, np.nan)[rows]
-    # What the reference explains is no spike: the top of a tap is a single reading, too.
+    # Less the part that the reference explains: the top of a tap is a single reading, too.
     unexplained_kpa = kpa - _kpa_per_n(kpa, force_n) * force_n
     kpa = np.where(spikes(unexplained_kpa[:, None], np.array([zero.noise_kpa]))[:, 0], np.nan, kpa)
     active = phase != "rest"
     before = np.concatenate([["rest"], phase[:-1]])
-    # After a stroke back the next loading may come without a rest.
+    # A loading may follow a stroke without a rest.
     begins = active & ((before == "rest") | ((phase == "load") & (before == "unload")))
     loading = np.maximum(np.cumsum(begins) - 1, 0)
     fast = np.isin(phase, ("hold", "release", "tap"))
-    # What follows a fast loading, and the load that precedes a hold, belong to it.
+    # The load before a hold, and all after a fast phase, belong to that loading.
     is_fast = np.zeros(int(loading[-1]) + 1, dtype=bool)
     is_fast[loading[fast]] = True
     fast = is_fast[loading]
-    # A block ends where it is full, and wherever reading by reading begins or ends.
+    # A block ends when it is full, and at each change between slow and fast.
     run = np.cumsum(np.concatenate([[0], np.diff(fast.astype(np.int8)) != 0]))
     index = np.arange(len(t_s))
     first = np.searchsorted(run, run)
     number = np.where(fast, index, first + (index - first) // BLOCK * BLOCK)
-    # Of one instant there is one point.
+    # One point for each instant.
     _, block = np.unique(number[np.searchsorted(t_s, t_s)], return_inverse=True)
     size = np.bincount(block)
     good = np.isfinite(kpa)
@@ -93,7 +93,7 @@ def presses(recording: Indentation, zero: Unloaded) -> Presses:
 
 
 def _kpa_per_n(kpa: Floats, force_n: Floats) -> float:
-    """Slope of pressure over force, all in all; 0 without any load."""
+    """Compute the mean slope of pressure over force; 0 without any load."""
     good = np.isfinite(kpa)
     spread_n = force_n[good] - force_n[good].mean() if good.any() else np.zeros(1)
     square = float((spread_n**2).sum())
@@ -101,7 +101,7 @@ def _kpa_per_n(kpa: Floats, force_n: Floats) -> float:
 
 
 def joined(parts: Sequence[Presses]) -> Presses:
-    """Several recordings as one run of loadings, far enough apart to be independent."""
+    """Join several recordings to one sequence, far enough apart to be independent."""
     begin_s, loadings = 0.0, 0
     shifted = []
     for part in parts:

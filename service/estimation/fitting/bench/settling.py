@@ -1,9 +1,8 @@
-"""Whether an unloaded pressure that has changed on the bench goes back as rubber does.
+"""Recovery of the unloaded pressure between strokes in the rig, by creep of the rubber.
 
-Rubber that creeps for seconds is not done when the next stroke begins: unloaded, the tile reads
-more than before anything had pressed. That goes back by itself, and how much of it is left at any
-time follows from the loads before. What leaks reads less, what has slipped stays as it is, and what
-warms up goes on: no creep explains these.
+Creep lasts seconds, so a tile reads more between strokes than before the first one. It recovers by
+itself, by an amount that follows from the loads before. A leaking dome reads less, a slipped tile
+stays as it is, and warming continues: creep explains none of these.
 """
 
 from __future__ import annotations
@@ -17,22 +16,22 @@ from devices.arrays import Floats
 from service.estimation.fitting.bench.indentation import Indentation, rests, stroke_rows
 
 _CREEP_S = np.array([0.3, 1.0, 3.0, 10.0])
-"""Times of the creep that a rest or a stroke leaves something of."""
+"""Time constants of creep that outlast a rest or a stroke."""
 _BLOCK_S = 0.5
 _ALONE_S = 5.0
-"""Half of the longest time: so long nothing has to press for what goes back to be seen."""
+"""Least unloaded time for a recovery to show: half of the longest time constant."""
 _STEADY_COUNTS = 1.0  # of the chip's temperature: 0.2 K, 0.06 kPa
 _AHEAD_S = 3.0
-"""How long before its chip a gas may be warm."""
+"""Largest lead of a gas' temperature before its chip's."""
 
 
 @dataclass(frozen=True)
 class Settling:
-    """Unloaded pressures above the first one: before each stroke, then while nothing pressed.
+    """Unloaded pressures above the first one, before each stroke and in the soak.
 
     Attributes:
         kpa: (n,).
-        left_kpa: (n,), what creep does not explain of them.
+        left_kpa: (n,), residual after a fit of creep.
     """
 
     kpa: Floats
@@ -40,7 +39,7 @@ class Settling:
 
 
 def settling(recording: Indentation) -> Settling | None:
-    """How a tile's unloaded pressure settles; None if it is not left alone long enough to tell."""
+    """Fit creep to a tile's unloaded pressures; None if it is not unloaded for long enough."""
     t_s = (recording.t_ns - recording.t_ns[0]) * 1e-9
     alone_s, alone_kpa = _alone(t_s, recording)
     if not len(alone_s) or np.ptp(alone_s) < _ALONE_S:
@@ -56,7 +55,7 @@ def settling(recording: Indentation) -> Settling | None:
 
 
 def _alone(t_s: Floats, recording: Indentation) -> tuple[Floats, Floats]:
-    """Instants and pressures of the soak, in blocks, before its temperature changes."""
+    """Return instants and pressures of the soak, in blocks, before its temperature changes."""
     rows = (recording.phase == "soak") & np.isfinite(recording.kpa) & np.isfinite(recording.tadc)
     if not rows.any():
         return np.zeros(0), np.zeros(0)
@@ -71,17 +70,17 @@ def _alone(t_s: Floats, recording: Indentation) -> tuple[Floats, Floats]:
 
 
 def _crept(t_s: Floats, recording: Indentation, at_s: Floats) -> Floats:
-    """Force that is still felt at instants (n,) by rubber of each time, (n, times)."""
+    """Compute the remaining crept force at instants (n,) for each time constant, (n, times)."""
     pressed = recording.under_spindle & np.isfinite(recording.reference_n)
     before = pressed & (np.arange(len(t_s)) < np.argmax(pressed & (recording.phase != "rest")))
     zero_n = float(recording.reference_n[before].mean()) if before.any() else 0.0
-    # A reading stands for the time to the one before it; none for a time in which nothing is read.
+    # A reading stands for the time since the one before; times without readings do not count.
     step_s = np.diff(t_s, prepend=t_s[0])
     step_s[step_s > _BLOCK_S] = 0.0
     impulse = (step_s * (np.where(pressed, recording.reference_n, zero_n) - zero_n))[pressed]
     pressed_s = t_s[pressed]
     left = np.zeros((len(at_s), len(_CREEP_S)))
-    for row, now_s in zip(left, at_s.tolist(), strict=True):  # of all at once, too much for memory
+    for row, now_s in zip(left, at_s.tolist(), strict=True):  # all at once need too much memory
         stop = int(np.searchsorted(pressed_s, now_s))
         ago_s = now_s - pressed_s[:stop]
         row[:] = np.exp(-ago_s / _CREEP_S[:, None]) @ impulse[:stop] / _CREEP_S

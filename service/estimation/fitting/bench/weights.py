@@ -1,56 +1,37 @@
-"""Dead weights: which one stood on a tile, and what the tile read while it did.
+"""Settled readings of a tile under dead weights.
 
-A step names the weight and how far it may be off, `500 g +-0.5 %`. One that a kitchen scale or a
-force sensor has read is written the same way. The reading that counts is that of the end of the
-step, above the end of the rest before it, because the rubber goes on creeping for seconds.
+A step names the weight and its tolerance, `500 g +-0.5 %`; a reading of a kitchen scale or a force
+sensor is written the same way. The pressure is that at the end of the step, above the end of the
+rest before it, because the rubber creeps for seconds.
 """
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from devices.errors import CalibrationError
 from service.estimation.fitting.bench.indentation import Indentation, place
+from service.estimation.weights import Weight, parse_weight
 
-STANDARD_GRAVITY_M_S2 = 9.80665
-GRAVITY_SIGMA = 0.0015
-"""Relative; gravity differs by 0.5 % between pole and equator, and 0.1 % by height."""
-TOLERANCE_PERCENT = 1.0
-"""Of a weight whose tolerance is not stated."""
 LEAST_NS = 2_000_000_000
-"""A shorter step or rest does not show whether the tile has settled."""
-_PART_NS = 1_000_000_000  # the end of a step, and its beginning, which are compared
+"""Least duration of a step or rest, for the tile to settle."""
+_PART_NS = 1_000_000_000  # first and last part of a step, which are compared
 _READINGS_MIN = 10
-_WEIGHT = re.compile(
-    r"(?P<size>\d{1,6}(?:\.\d{1,6})?) ?(?P<unit>g|kg|N)"
-    r"(?: ?(?:\+-|±) ?(?P<off>\d{1,2}(?:\.\d{1,4})?) ?%)?"
-)
-_NEWTONS = {"g": 1e-3 * STANDARD_GRAVITY_M_S2, "kg": STANDARD_GRAVITY_M_S2, "N": 1.0}
-_HEAVIEST_N = 1000.0
-
-
-@dataclass(frozen=True)
-class Weight:
-    """A known force, with its standard uncertainty as a part of it."""
-
-    force_n: float
-    relative_sigma: float
 
 
 @dataclass(frozen=True)
 class Hold:
-    """A weight on a tile, and the tile's pressure; in kPa above the rest before it.
+    """Weight on a tile, with the tile's pressure in kPa above the rest before.
 
     Attributes:
-        text: the weight as it was written.
-        weight: its force.
+        text: text of the weight.
+        weight: force.
         gauge_kpa: mean over the last second.
         noise_kpa: standard deviation of a reading in that second.
         settle_kpa: mean of the last second less that of the first.
-        baseline_kpa: absolute pressure of the rest before it.
+        baseline_kpa: absolute pressure of the rest before.
     """
 
     text: str
@@ -61,31 +42,17 @@ class Hold:
     baseline_kpa: float
 
 
-def parse_weight(text: str) -> Weight | None:
-    """Return the force of `500 g`, `0.5 kg +-1 %` or `4.9 N`; None: it names no weight."""
-    found = _WEIGHT.fullmatch(text.strip())
-    if found is None:
-        return None
-    force_n = float(found["size"]) * _NEWTONS[found["unit"]]
-    if not 0.0 < force_n <= _HEAVIEST_N:
-        return None
-    # A tolerance bounds the error: its standard uncertainty is that of a uniform distribution.
-    percent = TOLERANCE_PERCENT if found["off"] is None else float(found["off"])
-    gravity = 0.0 if found["unit"] == "N" else GRAVITY_SIGMA
-    return Weight(force_n, float(np.hypot(0.01 * percent / np.sqrt(3.0), gravity)))
-
-
 def has_weights(recording: Indentation) -> bool:
     """Return whether any step of the tile is a weight."""
     return any(parse_weight(str(phase)) for phase in np.unique(_steps(recording)))
 
 
 def holds(recording: Indentation) -> list[Hold]:
-    """Return every weight that stood on the tile, in order of time.
+    """Return every weight on the tile with its reading, in order of time.
 
     Raises:
-        CalibrationError: a step is too short or has no readings, none was a rest before it, or the
-            chip was at its end.
+        CalibrationError: a step is too short or has no readings, has no rest before it, or the chip
+            was saturated.
     """
     steps = _steps(recording)
     begins = np.flatnonzero(np.append(True, steps[1:] != steps[:-1]))
@@ -112,12 +79,12 @@ def holds(recording: Indentation) -> list[Hold]:
 
 
 def _steps(recording: Indentation) -> np.ndarray:
-    """Return the step of every reading; empty where nothing is done with this tile."""
+    """Return the step of every reading; empty where the indenter is elsewhere."""
     return np.where(recording.under_spindle, recording.phase, "")
 
 
 def _settled(recording: Indentation, begin: int, end: int, text: str) -> tuple[float, float, float]:
-    """Return mean and noise of the last second of a step, and what it moved since the first."""
+    """Return mean and noise of the last second of a step, and its change since the first."""
     t_ns, kpa = recording.t_ns[begin:end], recording.kpa[begin:end]
     where, step = place(recording), "rest" if text == "rest" else f"weight of {text}"
     if np.isinf(kpa).any():

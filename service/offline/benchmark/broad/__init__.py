@@ -1,1 +1,1 @@
-"""Arrays of the broad family, each with its own bench: quantiles of errors, coverage, refusals."""
+"""Benchmark over many random arrays of the broad part family, each calibrated on its own rig."""

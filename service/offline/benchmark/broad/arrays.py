@@ -1,4 +1,4 @@
-"""One array: drawn, pressed on its own bench, run through every scene and condition, and judged."""
+"""Evaluation of one random array: calibration on its rig, all scenes and conditions, errors."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ from service.offline.calibrations import EMULATED_RIG, RIG_REFERENCE, find_calib
 
 SCENES = ("rolling", "poppy", "mud")
 SERIALS = ("T01", "T02", "T03", "T04")
-"""Of all three scenes: the same tiles in each."""
+"""Serials of the tiles, the same in all three scenes."""
 ROLLING_S = 12.0
 """One pass of the arc, back, and half another."""
 HEAVY = "heavy"
 _HEAVY = {"mass_kg": 3.3, "leg_n_per_m": 2250.0, "strength_n_per_cm3": 1.0}
-"""A leg of 3.3 kg on firmer poppy seeds: 28 N come within 50 ms, which is near or beyond the end of
-the softer domes."""
+"""A leg of 3.3 kg on firmer poppy seeds: 28 N within 50 ms, near or beyond the range of the softer
+domes."""
 CLEAN = "clean"
 REPEATABILITY_MAX = 0.03
 CONDITIONS: Mapping[str, str] = {
     CLEAN: "repeatability 0, drift 0, white noise",
-    "repeatability": "loadings differ as they did on the array's bench, by 0 to 3 %",
+    "repeatability": "loadings differ as on the array's rig, by 0 to 3 %",
     "correlated": "noise correlated over 10 ms, of the same variance",
-    "drift": "gains have drifted by up to 1 % since the bench",
+    "drift": "gains have drifted by up to 1 % since the calibration",
 }
 
 
 @dataclass(frozen=True)
 class ArrayTask:
-    """Which array, and how often its loadings are alike; None: drawn."""
+    """Array to evaluate; `repeatability` None: drawn at random."""
 
     number: int
     seeds: Seeds
@@ -58,12 +58,12 @@ class ArrayTask:
 
     @property
     def seed(self) -> int:
-        """Of its parts, noise and grounds."""
+        """Seed of its parts, noise and grounds."""
         return FIRST_SEED[self.seeds] + self.number
 
 
 def run_array(task: ArrayTask) -> ArrayResult:
-    """Everything of one array; what fails is reported, not raised."""
+    """Calibrate and evaluate one array; failures are returned, not raised."""
     began_s = time.process_time()
     repeatability = task.repeatability
     if repeatability is None:
@@ -97,7 +97,7 @@ def run_array(task: ArrayTask) -> ArrayResult:
 
 
 def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Refusal]]:
-    """The array's calibration, if no tile is refused."""
+    """Calibrate the array; None with the reasons if a tile is refused."""
     entries: list[Calibration] = []
     refusals = []
     with tempfile.TemporaryDirectory(prefix="foottile-broad-") as work:
@@ -114,9 +114,9 @@ def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Re
                     )
                 )
             except Exception as error:
-                # Without the folder, which is another one each time.
+                # Without the path of the temporary folder.
                 why = re.sub(r"\S*/(?=bench-)", "", reason(error))
-                refusals.append(Refusal(what=f"bench of {serial}", why=why))
+                refusals.append(Refusal(what=f"calibration of {serial}", why=why))
     if refusals:
         return None, refusals
     tiles = tuple(tile for entry in entries for tile in entry.tiles)
@@ -127,7 +127,7 @@ def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Re
 
 
 def _cases(repeatability: float) -> Iterator[tuple[Scene, str]]:
-    """Every scene under every condition; the heavy leg under one."""
+    """Yield every scene under every condition; the heavy leg under one."""
     changes: Mapping[str, Mapping[str, Any]] = {
         CLEAN: {},
         "repeatability": {"repeatability": repeatability},
@@ -143,7 +143,7 @@ def _cases(repeatability: float) -> Iterator[tuple[Scene, str]]:
 
 
 def _emulated(scene: Scene, **changes: Any) -> Scene:
-    """With broad parts, and without the servo, whose angle no figure here needs."""
+    """Return the scene with broad parts and without the servo, which no figure needs."""
     emulation = scene.emulation.model_copy(update={"family": "broad", **changes})
     return scene.model_copy(update={"emulation": emulation, "servo": None})
 
@@ -151,7 +151,7 @@ def _emulated(scene: Scene, **changes: Any) -> Scene:
 def _case(
     scene: Scene, condition: str, seed: int, calibration: Calibration
 ) -> tuple[dict[str, Judged], tuple[Tile, ...]]:
-    """One recording in both modes; of clean poppy seeds also what the tiles are."""
+    """Evaluate one recording in both modes; for clean poppy seeds also describe the tiles."""
     seconds = ROLLING_S if scene.name == "rolling" else None
     recording, world = recorded(scene, seconds, seed, calibration)
     below_end = cache(partial(surely_below_end, recording, world))

@@ -1,4 +1,4 @@
-"""From arrays to figures: quantiles over arrays, coverage pooled and at its worst, models lost."""
+"""Figures over arrays: error quantiles, pooled and worst coverage, lost models, goals."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from service.offline.benchmark.figures import (
 )
 
 EXCEEDS_N = 0.1
-"""A tile whose effect is greater needs the model."""
+"""Effect on the force above which a tile needs the model."""
 ANY_PHASE = "all"
 
-# Issue 14, by mode: median and 95th percentile over arrays.
+# Goals of issue 14, by mode: median and 95th percentile over arrays.
 GRF_MAE_N = {
     "rolling": {"live": (0.20, 0.35), "offline": (0.16, 0.30)},
     "poppy": {"live": (0.20, 0.35), "offline": (0.16, 0.30)},
@@ -39,19 +39,19 @@ _MODELS_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Row:
-    """One scene under one condition in one mode, over arrays.
+    """Summary over arrays of one scene under one condition in one mode.
 
     Attributes:
         scene: its name.
         condition: one of `CONDITIONS`, or `HEAVY`.
         mode: live or offline.
-        errors: spreads of `grf_mae_n`, `peak_error_n`, `cop_p95_m` and `flight_mean_n`, of the last
-            the magnitude.
-        coverage: pooled over all frames, by the names of `COVERED`.
-        coverage_of_arrays: the same of each array.
-        sigma_over_rms: stated over actual error of each array, in all frames and in each phase.
-        sums: of flags, over all arrays.
-        after_saturation_mae_n: in frames flagged so, where arrays have any.
+        errors: quantiles of `grf_mae_n`, `peak_error_n`, `cop_p95_m` and the magnitude of
+            `flight_mean_n`.
+        coverage: pooled over all frames, by the keys of `COVERAGE_TITLES`.
+        coverage_of_arrays: quantiles of the arrays' coverage.
+        sigma_over_rms: quantiles of stated over actual error, in all frames and in each phase.
+        sums: counts of flags over all arrays.
+        after_saturation_mae_n: error in frames after saturation, over arrays with any.
     """
 
     scene: str
@@ -77,11 +77,11 @@ SUMS = (
     "after_frames",
 )
 ALARMS_PER_HOUR = 1.0
-"""Said of healthy tiles, that they are stuck, clipped or off their baseline: beyond doubt less."""
+"""Upper limit of false alarms, with 95 % confidence: healthy tiles flagged as faulty."""
 
 
 def rows_of(results: Sequence[ArrayResult]) -> list[Row]:
-    """Every row that any array gave a figure for, in the order of conditions and scenes."""
+    """Summarize every case with a result, in the order of conditions and scenes."""
     places = [(scene, condition) for condition in CONDITIONS for scene in SCENES]
     rows = []
     for scene, condition in [*places, ("poppy", HEAVY)]:
@@ -135,7 +135,7 @@ def _whole(phases: Iterable[Phase]) -> Phase:
 
 @dataclass(frozen=True)
 class Models:
-    """How many tiles need a model and lost it, and lack its effect and were given it."""
+    """Number of tiles that need a model, lost it, lack its effect, and were given it anyway."""
 
     name: str
     needed: int
@@ -145,12 +145,12 @@ class Models:
 
 
 def needs(tile: Tile, model: str) -> bool:
-    """Whether a tile's effect is too great to do without; every gas follows its temperature."""
+    """Return whether a tile needs a model; every tile needs the temperature model."""
     return model == "temperature" or tile.effect_n[model] > EXCEEDS_N
 
 
 def models_of(results: Sequence[ArrayResult]) -> list[Models]:
-    """For each model."""
+    """Count tiles by need, for each model."""
     tiles = [tile for result in results for tile in result.tiles]
     counted = []
     for name in ("gas", "rubber", "hysteresis", "temperature"):
@@ -169,12 +169,12 @@ def models_of(results: Sequence[ArrayResult]) -> list[Models]:
 
 
 def goals_of(results: Sequence[ArrayResult]) -> list[Goal]:
-    """All goals of issue 14 with what was measured."""
+    """Compare the figures with all goals of issue 14."""
     return [*error_goals(results), *sigma_goals(results)]
 
 
 def sigma_goals(results: Sequence[ArrayResult]) -> list[Goal]:
-    """Of what is said of errors: coverage, sigma, and saturation."""
+    """Compare stated uncertainty with its goals: coverage, sigma and saturation."""
     goals = []
     for row in rows_of(results):
         if row.condition not in (HEAVY, "drift"):
@@ -187,25 +187,25 @@ def sigma_goals(results: Sequence[ArrayResult]) -> list[Goal]:
 
 @dataclass(frozen=True)
 class Alarms:
-    """False alarms of the live estimates of all recordings."""
+    """False alarms in the live estimates of all recordings."""
 
     alarms: int
     hours: float
 
     @property
     def most_per_hour(self) -> float:
-        """What their rate is below, with 95 % confidence (Poisson)."""
+        """Upper 95 % confidence limit of their rate (Poisson)."""
         return float(chdtri(2 * (self.alarms + 1), 0.05)) / 2.0 / self.hours
 
 
 def alarms_of(results: Sequence[ArrayResult]) -> Alarms:
-    """Over all scenes and conditions."""
+    """Count false alarms over all scenes and conditions."""
     live = [j for r in results for key, j in r.judged.items() if key.endswith("/live")]
     return Alarms(sum(j.alarms for j in live), sum(j.seconds for j in live) / 3600.0)
 
 
 def error_goals(results: Sequence[ArrayResult]) -> list[Goal]:
-    """Of errors, which have goals in clean scenes only, and of models."""
+    """Compare errors in clean scenes, and lost models, with their goals."""
     goals = [goal for row in rows_of(results) if row.condition == CLEAN for goal in _errors(row)]
     pressed, refused = len(SERIALS) * len(results), sum(r.tiles_refused for r in results)
     share = 100.0 * refused / pressed if pressed else math.nan
@@ -214,7 +214,7 @@ def error_goals(results: Sequence[ArrayResult]) -> list[Goal]:
             f"false alarms an hour at most (95 %): {alarms.alarms} within {alarms.hours:.1f} hours"
         )
         goals.append(Goal("live", figure, alarms.most_per_hour, None, ALARMS_PER_HOUR))
-    figure = "tiles that their bench refuses, %"
+    figure = "tiles refused by the calibration, %"
     goals.append(Goal("", figure, share, None, 100.0 * _MODELS_SHARE))
     for title, of, part in (
         ("tiles that lose a model whose effect exceeds 0.1 N, %", "needed", "lost"),

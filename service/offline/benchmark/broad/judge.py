@@ -1,4 +1,4 @@
-"""From the estimates of one recording to what is kept of them."""
+"""Evaluation of one recording's estimates for the result file."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from service.offline.benchmark.draws import Recording
 
 JUDGED = (*COMPARED, "force_n", "force_sigma_n", "true_force_n")
 WRONG_TILE = (EstimateStatus.STUCK, EstimateStatus.CLIPPED, EstimateStatus.BASELINE_LOST)
-"""Flags of tiles that answer and are wrong."""
+"""Flags of tiles that answer but are faulty."""
 NOISES = 4.0
-"""A tile whose settled pressure is that many standard deviations of a reading below the end of its
-calibration was called saturated wrongly."""
+"""Distance of the settled pressure below the calibrated end, in standard deviations of a reading,
+from which a saturation flag is wrong."""
 
 
 def judged(
@@ -30,12 +30,12 @@ def judged(
     below_end: Callable[[], npt.NDArray[np.bool_]],
     lag_ms: float,
 ) -> Judged:
-    """Errors, coverage and flags.
+    """Compute errors, coverage and flag counts.
 
     Args:
-        columns: `JUDGED`, of every frame of the recording.
-        below_end: gives what `surely_below_end` says, (n, tiles); asked only if it matters, since
-            that takes as long as the recording did.
+        columns: `EVALUATED_COLUMNS` of every frame of the recording.
+        find_unsaturated: returns `find_unsaturated_tiles`, (n, tiles); called only if needed,
+            because it takes as long as the recording.
         lag_ms: look-ahead of the estimates.
     """
     accuracy = accuracy_of({name: columns[name] for name in COMPARED}, lag_ms=lag_ms)
@@ -81,7 +81,7 @@ def judged(
 
 
 def _alarms(status: npt.NDArray[np.uint16]) -> int:
-    """How often one of `WRONG_TILE` comes on."""
+    """Count the onsets of `FAULTY_TILE_FLAGS`."""
     return sum(
         int((np.diff((status & bit) != 0, prepend=False) & ((status & bit) != 0)).sum())
         for bit in WRONG_TILE
@@ -89,7 +89,7 @@ def _alarms(status: npt.NDArray[np.uint16]) -> int:
 
 
 def surely_below_end(recording: Recording, world: World) -> npt.NDArray[np.bool_]:
-    """Which tiles are within their calibration and their chip's range beyond doubt, (n, tiles)."""
+    """Return which tiles are surely within calibration and chip range, (n, tiles)."""
     t_ns = recording.frames.t_mono_ns
     doubt_kpa = NOISES * world.scene.emulation.noise_kpa
     unloaded_kpa = np.array([part.seal_kpa for part in world.domes])
@@ -101,7 +101,7 @@ def surely_below_end(recording: Recording, world: World) -> npt.NDArray[np.bool_
 
 
 def _ends_kpa(recording: Recording) -> Floats:
-    """Where each tile's calibration ends, gauge; of a bare tile nowhere."""
+    """Return each tile's calibrated gauge pressure range end; infinite for a bare tile."""
     return np.array(
         [
             math.inf if tile.reference else recording.calibration.of(tile.serial).range_kpa[1]
@@ -111,5 +111,5 @@ def _ends_kpa(recording: Recording) -> Floats:
 
 
 def known(value: float) -> float | None:
-    """A number, if it is one."""
+    """Return the number, or None for NaN."""
     return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Every array as a dot, by scene and condition, with its quantiles; and coverage by phase."""
+"""Plot of every array's errors by scene and condition, with quantiles, and coverage by phase."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _WIDTH = 0.14
 
 
 def plot_broad(results: Sequence[ArrayResult]) -> bytes:
-    """The plot as a PNG.
+    """Draw the plot as a PNG.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -61,7 +61,7 @@ def plot_broad(results: Sequence[ArrayResult]) -> bytes:
     figure.legend(loc="outside lower center", ncols=4, frameon=False)
     refused = sum(result.tiles_refused > 0 for result in results)
     but = f", {refused} of them without a calibration" if refused else ""
-    figure.suptitle(f"{len(results)} arrays of domes nobody has seen{but}", fontsize=14)
+    figure.suptitle(f"{len(results)} arrays of unseen domes{but}", fontsize=14)
     return png_of(figure)
 
 
@@ -73,7 +73,7 @@ def _dots(
     scale: float,
     goals: dict[str, tuple[float, float]],
 ) -> None:
-    """Every array, median and range, under each condition."""
+    """Draw arrays as dots, with median and range, under each condition."""
     for at, condition in enumerate(CONDITIONS):
         for side, (mode, (colour, shape)) in zip((-1, 1), STYLES.items(), strict=True):
             key = key_of(scene, condition, mode)
@@ -95,7 +95,7 @@ def _dots(
 
 
 def _covered(axes: Axes, rows: Sequence[Row]) -> None:
-    """Pooled coverage by phase; dots clean, smaller ones under the other conditions."""
+    """Draw pooled coverage by phase; large dots: clean scenes, small dots: other conditions."""
     names = (ANY_PHASE, *PHASES)
     for row in rows:
         if row.condition not in CONDITIONS:

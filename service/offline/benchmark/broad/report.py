@@ -1,4 +1,4 @@
-"""Arrays of the broad family as Markdown: goals, errors, coverage, flags, models, refusals."""
+"""Markdown report of the broad benchmark: goals, errors, coverage, flags, models, refusals."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ _HEAVY = "a leg of 3.3 kg on firmer poppy seeds, up to 28 N a tile: for saturati
 
 
 def markdown(bench: BroadBench) -> str:
-    """All tables."""
+    """Format the report."""
     o, results = bench.options, bench.results
     rows = rows_of(results)
     spent_s = sum(result.cpu_bench_s + result.cpu_scenes_s for result in results)
     alike = "each array's own, 0 to 3 %" if o.repeatability is None else f"{o.repeatability:g}"
     lines = [
-        "# Domes nobody has seen",
+        "# Unseen domes",
         "",
         f"{bench.software}, code {bench.made_by}, {bench.made}, on {bench.machine}.",
         "",
         f"{len(results)} arrays of four tiles of the broad family, seeds of {o.seeds}, each "
-        f"pressed on its own emulated bench (repeatability there: {alike}), then run through every "
+        f"calibrated on its own rig (repeatability there: {alike}), then run through every "
         f"scene with the scene's own models. {spent_s / 60:.0f} min CPU in all. Quantiles are over "
         "arrays, signs are dropped; coverage is pooled over the frames of all arrays.",
         "",
         EMULATED,
         "",
-        *(f"- `{name}`: {said}" for name, said in {**CONDITIONS, HEAVY: _HEAVY}.items()),
+        *(f"- `{name}`: {meaning}" for name, meaning in {**CONDITIONS, HEAVY: _HEAVY}.items()),
         "",
         "## Goals",
         "",
@@ -93,10 +93,10 @@ def _goals(bench: BroadBench) -> list[str]:
     errors, sigmas = _asked(error_goals(bench.results)), _asked(sigma_goals(bench.results))
     missed = [row for row in sigmas if row[-1] == "NO"]
     head = ("figure", "mode", "measured", "goal", "met")
-    said = (
+    remark = (
         f"Of coverage, sigma and saturation {len(sigmas) - len(missed)} of {len(sigmas)} are met."
     )
-    return [*table(head, errors), "", said, *(["", *table(head, missed)] if missed else [])]
+    return [*table(head, errors), "", remark, *(["", *table(head, missed)] if missed else [])]
 
 
 def _asked(goals: Sequence[Goal]) -> list[tuple[str, ...]]:
@@ -191,7 +191,7 @@ def _refusals(bench: BroadBench) -> list[str]:
                 if name != "ambient" and (name in tile.lacks or needs(tile, name))
             ]
     rows += [("", refusal.what, "", refusal.why) for refusal in bench.lost]
-    said = [
+    lines = [
         "Every array and scene that gave nothing, and every model that a tile was refused although "
         "it needs it, or lacks the effect; with the true effect.",
         "",
@@ -199,8 +199,11 @@ def _refusals(bench: BroadBench) -> list[str]:
     ]
     if at_bound:
         found = ", ".join(f"{name} {n}" for name, n in at_bound.most_common())
-        said += ["", f"Parameters found at the end of what is possible, in so many tiles: {found}."]
-    return said
+        lines += [
+            "",
+            f"Parameters found at the end of what is possible, in so many tiles: {found}.",
+        ]
+    return lines
 
 
 def _covered(share: float, worst: float) -> str:

@@ -1,4 +1,4 @@
-"""What is kept of one array, in a file of its own: written as it ends, so that a run goes on."""
+"""Result file of one array, written when it is done, so that an interrupted run can continue."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from storage.checked_json import read_checked, write_checked
 
 Seeds = Literal["development", "judgement"]
 FIRST_SEED: dict[Seeds, int] = {"development": 1_000_000, "judgement": 2_000_000}
-"""Of array 0. No constant of the estimator may be set from an array of the second range."""
+"""Seed of array 0. Estimator constants must not be tuned on arrays of the "judgement" range."""
 
 
 class Phase(Facts):
-    """Frames of one phase: how many, how many covered, and sums of squares in N^2."""
+    """Counts of one phase: frames, covered frames, and sums of squares in N^2."""
 
     frames: int
     within: int
@@ -32,21 +32,21 @@ class Phase(Facts):
 
     @property
     def covered(self) -> Covered:
-        """For pooling."""
+        """Coverage counts, for pooling."""
         return Covered(self.frames, self.within)
 
     @property
     def sigma_over_rms(self) -> float:
-        """Stated over actual error, both root mean square; NaN if there is none."""
+        """Ratio of stated to actual RMS error; NaN without error."""
         return math.sqrt(self.sigma2 / self.error2) if self.error2 else math.nan
 
 
 class Judged(Facts):
-    """One scene under one condition in one mode; None: nothing to judge.
+    """Errors and counts of one scene, condition and mode; None where no frame qualifies.
 
-    "Tile frames" are counted tile by tile. `wrongly`: the chip is within its range, and what the
-    load would settle at is more than four times the noise below the calibrated end. `held`: the
-    true force is at or above the stated bound.
+    "Tile frames" are counted by tile. `wrongly`: flagged as saturated although the chip is within
+    its range and the settled pressure is more than four times the noise below the calibrated end.
+    `held`: the true force is at or above the stated lower bound.
     """
 
     frames: int
@@ -67,23 +67,23 @@ class Judged(Facts):
     after_within: int
     after_saturation_mae_n: float | None
     seconds: float
-    """That were recorded."""
+    """Recorded duration."""
     alarms: int
-    """How often a tile was said to be stuck, clipped or off its baseline. None is."""
+    """Number of false alarms: a tile flagged as stuck, clipped or off its baseline."""
 
 
 class Tile(Facts):
-    """What a tile is, and what its bench made of it.
+    """True properties of a tile, and those found on its rig.
 
     Attributes:
         serial: its name in the array.
-        drawn: what the emulator drew, by name; an estimator does not know it.
-        effect_n: how far each effect moves it on poppy seeds, 95th percentile of loaded frames.
-        lacks: models that it has nothing for.
-        given: models that its calibration offers.
-        found: values of parameters, and their uncertainty as `NAME_sigma`.
-        refused: models that it does not offer, with the reason.
-        at_bound: parameters at the end of what is possible.
+        drawn: emulated parameters by name, hidden from the estimator.
+        effect_n: size of each effect on poppy seeds, 95th percentile of loaded frames.
+        lacks: models whose effect the tile does not have.
+        given: models in its calibration.
+        found: fitted parameters, and their uncertainty as `NAME_sigma`.
+        refused: models not in its calibration, with the reason.
+        at_bound: parameters at a limit of the fit.
     """
 
     serial: str
@@ -97,14 +97,14 @@ class Tile(Facts):
 
 
 class Refusal(Facts):
-    """Something that gave no result, and why."""
+    """Item without a result, and the reason."""
 
     what: str
     why: str
 
 
 class ArrayResult(Facts):
-    """All of one array."""
+    """Result of one array."""
 
     number: int
     seeds: Seeds
@@ -114,19 +114,19 @@ class ArrayResult(Facts):
     cpu_scenes_s: float
     tiles: tuple[Tile, ...]
     judged: dict[str, Judged]
-    """By scene, condition and mode: `key_of`."""
+    """Results by scene, condition and mode; see `make_case_key`."""
     tiles_refused: int
-    """By their bench; then the array gives nothing."""
+    """Number of tiles refused by the calibration; the array then has no other results."""
     refusals: tuple[Refusal, ...]
 
 
 def key_of(scene: str, condition: str, mode: str) -> str:
-    """Name of one judgement."""
+    """Return the key of a scene, condition and mode in `ArrayResult.judged`."""
     return f"{scene}/{condition}/{mode}"
 
 
 def code_id() -> str:
-    """Hash of all of the project's code: results of another code are no results of this one."""
+    """Hash the project's code; results of other code are not reused."""
     digest = hashlib.sha256()
     for package in (devices, storage, service):
         (root,) = package.__path__
@@ -137,12 +137,12 @@ def code_id() -> str:
 
 
 def path_of(folder: Path, seeds: Seeds, number: int) -> Path:
-    """Where an array's result is."""
+    """Return the path of an array's result file."""
     return folder / "arrays" / f"{seeds}-{number:05d}.json"
 
 
 def write_result(folder: Path, result: ArrayResult) -> None:
-    """Keep it.
+    """Write an array's result file.
 
     Raises:
         StorageError: the disk is full or not writable.
@@ -152,7 +152,7 @@ def write_result(folder: Path, result: ArrayResult) -> None:
 
 
 def read_result(path: Path) -> ArrayResult | None:
-    """What is kept there; None if nothing is, or nothing whole: then it is made again."""
+    """Read a result file; None if it is missing or damaged."""
     try:
         return ArrayResult.model_validate_json(read_checked(path).text)
     except (FileNotFoundError, FootTileError, pydantic.ValidationError):

@@ -1,4 +1,4 @@
-"""A run over arrays: goes on where it was broken off, and says first what it will cost."""
+"""Run over many arrays, resumable, with an estimate of its run time."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from storage.durable import make_folder
 
 @dataclass(frozen=True)
 class BroadOptions:
-    """What to run; see `foottile benchmark --help`."""
+    """Options of the broad benchmark; see `foottile benchmark --help`."""
 
     arrays: int
     seeds: Seeds
     jobs: int
     folder: Path
     repeatability: float | None = None
-    """Of all arrays, on their benches too, instead of each array's own."""
+    """Standard deviation between loadings in all scenes and rigs; None: drawn for each array."""
 
 
 @dataclass(frozen=True)
 class BroadBench:
-    """What came of it."""
+    """Result of the broad benchmark."""
 
     options: BroadOptions
     made: str
-    """When, ISO 8601 in UTC."""
+    """Time of the run, ISO 8601 in UTC."""
     made_by: str
     """Hash of the code."""
     software: str
@@ -53,11 +53,11 @@ class BroadBench:
 
 
 def run_broad(options: BroadOptions, tell: Callable[[str], None]) -> BroadBench:
-    """Every array that has no result yet; each result is written as it is there.
+    """Evaluate every array without a result file; write each result when it is done.
 
     Args:
-        options: what to run.
-        tell: told what it will cost, and how far it is.
+        options: options of the benchmark.
+        on_progress: called with the expected run time and progress.
 
     Raises:
         StorageError: results cannot be written.
@@ -74,7 +74,7 @@ def run_broad(options: BroadOptions, tell: Callable[[str], None]) -> BroadBench:
     if results:
         tell(f"{len(results)} of {options.arrays} arrays are there already")
     lost = []
-    # The first by itself, if nothing tells yet what one costs.
+    # Without any result, run the first array alone to estimate the run time.
     batches = [left] if results else [left[:1], left[1:]]
     for batch in batches:
         if results and batch:

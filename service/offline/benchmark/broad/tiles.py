@@ -1,4 +1,4 @@
-"""What the emulator knows of a tile beside what its bench found: which models it should have."""
+"""True tile properties of the emulator beside the fitted ones, to judge each tile's models."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EFFECT_PERCENTILE = 95
 
 
 def tiles_of(recording: Recording, world: World, seed: int) -> tuple[Tile, ...]:
-    """Every tile of an array of a seed that was recorded at a steady temperature."""
+    """Describe every tile of an array, from a recording at constant temperature."""
     t_ns = recording.frames.t_mono_ns
     whole_kpa = world.dome_kpa(t_ns)
     less_kpa = {name: world.dome_kpa(t_ns, (name,)) for name in RUBBERY}

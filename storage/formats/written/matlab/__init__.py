@@ -1,1 +1,1 @@
-"""MATLAB's .mat: quantities of a session as its numbers, a variable each, or structs of several."""
+"""MATLAB writer: a variable for each quantity of a session, or structs of several sessions."""

@@ -1,8 +1,8 @@
-"""Elements of a .mat file of version 5, encoded by scipy, and what is too large for that.
+"""Encoders of elements of a .mat file of version 5: scipy's, and streaming ones for large elements.
 
-scipy writes a struct as a whole. Here its fields follow one another, so that one is in memory at a
-time: what stands in front of them is scipy's, of a struct with empty fields, and says how long all
-of them are (MAT-File Format, "Level 5 MAT-File Format", mxSTRUCT_CLASS).
+scipy writes a struct at once. Here its fields are encoded one after the other, so that one field is
+in memory at a time. The head of the struct is scipy's head of a struct with empty fields, with the
+length replaced (MAT-File Format, "Level 5 MAT-File Format", mxSTRUCT_CLASS).
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ _NUMBERS: Mapping[str, tuple[int, int]] = {
     "i8": (14, 12),
     "u8": (15, 13),
 }
-"""Classes of arrays and types of their data, as MathWorks' "MAT-File Format" numbers them."""
+"""Class of array and type of data by numpy type, from MathWorks' "MAT-File Format"."""
 _MATRIX, _FLAGS, _SIZE, _NAME = 14, 6, 5, 1
 """Types of elements, from the same tables."""
 HEADER_BYTES = 128
-"""Of a file; variables follow."""
+"""Length of a file's header; variables follow."""
 BYTES_MAX = 2**31 - 1
-"""Of one variable, as MATLAB reads it."""
+"""Limit of a variable's length in MATLAB."""
 _MATRIX_HEAD = 56
-"""Of a matrix without a name: its tag, flags, size, name, and the tag of its numbers."""
+"""Length of the head of a matrix without a name: tag, flags, size, name, tag of the numbers."""
 _EMPTY = np.empty((0, 0))
 
 
 def saved(variables: Mapping[str, object]) -> bytes:
-    """A file of these variables, as scipy writes it."""
+    """Return a file of these variables, encoded by scipy."""
     from scipy.io import savemat
 
     file: Any = io.BytesIO()  # its stubs know names of files only
@@ -53,20 +53,20 @@ def saved(variables: Mapping[str, object]) -> bytes:
 
 
 def variable(name: str, value: object) -> bytes:
-    """A variable as it stands in a file, behind the header."""
+    """Return an encoded variable, without the file's header."""
     return saved({name: value})[HEADER_BYTES:]
 
 
 def matrix(
     name: str, shape: tuple[int, int], class_: npt.DTypeLike, pieces: Iterable[Array]
 ) -> Iterator[bytes]:
-    """A variable of numbers, given away as they come.
+    """Yield an encoded variable of numbers while `pieces` is read.
 
     Args:
-        name: of the variable.
-        shape: rows and columns.
-        class_: of the numbers.
-        pieces: these numbers, column after column.
+        name: name of the variable.
+        shape: numbers of rows and columns.
+        class_: numpy type of the numbers.
+        pieces: arrays of this type, column after column.
     """
     kind = np.dtype(class_)
     of_class, of_data = _NUMBERS[kind.str[1:]]
@@ -88,11 +88,11 @@ def matrix(
 
 @dataclass(frozen=True)
 class Field:
-    """A field of one struct of the array.
+    """Field of a struct.
 
     Attributes:
-        size: of its element, in bytes.
-        make: gives the element.
+        size: length of its element in bytes.
+        make: function that encodes the element.
     """
 
     size: int
@@ -100,7 +100,7 @@ class Field:
 
     @classmethod
     def of(cls, value: object) -> Field:
-        """One that is small enough to be kept."""
+        """Return a field whose small value is encoded now."""
         content = _element(value)
         return cls(len(content), lambda: content)
 
@@ -108,18 +108,18 @@ class Field:
     def matrix(
         cls, shape: tuple[int, int], class_: npt.DTypeLike, make: Callable[[], object]
     ) -> Field:
-        """Numbers of this shape and class, made when they are due."""
+        """Return a field of numbers of this shape and class, computed by `make` when written."""
         size = shape[0] * shape[1] * np.dtype(class_).itemsize
-        in_tag = size <= 4  # so few stand in the tag of the numbers
+        in_tag = size <= 4  # up to 4 bytes are stored in the tag of the numbers
         return cls(_MATRIX_HEAD + (0 if in_tag else -(-size // 8) * 8), lambda: _element(make()))
 
 
 def struct_array(name: str, elements: Sequence[Mapping[str, Field]]) -> Iterator[bytes]:
-    """A variable: a row of structs, each with the fields of all; those that it has not are empty.
+    """Yield an encoded array of structs; each has the fields of all, missing ones are empty.
 
     Args:
-        name: of the variable.
-        elements: by name, the fields of each struct.
+        name: name of the variable.
+        elements: fields of each struct by name.
     """
     names = list(dict.fromkeys(key for element in elements for key in element))
     plain = np.empty((1, len(elements)), dtype=[(key, object) for key in names])
@@ -140,11 +140,11 @@ def struct_array(name: str, elements: Sequence[Mapping[str, Field]]) -> Iterator
 
 
 def struct_bytes(elements: Sequence[Mapping[str, Field]]) -> int:
-    """About as many bytes has a variable of these structs."""
+    """Return the approximate length of an array of these structs in bytes."""
     return sum(field.size for element in elements for field in element.values())
 
 
 def _element(value: object) -> bytes:
-    """A value as it stands in a struct: without a name."""
+    """Return a value encoded as in a struct, without a name."""
     empty = len(variable("s", {"f": _EMPTY})) - _MATRIX_HEAD
     return variable("s", {"f": value})[empty:]

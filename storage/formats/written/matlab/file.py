@@ -1,9 +1,9 @@
-"""MATLAB's .mat of version 5, which Octave and scipy read too: a variable for each quantity.
+"""MATLAB writer: .mat of version 5, a variable for each quantity; Octave and scipy read it too.
 
-Variables stand one after the other in the file, so that `load("session.mat", "t_ns", "grf_n")`
-reads no more than that. A matrix is written as it is read, a piece of a column at a time, what is
-no matrix of numbers by scipy. Several sessions are an array of structs, `sessions`, with the same
-names in each; of these one field is in memory at a time.
+Variables follow one another in the file: `load("session.mat", "t_ns", "grf_n")` reads only these.
+A matrix is written while it is read, a chunk of a column at a time; scipy writes all else. Several
+sessions are an array of structs, `sessions`, with the same names in each; one field is in memory at
+a time.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ from storage.formats.written.together import instants_of
 from storage.schema import SERVER_TIME, Array, Column
 
 FRAMES_MAX = 6_000_000
-"""Three hours at 544 Hz; four tiles of them are the 24 million numbers of a variable at most."""
+"""Limit of frames: three hours at 544 Hz; with four tiles, a variable has 24 million numbers."""
 _VALUES_MAX = 4 * FRAMES_MAX
 _TEXT = 116
-"""Of the header's bytes so many are for people."""
+"""Length of the header's descriptive text in bytes."""
 
 
 def _write(export: Export) -> Iterator[bytes]:
     quantities = quantities_of(export)
-    # Refuses too many frames, before anything is given away.
+    # Refuses too many frames before the first chunk.
     frames = len(_t_ns(export)["t_ns"])
     yield _header(export) + variable("about", facts_of(export))
     yield from _meanings(quantities)
@@ -93,7 +93,7 @@ def _fields(export: Export) -> dict[str, Field]:
 
 
 def _on_one_axis(export: Export) -> list[Column]:
-    """What was chosen, and the server's time, whatever was chosen: it is all that they share."""
+    """Return the selected quantities, and always the server's time, the sessions' common axis."""
     return list(dict.fromkeys([*quantities_of(export), *SERVER_TIME]))
 
 
@@ -102,7 +102,7 @@ def _values(export: Export, column: Column) -> Array:
 
 
 def _t_ns(export: Export) -> dict[str, Array]:
-    """Instants of its frames, by each clock that was asked for."""
+    """Return the instants of the frames by each requested clock."""
     limit = min(FRAMES_MAX, _VALUES_MAX // max(len(export.info.tiles), 1))
     asked = ["t_ns", *(["part"] if "part" in export.content.names else [])]
     asked += [] if export.clock is None else ["t_server_ns"]
@@ -115,7 +115,7 @@ def _meanings(quantities: Sequence[Column]) -> Iterator[bytes]:
 
 
 def _header(export: Export) -> bytes:
-    """scipy's, but for the text, in which the time of day would make each file another one."""
+    """Return scipy's header without the time of day in its text: equal exports are equal files."""
     text = f"MATLAB 5.0 MAT-file, written by {export.info.software}"
     shown = text.encode("ascii", "replace")[:_TEXT].ljust(_TEXT)
     return shown + saved({})[_TEXT:HEADER_BYTES]

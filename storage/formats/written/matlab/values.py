@@ -1,8 +1,8 @@
-"""What of a session becomes a variable, and in which class of numbers.
+"""Variables of a session for MATLAB, and their numeric classes.
 
 A quantity of all tiles is a matrix of frames by tiles. Numbers that may be unknown are NaN, in a
-class that has room for all of their values; `t_server_ns`, which no float holds, is
-intmin("int64") then.
+float class that holds all of their values. An unknown `t_server_ns`, which no float holds, is
+intmin("int64").
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from storage.schema import KNOWN, Array, Column, numpy_dtype
 
 
 def quantities_of(export: Export) -> list[Column]:
-    """Those that were chosen, in the order of their columns; marks are beside them."""
+    """Return the selected quantities in the order of their columns, without markers."""
     chosen = dict.fromkeys(export.chosen().values())
     return [KNOWN[of] for of in chosen if of not in ("time_utc", "event")]
 
 
 def names_of(export: Export, column: Column) -> list[str]:
-    """Its columns that were chosen; of one that nobody named, as the server's time, all."""
+    """Return the selected columns of a quantity; its own name if no column is selected."""
     return [name for name, of in export.chosen().items() if of == column.name] or [column.name]
 
 
 def class_of(column: Column) -> npt.DTypeLike:
-    """The class of its numbers; of a text, of the numbers of its kinds."""
+    """Return the class of a quantity's numbers; for a text, of the codes of its kinds."""
     kind = column.type
     if pa.types.is_string(kind):
         return np.uint16
@@ -43,7 +43,7 @@ def class_of(column: Column) -> npt.DTypeLike:
 
 
 def values_of(export: Export, column: Column) -> Mapping[str, Array]:
-    """A quantity as a variable by name, (frames, columns); of a text its kinds beside it."""
+    """Read a quantity as a variable by name, (frames, columns); for a text with its kinds."""
     names = names_of(export, column)
     pieces = list(_plain(export, column).pieces(names))
     flat = [np.concatenate([piece[name] for piece in pieces]) for name in names]
@@ -55,20 +55,20 @@ def values_of(export: Export, column: Column) -> Mapping[str, Array]:
 
 
 def pieces_of(export: Export, column: Column) -> Iterator[Array]:
-    """The numbers of a quantity, one of its columns after the other, as they are read."""
+    """Read the numbers of a quantity in chunks, column after column."""
     for name in names_of(export, column):
         for piece in _plain(export, column).pieces([name]):
             yield _known(column, piece[name])
 
 
 def _plain(export: Export, column: Column) -> Export:
-    """Without what a quantity does not need, and would be made for each anew."""
+    """Return the export without markers, and without a clock unless the quantity needs it."""
     is_server = column.name.startswith("t_server")
     return replace(export, marks=None, clock=export.clock if is_server else None)
 
 
 def _known(column: Column, values: Array) -> Array:
-    """Numbers with NaN for what is not known."""
+    """Return the numbers in the quantity's class, NaN where unknown."""
     found = values.astype(class_of(column))
     if column.missing is not None and found.dtype.kind == "f":
         found[values == column.missing] = np.nan
@@ -76,7 +76,7 @@ def _known(column: Column, values: Array) -> Array:
 
 
 def facts_of(export: Export) -> dict[str, Any]:
-    """What the file says of it; what is no text is JSON."""
+    """Return the file's metadata; values that are no text are JSON."""
     facts = {
         **export.about,
         "array_info": export.info.model_dump(mode="json"),
@@ -94,7 +94,7 @@ def _text(value: object) -> object:
 
 
 def tiles_of(export: Export) -> dict[str, Any]:
-    """Serials and places."""
+    """Return serials and positions of the tiles."""
     tiles = export.info.tiles
     places = np.array([(t.x_m, t.y_m, t.z_m) for t in tiles], dtype=np.float64)
     return {
@@ -104,7 +104,10 @@ def tiles_of(export: Export) -> dict[str, Any]:
 
 
 def marks_of(export: Export) -> dict[str, Any]:
-    """Labels, instants in the server's UTC, and rows, from 1; NaN: at no frame of this file."""
+    """Return labels, instants in the server's UTC, and rows of the markers.
+
+    Rows count from 1; NaN: no frame of this file.
+    """
     marks = export.marks.all if export.marks is not None else ()
     keys = ["seq", "part"] if "part" in export.content.names else ["seq"]
     pieces = list(replace(export, marks=None, clock=None).pieces(keys))

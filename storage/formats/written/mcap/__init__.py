@@ -1,1 +1,1 @@
-"""MCAP: a session as messages, Foxglove's or those of ROS 2, one way of writing for both."""
+"""MCAP writer: a session as messages of Foxglove or of ROS 2."""

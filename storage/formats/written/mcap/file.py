@@ -1,6 +1,6 @@
-"""Writes an MCAP file: messages in the order of their instants, and what is said of each session.
+"""MCAP writer: messages in the order of their instants, then the metadata of each session.
 
-That comes behind them, since how far the server's time may be off is known by then.
+Metadata follow the messages because the largest bound of the server's time is known only then.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from storage.formats.written.together import distinct
 
 _CHUNK = 1 << 20
 _LOOK_EVERY = 1 << 10
-"""After so many messages what was written is handed on."""
+"""Number of messages after which written bytes are yielded."""
 
 
 def _write(export: Export) -> Iterator[bytes]:
@@ -44,12 +44,12 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
     is_ros2 = exports[0].options.messages == "ros2"
     if is_ros2 and exports[0].part.columns:
         raise UsageError(
-            "messages of ROS 2 have fields of their own, and no columns can be chosen",
+            "messages of ROS 2 have fixed fields, and no columns can be selected",
             remedy="Leave columns out, or ask for messages=foxglove",
         )
     needed = ros2.needed if is_ros2 else foxglove.needed
     pieces = [frames_of(export, needed(export)) for export in exports]
-    firsts = [next(frames) for frames in pieces]  # what is wrong is said before anything is given
+    firsts = [next(frames) for frames in pieces]  # errors are raised before the first chunk
     sink = Sink()
     writer = Writer(sink, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
     writer.start(profile="ros2" if is_ros2 else "", library=exports[0].info.software)
@@ -73,14 +73,14 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
 
 @dataclass
 class _Session:
-    """One of those in the file.
+    """Session in the file.
 
     Attributes:
-        prefix: of its topics.
-        export: the session.
-        vocabulary: makes its messages.
-        pieces: its frames, in their order.
-        uncertainty_ns: greatest bound of their instants so far; None: they are the node's own.
+        prefix: prefix of its topics.
+        export: export of the session.
+        vocabulary: encoder of its messages.
+        pieces: chunks of its frames, in order.
+        uncertainty_ns: largest bound of the instants up to now; None: instants of the node's clock.
     """
 
     prefix: str
@@ -90,7 +90,7 @@ class _Session:
     uncertainty_ns: int | None = None
 
     def messages(self) -> Iterator[Message]:
-        """All of them."""
+        """Yield all messages of the session; update the largest bound of the instants."""
         for frames in self.pieces:
             if frames.uncertainty_ns is not None:
                 self.uncertainty_ns = max(self.uncertainty_ns or 0, frames.uncertainty_ns)
@@ -98,7 +98,7 @@ class _Session:
 
 
 def _said(session: _Session, *, is_ros2: bool) -> dict[str, str]:
-    """What the file says of one; values that are no text are JSON."""
+    """Return the metadata of a session; values that are no text are JSON."""
     export = session.export
     clock = "the node's" if export.clock is None else "the server's"
     facts = {

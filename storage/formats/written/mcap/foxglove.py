@@ -1,14 +1,14 @@
-"""Foxglove's messages, as Protobuf: every frame with all its columns, the foot, marks as log.
+"""Encoder of Foxglove messages (Protobuf): frames with all columns, the foot, markers as log.
 
-A frame is a message of our own, `foottile.Frame`, whose fields are the columns; numbers in it have
-fixed widths, so that all messages of a session are equally long. The foot is a
-`foxglove.SceneUpdate`, a mark a `foxglove.Log` (https://docs.foxglove.dev/docs/visualization/
-message-schemas).
+A frame is a `foottile.Frame`, whose fields are the columns. Its numbers have fixed widths, so that
+all messages of a session have one length. The foot is a `foxglove.SceneUpdate`, a marker a
+`foxglove.Log` (https://docs.foxglove.dev/docs/visualization/message-schemas).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -31,10 +31,12 @@ from storage.formats.written.mcap.source import (
     frame_id,
     numbers,
 )
+from storage.formats.written.row_place import NEEDED as POINT
+from storage.formats.written.row_place import with_row_place
 from storage.schema import KNOWN, Array, Column
 
 _NS = 1_000_000_000
-_SCENE = ("grf_n", "cop_x_m", "cop_y_m", "force_n")
+_SCENE = (*POINT, "force_n")
 
 # Protobuf's types of fixed width: their number, wire type (of 32 or 64 bits), and numpy's name.
 _FLOAT = FieldDescriptorProto.TYPE_FLOAT, 5, "<f4"
@@ -46,7 +48,7 @@ _SFIXED64 = FieldDescriptorProto.TYPE_SFIXED64, 1, "<i8"
 
 
 def columns_of(export: Export) -> list[str]:
-    """Flat columns of a frame: those that were chosen, but times made for tables and texts."""
+    """Return the flat columns of a frame message: selected numbers, `time_s` only if named."""
     return [
         name
         for name, of in export.chosen().items()
@@ -56,18 +58,18 @@ def columns_of(export: Export) -> list[str]:
 
 
 def needed(export: Export) -> list[str]:
-    """Columns to be read."""
-    there = [name for name in _SCENE if export.has_forces]
-    return [*columns_of(export), *there]
+    """Return the columns to read."""
+    drawn = [name for name in _SCENE if export.has_forces]
+    return [*columns_of(export), *drawn]
 
 
 class FoxgloveMessages:
-    """Of one session.
+    """Encoder of a session's Foxglove messages.
 
     Args:
-        channels: where they go.
-        export: the session.
-        prefix: of its topics.
+        channels: registry of schemas and channels.
+        export: export of the session.
+        prefix: prefix of its topics.
     """
 
     def __init__(self, channels: Channels, export: Export, prefix: str) -> None:
@@ -84,7 +86,7 @@ class FoxgloveMessages:
         self._scene = _channel(channels, f"{prefix}/foot", SceneUpdate)
 
     def messages(self, frames: Frames) -> Iterator[Message]:
-        """Of some frames."""
+        """Yield the encoded messages of a chunk of frames, in order."""
         packed = self._packed.messages(
             {name: _in_field(c, frames.flat[name]) for name, c in self._columns.items()}
         )
@@ -106,6 +108,8 @@ class FoxgloveMessages:
     def _scenes(self, frames: Frames) -> Iterator[bytes]:
         tiles = self._info.tiles
         rows = frames.shown
+        if self._has_forces:
+            frames = replace(frames, flat=with_row_place(frames.flat, self._info))
         unknown = np.full((len(rows), len(tiles)), np.nan)
         forces_n = frames.tiles("force_n", len(tiles))[rows] if self._has_forces else unknown
         for row, force_n in zip(rows, forces_n.tolist(), strict=True):
@@ -138,7 +142,7 @@ class FoxgloveMessages:
         )
         place, turn, shade = arrow.pose.position, arrow.pose.orientation, arrow.color
         place.x, place.y, place.z = x_m, y_m, lowest_m
-        # An arrow points along x: turned about y by -90 degrees it points upwards.
+        # Arrows point along x: rotate by -90 degrees about y to point upwards.
         turn.y, turn.w = -np.sqrt(0.5), np.sqrt(0.5)
         shade.r, shade.g, shade.b, shade.a = 0.1, 0.7, 0.3, 1.0
 
@@ -155,7 +159,7 @@ def _time(t_ns: int) -> Timestamp:
 
 
 def _field(column: Column) -> tuple[int, int, str]:
-    """Type of a column's field: whatever may be unknown has a NaN, and the bits for its values."""
+    """Return the type of a column's field; a float if unknown values need NaN."""
     kind = column.type
     if pa.types.is_floating(kind):
         return _DOUBLE if kind.bit_width == 64 else _FLOAT
@@ -186,9 +190,9 @@ def _frame_descriptors(columns: dict[str, Column]) -> FileDescriptorSet:
 
 
 def _packed(columns: list[Column], names: list[str]) -> Packed:
-    """Key and value of each field, one after the other (protobuf.dev/programming-guides/encoding).
+    """Return the template of a message with key and value of each field.
 
-    All are there, zeros too, which readers take as well as none.
+    Encoding: protobuf.dev/programming-guides/encoding. Zeros are written too; readers accept them.
     """
     template = bytearray()
     fields: dict[str, tuple[str, int]] = {}

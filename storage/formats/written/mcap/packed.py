@@ -1,6 +1,6 @@
-"""Messages that are all of one length, thousands at a time: a template, and columns put into it.
+"""Fast encoder of thousands of messages of equal length from a template and columns.
 
-A library makes the template, so that the encoding is its own; only numbers are replaced in it.
+The template is a message encoded by the format's library; only numbers are replaced in it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from storage.schema import Array
 
 
 class Packed:
-    """Makes messages from a template.
+    """Template of encoded messages whose numbers are replaced.
 
     Args:
-        template: one message.
-        fields: type and place of each number in it that is another one in each message.
+        template: one encoded message.
+        fields: numpy type and byte offset of each replaced number, by name.
     """
 
     def __init__(self, template: bytes, fields: Mapping[str, tuple[str, int]]) -> None:
@@ -32,10 +32,10 @@ class Packed:
         )
 
     def messages(self, values: Mapping[str, Array]) -> list[bytes]:
-        """N messages.
+        """Return n encoded messages.
 
         Args:
-            values: n numbers for each of the fields.
+            values: n numbers for each field, by name.
         """
         n, size = len(next(iter(values.values()))), len(self._template)
         content = np.tile(self._template, (n, 1))

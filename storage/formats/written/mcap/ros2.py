@@ -1,14 +1,15 @@
-"""ROS 2's messages, as CDR: a wrench of each foot, the pressure of each tile, markers, marks.
+"""Encoder of ROS 2 messages (CDR): wrench of a foot, pressure of each tile, drawing, markers.
 
 `geometry_msgs/WrenchStamped` has the GRF along z of the foot frame and its moment about the origin,
 from which the centre of pressure follows: x = -torque.y / force.z, y = torque.x / force.z.
-`sensor_msgs/FluidPressure` is absolute, in pascals, at the instant at which the tile was sampled.
+`sensor_msgs/FluidPressure` is absolute pressure in Pa, at the instant when the tile was sampled.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,30 +29,32 @@ from storage.formats.written.mcap.source import (
     colour,
     frame_id,
 )
+from storage.formats.written.row_place import NEEDED as POINT
+from storage.formats.written.row_place import with_row_place
 from storage.schema import Array
 
 _NS = 1_000_000_000
 _STAMP = {"sec": ("<i4", 4), "nanosec": ("<u4", 8)}
-"""A header begins with it, behind the four bytes that say how it is encoded."""
+"""Fields of a header's stamp, after four bytes that state the encoding."""
 _READINGS = ("padc", "tadc", "status", "sample_offset_us")
-_FORCES = ("grf_n", "cop_x_m", "cop_y_m", "force_n")
+_FORCES = (*POINT, "force_n")
 _HELD_NS = _NS
-"""For so long the chip's last temperature stands for those that were not read."""
+"""Longest age of a chip's last temperature that is used for frames without one."""
 
 
 def needed(export: Export) -> list[str]:
-    """Columns to be read."""
+    """Return the columns to read."""
     return [*_READINGS, *(_FORCES if export.has_forces else ())]
 
 
 def name_of(text: str) -> str:
-    """A name that ROS 2 takes: letters, digits and underscores, no digit in front."""
+    """Return a valid ROS 2 name: letters, digits and underscores, beginning with a letter."""
     name = re.sub(r"_+", "_", re.sub(r"[^0-9A-Za-z]", "_", text)).strip("_")
     return name if re.match(r"[A-Za-z]", name) else f"n_{name}".rstrip("_")
 
 
 class Ros2Messages:
-    """Of one session; arguments as for `FoxgloveMessages`."""
+    """Encoder of a session's ROS 2 messages; arguments as for `FoxgloveEncoder`."""
 
     def __init__(self, channels: Channels, export: Export, prefix: str) -> None:
         self._types = get_typestore(Stores.ROS2_HUMBLE)
@@ -86,10 +89,11 @@ class Ros2Messages:
         self._marks = self._topic(f"{prefix}/marks", "std_msgs/msg/String")
 
     def messages(self, frames: Frames) -> Iterator[Message]:
-        """Of some frames."""
+        """Yield the encoded messages of a chunk of frames, in order."""
         t_ns = frames.t_ns.tolist()
         topics: list[tuple[int, list[bytes]]] = []
         if self._has_forces:
+            frames = replace(frames, flat=with_row_place(frames.flat, self._info))
             topics.append((self._wrenches, self._wrench.messages(_wrenches(frames))))
         topics += zip(self._tiles, self._of_tiles(frames), strict=True)
         beside: dict[int, list[Message]] = {}
@@ -212,14 +216,14 @@ class Ros2Messages:
 
 
 class _Held:
-    """The last temperature counts of each tile, for the frames that did not read any."""
+    """Zero-order hold of each tile's temperature counts, for frames that did not read any."""
 
     def __init__(self, tiles: int) -> None:
         self._counts = np.full(tiles, np.nan)
         self._at_ns = np.full(tiles, np.iinfo(np.int64).min // 2)
 
     def filled(self, t_ns: Array, tadc: Array) -> Array:
-        """Counts, (n, tiles), NaN where none was read for a second."""
+        """Return the counts with gaps held, (n, tiles); NaN if none was read for a second."""
         n = len(t_ns)
         if not n:
             return np.empty(tadc.shape)

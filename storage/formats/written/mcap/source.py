@@ -1,4 +1,4 @@
-"""What messages are made of: frames with their instants, and the foot that is drawn of some."""
+"""Input of message encoders: frames with instants and markers, and constants of the drawn foot."""
 
 from __future__ import annotations
 
@@ -14,46 +14,46 @@ from storage.formats.written.together import instants_of
 from storage.schema import KNOWN, SERVER_TIME, Array
 
 SHOWN_NS = 50_000_000
-"""The foot is drawn twenty times a second: more no screen needs, and it is most of the bytes."""
+"""Interval of drawings of the foot: enough for a screen, and drawings are most of the bytes."""
 TILE_RADIUS_M, TILE_HEIGHT_M = 0.008, 0.006
 METRES_PER_NEWTON = 0.001
 """Length of the arrow of the GRF."""
 FULL_COLOUR_N = 30.0
-"""Force from which on a tile is drawn in its fullest colour."""
+"""Force at which a tile's colour saturates."""
 
 Message = tuple[int, int, bytes]
-"""Instant, channel and content."""
+"""Message: instant in ns, number of the channel, content."""
 
 
 class Channels(Protocol):
-    """Where messages go; `mcap.writer.Writer` has these."""
+    """Registry of schemas and channels, as in `mcap.writer.Writer`."""
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Number of a kind of message."""
+        """Register a type of message; return its number."""
 
     def register_channel(
         self, topic: str, message_encoding: str, schema_id: int, metadata: dict[str, str]
     ) -> int:
-        """Number of a topic."""
+        """Register a topic; return its number."""
 
 
 class Vocabulary(Protocol):
-    """Messages of one session."""
+    """Encoder of one session's messages."""
 
     def messages(self, frames: Frames) -> Iterator[Message]:
-        """Of some frames, in their order."""
+        """Yield the encoded messages of a chunk of frames, in order."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Some frames of a session.
+    """Chunk of a session's frames.
 
     Attributes:
-        t_ns: int64[n], instants on the clock that was asked for.
+        t_ns: int64[n], instants on the export's clock.
         flat: flat columns.
-        shown: rows of which the foot is drawn.
-        marks: row and text of what was marked.
-        uncertainty_ns: greatest bound of the instants; None: they are the node's own.
+        shown: rows for which the foot is drawn.
+        marks: row and label of each marker.
+        uncertainty_ns: largest bound of the instants; None: instants of the node's clock.
     """
 
     t_ns: Array
@@ -63,13 +63,13 @@ class Frames:
     uncertainty_ns: int | None
 
     def tiles(self, name: str, count: int) -> Array:
-        """One quantity of all tiles, (n, tiles), NaN where it is not known."""
+        """Return one quantity of all tiles, (n, tiles), NaN where unknown."""
         columns = [numbers(name, self.flat[f"{name}_{i}"]) for i in range(count)]
         return np.stack(columns, axis=1) if columns else np.empty((len(self.t_ns), 0))
 
 
 def numbers(name: str, values: Array) -> Array:
-    """A column of any type as float64, NaN where it is not known."""
+    """Return a column of any type as float64, NaN where unknown."""
     found = values.astype(np.float64)
     missing = KNOWN[name].missing
     if missing is not None:
@@ -78,10 +78,10 @@ def numbers(name: str, values: Array) -> Array:
 
 
 def frames_of(export: Export, columns: list[str]) -> Iterator[Frames]:
-    """A session's frames, with these columns.
+    """Read a session's frames in chunks, with these columns.
 
     Raises:
-        UsageError: as for `Export.pieces`; the server's time of a frame is not known.
+        UsageError: as for `Export.read_chunks`; the server's time of a frame is unknown.
     """
     asked = [*columns, "t_ns", *(["part"] if "part" in export.content.names else [])]
     asked += [column.name for column in SERVER_TIME] if export.clock is not None else []
@@ -100,7 +100,7 @@ def frames_of(export: Export, columns: list[str]) -> Iterator[Frames]:
 
 
 def colour(force_n: float) -> tuple[float, float, float, float]:
-    """Of a tile: red, green, blue, opacity. Grey: its force is not known."""
+    """Return the colour of a tile: red, green, blue, opacity; grey for an unknown force."""
     if np.isnan(force_n):
         return 0.5, 0.5, 0.5, 0.5
     share = min(max(force_n / FULL_COLOUR_N, 0.0), 1.0)
@@ -108,5 +108,5 @@ def colour(force_n: float) -> tuple[float, float, float, float]:
 
 
 def frame_id(info: ArrayInfo) -> str:
-    """Name of the foot frame."""
+    """Return the name of the foot's coordinate frame."""
     return f"{info.node}_foot"

@@ -1,1 +1,1 @@
-"""OpenSim: what acts on each foot as rows without a gap, and the files that say so."""
+"""OpenSim writer: loads of each foot as rows without gaps, and their files."""

@@ -1,8 +1,7 @@
-"""OpenSim's files: a `.mot` file with the `ExternalLoads` that name its columns.
+"""OpenSim writer: a zip file with a `.mot` file and the `ExternalLoads` that name its columns.
 
-Both come in one zip file, for neither is of use without the other, with what was filled and what
-happened as tables, and what else there is to know as text. Of several sessions each is a force of
-its own, on a body of its own, over one time.
+The zip file also has tables of filled stretches and of events, and metadata as text. Each of
+several sessions is a separate force on a separate body, over one time.
 """
 
 from __future__ import annotations
@@ -26,33 +25,33 @@ from storage.formats.export import Export
 from storage.formats.written.csv_text import write_csv
 from storage.formats.written.described import ascii_of, clock_bound, described
 from storage.formats.written.format import Format
-from storage.formats.written.opensim.loads import COLUMNS, GROUND, Loads, loads_of
+from storage.formats.written.opensim.loads import COLUMNS, GROUND_X, Loads, loads_of
 from storage.formats.written.reaction import Reaction, reactions_of
 from storage.formats.written.sink import Sink
 from storage.formats.written.together import distinct
 from storage.formats.written.xml_text import xml_text
 
 FRAMES_MAX = 2_000_000
-"""An hour at 544 Hz, of all sessions together."""
+"""Limit of frames of all sessions: an hour at 544 Hz."""
 BODY = "foot"
-"""Of the model, if nobody says which; of several, each is called after its node."""
+"""Default body of the model; for several sessions with the node's name as prefix."""
 
 _NOT_IN_NAMES = re.compile(r"[^0-9A-Za-z._-]")
 _ROWS = 1 << 15
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
-"""The same session has the same bytes."""
+"""Constant date: the same session gives the same bytes."""
 
 
 @dataclass(frozen=True)
 class Foot:
-    """One session in the files.
+    """One foot of the export, with its session.
 
     Attributes:
-        export: the session.
-        found: what was measured.
-        loads: what acts on it.
-        name: of its node, in letters that files and models take; empty: it is the only one.
-        body: of the model.
+        export: export of the session.
+        found: ground reaction of the session.
+        loads: loads on the foot.
+        name: name of the node in characters valid for files and models; empty for a single foot.
+        body: body of the model.
     """
 
     export: Export
@@ -63,12 +62,12 @@ class Foot:
 
     @property
     def prefix(self) -> str:
-        """Of its columns."""
+        """Prefix of the foot's columns."""
         return f"{self.name}_" if self.name else ""
 
     @property
     def frame(self) -> str:
-        """Body in whose frame force and point are."""
+        """Name of the body in whose frame force and point are expressed."""
         return "ground" if self.loads.frame == "ground" else self.body
 
 
@@ -81,7 +80,7 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
     named = ascii_of(str(exports[0].about.get("session") or "session"))
     stem = _NOT_IN_NAMES.sub("_", named if len(feet) == 1 else f"{named}-and-{len(feet) - 1}-more")
     filled = [foot.loads.filled() for foot in feet]
-    said = [_said(foot, table) for foot, table in zip(feet, filled, strict=True)]
+    foot_notes = [_said(foot, table) for foot, table in zip(feet, filled, strict=True)]
     events = [_events(foot.found) for foot in feet]
     time_s = feet[0].found.steady.time_s
     table = np.concatenate([time_s[:, None], *(foot.loads.table for foot in feet)], axis=1)
@@ -90,7 +89,7 @@ def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
         file.writestr(_entry(f"{stem}.xml"), external_loads(f"{stem}.mot", feet))
         file.writestr(_entry(f"{stem}_filled.csv"), _csv(_of_feet(filled, feet)))
         file.writestr(_entry(f"{stem}_events.csv"), _csv(_of_feet(events, feet)))
-        notes = said[0] if len(said) == 1 else {"SESSIONS": said}
+        notes = foot_notes[0] if len(foot_notes) == 1 else {"SESSIONS": foot_notes}
         file.writestr(_entry(f"{stem}_notes.json"), json.dumps(notes, indent=1))
         with file.open(_entry(f"{stem}.mot"), "w", force_zip64=True) as entry:
             names = ["time", *(foot.prefix + name for foot in feet for name in COLUMNS)]
@@ -114,7 +113,7 @@ def _feet(exports: Sequence[Export]) -> list[Foot]:
                 expected="one for each, in their order, with commas between: "
                 + ", ".join(each.called for each in exports),
             )
-    found = reactions_of(exports, GROUND, FRAMES_MAX // len(exports))
+    found = reactions_of(exports, [GROUND_X], FRAMES_MAX // len(exports))
     loads = [
         loads_of(each, export, is_alone=is_alone)
         for each, export in zip(found, exports, strict=True)
@@ -123,7 +122,7 @@ def _feet(exports: Sequence[Export]) -> list[Foot]:
 
 
 def external_loads(mot: str, feet: Sequence[Foot]) -> str:
-    """The file that says what the columns of a `.mot` file are, and on which bodies they act."""
+    """Return the XML that maps the columns of a `.mot` file to forces on bodies."""
     forces = "".join(_external_force(foot) for foot in feet)
     return (
         '<?xml version="1.0" encoding="UTF-8" ?>\n'
@@ -169,8 +168,8 @@ def _said(foot: Foot, filled: pa.Table) -> dict[str, object]:
         **described(foot.export, steady.begin_ns),
         "AXES": ascii_of(axes),
         "RESAMPLED": steady.says(),
-        "FILLED": "what is not known, for there is no number for it: every stretch is in the table "
-        "of what was filled",
+        "FILLED": "unknown numbers, as the format has no number for them: every stretch is in the "
+        "table of filled stretches",
         "BODY": foot.body,
         "COLUMNS": f"{foot.prefix}ground_force_vx and the eight behind it",
         "NOT_MEASURED": "shear and free moment: 0",
@@ -204,7 +203,7 @@ def _events(found: Reaction) -> pa.Table:
 
 
 def _of_feet(tables: Sequence[pa.Table], feet: Sequence[Foot]) -> pa.Table:
-    """One table; of several feet with the one that a row is of."""
+    """Return one table; for several feet, a column `foot` tells the foot of each row."""
     if len(feet) == 1:
         return tables[0]
     return pa.concat_tables(

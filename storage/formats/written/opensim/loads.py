@@ -1,12 +1,12 @@
-"""What acts on a foot at each row of a `.mot` file, and what was filled in it.
+"""Loads on a foot at each row of a `.mot` file, with a record of filled stretches.
 
-OpenSim's axes: x forward, y up, z to the right. Points are in the ground's frame where the session
-knows it; else force and point are in that of the foot, as a body of the model, which moves them.
-Of several feet each has a ground of its own under its ankle, and none knows where the others
-are: there all are in the frames of their bodies.
+OpenSim's axes: x forward, y up, z to the right. Points are in the ground's frame if the session
+has it; else force and point are in the frame of the foot's body, which moves them. The ground frame
+of each foot lies under its ankle, and relative positions of feet are unknown: for several feet, all
+are in the frames of their bodies.
 
-A `.mot` file has no number for what is not known. So that nobody takes what was put there for a
-measurement, every stretch of it is in a table.
+A `.mot` file has no value for unknown numbers, so they are filled. A table lists every filled
+stretch, to distinguish it from measured values.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from devices.arrays import Floats
 from devices.errors import UsageError
 from storage.formats.export import Export
 from storage.formats.written.reaction import Reaction
+from storage.formats.written.row_place import COP
 
 LINE_S = 0.02
-"""A GRF that is not known for longer is 0, and not on a line between what is known."""
+"""Longest interpolated stretch of unknown GRF; longer stretches are 0."""
 
 COLUMNS = (
     *(f"ground_force_v{axis}" for axis in "xyz"),
     *(f"ground_force_p{axis}" for axis in "xyz"),
     *(f"ground_torque_{axis}" for axis in "xyz"),
 )
-"""Of one foot, behind `time`."""
-GROUND = ("cop_ground_x_m", "cop_ground_y_m")
-_FOOT = ("cop_x_m", "cop_y_m")
+"""Columns of one foot, after `time`."""
+GROUND_X = "cop_ground_x_m"
+"""Ground x; the foot rolls about its y axis, so y is the same in both frames."""
 
 
 _WHY = {
@@ -53,14 +54,14 @@ _UNLOADED, _LINE, _ZERO, _LINE_EMPTY, _ZERO_EMPTY, _POINT = _WHY
 
 @dataclass(frozen=True)
 class Loads:
-    """What acts on one foot in n rows of a `.mot` file, and what of them was filled.
+    """Loads on one foot in n rows of a `.mot` file, with a code for filled rows.
 
     Attributes:
-        time_s: (n,), since the first row.
-        table: (n, 9), in the order of `COLUMNS`; no NaN.
-        code: (n,), what was filled: a key of `_WHY`, or 0.
-        status: (n,), `estimate_status`, NaN where there is no frame.
-        frame: "ground" or "foot".
+        time_s: (n,), times since the first row.
+        table: (n, 9), loads in the order of `COLUMNS`; no NaN.
+        code: (n,), reason for filling: a key of `_WHY`, or 0 if the row is not filled.
+        status: (n,), `estimate_status`, NaN without a frame.
+        frame: frame of forces and points, "ground" or "foot".
     """
 
     time_s: Floats
@@ -70,20 +71,20 @@ class Loads:
     frame: str
 
     def filled(self) -> pa.Table:
-        """A row for each stretch: from, to, what, with what, why, and the flags there."""
+        """Return the table of filled stretches: from, to, what, by what, why, and flags."""
         edges = np.flatnonzero(np.diff(self.code)) + 1
         begins, ends = np.append(0, edges), np.append(edges, len(self.code))
-        kept = self.code[begins] != _NOTHING
-        begins, ends = begins[kept], ends[kept]
-        said = [_WHY[int(self.code[begin])] for begin in begins]
+        is_filled = self.code[begins] != _NOTHING
+        begins, ends = begins[is_filled], ends[is_filled]
+        reasons = [_WHY[int(self.code[begin])] for begin in begins]
         flags = [_all_bits(self.status[a:b]) for a, b in zip(begins, ends, strict=True)]
         columns = {
             "from_s": self.time_s[begins],
             "to_s": self.time_s[ends - 1],
             "rows": ends - begins,
-            "filled": [what for what, _, _ in said],
-            "with": [how for _, how, _ in said],
-            "because": [why for _, _, why in said],
+            "filled": [what for what, _, _ in reasons],
+            "with": [how for _, how, _ in reasons],
+            "because": [why for _, _, why in reasons],
             "estimate_status": flags,
         }
         types = [pa.float64(), pa.float64(), pa.int64(), *[pa.string()] * 3, pa.int64()]
@@ -97,20 +98,23 @@ class Loads:
 
 
 def loads_of(found: Reaction, export: Export, *, is_alone: bool) -> Loads:
-    """What acts on the foot, at each sample.
+    """Compute the loads on the foot at each sample, with unknown numbers filled.
 
     Args:
-        found: what was measured.
-        export: its session.
-        is_alone: is it the only foot?
+        found: ground reaction of the session.
+        export: export of the session.
+        is_alone: True for a single foot; only then loads may be in the ground's frame.
 
     Raises:
-        UsageError: no centre of pressure is stated in it.
+        UsageError: no sample has a centre of pressure.
     """
     places = [tile.z_m for tile in export.info.tiles if not tile.reference]
-    ground = [found.at(name) for name in GROUND if name in found.columns]
-    is_ground = is_alone and len(ground) == 2 and bool(np.isfinite(ground).all(axis=0).any())
-    points = ground if is_ground else [found.at(name) for name in _FOOT]
+    points = [found.at(name) for name in COP]
+    is_ground = False
+    if is_alone and GROUND_X in found.columns:
+        ground_x_m = found.at(GROUND_X)
+        is_ground = bool(np.isfinite(ground_x_m).any())
+        points[0] = ground_x_m if is_ground else points[0]
     stated = np.isfinite(points).all(axis=0)
     if not stated.any():
         raise UsageError(
@@ -148,7 +152,7 @@ def loads_of(found: Reaction, export: Export, *, is_alone: bool) -> Loads:
 def _bridged(
     time_s: Floats, force_n: Floats, known: npt.NDArray[np.bool_]
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
-    """Forces without NaN, and where they are on a line between two that are known."""
+    """Return forces without NaN, and the mask of the interpolated samples."""
     at = np.flatnonzero(known)
     after = np.searchsorted(at, np.arange(len(time_s)))
     inside = (after > 0) & (after < len(at)) & ~known

@@ -44,7 +44,7 @@ def test_the_machine_that_asked_last_is_accepted_and_named(
 def test_a_machine_with_another_fingerprint_is_not(accept: Accept, stranger: FakeNode) -> None:
     outcome = accept("bench", "--fingerprint", "0000-0000-0000-0000")
     assert outcome.code == 1
-    assert "another machine asked to connect as 'bench' meanwhile" in outcome.err
+    assert "another machine was refused as 'bench' meanwhile" in outcome.err
     stranger.open_with_hello()
     assert closed(stranger.socket)[0] == 4013
 

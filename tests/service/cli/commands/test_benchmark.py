@@ -48,7 +48,7 @@ def test_bench_writes_json_tables_and_plot(run: Run, scene: Path, tmp_path: Path
     assert sum(rung["default"] for rung in rolling["rungs"]) == 1
     text = (folder / "bench.md").read_text()
     assert "an emulated foot" in text
-    assert "newtons are not to be trusted" in text
+    assert "forces in newtons are unreliable" in text
     assert (folder / "bench.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -48,12 +48,12 @@ def test_what_gave_no_result_is_named_and_code_3(
     from service.offline.benchmark.broad import run as broad_run
 
     def refused(task: ArrayTask) -> ArrayResult:
-        refusal = Refusal(what="bench of T02", why="it drifts")
+        refusal = Refusal(what="calibration of T02", why="it drifts")
         return made(task).model_copy(update={"judged": {}, "refusals": (refusal,)})
 
     monkeypatch.setattr(broad_run, "run_array", refused)
-    run(*BROAD).fails(3, "no result: array 2, bench of T02: it drifts")
-    assert "| 2 | bench of T02 |  | it drifts |" in (tmp_path / "o" / "broad.md").read_text()
+    run(*BROAD).fails(3, "no result: array 2, calibration of T02: it drifts")
+    assert "| 2 | calibration of T02 |  | it drifts |" in (tmp_path / "o" / "broad.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(
     assert "…" not in outcome.out
     assert max(len(line) for line in outcome.out.splitlines()) <= 80
     twice = run("calibrate", "1.parquet", "1.parquet", "--out", "twice.json")
-    twice.fails(1, "the same frames are given twice")
+    twice.fails(1, "the same frames occur twice")
     parts = ("--parts-seed", 9, "--seconds", 3, "--out", "parts.parquet")
     run("simulate", "--scene", "short.toml", "--tiles", "T01", *parts)
     other = run("calibrate", "1.parquet", "parts.parquet", "--out", "other.json")

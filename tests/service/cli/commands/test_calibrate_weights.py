@@ -11,13 +11,12 @@ import pytest
 
 from devices.arrays import Floats
 from devices.chips.compensation import Compensation
-from service.cli.commands import calibrate_live
 from service.estimation.calibration import Calibration
 from service.estimation.fitting.bench.indentation import Indentation
-from service.estimation.fitting.bench.weights import STANDARD_GRAVITY_M_S2, parse_weight
 from service.estimation.fitting.weights_fit import fit_weights
-from service.offline import weighing
-from service.offline.weighing import Action, Begin, Withdraw
+from service.estimation.weights import STANDARD_GRAVITY_M_S2, parse_weight, weight_labels
+from service.server import weighing, weighings
+from service.server.weighing import Action, Begin, Withdraw
 from service.sessions.calibration_file import calibration_of, write_calibration
 from storage.sessions.reader import SessionReader
 from tests.service.cli.outcome import Run, scene_text, static_only
@@ -40,7 +39,7 @@ def put_on(path: Path, grams: tuple[float, ...]) -> None:
     path.write_text("\n".join([*rows, f"{17.0 * len(grams)},0", ""]))
 
 
-def follow(path: Path, weights: list[str]) -> Indentation:
+def follow(path: Path, weights: tuple[str, ...]) -> Indentation:
     """Tile T01 of a recording, with the steps that the guide has marked in it."""
     with SessionReader(path) as session:
         frames = [frames for frames, _ in session.batches()]
@@ -52,9 +51,9 @@ def follow(path: Path, weights: list[str]) -> Indentation:
     begins: list[int] = []
     for begin in range(0, len(t_ns), 10):
         rows = slice(begin, begin + 10)
-        for action in guide.push(1e-9 * t_ns[rows], kpa[rows]):
+        for action in guide.push(t_ns[rows], kpa[rows]):
             match action:
-                case Begin(label):
+                case Begin(label, _):
                     phase[begin:] = label.removeprefix("T01 ")
                     begins.append(begin)
                 case Withdraw():
@@ -80,7 +79,7 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
         put_on(Path(f"{name}.csv"), grams)
         asked = ("--scene", "one.toml", "--load", f"{name}.csv", "--truth", "--no-estimates")
         assert run("simulate", *asked, "--out", f"{name}.parquet").code == 0
-    weights = calibrate_live.read_weights(FIVE, 0.5)
+    weights = weight_labels(FIVE.split(","), 0.5)
     tile = fit_weights([follow(Path("five.parquet"), weights)])
     made = Calibration(name="five", reference="weights", date="2026-11-25", tiles=(tile,))
     write_calibration(Path("five.json"), made)
@@ -113,16 +112,16 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
     class Followed(weighing.Weighing):
         """A guide whose prompts somebody follows."""
 
-        def push(self, t_s: Floats, kpa: Floats) -> list[Action]:
+        def push(self, t_ns: npt.NDArray[np.int64], kpa: Floats) -> list[Action]:
             # By now the prompt is there, and the marks before it are made.
             known = parse_weight(self.weights[self.number]) if self.step == "put on" else None
             if known is not None:
                 play.force_n = known.force_n
             elif self.step == "empty":
                 play.force_n = 0.0
-            return super().push(t_s, kpa)
+            return super().push(t_ns, kpa)
 
-    monkeypatch.setattr(calibrate_live, "Weighing", Followed)
+    monkeypatch.setattr(weighings, "Weighing", Followed)
     monkeypatch.setenv("FOOTTILE_TOKEN", tared.running.shown["Authorization"].split()[-1])
     asked: tuple[Any, ...] = ("--tile", "T01", "--weights", "10N,20N,40N,60N,80N")
     with Play(tared, alive=True) as play:
@@ -135,8 +134,8 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
     facts = found.tiles[0].weights
     assert facts is not None
     assert [step.force_n for step in facts.steps] == [10.0, 20.0, 40.0, 60.0, 80.0]
-    assert facts.band_95[-1].force_n == pytest.approx(80.0, abs=2.0)  # two counts
-    assert "80N" in outcome.out
+    assert facts.band_95[-1].force_n == pytest.approx(80.0, abs=1.0)  # a count
+    assert "80 N" in outcome.out
     (session,) = running.http.get("/sessions").json()["items"]
     assert session["id"] in outcome.err
 

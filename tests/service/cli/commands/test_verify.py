@@ -132,7 +132,7 @@ def test_what_is_lone_says_what_it_does_not_prove(run: Run, data: Path) -> None:
     run("recover", data)
     found = run("verify", data / "sessions" / ID / "frames.parquet")
     assert found.code == 4
-    assert "not proven: that it is the file that session.json" in found.out
+    assert "not proven: that it is the file in session.json" in found.out
     assert "whole and complete" not in found.out
 
 
@@ -233,7 +233,7 @@ def test_what_simulate_and_estimate_write_is_whole_but_of_no_recorded_session(
     for path in (raw, estimated):
         found = run("verify", path)
         assert (found.code, "  damaged" in found.out) == (4, False)
-        assert "not proven: where its recording began and ended" in found.out
+        assert "not proven: begin and end of its recording" in found.out
 
 
 def test_every_other_file_of_a_data_folder_is_looked_at(run: Run, data: Path) -> None:
@@ -341,7 +341,7 @@ def test_verify_does_not_follow_a_link_in_the_place_of_a_folder(
     found = run("verify", data)
     assert found.code == 1
     assert f"damaged: {place}" in found.out
-    assert "which is not followed" in found.out
+    assert "links are not followed" in found.out
 
 
 def test_a_list_of_sessions_goes_on_behind_a_damaged_one(run: Run, data: Path) -> None:

@@ -72,9 +72,9 @@ def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
     sprung, loop = flow.Flow(*(np.array([x]) for x in law)), hysteresis.Hysteresis(np.array([LOOP]))
     creep, nan = rubber.Rubber(np.array([PART]), np.array([CREEP_S])), math.nan
     felt_n = apparent_n(out[:, 0])
-    for model, of in ((flow, sprung), (hysteresis, loop), (rubber, creep)):
-        when = () if model is hysteresis else (t_ns, nan)
-        felt_n = through(model.compensated, of.laws(), model.at_rest(1), felt_n, *when, nan)
+    felt_n = through(flow.compensated, sprung.laws(), flow.at_rest(1), felt_n, t_ns, nan, nan)
+    felt_n = through(hysteresis.compensated, loop.laws(), hysteresis.at_rest(1), felt_n, nan)
+    felt_n = through(rubber.compensated, creep.laws(), rubber.at_rest(1), felt_n, t_ns, nan, nan)
     assert felt_n == pytest.approx(force_n, abs=1e-9)
     assert out[:, 2] == pytest.approx(force_n - apparent_n(out[:, 0]), abs=1e-9)
 

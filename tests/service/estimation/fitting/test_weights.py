@@ -8,8 +8,8 @@ import pytest
 from devices.errors import CalibrationError
 from service.estimation.calibration import TileCalibration
 from service.estimation.fitting.bench.indentation import Indentation
-from service.estimation.fitting.bench.weights import STANDARD_GRAVITY_M_S2, parse_weight
 from service.estimation.fitting.weights_fit import fit_weights
+from service.estimation.weights import STANDARD_GRAVITY_M_S2, parse_weight
 
 RATE_HZ = 50
 BASELINE_KPA = 100.0

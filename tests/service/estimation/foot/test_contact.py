@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.foot.contact import STATE, ContactRule, has_lasted, seeming
-from service.estimation.records import records
+from service.estimation.foot.contact import ContactRule, ContactState, has_lasted, seeming
 
 RULE = ContactRule(on_n=5.0, off_n=3.0, min_ns=10_000_000)
 MS = 1_000_000
@@ -24,11 +23,11 @@ def contact_of(
     """Contact of a recording."""
     n = len(grf_n)
     t_ns = np.array(t_ms if t_ms is not None else range(0, 2 * n, 2), dtype=np.int64) * MS
-    (state,), since_ns, loaded = records(STATE, 1), np.empty(n, np.int64), []
+    states, since_ns, loaded = ContactState.array(1), np.empty(n, np.int64), []
     for i, force_n in enumerate(grf_n):
-        seeming(RULE.on_n, RULE.off_n, state, float(force_n), t_ns[i], i in gaps)
-        since_ns[i] = state["since_ns"]
-        loaded.append(int(state["loaded"]))
+        seeming(RULE.on_n, RULE.off_n, states[0], float(force_n), t_ns[i], i in gaps)
+        since_ns[i] = states["since_ns"][0]
+        loaded.append(int(states["is_loaded"][0]))
     contact, out = 0, []
     for i in range(n):
         if has_lasted(since_ns, t_ns, i, n, RULE.min_ns, lag_ms * MS):

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
 from service.estimation.estimate import Estimator
-from service.estimation.foot.kinematics import READING, carry, counts_at
-from service.estimation.records import Records, records
+from service.estimation.foot.kinematics import ServoReading, carry, counts_at
+from service.estimation.records import RecordArray
 from tests.builders.arrays import array_at, make_servo
 from tests.builders.estimates import newton_plan
 from tests.builders.frames import loaded_frames
@@ -43,16 +43,16 @@ def carried(
     return loaded_frames(np.zeros((n, tiles)), **columns)
 
 
-def readings_of(frames: FrameBatch, broken: Sequence[bool]) -> Records:
-    """What frames carry of the servo, some of them after a gap."""
-    readings = records(READING, len(frames))
+def readings_of(frames: FrameBatch, broken: Sequence[bool]) -> RecordArray[ServoReading]:
+    """Store the servo readings of frames, some of them after a gap."""
+    readings = ServoReading.array(len(frames))
     for i, after_gap in enumerate(broken):
         carry(
             readings,
             i,
             frames.t_mono_ns[i],
-            np.int64(frames.servo_counts[i]),
-            np.int64(frames.servo_age_us[i]),
+            int(frames.servo_counts[i]),
+            int(frames.servo_age_us[i]),
             frames.frame_status[i],
             TURN,
             bool(after_gap),
@@ -137,11 +137,11 @@ def test_ages_cut_to_microseconds_make_no_new_readings() -> None:
     t_ns = [1_000_000, 3_000_999, 5_000_500, 7_000_001, 9_000_000]
     frames = carried(t_ns, [(123, 100)] * 4 + [(8_000_123, 900)])
     readings = readings_of(frames, [False] * 5)
-    assert readings["begins"].tolist() == [1, 0, 0, 0, 1]
-    assert readings["joins"].tolist() == [0, 0, 0, 0, 1]
+    assert readings["is_new"].tolist() == [1, 0, 0, 0, 1]
+    assert readings["is_next"].tolist() == [0, 0, 0, 0, 1]
 
 
-def loop(readings: Records, lag_ns: int) -> list[float]:
+def loop(readings: RecordArray[ServoReading], lag_ns: int) -> list[float]:
     """What `counts_at` says, frame by frame."""
     result = []
     n = len(readings["t_ns"])
@@ -150,10 +150,10 @@ def loop(readings: Records, lag_ns: int) -> list[float]:
         here, after = i, None
         for j in range(i + 1, n):
             if readings["t_ns"][j] > t_ns + lag_ns or (
-                readings["begins"][j] and not readings["joins"][j]
+                readings["is_new"][j] and not readings["is_next"][j]
             ):
                 break
-            if readings["joins"][j]:
+            if readings["is_next"][j]:
                 if readings["sampled_ns"][j] > t_ns:
                     after = j
                     break
@@ -165,7 +165,7 @@ def loop(readings: Records, lag_ns: int) -> list[float]:
             begin_ns, end_ns = int(readings["sampled_ns"][here]), int(readings["sampled_ns"][after])
             part = (t_ns - begin_ns) / (end_ns - begin_ns)
             counts += part * int(readings["counts"][after] - readings["counts"][here])
-        result.append(counts if readings["known"][i] else np.nan)
+        result.append(counts if readings["is_valid"][i] else np.nan)
     return result
 
 

@@ -11,8 +11,9 @@ from devices.arrays import Floats
 from devices.compiled import compiled
 from service.estimation.ladder.laws import Laws, make_laws
 from service.estimation.ladder.room import Room, make_room
-from service.estimation.ladder.upper import BORNE, average
+from service.estimation.ladder.upper import BORNE, TileForce, average
 from service.estimation.models import denoise
+from service.estimation.records import RecordArray
 from tests.builders.arrays import array_at
 from tests.builders.estimates import newton_plan
 
@@ -23,28 +24,29 @@ def smooth(forces_n: Floats) -> Floats:
     """Averaged forces of tiles, (n, tiles), all sampled with their frame."""
     n, tiles = forces_n.shape
     info = array_at([(0.01 * j, 0.0, 0.0) for j in range(tiles)])
-    laws = make_laws(newton_plan(info, models=("static", "skew", "denoise"), lag_ms=100.0))
-    room = make_room(n, tiles)
-    room.t_mono_ns[:] = PERIOD_NS * np.arange(n)
-    room.sampled_ns[:] = room.t_mono_ns[:, None]
-    room.usable_n[:, :tiles], room.noise_n[:, :tiles] = forces_n, SIGMA_N
-    room.usable_n[:, tiles], room.noise_n[:, tiles] = forces_n.sum(axis=1), tiles**0.5 * SIGMA_N
+    params = make_laws(newton_plan(info, models=("static", "skew", "denoise"), lag_ms=100.0))
+    buffer = make_room(n, tiles)
+    buffer.t_mono_ns[:] = PERIOD_NS * np.arange(n)
+    buffer.sampled_ns[:] = buffer.t_mono_ns[:, None]
+    buffer.usable_n[:, :tiles], buffer.noise_n[:, :tiles] = forces_n, SIGMA_N
+    buffer.usable_n[:, tiles] = forces_n.sum(axis=1)
+    buffer.noise_n[:, tiles] = tiles**0.5 * SIGMA_N
     out = np.full((n, tiles), math.nan)
-    _average_all(laws, room, out)
+    _average_all(params, buffer, out)
     return out
 
 
 @compiled
-def _average_all(laws: Laws, room: Room, out: Floats) -> None:
-    borne = np.zeros(len(laws.tiles), BORNE)
+def _average_all(params: Laws, buffer: Room, out: Floats) -> None:
+    forces: RecordArray[TileForce] = np.zeros(len(params.tiles), BORNE)
     rows, windows = (0, 0), denoise.scratch_of_windows()
     for i in range(len(out)):
-        rows = denoise.in_sight(room.t_mono_ns, i, 0, len(out), rows, 100_000_000)
-        for j in range(len(borne)):
-            borne[j].force_n, borne[j].noise_n = room.usable_n[i, j], room.noise_n[i, j]
-        average(laws, room, i, rows, windows, borne)
-        for j in range(len(borne)):
-            out[i, j] = borne[j].force_n
+        rows = denoise.in_sight(buffer.t_mono_ns, i, 0, len(out), rows, 100_000_000)
+        for j in range(len(forces)):
+            forces[j].force_n, forces[j].noise_n = buffer.usable_n[i, j], buffer.noise_n[i, j]
+        average(params, buffer, i, rows, windows, forces)
+        for j in range(len(forces)):
+            out[i, j] = forces[j].force_n
 
 
 def noisy(load_n: np.ndarray, seed: int) -> np.ndarray:

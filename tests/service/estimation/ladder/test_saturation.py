@@ -151,7 +151,7 @@ def test_a_bound_holds_for_a_dome_that_is_warmer_or_colder_than_at_its_tare(
     cool = GAS.model_copy(update={"gas": GasEffect(gamma=gamma, tau_s=gamma, misfit=0.1)})
     tiles = [tile(serial, cool) for serial in info.serials]
     plan = newton_plan(info, tiles=tiles, models=("unwrap", "temperature", "gas", "static"))
-    plan = replace(plan, chip_end_kpa=np.full(2, seen_kpa - 0.05))
+    plan = replace(plan, chip_end_kpa=np.full(2, seen_kpa - 0.05))  # ANY: fields of EstimationPlan
     # So long after the first frame that the gas is as warm as the chip.
     t_mono_ns = 60_000_000_000 + PERIOD_NS * np.arange(20)
     t_mono_ns[0] = 0

@@ -58,7 +58,7 @@ def test_a_dome_passes_on_what_its_wall_gives_way_to() -> None:
     plan = newton_plan(bare, models=("static", "ambient"), tiles=tiles)
     assert plan.ladder.ambient is not None
     give = 0.0013 * plan.baseline_kpa[0]
-    assert plan.ladder.ambient.passed == pytest.approx([give / (1 + give)])
+    assert plan.ladder.ambient.transmitted_fraction == pytest.approx([give / (1 + give)])
     assert plan.ladder.ambient.relative_sigma == pytest.approx(0.0002 / 0.0013)
     with pytest.raises(UsageError, match="bare reference tile"):
         newton_plan(array_at([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)

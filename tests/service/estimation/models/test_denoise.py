@@ -229,10 +229,10 @@ def test_any_instants_give_finite_values_among_the_readings(t_ns: list[int], see
 def shared_bend(bend_n: np.ndarray, noise_n: np.ndarray) -> np.ndarray:
     """What of the bends of tiles, (n, tiles), is in all of them."""
     tiles = np.zeros(bend_n.shape, BORNE)
-    tiles["bend_n"], tiles["of_bend_n"] = bend_n, noise_n
+    tiles["window_difference_n"], tiles["window_difference_sigma_n"] = bend_n, noise_n
     for frame in tiles:
         share_bend(frame)
-    return tiles["smoothed_n"]
+    return tiles["smoothing_error_n"]
 
 
 def test_what_windows_smooth_away_of_a_load_is_found_in_the_sum_of_its_tiles() -> None:

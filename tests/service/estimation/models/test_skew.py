@@ -18,7 +18,7 @@ PERIOD_NS = 2_000_000
 def lined_up(
     values: list[float], t_ns: list[int], frame_t_ns: list[int], broken: Sequence[int] = ()
 ) -> list[float]:
-    (state,) = at_rest(1)
+    state = at_rest(1)[0]
     frames = enumerate(zip(values, t_ns, frame_t_ns, strict=True))
     return [float(at_frame(state, *frame, i in broken)) for i, frame in frames]
 

@@ -7,8 +7,15 @@ import pytest
 
 from devices.arrays import Floats
 from devices.compiled import compiled
-from service.estimation.records import Records
-from service.estimation.watch.baseline import EVEN, LOST_KPA, SIGMAS, at_rest, lost
+from service.estimation.records import RecordArray
+from service.estimation.watch.baseline import (
+    EVEN,
+    LOST_KPA,
+    SIGMAS,
+    BaselineLossState,
+    at_rest,
+    lost,
+)
 
 RATE_HZ = 447.0
 STEP_NS = round(1e9 / RATE_HZ)
@@ -22,9 +29,11 @@ def judged(gauge_kpa: Floats, explained_kpa: float = 0.03) -> Floats:
 
 
 @compiled
-def _judge(state: Records, gauge_kpa: Floats, variance: float, out: Floats) -> None:
+def _judge(
+    states: RecordArray[BaselineLossState], gauge_kpa: Floats, variance: float, out: Floats
+) -> None:
     for i in range(len(gauge_kpa)):
-        out[i] = lost(state[0], EVEN, gauge_kpa[i], variance, 0.0, STEP_NS * i)
+        out[i] = lost(states[0], EVEN, gauge_kpa[i], variance, 0.0, STEP_NS * i)
 
 
 def noise(n: int) -> Floats:

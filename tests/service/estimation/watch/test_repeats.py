@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -9,8 +11,17 @@ from scipy.signal import lfilter
 
 from devices.arrays import Bools, Floats, Ints
 from devices.compiled import compiled
-from service.estimation.records import Records, record_type, records
-from service.estimation.watch.repeats import SHARES, Limits, apart, at_rest, is_stuck, make_limits
+from service.estimation.records import KernelRecord, RecordArray
+from service.estimation.watch.repeats import (
+    SHARES,
+    Limits,
+    StuckParams,
+    StuckState,
+    apart,
+    at_rest,
+    is_stuck,
+    make_limits,
+)
 
 RATE_HZ = 447.0
 COUNT_KPA = 0.15
@@ -32,23 +43,38 @@ def limits_of(counts: float, tiles: int) -> Limits:
     return make_limits(np.full(tiles, tared), RATE_HZ)
 
 
+class LimitTables(KernelRecord):
+    """Limits of an array, as the parameters of a foot have them."""
+
+    run_max_by_equal: Annotated[Ints, (SHARES + 1,)]
+    run_max_by_double_step: Annotated[Ints, (SHARES + 1,)]
+
+
 def judge(
-    limits: Limits, state: Records, padc: npt.NDArray[np.uint16], kpa: Floats, unloaded_kpa: float
+    limits: Limits,
+    states: RecordArray[StuckState],
+    pressure_raw: npt.NDArray[np.uint16],
+    kpa: Floats,
+    unloaded_kpa: float,
 ) -> npt.NDArray[np.bool_]:
-    """Which readings (n, tiles) are repeats that noise does not explain."""
-    tables = record_type([(name, np.int64, (SHARES + 1,)) for name in ("by_repeats", "by_twos")])
-    scene = records(tables, 1, by_repeats=limits.by_repeats, by_twos=limits.by_twos)
+    """Return which readings (n, tiles) are repeats that noise does not explain."""
+    tables = LimitTables.array(
+        1,
+        run_max_by_equal=limits.run_max_by_equal,
+        run_max_by_double_step=limits.run_max_by_double_step,
+    )
     out = np.empty(kpa.shape, dtype=bool)
-    _judge(scene, limits.laws(), state, padc.astype(np.int64), kpa, unloaded_kpa, out)
+    counts = pressure_raw.astype(np.int64)
+    _judge(tables, limits.laws(), states, counts, kpa, unloaded_kpa, out)
     return out
 
 
 @compiled
 def _judge(
-    scene: Records,
-    laws: Records,
-    state: Records,
-    padc: Ints,
+    limits: RecordArray[LimitTables],
+    params: RecordArray[StuckParams],
+    states: RecordArray[StuckState],
+    pressure_raw: Ints,
     kpa: Floats,
     unloaded_kpa: float,
     out: Bools,
@@ -58,8 +84,9 @@ def _judge(
     for i in range(n):
         for j in range(tiles):
             out[i, j], toggles = is_stuck(
-                scene[0], laws[j], state[j], padc[i, j], kpa[i, j], unloaded_kpa, toggles, tiles
-            )
+                limits[0], params[j], states[j], pressure_raw[i, j], kpa[i, j], unloaded_kpa,
+                toggles, tiles,
+            )  # fmt: skip
 
 
 def found(level: Floats, counts: float, *, n_lead: int = 447) -> npt.NDArray[np.bool_]:
@@ -126,7 +153,7 @@ def test_readings_that_cannot_be_read_say_nothing() -> None:
     state = at_rest(1)
     judged = judge(limits_of(0.85, 1), state, padc, np.full((500, 1), np.nan), 1.0)
     assert not judged.any()
-    assert state["pairs"].tolist() == [0]
+    assert state["unloaded_pairs"].tolist() == [0]
 
 
 @pytest.mark.parametrize("step", [0.05, 0.3, 1.0, 3.0])

@@ -156,14 +156,23 @@ def test_coverage_of_the_cop_is_said_by_axis_if_the_reference_says_how_good_it_i
     assert np.isnan(judged(pairs).figures["cop_coverage_x_95"])
 
 
-def test_across_a_line_of_tiles_nothing_is_said_of_coverage() -> None:
+@pytest.mark.parametrize("is_of_before", [False, True])
+def test_across_a_row_of_tiles_nothing_is_scored(is_of_before: bool) -> None:
     force_n = half_sines([20.0, 25.0])
     n = len(force_n)
-    sigmas: dict[str, Any] = {"cop_sigma_x_m": np.full(n, 0.001), "cop_sigma_y_m": np.zeros(n)}
-    there_m = np.tile([0.01, -0.02], (n, 1))
-    pairs = pair(columns(force_n, **sigmas), reference(force_n, cop_m=there_m), same_clock())
+    across: dict[str, Any] = {name: np.full(n, np.nan) for name in ("cop_y_m", "cop_sigma_y_m")}
+    if is_of_before:  # the row's place, with a sigma of 0
+        across = {name: np.zeros(n) for name in across}
+    there_m = np.tile([0.009, -0.02], (n, 1))  # ours is at x = 10 mm
+    pairs = pair(columns(force_n, **across), reference(force_n, cop_m=there_m), same_clock())
     trial = judged(pairs, reference_cop_sigma_m=0.001)
+    assert trial.cop_frames["both"] > 300
+    assert trial.figures["cop_mean_m"] == pytest.approx(0.001)
+    assert trial.figures["cop_p95_m"] == pytest.approx(0.001)
+    assert trial.figures["cop_p95_about_mean_m"] == pytest.approx(0.0, abs=1e-12)
+    assert trial.figures["cop_bias_x_m"] == pytest.approx(0.001)
     assert trial.figures["cop_coverage_x_95"] == 1.0
+    assert np.isnan(trial.figures["cop_bias_y_m"])
     assert np.isnan(trial.figures["cop_coverage_y_95"])
 
 

@@ -87,7 +87,7 @@ def test_two_plates_are_told_by_their_devices_and_added_up(tmp_path: Path) -> No
 
 def test_plates_of_one_name_follow_one_another_or_are_refused(tmp_path: Path) -> None:
     same = TWO.replace("\tFz\tFz\t|Ft|\tAx\tAy", "\tFz\tFx\tFz\tAx\tAy")
-    with pytest.raises(FileFormatError, match="belong together is not clear"):
+    with pytest.raises(FileFormatError, match="cannot be assigned to devices"):
         read(tmp_path, same.replace("left", "right"), Stated({"grf_n": "plate2_fz"}))
     lines = same.replace("left", "right").splitlines()
     text = "\n".join("\t".join(line.split("\t")[:5]) for line in lines)
@@ -121,9 +121,9 @@ def test_units_are_those_of_the_file(tmp_path: Path) -> None:
     [
         (ONE.replace("\tFz", "\tFy"), "no force plate"),
         (ONE.replace("abs time", "samples"), "no line of names"),
-        (ONE[: ONE.index("0.000000\t1.5")], "no lines of numbers stand below its names"),
+        (ONE[: ONE.index("0.000000\t1.5")], "there are no numbers below the names"),
         (ONE.replace("\t-0.010327", "\t-0.010327\t7"), "cannot be read"),
-        (ONE.replace("\tAx\tAy\n\tN", "\n\tN"), "3 names stand over 5 columns"),
+        (ONE.replace("\tAx\tAy\n\tN", "\n\tN"), "3 names for 5 columns"),
         (ONE.replace("100.5", "1OO.5"), "is not numeric: '1OO.5'"),
         (ONE.replace("(s)\tFx", "(min)\tFx"), "its time is in min"),
     ],

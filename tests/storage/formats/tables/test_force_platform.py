@@ -89,7 +89,7 @@ def test_a_plate_that_was_not_zeroed_is_said_and_nothing_taken_off(tmp_path: Pat
     path.write_bytes(c3d_bytes(force_plate(2, 6, ZERO=[1, 2]), analog))
     found = read(path)
     np.testing.assert_allclose(found.grf_n, LOAD_N + 5.0, atol=1e-4)
-    assert "frames 1 to 2 are to be its zero, in which plates read 24.000" in found.notes[0]
+    assert "ZERO states frames 1 to 2, in which plates read 24.000" in found.notes[0]
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

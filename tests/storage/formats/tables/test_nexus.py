@@ -120,7 +120,7 @@ def test_a_gap_of_frames_stays_a_gap(tmp_path: Path) -> None:
         (MARKERS, "no force plate in it"),
         (TWO.replace("Devices\n500\n", "Devices\n\n"), "the rate of its devices is ''"),
         (TWO.replace("1.5,-2.5", "1.5,-1e4"), "Fy of 'Imported AMTI 400 #2' is greater"),
-        (HEAD, "no lines of numbers"),
+        (HEAD, "there are no numbers below the names"),
         (HEAD + device_rows().replace("\n12,0", "\n11,0"), "do not rise"),
         (TWO.replace("-610.0", "much"), "is not numeric: 'much'"),
     ],

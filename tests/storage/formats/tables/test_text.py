@@ -290,8 +290,8 @@ def test_what_cannot_be_stated_of_a_text_is_wrong_usage(stated: dict[str, int | 
 
 def test_rows_that_are_not_there_are_refused(tmp_path: Path) -> None:
     for stated, says in (
-        (StatedText(skip_rows=9), "nothing stands below 9 lines"),
-        (StatedText(skip_rows=10**30), "nothing stands below"),
+        (StatedText(skip_rows=9), "there is no text below 9 lines"),
+        (StatedText(skip_rows=10**30), "there is no text below"),
         (StatedText(units_row=9), "line 9, of units, is empty"),
     ):
         with pytest.raises(FileFormatError, match=says):
@@ -314,9 +314,9 @@ def test_columns_that_no_line_names_are_numbered(tmp_path: Path) -> None:
 
 def test_how_a_text_is_laid_out_is_not_stated_of_other_files(tmp_path: Path) -> None:
     for name in ("plate.c3d", "plate.parquet", "plate.mot"):
-        with pytest.raises(UsageError, match="go with tables in text"):
+        with pytest.raises(UsageError, match="apply only to text tables"):
             table_of(tmp_path, PLAIN, name, StatedText(decimal="."))
-    with pytest.raises(LoadTraceError, match="go with tables in text"):
+    with pytest.raises(LoadTraceError, match="apply only to text tables"):
         read_load_trace(tmp_path / "plate.c3d", Stated(text=StatedText(skip_rows=1)))
 
 

@@ -23,11 +23,13 @@ from tests.storage.formats.walks import (
     BOUND_NS,
     LATE_NS,
     RATE_HZ,
+    ROW,
     ROWS,
     STANCES,
     compared,
     export_of_walk,
     lines_of_documents,
+    row_walk,
     saturated,
     two_feet,
     walk,
@@ -70,6 +72,19 @@ def test_forces_and_moments_are_those_of_the_manual(plain: Read) -> None:
     cop_mm = middle[:2] + x[:, None] * along[:2] + y[:, None] * across[:2]
     np.testing.assert_allclose(cop_mm[:, 0], 1e3 * columns["cop_x_m"], atol=1e-3)
     np.testing.assert_allclose(cop_mm[:, 1], 1e3 * columns["cop_y_m"], atol=1e-3)
+
+
+def test_of_tiles_in_one_row_the_force_acts_at_the_row_and_the_file_says_so(plain: Read) -> None:
+    read = Read(export_of_walk(row_walk(), info=ROW))
+    stated = np.isfinite(walk()["cop_x_m"])
+    corners = np.reshape(read.reader.get("FORCE_PLATFORM:CORNERS").float_array, (4, 3))
+    assert corners[:, 1].mean() == pytest.approx(10.0)
+    np.testing.assert_array_equal(read.channel("Mx1")[stated], 0.0)
+    np.testing.assert_array_equal(read.channel("My1"), plain.channel("My1"))
+    np.testing.assert_array_equal(np.isnan(read.channel("Mx1")), np.isnan(plain.channel("Mx1")))
+    said = " ".join(text.strip() for text in read.reader.get("FOOTTILE:ROW").string_array)
+    assert said.startswith("COP not measured along y: tiles in one row; points are at y = 10 mm")
+    assert "FOOTTILE:ROW" not in plain.reader
 
 
 def test_the_platform_is_the_rectangle_of_the_tiles_and_not_of_a_bare_one(plain: Read) -> None:
@@ -394,5 +409,5 @@ def test_sessions_without_a_common_axis_are_not_put_together() -> None:
 def test_sessions_of_different_days_are_refused_and_not_joined() -> None:
     one, _ = two_feet()
     other = replace(one, content=two_feet()[1].content, clock=compared(86_400_000_000_000))
-    with pytest.raises(UsageError, match="with what lies between"):
+    with pytest.raises(UsageError, match="gaps included"):
         list(C3D.written_together([one, other]))

@@ -113,7 +113,7 @@ def test_a_session_without_a_tare_has_no_number_of_newtons_or_is_refused(to: str
         with pytest.raises(UsageError, match="none of its 1000 frames has a force"):
             written(to, export)
     else:
-        assert "Nothing stands in their place" in said(to, export)["masked"]
+        assert "They are not replaced" in said(to, export)["masked"]
 
 
 # --- what breaks off ------------------------------------------------------------------------------

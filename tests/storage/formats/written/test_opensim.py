@@ -26,12 +26,16 @@ from storage.formats.written.opensim.file import OPENSIM
 from storage.formats.written.opensim.loads import COLUMNS
 from storage.schema import Array
 from storage.sessions.folder import Event
+from tests.builders.arrays import make_array
 from tests.storage.formats.walks import (
+    ARRAY,
     RATE_HZ,
+    ROW,
     ROWS,
     STANCES,
     export_of_walk,
     lines_of_documents,
+    row_walk,
     saturated,
     two_feet,
     walk,
@@ -96,6 +100,39 @@ def test_the_ground_pushes_upwards_where_the_foot_is(ground: Unpacked) -> None:
     assert (
         ground.tag("force_expressed_in_body") == ground.tag("point_expressed_in_body") == "ground"
     )
+
+
+@pytest.mark.parametrize("frame", ["ground", "foot"])
+def test_of_tiles_in_one_row_points_are_at_the_row(frame: str, tmp_path: Path) -> None:
+    columns = row_walk()
+    if frame == "ground":
+        columns["cop_ground_x_m"] = columns["cop_x_m"] + 0.1
+        columns["cop_ground_y_m"] = np.full(ROWS, np.nan)
+    found = Unpacked(export_of_walk(columns, info=ROW), tmp_path)
+    assert found.tag("point_expressed_in_body") == frame
+    stated = np.isfinite(columns["cop_x_m"])
+    ahead_m = 0.1 if frame == "ground" else 0.0
+    np.testing.assert_allclose(
+        found.columns["ground_force_px"][stated], columns["cop_x_m"][stated] + ahead_m, atol=1e-6
+    )
+    np.testing.assert_allclose(found.columns["ground_force_pz"], -0.01, atol=1e-9)
+    assert "y = 10 mm" in found.notes["ROW"]
+    assert found.notes["FILLED_ROWS"] == {"no contact": 300, "no centre of pressure stated": 4}
+
+
+def test_across_tiles_side_by_side_the_point_is_in_the_frame_of_the_foot(tmp_path: Path) -> None:
+    info = make_array(ARRAY.tiles[:2])  # both at x = 30 mm
+    columns = walk()
+    columns |= {
+        "cop_x_m": np.full(ROWS, np.nan),
+        "cop_ground_x_m": np.full(ROWS, np.nan),
+        "cop_ground_y_m": columns["cop_y_m"],
+        "force_n": columns["force_n"][:, :2],
+    }
+    found = Unpacked(export_of_walk(columns, info=info), tmp_path)
+    assert found.tag("point_expressed_in_body") == "foot"
+    np.testing.assert_allclose(found.columns["ground_force_px"], 0.03, atol=1e-9)
+    np.testing.assert_allclose(found.columns["ground_force_pz"], -0.004, atol=1e-9)
 
 
 def test_nothing_in_it_is_no_number_and_each_row_that_was_filled_is_listed(

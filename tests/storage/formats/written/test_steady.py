@@ -106,7 +106,7 @@ def test_time_that_runs_back_between_parts_is_refused() -> None:
 
 def test_years_between_two_parts_are_refused_and_not_filled() -> None:
     t_ns = np.append(times(10), times(10) + 10**18)
-    with pytest.raises(UsageError, match="with what lies between; the limit here is 10000"):
+    with pytest.raises(UsageError, match="gaps included; the limit is 10000"):
         at(t_ns, part=np.repeat([0, 1], 10))
 
 

@@ -58,7 +58,7 @@ def test_a_damaged_file_is_set_aside_and_as_long_as_it_is_there_all_may_be_wante
     again = Wanted(path)
     assert again.numbers("a") == Intervals([(0, 9)])
     assert again.may_be_all
-    assert "delete" in again.problems[0]
+    assert "Delete" in again.problems[0]
     path.with_name("wanted.json.damaged-1").unlink()
     assert not Wanted(path).may_be_all
     assert Wanted(path).problems == []

@@ -116,6 +116,8 @@ def test_an_array_whose_bench_fails_is_refused_with_the_reason(
     found = run_array(ArrayTask(0, "development", "this code"))
     assert found.judged == {}
     assert found.tiles_refused == 4
-    assert [refusal.what for refusal in found.refusals] == [f"bench of T0{i}" for i in range(1, 5)]
+    assert [refusal.what for refusal in found.refusals] == [
+        f"calibration of T0{i}" for i in range(1, 5)
+    ]
     assert found.refusals[0].why == "bench-T01.parquet: it drifts"
     assert 0.0 <= found.repeatability <= 0.03

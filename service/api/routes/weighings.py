@@ -1,0 +1,325 @@
+"""Guided calibrations with known weights: started, followed, repeated and cancelled."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from math import isfinite
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Header
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from devices.errors import UsageError
+from service.api.routes.access import FULL, ServerState, problems, tag_of
+from service.api.routes.calibrations import Line, check_fits
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.weights import TOLERANCE_PERCENT, weight_labels
+from service.private_paths import ShownText
+from service.server.node import ServerNode
+from service.server.screens.views import View
+from service.server.weighing import Method, Repeatability
+from service.server.weighings import NodeWeighing, WeighingPlan, WeighingState
+
+router = APIRouter(prefix="/nodes/{node}/weighing", tags=["calibrations"])
+
+_TILES_MAX, _WEIGHTS_MAX = 64, 60
+_REFERENCES: dict[Method, str] = {
+    "weights": "dead weights",
+    "scale": "kitchen scale",
+    "sensor": "force sensor",
+}
+_NONE = problems(_404="No such node, or no guided calibration on it.")
+_OTHER = problems(_412="Another guided calibration is there than If-Match names.")
+
+ThisOne = Annotated[
+    str | None, Header(description="`session_id` of the guided calibration: only if it is this.")
+]
+
+
+class StartWeighing(BaseModel):
+    """Tiles and weights."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    tiles: Annotated[
+        tuple[Annotated[str, StringConstraints(max_length=100)], ...],
+        Field(min_length=1, max_length=_TILES_MAX),
+    ] = Field(description="Serials, in the order in which they are loaded.", examples=[["T01"]])
+    weights: Annotated[
+        tuple[Annotated[str, StringConstraints(max_length=40)], ...],
+        Field(min_length=1, max_length=_WEIGHTS_MAX),
+    ] = Field(
+        description="In the order in which they are put on each tile; five or more, in g, kg or N.",
+        examples=[["200 g", "500 g", "1 kg", "1.5 kg", "2 kg"]],
+    )
+    within_percent: Annotated[float, Field(ge=0, le=50)] = Field(
+        default=TOLERANCE_PERCENT, description="Tolerance of the weights that state none."
+    )
+    method: Method = Field(
+        default="weights",
+        description="Reference of the force: weights on the dome, the reading of a kitchen scale "
+        "under the tile, or that of a force sensor.",
+    )
+    reference: Line | None = Field(
+        default=None, description="The reference in words; default: by `method`."
+    )
+    name: Line | None = Field(default=None, description="Of the calibration; default: by tiles.")
+
+    def plan(self) -> WeighingPlan:
+        """Return the plan, with the tolerance of each weight.
+
+        Raises:
+            UsageError: a weight is none, or they are too few.
+        """
+        reference = self.reference or _REFERENCES[self.method]
+        return WeighingPlan(
+            tiles=self.tiles,
+            weights=weight_labels(self.weights, self.within_percent),
+            method=self.method,
+            reference=reference,
+            name=self.name or f"{', '.join(self.tiles)}, {reference}"[:200],
+        )
+
+
+class RepeatabilityView(View):
+    """Pressure of a step, in kPa; of a weight above the rest before it."""
+
+    mean_kpa: float
+    spread_kpa: float = Field(description="Standard deviation of quarter seconds.")
+    settle_kpa: float = Field(description="Newest quarter second less the first.")
+
+    @classmethod
+    def of(cls, found: Repeatability) -> RepeatabilityView:
+        """As it is now."""
+        return cls(**vars(found))
+
+
+class TilePassView(View):
+    """One tile, and its weights that are done."""
+
+    serial: str
+    held: list[RepeatabilityView] = Field(description="Of the first weights, in order.")
+
+
+class WeightResultView(View):
+    """One weight on a tile, and the curve there."""
+
+    weight: str
+    force_n: float
+    gauge_kpa: float
+    noise_kpa: float = Field(description="Standard deviation of a reading.")
+    settle_kpa: float = Field(description="Last second less the first.")
+    residual_n: float = Field(description="Force of the curve less that of the weight.")
+    half_width_n: float = Field(description="Of the 95 % interval of another load like it.")
+
+
+class BandView(View):
+    """The curve at one pressure."""
+
+    gauge_kpa: float
+    force_n: float
+    half_width_n: float = Field(description="Of the 95 % interval of a new loading.")
+
+
+class TileResultView(View):
+    """The curve of one tile."""
+
+    serial: str
+    weights: list[WeightResultView] = Field(description="Lightest first.")
+    band: list[BandView]
+
+    @classmethod
+    def of(cls, tile: TileCalibration) -> TileResultView:
+        """From its calibration."""
+        facts = tile.weights
+        steps = () if facts is None else sorted(facts.steps, key=lambda step: step.force_n)
+        return cls(
+            serial=tile.serial,
+            weights=[
+                WeightResultView(
+                    **step.model_dump(), half_width_n=facts.half_width_n(step.gauge_kpa)
+                )
+                for step in steps
+                if facts is not None
+            ],
+            band=[
+                BandView(
+                    gauge_kpa=point.gauge_kpa,
+                    force_n=point.force_n,
+                    half_width_n=point.new_loading_n,
+                )
+                for point in (() if facts is None else facts.band_95)
+            ],
+        )
+
+
+class WeighingResultView(View):
+    """The calibration that was fitted; the server keeps it."""
+
+    calibration_id: str
+    name: str
+    date: str
+    tiles: list[TileResultView]
+    refused: dict[str, ShownText] = Field(description="Tiles without a curve, and why.")
+    misfit: ShownText | None = Field(
+        description="Why the node cannot be estimated with it; null: it can."
+    )
+
+    @classmethod
+    def of(cls, calibration: Calibration, node: ServerNode) -> WeighingResultView:
+        """From the calibration, for the tiles of a node."""
+        misfit = None
+        bearing = [tile.serial for tile in node.info.tiles if not tile.reference]
+        if lacking := [serial for serial in bearing if calibration.find(serial) is None]:
+            misfit = f"It has no curve of {', '.join(lacking)}: calibrate all tiles in one go"
+        else:
+            try:
+                check_fits(node, calibration)
+            except UsageError as error:
+                misfit = str(error)
+        return cls(
+            calibration_id=calibration.id,
+            name=calibration.name,
+            date=calibration.date,
+            tiles=[TileResultView.of(tile) for tile in calibration.tiles],
+            refused=calibration.refused,
+            misfit=misfit,
+        )
+
+
+class WeighingView(View):
+    """A guided calibration, under way or ended."""
+
+    session_id: str = Field(description="Of its recording, by which it is told from others.")
+    state: WeighingState
+    tiles: list[TilePassView] = Field(description="In the order in which they are loaded.")
+    weights: list[str] = Field(description="As markers have them.", examples=[["500 g +-1 %"]])
+    method: Method
+    reference: str
+    name: str
+    tile: str = Field(description="The tile under way.")
+    step: Literal["empty", "resting", "put on", "holding", "done"]
+    prompt: str = Field(description="Instruction for now.", examples=["Put 500 g on T02"])
+    left_s: float | None = Field(description="Rest of the step; null between steps.")
+    warning: str | None = Field(description="Why the last step is repeated.")
+    problem: ShownText | None = Field(description="Why it failed, and what to do.")
+    pressure_kpa: float | None = Field(
+        description="Mean of the newest quarter second, above the last rest; null before one."
+    )
+    recent_kpa: list[float] = Field(
+        description="Absolute pressure of the newest quarter seconds, up to 20 s."
+    )
+    rest_kpa: float | None = Field(description="Absolute pressure of the last rest.")
+    repeatability: RepeatabilityView | None = Field(
+        description="Of the step under way, or of the last one."
+    )
+    result: WeighingResultView | None = Field(description="Once it is done.")
+
+    @classmethod
+    def of(cls, weighing: NodeWeighing, node: ServerNode) -> WeighingView:
+        """As it is now."""
+        now, plan, found = weighing.now, weighing.plan, weighing.calibration
+        rest_kpa = now.rest_kpa if isfinite(now.rest_kpa) else None
+        recent_kpa = [round(kpa, 3) for kpa in now.recent_kpa]
+        seen = now.repeatability
+        return cls(
+            session_id=weighing.session_id,
+            state=weighing.state,
+            tiles=[
+                TilePassView(
+                    serial=each.serial, held=[RepeatabilityView.of(held) for held in each.held]
+                )
+                for each in weighing.passes
+            ],
+            weights=list(plan.weights),
+            method=plan.method,
+            reference=plan.reference,
+            name=plan.name,
+            tile=now.serial,
+            step=now.step,
+            prompt=now.prompt,
+            left_s=now.left_s,
+            warning=weighing.warning,
+            problem=weighing.problem,
+            pressure_kpa=None
+            if rest_kpa is None or not recent_kpa
+            else round(recent_kpa[-1] - rest_kpa, 3),
+            recent_kpa=recent_kpa,
+            rest_kpa=rest_kpa,
+            repeatability=None if seen is None else RepeatabilityView.of(seen),
+            result=None if found is None else WeighingResultView.of(found, node),
+        )
+
+
+class NodeWeighingView(View):
+    """The guided calibration of a node."""
+
+    node: str
+    weighing: WeighingView | None = Field(
+        description="Under way, or the last one; null: none since the server was started, or it "
+        "was closed."
+    )
+
+
+@router.get(
+    "",
+    operation_id="getWeighing",
+    summary="Guided calibration of a node",
+    responses=problems(_404="No such node."),
+)
+async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
+    """Ask again and again while it is under way: it has all that a person is shown."""
+    the_node = server.nodes.get(node)
+    found = server.weighings.find(node)
+    return NodeWeighingView(
+        node=node, weighing=None if found is None else WeighingView.of(found, the_node)
+    )
+
+
+@router.post(
+    "",
+    operation_id="startWeighing",
+    summary="Start a guided calibration",
+    status_code=HTTPStatus.CREATED,
+    responses={
+        **problems(
+            _404="No such node.",
+            _409="One is under way on this node, or the node cannot be recorded now.",
+            _422="A weight is none, they are too few, or there is no such tile.",
+        ),
+        **FULL,
+    },
+)
+async def start(node: str, body: StartWeighing, server: ServerState) -> WeighingView:
+    """Record, follow the pressure of each tile, mark each weight, and fit: one per node at a time.
+
+    It goes on without the one who started it, and ends by itself when the node leaves or no step is
+    completed for ten minutes.
+    """
+    the_node = server.nodes.get(node)
+    return WeighingView.of(server.weighings.start(the_node, body.plan()), the_node)
+
+
+@router.post(
+    "/repeat",
+    operation_id="repeatWeight",
+    summary="Repeat a weight",
+    responses={**_NONE, **problems(_409="It has ended."), **_OTHER, **FULL},
+)
+async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> WeighingView:
+    """Go back to the weight that is held, or else to the last one on this tile."""
+    the_node = server.nodes.get(node)
+    return WeighingView.of(server.weighings.repeat(the_node, tag_of(if_match)), the_node)
+
+
+@router.delete(
+    "",
+    operation_id="endWeighing",
+    summary="Cancel or close a guided calibration",
+    status_code=HTTPStatus.NO_CONTENT,
+    response_model=None,
+    responses={**_NONE, **_OTHER},
+)
+async def end(node: str, server: ServerState, if_match: ThisOne = None) -> None:
+    """Nothing is fitted if it is under way. Its recording stays, and so does its calibration."""
+    await server.weighings.end(node, tag_of(if_match))

@@ -1,0 +1,59 @@
+"""Record types: fields as annotated, readable in Python and in compiled code."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+import pytest
+
+from devices.arrays import Floats, Ints
+from devices.compiled import compiled
+from service.estimation.records import KernelRecord, RecordArray
+
+
+class Inner(KernelRecord):
+    """Part of another record."""
+
+    count: int
+
+
+class Outer(KernelRecord):
+    """Record with every kind of field."""
+
+    seq: np.uint64
+    inner: Inner
+    force_n: float
+    weights: Annotated[Floats, (3,)]
+    limits: Annotated[Ints, (2,)]
+
+
+@compiled
+def _add_up(records: RecordArray[Outer]) -> float:
+    total = 0.0
+    for i in range(len(records)):
+        total += records[i].force_n * records[i].inner.count + records[i].weights[2]
+        records[i].inner.count += records[i].limits[0]
+    return total
+
+
+def test_fields_have_the_types_and_the_order_of_the_annotations() -> None:
+    dtype = Outer.dtype()
+    assert dtype.names == ("seq", "inner", "force_n", "weights", "limits")
+    assert dtype["seq"] == np.uint64
+    assert dtype["inner"] == Inner.dtype()
+    assert dtype["force_n"] == np.float64
+    assert dtype["weights"] == np.dtype((np.float64, (3,)))
+    assert dtype["limits"] == np.dtype((np.int64, (2,)))
+
+
+def test_compiled_code_reads_and_writes_the_fields() -> None:
+    records = Outer.array(2, force_n=[2.0, 3.0], weights=[[0, 0, 1], [0, 0, 5]], limits=[[7, 0]])
+    records["inner"]["count"] = [10, 100]
+    assert _add_up(records) == 2.0 * 10 + 1.0 + 3.0 * 100 + 5.0
+    assert records["inner"]["count"].tolist() == [17, 107]
+
+
+def test_a_column_that_is_no_field_is_refused() -> None:
+    with pytest.raises(ValueError, match="force"):
+        Outer.array(1, force=1.0)

@@ -1,0 +1,104 @@
+// Form of a calibration: tiles, reference, weights, tolerance.
+
+import { byId, el, setText } from "../common/text.js";
+
+const METHODS = {
+  weights: {
+    hint: "Put the weights on a light, stiff plate on the dome. Add the mass of the plate.",
+    weights: "200 g, 500 g, 1 kg, 1.5 kg, 2 kg", within: "1",
+  },
+  scale: {
+    hint: "Zero the scale with the tile on it. Press with a clamp or a stand; a hand is not steady enough.",
+    weights: "200 g, 500 g, 1 kg, 1.5 kg, 2 kg", within: "1",
+  },
+  sensor: {
+    hint: "Press with a spindle until the sensor reads the force.",
+    weights: "2 N, 5 N, 10 N, 15 N, 20 N", within: "1",
+  },
+};
+const WEIGHT_S = 40; // including loading, settling and unloading
+
+/** Form that starts a calibration. */
+export class Setup {
+  /** @param {(body: WeighingPlan) => void} onStart */
+  constructor(onStart) {
+    this.form = byId("setup", HTMLFormElement);
+    this.weights = byId("weights", HTMLInputElement);
+    this.within = byId("within", HTMLInputElement);
+    /** @type {string[]} */
+    this.order = []; // selected tiles
+    this.shown = "";
+    this.method = "weights";
+    this.useMethod();
+    this.form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      onStart(this.body());
+    });
+    this.form.addEventListener("input", () => this.drawTexts());
+    for (const radio of this.form.querySelectorAll("[name=method]")) {
+      radio.addEventListener("change", () => {
+        this.method = /** @type {HTMLInputElement} */ (radio).value;
+        this.useMethod();
+      });
+    }
+  }
+
+  /** Show the tiles of a node. @param {LiveNode} node */
+  update(node) {
+    const serials = node.tiles.filter((tile) => !tile.reference).map((tile) => tile.serial);
+    const key = [node.node, ...serials].join("\n");
+    if (key === this.shown) return;
+    this.shown = key;
+    this.order = serials;
+    byId("tiles").replaceChildren(...serials.map((serial) => this.tileBox(serial)));
+    this.drawTexts();
+  }
+
+  /** Make the checkbox of a tile. @param {string} serial */
+  tileBox(serial) {
+    const box = el("input", { type: "checkbox", value: serial, checked: "" });
+    box.addEventListener("change", () => {
+      this.order = this.order.filter((one) => one !== serial);
+      if (box.checked) this.order.push(serial);
+    });
+    return el("label", {}, box, el("span", { text: serial }), el("span", { cls: "order", "data-order": serial }));
+  }
+
+  /** Fill in hint and default weights of the selected reference. */
+  useMethod() {
+    const { hint, weights, within } = METHODS[this.method];
+    setText(byId("method-hint"), hint);
+    this.weights.value = weights;
+    this.within.value = within;
+    this.drawTexts();
+  }
+
+  /** Weights of the form. */
+  get list() {
+    return this.weights.value.split(/[,;]/).map((one) => one.trim()).filter(Boolean);
+  }
+
+  /** Update order, duration and the start button. */
+  drawTexts() {
+    for (const label of this.form.querySelectorAll("[data-order]")) {
+      const at = this.order.indexOf(/** @type {HTMLElement} */ (label).dataset.order ?? "");
+      setText(label, at < 0 || this.order.length < 2 ? "" : `${at + 1}.`);
+    }
+    const [tiles, weights] = [this.order.length, this.list.length];
+    byId("start", HTMLButtonElement).disabled = !tiles || !weights;
+    const minutes = Math.max(1, Math.round(tiles * weights * WEIGHT_S / 60));
+    setText(byId("time-needed"), tiles ? `${countText(tiles, "tile")}, ${countText(weights, "weight")}${tiles > 1 ? " each" : ""}: about ${countText(minutes, "minute")}` : "Select a tile.");
+  }
+
+  /** Return the request body. @returns {WeighingPlan} */
+  body() {
+    const valueOf = (id) => byId(id, HTMLInputElement).value.trim();
+    return {
+      tiles: this.order, weights: this.list, within_percent: Number(this.within.value), method: this.method,
+      ...(valueOf("reference") ? { reference: valueOf("reference") } : {}), ...(valueOf("name") ? { name: valueOf("name") } : {}),
+    };
+  }
+}
+
+/** Return a count with its noun. @param {number} count @param {string} noun */
+const countText = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
