@@ -1,4 +1,4 @@
-// What the server says (docs/api.md), as far as the pages look at it: for `tsc --checkJs`, not for browsers.
+// Types of the server's messages (docs/api.md) that the pages use: for `tsc --checkJs`, not for browsers.
 
 interface Session {
   id: string; name: string; node: string; state: string; complete: boolean | "lossy"; problem: string | null;
@@ -9,11 +9,11 @@ interface Session {
   said: string;
 }
 
-/** Sessions of all nodes that were begun with one press, and why there is none of some. */
+/** Recording of several nodes: a session each, or the reason of its failure. */
 interface Take { id: string; sessions: Session[]; failed: Record<string, string> }
 
 /** Of GET /calibrations. */
-interface Kept {
+interface Calibration {
   id: string; name: string; date: string; serials: string[]; absolute_scale: "measured" | "assumed"; mounted: boolean;
 }
 
@@ -23,16 +23,18 @@ interface NodeCalibration {
   calibration: { id: string; name: string; absolute_scale: "measured" | "assumed" } | null;
 }
 
-/** A node, as far as the page of the guided calibration looks at it. */
+/** Node as the page of the guided calibration uses it. */
 interface LiveNode { node: string; connected: boolean; tiles: Tile[] }
 
-/** Of POST /nodes/NODE/weighing. */
+/** Body of POST /nodes/NODE/weighing. */
 interface WeighingPlan {
   tiles: string[]; weights: string[]; method: string; within_percent?: number; reference?: string; name?: string;
 }
 
+/** Pressure of a held weight: mean, spread and drift. */
 interface Repeatability { mean_kpa: number; spread_kpa: number; settle_kpa: number }
 
+/** Fitted curve of a tile. */
 interface TileResult {
   serial: string; band: { gauge_kpa: number; force_n: number; half_width_n: number }[];
   weights: {
@@ -51,32 +53,32 @@ interface Weighing {
   } | null;
 }
 
-/** A machine that asks to connect under the name of a node. */
+/** Machine that requests to connect under the name of a node. */
 interface Replacement { fingerprint: string; address: string }
 
-interface Mark { id: string; label: string; t_ns: number; said: string }
+interface Marker { id: string; label: string; t_ns: number; said: string }
 
 interface Tile {
   serial: string; x_m: number; y_m: number; z_m: number; reference?: boolean; full_scale_n?: number | null;
   range_kpa?: [number, number] | null;
 }
 
-/** What a live message says of one frame, or of all since the message before. */
+/** Live message: latest frame, with min and max since the previous message. */
 interface Frame {
   node?: string; seq: number; frame_status: number; estimate_status: number | null; contact: boolean | null;
   grf_n: number | null; grf_sigma_n: number | null; grf_at_least_n: number | null;
   force_n: (number | null)[]; force_sigma_n: (number | null)[]; gauge_kpa: (number | null)[]; status: (number | null)[];
   saturated: boolean[];
-  /** Of a session's page: seconds after its first frame. */
+  /** On a session's page: seconds after its first frame. */
   timeS?: number;
   [more: string]: any;
 }
 
-/** A place on the traces of the live page. */
+/** Point of a trace on the live page. */
 interface TilePoint { timeS: number; tiles: Record<string, (number | null)[]> | null; gap?: boolean }
 
 /** Of GET /sessions/ID/array. */
-interface Dressed {
+interface ArrayInfo {
   node: string; tiles: Tile[]; servo: object | null; nominal_rate_hz: number; calibration: object | null; lag_ms: number | null;
   estimates_problem: string | null;
 }
@@ -96,12 +98,12 @@ interface Verified {
 
 interface Clock { streams: { stretches: { begin_t_ns: number; end_t_ns: number; offset_ns: number; drift_ppm: number }[] }[] }
 
-interface Certain { value: number; interval_95: [number, number] }
+interface Estimate { value: number; interval_95: [number, number] }
 
-/** What `foottile compare` wrote; docs/compare.md. */
+/** Report of `foottile compare`: docs/compare.md. */
 interface ComparisonReport {
   reference: string; limits?: Record<string, number>; notes: string[]; contact_n: number | null;
   figures: Record<string, { mean: number | null; interval_95: [number, number] | null; trials: number }>;
-  alignment: { lag_s?: Certain; scale?: Certain; offset_in_flight_n?: Certain; offset_removed?: boolean };
+  alignment: { lag_s?: Estimate; scale?: Estimate; offset_in_flight_n?: Estimate; offset_removed?: boolean };
   trials?: object[]; trials_are?: string;
 }

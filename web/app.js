@@ -1,13 +1,13 @@
-// Ties the page together: one state, messages in, one drawing per display frame.
+// Live page: one state, messages in, one drawing per display frame.
 //
-// common/    REST calls, the websocket, dialogs, notices, words and elements
-// live/      panels that draw the newest frame, and the buttons beside them
-// nodes/     the page of all nodes
-// calibrate/ the page of the guided calibration
-// sessions/  the page of recorded sessions, and the trash
+// common/    REST calls, websocket, dialogs, notices, texts and elements
+// live/      panels that draw the latest frame, and the action buttons
+// nodes/     page of all nodes
+// calibrate/ page of the guided calibration
+// sessions/  page of recorded sessions, and the trash
 //
-// A panel is a class that owns one element of index.html; it is made here and handed what the
-// server says. Panels do not know each other. No build step, and nothing from another host.
+// A panel is a class that owns one element of index.html. This module creates it and passes server
+// messages to it. Panels do not import each other. No build step, no file from another host.
 
 import { Link } from "./common/link.js";
 import { look } from "./common/login.js";
@@ -23,9 +23,9 @@ import { helpWithKeys } from "./common/help.js";
 import { drawGrf } from "./live/grf.js";
 import { History } from "./live/history.js";
 import { LastSession } from "./live/last_session.js";
-import { Marks } from "./live/marks.js";
+import { MarkerQueue } from "./live/markers.js";
 import { Notes } from "./live/notes.js";
-import { Pace, Reading } from "./live/pace.js";
+import { Pace, TextPace } from "./live/pace.js";
 import { Pause } from "./live/pause.js";
 import { Range } from "./live/range.js";
 import { Status } from "./live/status.js";
@@ -37,113 +37,114 @@ const NODE_KEY = "foottile.node";
 
 const state = {
   nodes: new Map(),
-  problems: [], // what the server found damaged on its disk
-  wanted: null, // name of the node to show: survives a restart of the server
-  node: null, // the chosen one, as the server last described it
-  frame: null, // the newest frame of the chosen node; spans merged since the last drawing
+  problems: [], // damaged files on the server
+  requested: null, // name of the node to show: survives a restart of the server
+  node: null, // selected node, as the server last described it
+  frame: null, // latest frame of the selected node; min-max merged since the last drawing
   fresh: false, // `frame` has not been drawn yet
-  heard: { frameMs: null, beat: null, sinceMs: performance.now() },
+  received: { frameMs: null, heartbeat: null, sinceMs: performance.now() },
   recordings: new Map(),
-  cannotRecord: "", // why a recording or a tare would be refused now
+  cannotRecord: "", // reason why a recording or a tare would be refused now
   serverAheadMs: 0,
   serverNowMs: () => Date.now() + state.serverAheadMs,
 };
 
 inSunlight();
-const reading = new Reading();
+const textPace = new TextPace();
 const pace = new Pace(draw);
-const again = () => {
+const redraw = () => {
   state.fresh = true;
-  reading.again();
-  pace.ask();
+  textPace.reset();
+  pace.request();
 };
-const range = new Range(byId("range"), again);
-const bars = new Bars(again, range);
+const range = new Range(byId("range"), redraw);
+const bars = new Bars(redraw, range);
 const foot = new Foot(range);
-foot.resized = again;
-const trace = new Trace(() => { past.want(); pace.ask(); });
-const tileTraces = new TileTraces(range, () => { again(); trace.recolour(); });
-const past = new History(trace.points, () => state.node?.boot_id);
+foot.resized = redraw;
+const trace = new Trace(() => { history.request(); pace.request(); });
+const tileTraces = new TileTraces(range, () => { redraw(); trace.recolour(); });
+const history = new History(trace.points, () => state.node?.boot_id);
 const pause = new Pause(() => {
   if (pause.held) trace.pause(pause.held.nowMs);
-  else trace.goOn();
-  again();
+  else trace.resume();
+  redraw();
 });
-pause.newest = () => state.frame;
+pause.latest = () => state.frame;
 helpWithKeys();
 const notes = new Notes();
 const replacement = new ReplacementWarning();
 byId("replacement-box").append(replacement.element);
 const lastSession = new LastSession();
 const tares = new Tares();
-const marks = new Marks();
-const actions = new Actions(state, marks, takeSession);
+const markers = new MarkerQueue();
+const actions = new Actions(state, markers, updateSession);
 
 const handlers = {
   hello(message) {
     state.nodes = new Map((message.nodes ?? []).map((node) => [node.node, node]));
     state.problems = message.problems ?? [];
     state.recordings.clear();
-    past.want(); // what came while the link was down
-    (message.recording ?? []).forEach(takeSession);
-    lastSession.clear(); // another server may have others
-    chooseNode();
-    marks.send(); // the server is back
-    look(); // and may know us no more
+    history.request(); // frames sent while the link was down
+    (message.recording ?? []).forEach(updateSession);
+    lastSession.clear(); // may be another server
+    selectNode();
+    markers.send(); // the server is back
+    look(); // the login may have ended
   },
   node({ node }) {
     const isNew = !state.nodes.has(node.node);
     const wasBoot = state.nodes.get(node.node)?.boot_id;
     state.nodes.set(node.node, node);
     if (state.node?.node === node.node) {
-      if (wasBoot !== node.boot_id) forget(); // it restarted: the old trace is another story
+      if (wasBoot !== node.boot_id) clearFrames(); // new stream: the old trace does not continue
       state.node = node;
       show();
     }
-    if (isNew || !state.node) chooseNode();
+    if (isNew || !state.node) selectNode();
   },
-  session: ({ session }) => takeSession(session),
-  counted: ({ sessions: counts }) => Object.entries(counts).forEach(([id, counted]) => count(id, counted)),
-  deleted: ({ session_id: id }) => forgetSession(id),
+  session: ({ session }) => updateSession(session),
+  counted: ({ sessions: counts }) => Object.entries(counts).forEach(([id, progress]) => updateProgress(id, progress)),
+  deleted: ({ session_id: id }) => removeSession(id),
   heartbeat(message) {
-    state.heard.beat = message.nodes?.[state.node?.node] ?? null;
+    state.received.heartbeat = message.nodes?.[state.node?.node] ?? null;
   },
   frame(message) {
-    if (message.node === state.node?.node) takeFrame(message);
+    if (message.node === state.node?.node) receiveFrame(message);
   },
 };
 
 const link = new Link({
   onMessage(message) {
     if (Number.isFinite(message.t_ns) && ["hello", "heartbeat", "pong"].includes(message.type)) {
-      // What has come was sent half a round trip ago.
+      // Sent half a round trip ago.
       state.serverAheadMs = message.t_ns / 1e6 + (link.roundTripMs ?? 0) / 2 - Date.now();
     }
-    // Unknown types are a newer server's business.
+    // Types of a newer server are ignored.
     if (Object.hasOwn(handlers, message.type)) handlers[message.type](message);
   },
   onChange: () => {},
 });
 const status = new Status(link);
 
-function takeFrame(frame) {
+function receiveFrame(frame) {
   const nowMs = performance.now();
-  if (state.fresh && state.frame && !document.hidden) keepSpan(frame, state.frame); // two messages, one drawing: keep both peaks
+  if (state.fresh && state.frame && !document.hidden) mergeSpan(frame, state.frame); // two messages, one drawing: both peaks count
   state.frame = frame;
   show();
-  state.heard.frameMs = nowMs;
-  status.see(frame);
-  notes.see(state.node, frame, nowMs);
+  state.received.frameMs = nowMs;
+  status.addFrame(frame);
+  notes.addFrame(state.node, frame, nowMs);
   trace.add(frame, state.node.nominal_rate_hz, nowMs);
-  past.see(state.node, frame, trace.windowS, nowMs, tileTraces.wants(bars.unit));
+  history.update(state.node, frame, trace.windowS, nowMs, tileTraces.column(bars.unit));
 }
 
 function show() {
   state.fresh = true;
-  pace.ask();
+  pace.request();
 }
 
-function keepSpan(frame, earlier) {
+/** Widen min and max of a frame by those of an earlier one. */
+function mergeSpan(frame, earlier) {
   const wider = (now, before, pick) => now?.map((value, i) => {
     const old = before?.[i];
     return Number.isFinite(value) && Number.isFinite(old) ? pick(value, old) : value;
@@ -152,46 +153,46 @@ function keepSpan(frame, earlier) {
   for (const name of ["gauge_max_kpa", "force_max_n"]) frame[name] = wider(frame[name], earlier[name], Math.max);
 }
 
-function takeSession(session) {
+function updateSession(session) {
   if (session.state === "recording") state.recordings.set(session.id, session);
   else state.recordings.delete(session.id);
-  lastSession.take(session);
+  lastSession.update(session);
   actions.draw();
 }
 
-/** Frames are counted by the server's ledger alone; here its word is shown. */
-function count(id, counted) {
+/** Copy progress from the server: only its ledger counts frames. */
+function updateProgress(id, progress) {
   const session = state.recordings.get(id);
-  if (session) state.recordings.set(id, { ...session, ...counted });
+  if (session) state.recordings.set(id, { ...session, ...progress });
 }
 
-function forgetSession(id) {
+function removeSession(id) {
   state.recordings.delete(id);
   lastSession.drop(id);
   actions.draw();
 }
 
-function forget() {
+function clearFrames() {
   state.frame = null;
-  state.heard = { frameMs: null, beat: null, sinceMs: performance.now() };
-  pause.goOn();
+  state.received = { frameMs: null, heartbeat: null, sinceMs: performance.now() };
+  pause.resume();
   trace.clear();
-  past.want();
+  history.request();
   notes.clear();
   status.clear();
 }
 
-function kept() {
+function storedNode() {
   try { return localStorage.getItem(NODE_KEY); } catch { return null; }
 }
 
-/** Keep the choice; else the remembered node, else one that is there. */
-function chooseNode(wanted = state.wanted ?? kept()) {
+/** Select the requested node, else the stored one, else a connected one. */
+function selectNode(requested = state.requested ?? storedNode()) {
   const all = [...state.nodes.values()];
-  const next = state.nodes.get(wanted) ?? all.find((node) => node.connected) ?? all[0] ?? null;
-  if (next?.node !== state.node?.node || next?.boot_id !== state.node?.boot_id) forget();
+  const next = state.nodes.get(requested) ?? all.find((node) => node.connected) ?? all[0] ?? null;
+  if (next?.node !== state.node?.node || next?.boot_id !== state.node?.boot_id) clearFrames();
   state.node = next;
-  state.wanted = wanted ?? next?.node ?? null;
+  state.requested = requested ?? next?.node ?? null;
   show();
   const select = byId("node-select", HTMLSelectElement);
   const names = all.map((node) => node.node).sort();
@@ -204,7 +205,7 @@ function chooseNode(wanted = state.wanted ?? kept()) {
 byId("node-select").addEventListener("change", () => {
   const chosen = byId("node-select", HTMLSelectElement).value;
   try { localStorage.setItem(NODE_KEY, chosen); } catch { /* private window */ }
-  chooseNode(chosen);
+  selectNode(chosen);
 });
 
 byId("calibration").addEventListener("click", () => quietly(async () => {
@@ -212,11 +213,11 @@ byId("calibration").addEventListener("click", () => quietly(async () => {
   if (state.node) await openCalibration(state.node);
 }));
 
-/** What must also be right while the tab draws nothing: live or frozen, and the counters. */
+/** Update live or frozen state and counters, also while the tab draws nothing. */
 function tick() {
   const { node } = state;
-  const reached = link.open || node;
-  byId("empty").hidden = Boolean(node) || !reached;
+  const hasData = link.open || node;
+  byId("empty").hidden = Boolean(node) || !hasData;
   document.body.dataset.nodes = String(state.nodes.size);
   byId("node-choice").hidden = state.nodes.size < 2;
   byId("node-name").hidden = state.nodes.size >= 2;
@@ -225,14 +226,14 @@ function tick() {
   byId("emulated").hidden = !node?.emulated;
   document.body.dataset.emulated = String(Boolean(node?.emulated));
   const nowMs = performance.now();
-  // The chosen node may not be known yet: the banner still says that the server is not there.
-  status.draw(node ?? { node: "?", tiles: [] }, state.heard, nowMs, state.serverNowMs());
+  // Without a node the banner still states that the server is down.
+  status.draw(node ?? { node: "?", tiles: [] }, state.received, nowMs, state.serverNowMs());
   state.cannotRecord = node ? status.cannotRecord : "";
-  // Without a picture of any age, what was recorded comes first.
+  // Without any live data, recordings come first.
   const isAway = Boolean(node) && link.open && !node.connected && status.isBlank;
   byId("away").hidden = !isAway;
-  byId("live").hidden = isAway || (!node && Boolean(reached));
-  setText(byId("away-title"), isAway ? `Node ${node.node} is away` : "");
+  byId("live").hidden = isAway || (!node && Boolean(hasData));
+  setText(byId("away-title"), isAway ? `Node ${node.node} is offline` : "");
   document.body.dataset.away = String(isAway);
   notes.draw(node, state.frame, nowMs, state.serverNowMs(), state.problems);
   replacement.draw(node);
@@ -241,7 +242,7 @@ function tick() {
   setText(byId("calibration-name"), node?.calibration ? `Calibration “${node.calibration.name}”` : "No calibration");
   actions.draw();
   lastSession.draw(node);
-  if (node && !node.connected) past.see(node, null, trace.windowS, nowMs, tileTraces.wants(bars.unit));
+  if (node && !node.connected) history.update(node, null, trace.windowS, nowMs, tileTraces.column(bars.unit));
 }
 
 function draw() {
@@ -249,12 +250,12 @@ function draw() {
   if (!node) return;
   const nowMs = performance.now();
   const { frame, nowMs: shownMs } = pause.held ?? { frame: state.frame, nowMs };
-  const isRead = reading.isDue(node, frame, nowMs);
-  if (state.fresh || isRead) {
+  const writesText = textPace.isDue(node, frame, nowMs);
+  if (state.fresh || writesText) {
     state.fresh = false;
-    if (!tileTraces.shown) bars.draw(node, frame, shownMs, isRead);
-    foot.draw(node, frame, isRead);
-    if (isRead) drawGrf(node, frame);
+    if (!tileTraces.shown) bars.draw(node, frame, shownMs, writesText);
+    foot.draw(node, frame, writesText);
+    if (writesText) drawGrf(node, frame);
   }
   const drawn = trace.draw(nowMs, status.live);
   if (drawn) tileTraces.draw(node, drawn, nowMs, bars.unit);
@@ -263,4 +264,4 @@ function draw() {
 setText(byId("start-command"), `foottile node --scene FILE --server ${location.origin}`);
 setInterval(tick, 100);
 tick();
-pace.ask();
+pace.request();

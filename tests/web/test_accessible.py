@@ -64,9 +64,9 @@ def test_live_recording_and_marked(
         expect(page.locator("#recordings li")).to_have_count(2)
         if page.locator("#fields").is_visible():  # on a phone they are behind a tap
             page.click("#fields")
-        page.fill("#mark-label", "a stone")
-        page.press("#mark-label", "Enter")
-        expect(page.locator("#notices")).to_contain_text("Marked")
+        page.fill("#marker-label", "a stone")
+        page.press("#marker-label", "Enter")
+        expect(page.locator("#notices")).to_contain_text("Marker")
         page.click("#tares-card summary")
         page.keyboard.press("p")
         expect(page.locator("#paused")).to_be_visible()
@@ -103,7 +103,7 @@ def test_dialogs_and_refusals(scripted: Scripted, open_page: OpenPage, dialog: s
     elif dialog == "edit":
         choose(page, row, "Edit")
     elif dialog == "seal":
-        choose(page, row, "Seal without them")
+        choose(page, row, "Abandon missing frames")
     elif dialog == "help":
         page.keyboard.press("?")
     elif dialog == "token":

@@ -1,4 +1,4 @@
-"""The page of the guided calibration: from its form to a node that uses what came of it."""
+"""Page of the guided calibration: from the form to a node that uses the result."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ pytestmark = pytest.mark.real_time
 OpenPage = Callable[..., Page]
 TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 STEP_S = 3.0
-"""A fit takes steps of 2 s or more."""
+"""A fit requires steps of at least 2 s."""
 LEAD_S = 25
 EACH_S = 14.0
-"""A rest and a weight: each settles for some 3 s and is watched for 3 s."""
+"""A rest and a weight: each settles for about 3 s and is held for 3 s."""
 FORCES_N = (2.0, 5.0, 10.0, 15.0, 20.0)
 SLOW_MS = 1e3 * (LEAD_S + EACH_S + 60)
 
@@ -42,7 +42,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def foot_with_weights(
     running: Running, folder: Path, environment: dict[str, str]
 ) -> Iterator[None]:
-    """An emulated foot of one tile, on which somebody puts five forces after a lead."""
+    """Run an emulated foot of one tile, loaded with five forces after a lead-in."""
     (folder / "one.toml").write_text(static_only(scene_text("standing", 1)))
     rows = ["time_s,cell1_n"]
     for number, force_n in enumerate(FORCES_N):
@@ -86,7 +86,7 @@ def test_a_tile_is_calibrated_and_used_by_its_node(
         assert complaints(page) == []
         expect(steps).to_have_count(1, timeout=SLOW_MS)
         expect(page.locator("#repeat")).to_have_text("Repeat 2 N")
-        page.reload()  # the server has the place
+        page.reload()  # the server holds the state
         expect(steps).to_have_count(1)
         for count in range(2, 5):
             expect(steps).to_have_count(count, timeout=SLOW_MS)
@@ -98,14 +98,16 @@ def test_a_tile_is_calibrated_and_used_by_its_node(
         assert complaints(page) == []
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         page.click("#accept")
-        expect(page.locator("#notices")).to_contain_text("bench uses it from now on")
+        expect(page.locator("#notices")).to_contain_text(
+            "bench uses this calibration from the next frame"
+        )
         expect(page.locator("#setup")).to_be_visible()
         used = server.http.get("/nodes/bench/calibration").json()
         assert (used["source"], used["calibration"]["name"]) == ("server", "left heel")
 
 
 @SIZES
-def test_why_there_is_no_calibration_is_said_and_it_can_be_repeated(
+def test_a_failed_calibration_shows_its_reason_and_can_be_repeated(
     scripted: Scripted,
     open_page: OpenPage,
     size: tuple[int, int],
@@ -121,12 +123,12 @@ def test_why_there_is_no_calibration_is_said_and_it_can_be_repeated(
         page.fill("#weights", "200 g, 500 g, 1 kg, 1.5 kg, 2 kg")
         monkeypatch.setattr(weighings, "IDLE_S", 5.0)
         page.click("#start")
-        expect(page.locator("#place")).to_have_text("T02, weight 1 of 5, tile 1 of 2")
+        expect(page.locator("#progress")).to_have_text("T02, weight 1 of 5, tile 1 of 2")
         expect(page.locator("#problem")).to_contain_text("no step was completed")
         expect(page.locator("#accept")).to_be_hidden()
         assert complaints(page) == []
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-        page.click("#again")
+        page.click("#restart")
         expect(page.locator("#guide")).to_be_visible()
         expect(page.locator("#problem")).to_contain_text("no step was completed")
         page.click("#save")
@@ -134,7 +136,7 @@ def test_why_there_is_no_calibration_is_said_and_it_can_be_repeated(
         until(lambda: not scripted.running.node()["recording"])
 
 
-def test_a_viewer_sees_it_and_cannot_press(
+def test_a_viewer_sees_the_calibration_and_cannot_change_it(
     script: Callable[..., Scripted], open_page: OpenPage
 ) -> None:
     server = script(token=TOKEN)

@@ -54,23 +54,23 @@ def test_another_calibration_is_chosen_and_the_nodes_own_again(
         page = open_page(scripted.url, *size)
         expect(page.locator("#calibration-name")).to_have_text(f"Calibration “{own[1]}”")
         page.click("#calibration")
-        expect(page.locator("#calibration-used")).to_contain_text("said by the node itself")
+        expect(page.locator("#calibration-used")).to_contain_text("from the node")
         expect(page.locator("#calibrations li")).to_have_count(2)
         guided = page.locator("#calibration-guided")
         expect(guided).to_have_attribute("href", "/calibrate?node=bench")
-        expect(page.locator(row(page, lacks))).to_contain_text("Does not fit: no curve of T02")
+        expect(page.locator(row(page, lacks))).to_contain_text("Does not fit: no curve for T02")
         expect(page.locator(f"{row(page, lacks)} button")).to_have_count(0)
         expect(page.locator(row(page, fits))).to_contain_text(f"{fits.date}, T01, T02, scale")
         assert complaints(page) == []
         page.click(f"{row(page, fits)} button")
         expect(page.locator(row(page, fits))).to_have_attribute("data-used", "true")
         expect(page.locator("#calibration-used")).to_contain_text("“left leg, November”")
-        expect(page.locator("#calibration-used")).to_contain_text("chosen here on")
+        expect(page.locator("#calibration-used")).to_contain_text("assigned on")
         assert used(scripted) == ("server", "left leg, November")
         assert complaints(page) == []
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
         page.click("#calibration-back")
-        expect(page.locator("#calibration-used")).to_contain_text("said by the node itself")
+        expect(page.locator("#calibration-used")).to_contain_text("from the node")
         assert used(scripted) == own
         page.keyboard.press("Escape")
         expect(page.locator("#calibration-dialog")).to_have_count(0)
@@ -85,12 +85,12 @@ def test_a_file_is_uploaded_as_it_is_and_what_is_none_is_refused_in_the_servers_
     bad.write_bytes(content_of(calibration).replace(b"from the bench", b"from the bencH"))
     page = open_page(f"{scripted.url}/nodes")
     page.get_by_role("button", name="Calibration of bench").click()
-    expect(page.locator("#calibration-dialog")).to_contain_text("keeps none yet")
+    expect(page.locator("#calibration-dialog")).to_contain_text("None on the server yet")
     page.set_input_files("#calibration-file", bad)
     expect(page.locator("#calibration-said")).to_contain_text("not a calibration")
     assert complaints(page) == []
     page.set_input_files("#calibration-file", good)
-    expect(page.locator(row(page, calibration))).to_contain_text("Has a curve of each tile")
+    expect(page.locator(row(page, calibration))).to_contain_text("Covers all tiles")
     expect(page.locator("#calibration-said")).to_be_empty()
     assert scripted.running.http.get(f"/calibrations/{calibration.id}").content == good.read_bytes()
 
@@ -116,7 +116,7 @@ def test_a_viewer_sees_calibrations_and_cannot_press(
     calibration = kept(server, "T01", "T02", name="left leg")
     ticket = server.running.http.post("/tickets", json={"may": "look"}).json()["ticket"]
     page = open_page(f"{server.url}#ticket={ticket}")
-    expect(page.locator("#login")).to_have_text("viewer: looks only")
+    expect(page.locator("#login")).to_have_text("viewer (read-only)")
     page.click("#calibration")
     expect(page.locator(row(page, calibration))).to_be_visible()
     for button in (f"{row(page, calibration)} button", "#calibration-file", "#calibration-back"):

@@ -59,7 +59,7 @@ def script_answer(text: str) -> Answer:
     [
         (script_answer("const = broken"), r"SyntaxError: .*\(/static/common/text\.js:1:7\)"),
         (script_answer("export const older = 1;"), "does not provide an export named"),
-        (lambda route: route.abort(), "did not come: http"),
+        (lambda route: route.abort(), "did not load: http"),
     ],
     ids=["syntax", "older", "absent"],
 )
@@ -68,7 +68,7 @@ def test_a_page_whose_scripts_fail_says_so_and_what_to_report(
 ) -> None:
     page = open_faulty(f"{server.url}{path}?secret=1", answers={"**/common/text.js": answer})
     guard = page.locator("#guard")
-    expect(guard.locator("h2")).to_have_text(re.compile("could not start|met an error"))
+    expect(guard.locator("h2")).to_have_text(re.compile("could not start|Error on this page"))
     expect(guard.locator("pre")).to_contain_text(re.compile(said))
     expect(guard.locator("pre")).to_contain_text("Chrome/")
     expect(guard.locator("pre")).not_to_contain_text("secret")
@@ -125,7 +125,7 @@ def test_an_error_is_told_once_and_covers_no_control(
         (lambda route: route.abort(), "cannot be reached"),
         (
             lambda route: route.fulfill(body="<h1>Log in</h1>", content_type="text/html"),
-            "not one of FootTile",
+            "not from a FootTile server",
         ),
         (lambda route: route.fulfill(status=502, body="<h1>Bad</h1>"), "refused: 502"),
         (lambda route: route.fulfill(status=409, json={"detail": "It rests."}), "It rests."),
@@ -167,7 +167,7 @@ def test_a_server_whose_websockets_are_blocked_is_not_said_to_be_away(
         close() {}
       };"""
     page = open_faulty(f"{scripted.url}{path}", script=blocked)
-    expect(page.locator(where)).to_contain_text("may not pass WebSockets")
+    expect(page.locator(where)).to_contain_text("may block WebSockets")
 
 
 def test_a_silent_server_and_a_fault_of_the_page_are_told_apart(
@@ -231,5 +231,5 @@ def test_a_page_that_was_put_aside_connects_again_and_tells_of_another_version(
         page.evaluate("dispatchEvent(new PageTransitionEvent('pageshow', { persisted: true }))")
         expect(page.locator("#notices")).to_contain_text("to FootTile 99.0")
         expect(page.locator("body[data-live=true]")).to_have_count(1)
-        page.click("#notices button:has-text('Load again')")
+        page.click("#notices button:has-text('Reload')")
         expect(page.locator("#notices")).to_be_empty()

@@ -1,4 +1,4 @@
-"""The main path once more in Firefox: watch, record, mark, stop, look back, download."""
+"""The main path once more in Firefox: watch, record, set a marker, stop, look back, download."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_what_stands_on_the_foot_is_watched_recorded_marked_looked_at_and_downlo
         firefox.find("#session-name").send_keys("in Firefox")
         firefox.click("#record")
         firefox.wait_for_text("#recordings", "in Firefox")
-        firefox.find("#mark-label").send_keys("a stone", ENTER)
+        firefox.find("#marker-label").send_keys("a stone", ENTER)
         firefox.wait_for_text("#notices", "a stone")
         until(lambda: scripted.running.sessions()[0]["frames"] > 300)
         firefox.click("#stop")
@@ -71,7 +71,7 @@ def test_what_stands_on_the_foot_is_watched_recorded_marked_looked_at_and_downlo
     firefox.click("#sessions a[href^='/sessions/']")
     firefox.wait("document.querySelector('#plots')?.dataset.settled === 'true'")
     firefox.wait(is_drawn("#plots-canvas"))
-    firefox.wait_for_text("#marks-list", "a stone")
+    firefox.wait_for_text("#markers-list", "a stone")
     firefox.wait("document.getElementById('replay').dataset.waiting === 'false'")
     assert firefox.run("return document.getElementById('plots').dataset.whole") == "true"
     firefox.drag("#plots", (300, 200), (500, 200))

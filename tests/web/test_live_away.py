@@ -66,7 +66,7 @@ def test_of_a_foot_that_was_never_seen_and_is_away_the_page_shows_what_was_recor
     idle.leave()
     page = open_page(scripted.url, *size)
     page.select_option("#node-select", "idle")
-    expect(page.get_by_role("heading", name="Node idle is away")).to_be_visible()
+    expect(page.get_by_role("heading", name="Node idle is offline")).to_be_visible()
     expect(page.locator("#live")).to_be_hidden()
     link = page.get_by_role("link", name="Recorded sessions")
     expect(link).to_be_in_viewport()

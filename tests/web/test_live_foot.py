@@ -26,10 +26,10 @@ OF_THEIR_FORCE = """async () => {
   const shades = shadesOf(document.querySelector("#foot"));
   const most = Number.parseFloat(document.querySelector("#foot .heat-legend text").textContent);
   const tiles = [...document.querySelectorAll("#bars .tile")];
-  const marks = [...document.querySelectorAll("#foot .mark .dome")];
+  const symbols = [...document.querySelectorAll("#foot .tile-symbol .dome")];
   const near = (fill, share) =>
     [-1, 0, 1].some((by) => shadeOf(shades, share + by / 32).fill === fill);
-  return marks.length === 2 && marks.every((dome, i) =>
+  return symbols.length === 2 && symbols.every((dome, i) =>
     near(dome.getAttribute("fill"), Number(tiles[i].dataset.value) / most));
 }"""
 """Is each tile of the picture of the colour of its force? One step of the colours is let pass."""
@@ -85,12 +85,12 @@ def test_tiles_have_the_colour_of_their_force_and_the_range_says_which_it_is(
         page.wait_for_function(OF_THEIR_FORCE)
         before = top.text_content()
         page.click("#range")
-        expect(page.locator("#range")).to_have_text("Range: automatic")
+        expect(page.locator("#range")).to_have_text("Range: auto")
         expect(top).not_to_have_text(before or "")
         expect(page.locator("#bars .scale").first).not_to_have_text(fixed)
         page.wait_for_function(OF_THEIR_FORCE)
         page.reload()
-        expect(page.locator("#range")).to_have_text("Range: automatic")
+        expect(page.locator("#range")).to_have_text("Range: auto")
 
 
 def test_the_centre_of_pressure_draws_a_trail_of_two_seconds(
@@ -142,8 +142,8 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         page.select_option("#node-select", "grid")
         expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#foot rect.dome")).to_have_count(64)
-        expect(page.locator("#range")).to_have_text("Range: automatic")
-        number = page.locator("#foot .mark .name").first
+        expect(page.locator("#range")).to_have_text("Range: auto")
+        number = page.locator("#foot .tile-symbol .name").first
         expect(number).to_have_text("12")
         cell = page.locator("#foot rect.dome").first.bounding_box()
         assert cell is not None
@@ -155,9 +155,9 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
 
 
 @pytest.mark.parametrize(
-    ("places_m", "words"),
+    ("places_m", "text"),
     [
-        # A bare tile aside has the foot drawn from above.
+        # A reference tile beside the row: drawn from above.
         (
             [(0.0, 0.012), (0.014, 0.012), (0.0, 0.04)],
             "COP x .+ ± .+ mm, y not measured",
@@ -168,8 +168,8 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
         ),
     ],
 )
-def test_of_tiles_in_one_row_the_centre_is_drawn_at_the_row_and_no_number_is_told(
-    scripted: Scripted, open_page: OpenPage, places_m: list[tuple[float, float]], words: str
+def test_a_row_of_tiles_draws_the_cop_on_the_row_and_gives_no_number_across_it(
+    scripted: Scripted, open_page: OpenPage, places_m: list[tuple[float, float]], text: str
 ) -> None:
     tiles = [
         make_tile(i, x_m=x_m, y_m=y_m, reference=i == 2) for i, (x_m, y_m) in enumerate(places_m)
@@ -188,8 +188,8 @@ def test_of_tiles_in_one_row_the_centre_is_drawn_at_the_row_and_no_number_is_tol
     with Play(node, 15.0):
         page = open_page(scripted.url)
         page.select_option("#node-select", "row")
-        expect(page.locator("#cop")).to_have_text(re.compile(rf"^{words} \(95 %\)$"))
-        expect(page.locator("#foot .cop-mark")).to_be_visible()
+        expect(page.locator("#cop")).to_have_text(re.compile(rf"^{text} \(95 %\)$"))
+        expect(page.locator("#foot .cop-symbol")).to_be_visible()
         page.goto(f"{scripted.url}/nodes")
         expect(page.locator('.node[data-node="row"][data-live="true"]')).to_have_count(1)
     node.close()
@@ -214,7 +214,8 @@ def test_the_first_screen_of_a_phone_has_what_matters(
         if height == 844:
             assert bottom_of(page, "#bars") <= bar["y"]
         rows = {
-            round(top_of(page, f"#{name}")) for name in ("tare", "record", "stop", "mark", "fields")
+            round(top_of(page, f"#{name}"))
+            for name in ("tare", "record", "stop", "marker", "fields")
         }
         assert len(rows) == 1
         expect(page.locator("#session-name")).to_be_hidden()

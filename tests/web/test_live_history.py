@@ -35,7 +35,7 @@ JOINED = """async () => {
       heard += 1;
       if (heard === 5) {
         const before = frame.seq_first;
-        points.precede(await recent("bench", 10, before), before, performance.now());
+        points.addHistory(await recent("bench", 10, before), before, performance.now());
         joined = true;
       }
       if (heard >= 15 && joined) resolve();
@@ -117,7 +117,7 @@ def test_a_paused_picture_stands_still_says_so_and_goes_on(
         expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#paused")).to_be_hidden()
         page.keyboard.press("p")
-        expect(page.locator("#paused")).to_contain_text("data and recordings go on")
+        expect(page.locator("#paused")).to_contain_text("Acquisition and recording continue")
         expect(page.locator("#pause")).to_have_attribute("aria-pressed", "true")
         page.wait_for_timeout(200)
         before, sent, grf = page.evaluate(PICTURE), play.node.seq, page.inner_text("#grf")

@@ -18,27 +18,30 @@ LIVE_JS = Path(__file__).resolve().parents[2] / "web" / "live"
 OpenPage = Callable[..., Page]
 
 
-def explained() -> list[tuple[str, str]]:
-    text = (LIVE_JS / "why.js").read_text("utf-8").partition("const SECTIONS")[0]
-    return re.findall(r"^  \[/(.+)/, \"(.+)\"\],$", text, re.MULTILINE)
+def reasons() -> dict[str, str]:
+    """Reason and remedy of each warning, by its key."""
+    text = (LIVE_JS / "why.js").read_text("utf-8")
+    return dict(
+        re.findall(r"^  (\w+): \{[^\"]*(?:\"[a-z-]+\",)?\s+why: \"(.+)\" \},$", text, re.MULTILINE)
+    )
 
 
 def test_every_flag_of_frames_and_estimates_is_explained() -> None:
-    said = re.findall(r"\[(?:ESTIMATE|FRAME)\.\w+, \"(.+)\"\]", (LIVE_JS / "notes.js").read_text())
-    assert len(said) > 6
-    for text in said:
-        assert any(re.search(begins, text) for begins, _ in explained()), text
+    notes = (LIVE_JS / "notes.js").read_text("utf-8")
+    keys = re.findall(r"\[(?:ESTIMATE|FRAME)\.\w+, \"(\w+)\", ", notes)
+    keys += re.findall(r"(?:add|flag|makeNote)\(\"(\w+)\", ", notes)
+    assert len(keys) > 15
+    assert set(keys) <= set(reasons())
 
 
-@pytest.mark.parametrize("why", [why for _, why in explained()])
+@pytest.mark.parametrize("why", reasons().values(), ids=reasons())
 def test_an_explanation_has_two_sentences_in_plain_words(why: str) -> None:
     assert re.fullmatch(r"[A-Z][^.]+\. [A-Z][^.]+\.", why), why
     assert "slot" not in why
 
 
 def test_a_warning_links_to_a_section_that_is_there() -> None:
-    text = (LIVE_JS / "why.js").read_text("utf-8").partition("const SECTIONS")[2]
-    sections = re.findall(r', "([a-z-]+)"\],$', text, re.MULTILINE)
+    sections = re.findall(r'section: "([a-z-]+)"', (LIVE_JS / "why.js").read_text("utf-8"))
     assert len(sections) > 3
     help_page = (LIVE_JS.parent / "tile-reads-nonsense.html").read_text("utf-8")
     assert set(sections) <= set(re.findall(r'<h2 id="([a-z-]+)">', help_page))
@@ -57,10 +60,10 @@ def test_a_warning_says_since_when_and_why_and_stays_open(
         expect(note.locator("time")).to_have_text(re.compile(r" since \d\d:\d\d:\d\d$"))
         expect(note.get_by_text("Tile S0 (mux 0x70 channel 0) does not answer.")).to_be_visible()
         since = note.locator("time").text_content()
-        note.get_by_text("why?").click()
-        expect(note.locator("p")).to_contain_text("what it bears is not known")
+        note.get_by_text("Why?").click()
+        expect(note.locator("p")).to_contain_text("its load is unknown")
         with page.expect_popup() as opened:
-            note.get_by_role("link", name="What to do").click()
+            note.get_by_role("link", name="Troubleshooting").click()
         expect(opened.value.locator("#it-is-missing")).to_be_in_viewport()
         assert complaints(opened.value) == []
         tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer", "another trouble")
@@ -69,7 +72,7 @@ def test_a_warning_says_since_when_and_why_and_stays_open(
         assert note.locator("time").text_content() == since
         assert complaints(page) == []
         page.reload()
-        expect(note.locator("time")).to_contain_text("or before")
+        expect(note.locator("time")).to_contain_text("or earlier")
 
 
 def tell(scripted: Scripted, *troubles: str) -> None:

@@ -16,21 +16,21 @@ OpenPage = Callable[..., Page]
 LIVE = "body[data-live=true]"
 
 WRITTEN = """async () => {
-  const { Reading } = await import("/static/live/pace.js");
-  const reading = new Reading();
+  const { TextPace } = await import("/static/live/pace.js");
+  const pace = new TextPace();
   const node = {};
   const of = (status, force_n) =>
     ({ status, force_n, saturated: [false], frame_status: 0, estimate_status: 0 });
   const steady = of([0], [1]);
   return {
-    first: reading.isDue(node, steady, 1000),
-    same: reading.isDue(node, steady, 9000),
-    another: reading.isDue(node, of([0], [2]), 9010),
-    soonAfter: reading.isDue(node, of([0], [3]), 9040),
-    faultAtOnce: reading.isDue(node, of([1], [null]), 9043),
-    knownAgainAtOnce: reading.isDue(node, of([0], [4]), 9046),
-    nodeSaysMore: reading.isDue({}, of([0], [5]), 9049),
-    later: reading.isDue({}, of([0], [6]), 9300),
+    first: pace.isDue(node, steady, 1000),
+    same: pace.isDue(node, steady, 9000),
+    another: pace.isDue(node, of([0], [2]), 9010),
+    soonAfter: pace.isDue(node, of([0], [3]), 9040),
+    faultAtOnce: pace.isDue(node, of([1], [null]), 9043),
+    knownAgainAtOnce: pace.isDue(node, of([0], [4]), 9046),
+    nodeSaysMore: pace.isDue({}, of([0], [5]), 9049),
+    later: pace.isDue({}, of([0], [6]), 9300),
   };
 }"""
 
@@ -39,10 +39,10 @@ PICTURES = """async () => {
   let drawn = 0;
   const pace = new Pace(() => { drawn += 1; });
   const frame = () => new Promise(requestAnimationFrame);
-  for (let i = 0; i < 5; i++) pace.ask();
+  for (let i = 0; i < 5; i++) pace.request();
   await frame();
   const first = drawn;
-  pace.ask();
+  pace.request();
   await frame();
   return [first, drawn];
 }"""
@@ -56,7 +56,7 @@ BARS_OF_THEIR_FORCE = """() => {
   return [...document.querySelectorAll("#bars .tile")].every((tile) => {
     const track = tile.querySelector(".track");
     const box = track.getBoundingClientRect();
-    const full = Number.parseFloat(tile.querySelector(".scale").textContent);
+    const full = Number.parseFloat(tile.querySelector(".scale").textContent.split("-")[1]);
     const left = Math.round(box.left - origin.left + 0.1 * box.width);
     const [top, height] = [Math.round(box.top - origin.top), Math.round(box.height)];
     const column = copy.getImageData(left, top, 1, height).data;

@@ -71,13 +71,15 @@ def test_a_page_opened_after_the_node_died_tells_one_story(
     scripted.node.leave()
     page = open_page(scripted.url)
     expect(page.locator("#frozen")).to_contain_text("No data for")
-    expect(page.locator("#frozen")).to_contain_text("Node bench is away.")
+    expect(page.locator("#frozen")).to_contain_text("Node bench is offline.")
     expect(page.locator("#age")).to_contain_text("ago")
     for button in ("#record", "#tare"):
         expect(page.locator(button)).to_be_disabled()
-    expect(page.locator("#cannot-record")).to_have_text("Record and Tare wait: node bench is away.")
+    expect(page.locator("#cannot-record")).to_have_text(
+        "Cannot record or tare: node bench is offline."
+    )
     page.keyboard.press("r")
-    expect(page.locator("#notices")).to_contain_text("Node bench is away.")
+    expect(page.locator("#notices")).to_contain_text("Node bench is offline.")
     assert scripted.running.sessions() == []
     scripted.node.connect()
     with Play(scripted.node):
@@ -95,29 +97,29 @@ def test_a_node_out_of_reach_is_silent_on_the_page_and_then_away(
         expect(page.locator(LIVE)).to_have_count(1)
         page.evaluate(NOTE_WHAT_IS_FROZEN)
     # Nothing comes any more, and nobody says goodbye: as when a cable is pulled.
-    expect(page.locator("#frozen")).to_contain_text("Node bench is away.")
-    assert any("silent, though connected" in text for text in page.evaluate("window.frozen"))
+    expect(page.locator("#frozen")).to_contain_text("Node bench is offline.")
+    assert any("connected but sends no frames" in text for text in page.evaluate("window.frozen"))
 
 
-def test_what_follows_a_labelled_mark_is_a_shortcut_again(
+def test_what_follows_a_labelled_marker_is_a_shortcut_again(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.node.record(name="walk")
     with Play(scripted.node):
         page = open_page(scripted.url)
-        expect(page.locator("#mark")).to_be_enabled()
-        page.focus("#mark-label")
+        expect(page.locator("#marker")).to_be_enabled()
+        page.focus("#marker-label")
         page.keyboard.type("a stone")
         page.keyboard.press("Enter")
         page.keyboard.press("s")
         expect(page.locator("#recordings")).to_be_hidden()
-        assert page.input_value("#mark-label") == ""
+        assert page.input_value("#marker-label") == ""
         session.sealed()
     events = scripted.running.http.get(f"{session.url}/events").json()["items"]
     assert [event["label"] for event in events] == ["a stone"]
 
 
-@pytest.mark.parametrize("field", ["#mark-label", "#session-name"])
+@pytest.mark.parametrize("field", ["#marker-label", "#session-name"])
 def test_escape_empties_a_field_and_leaves_it(
     scripted: Scripted, open_page: OpenPage, field: str
 ) -> None:
@@ -146,11 +148,11 @@ def test_a_session_whose_end_alone_is_open_says_so_and_completes_when_the_node_i
     assert (now["pending_frames"], now["waits_for"]) == (0, "end")
     page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
-    expect(row).to_contain_text("Only its end is open")
+    expect(row).to_contain_text("Waiting for the last frames before stop")
     assert page.evaluate("document.documentElement.scrollWidth") <= 1366
     menu = open_menu(page, row)
-    expect(menu.get_by_role("menuitem", name="Seal as it is")).to_be_visible()
-    expect(menu.get_by_role("menuitem", name="Seal without")).to_have_count(0)
+    expect(menu.get_by_role("menuitem", name="Seal now")).to_be_visible()
+    expect(menu.get_by_role("menuitem", name="Abandon")).to_have_count(0)
     scripted.node.connect()
     scripted.node.send(10, now=True)
     expect(row.locator(".state")).to_have_text("complete")
@@ -163,9 +165,9 @@ def test_a_session_whose_node_never_comes_back_is_sealed_with_what_is_here(
     session = ends_open(scripted)
     page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
-    choose(page, row, "Seal as it is")
-    expect(page.locator("#ask-dialog")).to_contain_text("is given up")
+    choose(page, row, "Seal now")
+    expect(page.locator("#ask-dialog")).to_contain_text("are abandoned")
     page.get_by_role("button", name="Seal as lossy").click()
     expect(row.locator(".state")).to_have_text("lossy")
-    expect(row).to_contain_text("more may be missing where the node could not tell its end")
+    expect(row).to_contain_text("at the end may be lost")
     assert session.now()["frames"] == 50

@@ -22,7 +22,7 @@ PLACES = """() => Object.fromEntries(
     .map((id) => [id, document.getElementById(id).getBoundingClientRect().toJSON()]))"""
 COVERED = """() => {
   const at = document.querySelector("#notices .notice:last-child").getBoundingClientRect();
-  const parts = "#pause #foot #grf #trace #bars #record #stop #mark #tare".split(" ");
+  const parts = "#pause #foot #grf #trace #bars #record #stop #marker #tare".split(" ");
   return parts.filter((name) => {
     const { left, right, top, bottom } = document.querySelector(name).getBoundingClientRect();
     return left < at.right && right > at.left && top < at.bottom && bottom > at.top;
@@ -61,7 +61,7 @@ def test_warnings_pauses_messages_and_recordings_leave_everything_where_it_is(
         assert {name: now[name] for name in still} == {name: before[name] for name in still}
         assert now["actions"] == before["actions"]
         page.keyboard.press("m")
-        expect(page.locator("#notices")).to_contain_text("Marked")
+        expect(page.locator("#notices")).to_contain_text("Marker")
         assert places(page)["actions"] == before["actions"]
         assert page.evaluate(COVERED) == []
         assert page.evaluate("document.documentElement.scrollWidth") == size[0]
@@ -110,7 +110,7 @@ def test_in_flight_the_trail_of_the_last_contact_stays_on_the_sole(
         assert all(y == pytest.approx(sole, abs=1.0) for _, y in page.evaluate(TRAIL))
         play.force_n = 0.0
         expect(page.locator("#contact")).to_have_attribute("data-contact", "false")
-        expect(page.locator("#cop")).to_contain_text("no COP: no contact, last x")
+        expect(page.locator("#cop")).to_contain_text("No COP: no contact, last x")
         assert len(page.evaluate(TRAIL)) > 5
 
 

@@ -86,13 +86,13 @@ def test_a_viewer_is_offered_nothing_and_the_server_refuses_it(
         server.node.record(name="by another one")
         page = open_page(address(server, "look"), *PHONE)
         expect(page.locator(_LIVE)).to_have_count(1)
-        expect(page.locator("#login")).to_have_text("viewer: looks only")
+        expect(page.locator("#login")).to_have_text("viewer (read-only)")
         expect(page.locator("#recordings li")).to_have_count(1)
-        for gone in ("#tare", "#record", "#stop", "#mark", "#session-name", "#mark-label"):
+        for gone in ("#tare", "#record", "#stop", "#marker", "#session-name", "#marker-label"):
             expect(page.locator(gone)).to_be_hidden()
         assert complaints(page) == []
         page.keyboard.press("s")
-        expect(page.locator("#notices")).to_contain_text("may look, and not press")
+        expect(page.locator("#notices")).to_contain_text("viewers cannot tare")
         page.click("#to-sessions")
         menu = open_menu(page, page.locator("#sessions .session"))
         expect(menu.get_by_role("menuitem", name="Download CSV")).to_be_visible()

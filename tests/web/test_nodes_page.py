@@ -1,4 +1,4 @@
-"""The page of all nodes: a card for each, and all recorded, marked and stopped with one press."""
+"""The page of all nodes: a card for each, and record, marker and stop for all."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ def test_two_feet_are_recorded_marked_and_stopped_together_and_one_is_lost_in_be
     expect(page.locator("#take-running")).to_contain_text("0 frames lost")
     page.fill("#take-label", "a stone")
     page.press("#take-label", "Enter")
-    expect(page.locator("#notices")).to_contain_text("Marked “a stone” on 2 nodes")
+    expect(page.locator("#notices")).to_contain_text("Marker “a stone” set on 2 nodes")
 
     two.others[1].kill()  # the right one
-    expect(page.locator(f"{card('right')} .state")).to_have_text("away")
+    expect(page.locator(f"{card('right')} .state")).to_have_text("offline")
     page.fill("#take-label", "one is lost")
     page.press("#take-label", "Enter")
-    expect(page.locator("#notices")).to_contain_text("Marked “one is lost” on 2 nodes")
+    expect(page.locator("#notices")).to_contain_text("Marker “one is lost” set on 2 nodes")
     page.keyboard.press("s")
     expect(page.locator("#take-text")).to_be_hidden()
     expect(page.locator(f"{card('left')} .node-session")).to_contain_text("complete")
@@ -86,9 +86,9 @@ def test_two_feet_are_recorded_marked_and_stopped_together_and_one_is_lost_in_be
     assert (left["node"], right["node"]) == ("left", "right")
     assert left["name"] == right["name"] == "both feet"
     assert left["take"] == right["take"] is not None
-    marks = [two.get(f"/sessions/{session['id']}/events")["items"] for session in (left, right)]
-    assert marks[0] == marks[1]
-    assert [mark["label"] for mark in marks[0]] == ["a stone", "one is lost"]
+    markers = [two.get(f"/sessions/{session['id']}/events")["items"] for session in (left, right)]
+    assert markers[0] == markers[1]
+    assert [marker["label"] for marker in markers[0]] == ["a stone", "one is lost"]
 
 
 @SIZES
@@ -104,7 +104,7 @@ def test_a_node_that_sends_nothing_is_not_recorded_and_its_card_says_why(
             expect(page.locator(f"{card('silent')} .state")).to_have_text("no data yet")
             assert complaints(page) == []
             page.keyboard.press("?")
-            expect(page.locator("#help-dialog")).to_contain_text("Record all that are connected")
+            expect(page.locator("#help-dialog")).to_contain_text("Record all connected nodes")
             assert complaints(page) == []
             page.keyboard.press("Escape")
             expect(page.locator("#help-dialog")).to_be_hidden()
@@ -113,12 +113,12 @@ def test_a_node_that_sends_nothing_is_not_recorded_and_its_card_says_why(
             expect(page.locator(f"{card('bench')}[data-recording=true]")).to_have_count(1)
             refused = page.locator(f"{card('silent')} .refused")
             expect(refused).to_contain_text("Not recorded: node 'silent' sends no frames")
-            expect(page.locator("#notices")).to_contain_text("silent is not recorded")
+            expect(page.locator("#notices")).to_contain_text("silent not recorded")
             expect(page.locator("#stop-all")).to_be_enabled()
             assert complaints(page) == []
             assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
             page.keyboard.press("r")
-            expect(page.locator("#notices")).to_contain_text("Stop what is being recorded first")
+            expect(page.locator("#notices")).to_contain_text("stop the running recording first")
             page.keyboard.press("s")
             expect(page.locator("#take-text")).to_be_hidden()
             assert len(scripted.running.sessions()) == 1
@@ -174,7 +174,7 @@ COLOURS = """async () => {
     return (0.2126 * r + 0.7152 * g + 0.0722 * b) / 255;
   });
   canvas.remove();
-  return { light, top: foot.range.ofAll };
+  return { light, top: foot.range.foot };
 }"""
 """How light tiles of 0, 10, 17 and 21 N are on a card."""
 
@@ -230,7 +230,7 @@ def test_the_page_says_that_a_node_or_the_server_is_away_and_goes_on_by_itself(
         expect(page.locator(live("bench"))).to_have_count(1)
     expect(page.locator(f"{card('bench')} .state")).to_contain_text("no data for")
     scripted.node.leave()
-    expect(page.locator(f"{card('bench')} .state")).to_have_text("away")
+    expect(page.locator(f"{card('bench')} .state")).to_have_text("offline")
     expect(page.locator("#record-all")).to_be_disabled()
     expect(page.locator("#take-why")).to_contain_text("no node is connected")
     assert complaints(page) == []
@@ -251,10 +251,10 @@ def test_a_viewer_sees_all_nodes_and_is_offered_no_button(
     with Play(server.node):
         page = open_page(f"{server.url}/nodes#ticket={ticket}")
         expect(page.locator(live("bench"))).to_have_count(1)
-        expect(page.locator("#login")).to_have_text("viewer: looks only")
+        expect(page.locator("#login")).to_have_text("viewer (read-only)")
         expect(page.locator("#record-all")).to_be_hidden()
         page.keyboard.press("r")
-        expect(page.locator("#notices")).to_contain_text("may look, and not press")
+        expect(page.locator("#notices")).to_contain_text("viewers cannot tare")
         assert complaints(page) == []
         server.running.http.post("/takes", json={"name": "by another one"})
         expect(page.locator("#take-running")).to_contain_text("“by another one” on 1 node")
@@ -280,13 +280,13 @@ def test_another_machine_that_asks_for_a_name_is_accepted_with_a_button(
             warning = page.locator(".replacement")
             expect(warning).to_be_hidden()
             assert ask() == 4013
-            expect(warning).to_contain_text(f"{fingerprint}, from 127.0.0.1")
+            expect(warning).to_contain_text(f"{fingerprint} from 127.0.0.1")
             assert complaints(page) == []
             warning.locator("button").click()
             expect(page.locator("#ask-text")).to_contain_text("is disconnected and refused")
             page.click("#ask-yes")
             expect(warning).to_be_hidden()
-            expect(page.locator("#notices")).to_contain_text(f"{fingerprint} is bench")
+            expect(page.locator("#notices")).to_contain_text(f"{fingerprint} is now bench")
         stranger.connect()
     finally:
         stranger.close()

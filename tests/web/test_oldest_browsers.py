@@ -75,7 +75,7 @@ def test_the_oldest_browsers_are_the_same_everywhere(path: str) -> None:
 
 @SIZES
 @pytest.mark.real_time
-def test_an_old_browser_in_a_network_records_marks_and_looks_back(
+def test_an_old_browser_in_a_network_records_markers_and_looks_back(
     scripted: Scripted, open_page: OpenPage, size: tuple[int, int]
 ) -> None:
     address = scripted.url.replace("127.0.0.1", "192.0.2.1")
@@ -89,8 +89,8 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
         page.click("#record")
         expect(page.locator("#recordings li")).to_have_count(1)
         play.force_n = 8.0
-        page.click("#mark")
-        expect(page.locator("#notices")).to_contain_text("Marked")
+        page.click("#marker")
+        expect(page.locator("#notices")).to_contain_text("Marker")
         page.click("#as-traces")
         expect(page.locator("#tile-traces")).to_be_visible()
         until(lambda: scripted.running.sessions()[0]["frames"] > 300)
@@ -105,7 +105,7 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
         expect(page).to_have_url(re.compile("from="))
         page.click("#zoom-all")
         expect(page).not_to_have_url(re.compile("from="))
-        expect(page.locator("#marks-list li")).to_have_count(1)
+        expect(page.locator("#markers-list li")).to_have_count(1)
         expect(page.locator("#stance-line")).to_be_visible()
         page.click("#ledger-card summary")
         page.click("#verify")
@@ -116,8 +116,8 @@ def test_an_old_browser_in_a_network_records_marks_and_looks_back(
         page.goto(f"{address}/nodes")
         page.click("#record-all")
         expect(page.locator("#take-text")).to_be_visible()
-        page.click("#mark-all")
-        expect(page.locator("#notices")).to_contain_text("Marked")
+        page.click("#marker-all")
+        expect(page.locator("#notices")).to_contain_text("Marker")
         page.click("#stop-all")
         expect(page.locator("#take-text")).to_be_hidden()
     expect(page.locator("#guard")).to_have_count(0)

@@ -88,14 +88,14 @@ def test_bars_and_grf_follow_a_known_load(known: Field, open_page: OpenPage) -> 
     assert value_of(page, "T04") > value_of(page, "T02") > value_of(page, "T01")
 
 
-def test_record_mark_stop_download(known: Field, open_page: OpenPage, tmp_path: Path) -> None:
+def test_record_marker_stop_download(known: Field, open_page: OpenPage, tmp_path: Path) -> None:
     page = open_page(known.url)
     expect(page.locator("body")).to_have_attribute("data-live", "true")
     page.fill("#session-name", "mud & <b>stones</b>")
     page.click("#record")
     expect(page.locator("#stop")).to_be_enabled()
-    page.fill("#mark-label", "a stone")
-    page.press("#mark-label", "Enter")
+    page.fill("#marker-label", "a stone")
+    page.press("#marker-label", "Enter")
     wait_until(lambda: known.get("/sessions")["items"][0]["frames"] > 300, "some frames")
     page.click("#stop")
     wait_until(lambda: known.get("/sessions")["items"][0]["state"] == "sealed", "the sealed file")
@@ -123,11 +123,11 @@ def test_everything_can_be_done_with_the_keyboard(known: Field, open_page: OpenP
     before = len(known.get("/sessions")["items"])
     page.keyboard.press("r")
     expect(page.locator("#stop")).to_be_enabled()
-    page.focus("#mark-label")
+    page.focus("#marker-label")
     page.keyboard.type("rest")  # letters of shortcuts, in a field
-    assert page.input_value("#mark-label") == "rest"
+    assert page.input_value("#marker-label") == "rest"
     page.keyboard.press("Escape")
-    page.locator("#mark-label").blur()
+    page.locator("#marker-label").blur()
     page.keyboard.press("s")
     wait_until(lambda: known.get("/sessions")["items"][0]["state"] == "sealed", "the sealed file")
     assert len(known.get("/sessions")["items"]) == before + 1
@@ -140,7 +140,7 @@ def test_a_phone_shows_the_bars_and_needs_no_sideways_scrolling(
     expect(page.locator("body")).to_have_attribute("data-live", "true")
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     expect(page.locator('#bars [data-serial="T04"]')).to_be_in_viewport()
-    for button in ("#tare", "#record", "#stop", "#mark"):
+    for button in ("#tare", "#record", "#stop", "#marker"):
         expect(page.locator(button)).to_be_in_viewport()
 
 
@@ -204,8 +204,8 @@ def test_saturated_and_silent_tiles_cannot_be_mistaken_for_values(
         expect(page.locator("#grf-bound")).to_have_text("at least")
         at_least_n = float(page.inner_text("#grf"))
         assert 20.0 < at_least_n < 110.0
-        expect(page.locator("#grf-sigma")).to_have_text("(T02 missing, T03 beyond its range)")
-        expect(page.locator("#cop")).to_have_text("no COP: T02 missing, T03 beyond its range")
+        expect(page.locator("#grf-sigma")).to_have_text("(T02 missing, T03 saturated)")
+        expect(page.locator("#cop")).to_have_text("No COP: T02 missing, T03 saturated")
         for serial in ("T01", "T04"):  # the others go on
             expect(page.locator(f'#bars [data-serial="{serial}"]')).to_have_attribute(
                 "data-state", "ok"

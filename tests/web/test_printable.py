@@ -66,7 +66,7 @@ def test_hostile_names_are_spelt_out_wherever_they_are_shown(
         page.goto(f"{scripted.url}/sessions/{session.id}")
         settled(page)
         expect(page.locator("#name")).to_have_text(SHOWN)
-        expect(page.locator("#marks-list")).to_contain_text(SHOWN)
+        expect(page.locator("#markers-list")).to_contain_text(SHOWN)
         expect(page.locator("#about")).to_contain_text(f"#{SHOWN}")
         assert unprintable(page) == []
 

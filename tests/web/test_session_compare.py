@@ -26,8 +26,8 @@ PLATE = "plate <b>1"
 STONE = "a stone"
 
 
-def marked(session: Recording, frame: int) -> int:
-    """Mark a frame as a stone; its instant."""
+def add_marker(session: Recording, frame: int) -> int:
+    """Set a marker at a frame; return its time."""
     t_ns = int(session.column("t_ns")[frame])
     answer = session.running.http.post(f"{session.url}/events", json={"label": STONE, "t_ns": t_ns})
     assert answer.status_code == 201
@@ -46,7 +46,7 @@ def compared(server: Running, tmp_path_factory: pytest.TempPathFactory) -> Recor
     write_plate(session, plate)
     limits = "grf_mae_n=2,peak_mae_n=0.001"
     assert compare(session, plate, "--remove-offset", "--limits", limits) == 3
-    marked(session, 700)
+    add_marker(session, 700)
     return session
 
 
@@ -64,7 +64,7 @@ def other(server: Running) -> Recording:
     node.deliver(300, [0.0, 0.0], alive=True)
     node.finish(session)
     node.close()
-    marked(session, 950)
+    add_marker(session, 950)
     return session
 
 
@@ -109,10 +109,10 @@ def test_figures_of_a_comparison_are_said_in_words_with_limits_met_or_missed(
     page = open_page(url_of(compared))
     name = compared.running.http.get(f"{compared.url}/comparisons").json()["items"][0]["name"]
     page.select_option("#beside", f"against:{name}")
-    says = page.locator("#report-says")
+    says = page.locator("#report-summary")
     expect(says).to_contain_text("1 of 2 limits missed")
-    expect(says).to_contain_text(f"Its clock is {1e3 * LAG_S:.0f}.")
-    expect(says).to_contain_text("which is taken off")
+    expect(says).to_contain_text(f"Reference clock: {1e3 * LAG_S:.0f}.")
+    expect(says).to_contain_text("corrected")
     rows = page.locator("#report-rows")
     expect(rows.locator("[data-figure=grf_mae_n]")).to_contain_text("met: 2.00 N")
     expect(rows.locator("[data-figure=peak_mae_n][data-missed=true]")).to_contain_text("missed")
@@ -129,7 +129,7 @@ def test_figures_of_a_comparison_are_said_in_words_with_limits_met_or_missed(
     expect(page).not_to_have_url(re.compile("against="))
 
 
-def test_another_session_is_laid_over_by_start_contact_or_mark_and_says_how_far_it_moved(
+def test_another_session_is_laid_over_by_start_contact_or_marker_and_says_how_far_it_moved(
     compared: Recording, other: Recording, open_page: OpenPage
 ) -> None:
     since_s, grf_n = grf(other)
@@ -139,21 +139,21 @@ def test_another_session_is_laid_over_by_start_contact_or_mark_and_says_how_far_
     expect(page.locator(f"#beside option[value='with:{compared.id}']")).to_have_count(1)
     page.goto(url_of(compared))
     page.select_option("#beside", f"with:{other.id}")
-    shifts = {"start": 0.0, f"mark:{STONE}": (700 - 950) * 2e-3}
+    shifts = {"start": 0.0, f"marker:{STONE}": (700 - 950) * 2e-3}
     http = compared.running.http
     first_s = [
         (http.get(f"{s.url}/stances").json()[0]["begin_t_ns"] - int(s.column("t_ns")[0])) * 1e-9
         for s in (compared, other)
     ]
     shifts["contact"] = first_s[0] - first_s[1]
-    says = page.locator("#beside-says")
+    says = page.locator("#beside-summary")
     for key, shift_s in shifts.items():
         page.select_option("#beside-align", key)
         expect(says).to_have_attribute("data-shift-s", re.compile("."))
         moved_s = float(says.get_attribute("data-shift-s") or "nan")
         assert moved_s == pytest.approx(shift_s, abs=1e-5)
         if shift_s:
-            expect(says).to_contain_text(f"moved by {shift_s:.3f} s".replace("-", "\u2212"))
+            expect(says).to_contain_text(f"shifted by {shift_s:.3f} s".replace("-", "\u2212"))
         least_n, most_n, begin_s, end_s = beside(page)
         inside = (since_s + moved_s >= begin_s - 1e-6) & (since_s + moved_s <= end_s + 1e-6)
         assert most_n == pytest.approx(float(np.nanmax(grf_n[inside])), abs=1e-5)
@@ -222,7 +222,7 @@ def test_a_damaged_comparison_is_said_to_be_and_the_page_stays(
     with browser.new_context() as context:  # its console says 422, and is right
         page = context.new_page()
         page.goto(url_of(compared, against="damaged"))
-        expect(page.locator("#beside-says")).to_contain_text("is no report of a comparison")
+        expect(page.locator("#beside-summary")).to_contain_text("is no report of a comparison")
         expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
     (folder / "compare.json").unlink()
     folder.rmdir()

@@ -77,17 +77,17 @@ def test_the_page_says_what_the_session_is_and_what_is_drawn(
     about = page.locator("#about")
     for fact in ("bench", "leg 2", "#wet", f"{int(walk.now()['frames']):,}"):
         expect(about).to_contain_text(fact)
-    expect(page.locator("header")).to_contain_text("40 frames: the link was down for longer")
+    expect(page.locator("header")).to_contain_text("40 frames: link down longer")
     plots = settled(page)
     assert (plots.get_attribute("data-panels") or "").split()[:3] == ["grf", "tile-0", "tile-1"]
     legend = page.locator("#legend")
     expect(legend.locator("[data-kind=lost]")).to_have_text("frames lost")
-    expect(legend.locator("[data-kind=saturated]")).to_contain_text("a tile is saturated")
+    expect(legend.locator("[data-kind=saturated]")).to_contain_text("tile saturated")
     assert summary(page, "missing") == LOST
-    expect(page.locator("#marks-list")).to_contain_text(LABEL)
+    expect(page.locator("#markers-list")).to_contain_text(LABEL)
     since_s, _ = grf(walk)
-    mark_s = page.locator("#marks-list li").get_attribute("data-time-s")
-    assert float(mark_s or "nan") == pytest.approx(since_s[700], abs=1e-4)
+    marker_s = page.locator("#markers-list li").get_attribute("data-time-s")
+    assert float(marker_s or "nan") == pytest.approx(since_s[700], abs=1e-4)
     # Where nothing is wrong nothing is drawn to be.
     page.goto(url_of(walk, "?from=0.5&to=1.5"))
     settled(page)
@@ -127,7 +127,7 @@ def test_where_the_node_was_started_again_is_shown(twice: Recording, open_page: 
 def test_instants_are_said_with_the_unit_that_they_are_in(
     live_page: Page, time_s: float, step: float, said: str
 ) -> None:
-    code = "async ([t, s]) => (await import('/static/session/overlay.js')).timeWords(t, s)"
+    code = "async ([t, s]) => (await import('/static/session/overlay.js')).timeText(t, s)"
     assert live_page.evaluate(code, [time_s, step]) == said
 
 
@@ -135,8 +135,8 @@ def test_without_estimates_raw_counts_are_plotted(raw: Recording, open_page: Ope
     page = open_page(url_of(raw))
     plots = settled(page)
     expect(plots).to_have_attribute("data-panels", "tile-0 tile-1")
-    expect(page.locator("#summary")).to_contain_text("these are raw counts")
-    expect(page.locator("#replay-lag")).to_contain_text("no forces: the node had no calibration")
+    expect(page.locator("#summary")).to_contain_text("no estimates, raw counts")
+    expect(page.locator("#replay-lag")).to_contain_text("No forces: the node had no calibration")
     expect(page.locator("#replay-foot")).to_be_hidden()
     page.keyboard.press("ArrowRight")
     expect(page.locator("#readout [data-key=tile-1]")).to_contain_text(
@@ -151,7 +151,7 @@ def test_a_session_is_shown_while_it_is_recorded_and_as_it_was_sealed_afterwards
         session = scripted.node.record(name="now")
         page = open_page(f"{scripted.url}/sessions")
         page.click('#sessions [data-part="open"]')
-        expect(page.locator("#message")).to_contain_text("still being recorded")
+        expect(page.locator("#message")).to_contain_text("Recording")
         expect(page.locator("#message")).to_contain_text("provisional")
         settled(page)
         wait_until(lambda: summary(page, "frames") >= 100, "the first frames")
@@ -160,7 +160,7 @@ def test_a_session_is_shown_while_it_is_recorded_and_as_it_was_sealed_afterwards
         expect(page.locator("#replay-lag")).to_contain_text("Provisional forces")
         expect(page.locator("#download-parquet")).to_be_hidden()
         scripted.running.http.post(f"{session.url}/events", json={"label": "a stone"})
-        expect(page.locator("#marks-list")).to_contain_text("a stone")
+        expect(page.locator("#markers-list")).to_contain_text("a stone")
         page.keyboard.press("ArrowRight")
         expect(page.locator("#grf")).not_to_have_attribute("data-value", "")
         assert complaints(page) == []
@@ -171,7 +171,7 @@ def test_a_session_is_shown_while_it_is_recorded_and_as_it_was_sealed_afterwards
     settled(page)
     assert summary(page, "frames") == session.now()["frames"]
     assert summary(page, "missing") == 0
-    expect(page.locator("#replay-lag")).to_contain_text("as they are stored")
+    expect(page.locator("#replay-lag")).to_contain_text("Stored forces")
     expect(page.locator("#download-parquet")).to_be_visible()
     page.click("#back")
     expect(page.locator("#sessions")).to_contain_text("now")
@@ -220,9 +220,9 @@ def test_the_rate_that_was_reached_stands_beside_that_of_the_node(
     page = open_page(url_of(walk))
     expect(page.locator("#about")).to_contain_text(" of 500 frames/s")
     asked = """Promise.all([import("/static/session/header.js"), import("/static/session/bins.js")])
-      .then(([{ rateWords }, { Bins }]) => {
+      .then(([{ rateText }, { Bins }]) => {
         const whole = { rateHz: 434.2 };
-        const rate = (missed) => rateWords({ missed_slots: missed }, whole, 449.1);
+        const rate = (missed) => rateText({ missed_slots: missed }, whole, 449.1);
         const columns = {
           t_first_s: [0, 1, 10], t_last_s: [0.9, 2, 11], part: [0, 0, 1],
           frames: [90, 71, 101], missing: [0, 40, 0],
@@ -279,7 +279,7 @@ def test_a_session_that_is_not_there_is_said_not_to_be(server: Running, browser:
     with browser.new_context() as context:  # its console says 404, and is right
         page = context.new_page()
         page.goto(f"{server.url}/sessions/none")
-        expect(page.locator("#message")).to_contain_text("There is no such session")
+        expect(page.locator("#message")).to_contain_text("Session not found")
         expect(page.locator("#message")).to_contain_text("in the trash")
         page.click("#back")
         expect(page.locator("#sessions-card")).to_be_visible()

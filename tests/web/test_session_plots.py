@@ -104,13 +104,13 @@ def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
     page = open_page(url_of(walk))
     canvas = page.locator("#overlay-canvas")
     canvas.scroll_into_view_if_needed()
-    says = page.locator("#overlay-says")
+    says = page.locator("#overlay-summary")
     expect(says).to_contain_text("6 whole stances")
-    expect(says).to_contain_text("1 stance not seen whole is left out")
+    expect(says).to_contain_text("1 incomplete stance left out")
     box = canvas.bounding_box()
     assert box is not None
     at = page.locator("#overlay-at")
-    expect(at).to_contain_text("The mean is greatest")
+    expect(at).to_contain_text("Mean has its maximum")
     overlay = walk.running.http.get(f"{walk.url}/stances/overlay").json()
     half = overlay["points"] // 2
     for down in range(0, int(box["height"]), 6):  # from above: some curve is met
@@ -131,7 +131,7 @@ def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
     expect(legend).to_have_attribute("data-chosen", found[1])
     expect(legend).to_contain_text(f"stance {found[1]}, frame by frame")
     page.locator("#stances-rows tr").nth(6).click()  # saturated: it has no place among them
-    expect(legend).to_contain_text("stance 7 was not seen whole")
+    expect(legend).to_contain_text("stance 7 is incomplete")
 
 
 def test_paths_of_the_centre_of_pressure_are_coloured_by_time_or_by_stance(
@@ -145,14 +145,14 @@ def test_paths_of_the_centre_of_pressure_are_coloured_by_time_or_by_stance(
     legend = page.locator("#cop-legend")
     expect(legend).to_contain_text("first contact to lift-off")
     page.locator("#stances-rows tr").nth(1).click()
-    expect(legend).to_contain_text("ends: stance 2")
+    expect(legend).to_contain_text("end: stance 2")
     by_time = canvas.screenshot()
     page.get_by_role("button", name="stance", exact=True).click()
     expect(legend).to_contain_text("first stance to last stance")
     assert canvas.screenshot() != by_time
 
 
-def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
+def test_a_marker_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
     walk: Recording, open_page: OpenPage
 ) -> None:
     page = open_page(url_of(walk, "?from=1&to=1.2"))
@@ -161,9 +161,9 @@ def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
     readout = page.locator("#readout")
     expect(readout).to_have_attribute("data-time-s", re.compile("."))
     at_s = readout.get_attribute("data-time-s")
-    page.fill("#new-mark-label", "here")
-    page.press("#new-mark-label", "Enter")
-    expect(page.locator("#notices")).to_contain_text("Marked “here”")
+    page.fill("#new-marker-label", "here")
+    page.press("#new-marker-label", "Enter")
+    expect(page.locator("#notices")).to_contain_text("Marker “here” set")
     events = walk.running.http.get(f"{walk.url}/events").json()["items"]
     t_ns = next(event["t_ns"] for event in events if event["label"] == "here")
     since_s = (t_ns - int(walk.column("t_ns")[0])) * 1e-9

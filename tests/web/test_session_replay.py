@@ -116,7 +116,12 @@ def shows(page: Page, stored: dict[str, np.ndarray], row: int) -> None:
             )
             expect(bar.locator(".sigma")).to_have_text(f"± {1.96 * sigma_n:.1f}")
     angle_deg = np.degrees(float(stored["angle_rad"][row]))
-    said = (page.locator("#angle").text_content() or "").replace("\u2212", "-").removesuffix("°")
+    said = (
+        (page.locator("#angle").text_content() or "")
+        .replace("\u2212", "-")
+        .removeprefix("Foot angle ")
+        .removesuffix("°")
+    )
     assert float(said) == pytest.approx(angle_deg, abs=0.051)
     contact = {0: "false", 1: "true"}.get(stored["contact"][row], "")
     expect(page.locator("#contact")).to_have_attribute("data-contact", contact)
@@ -133,7 +138,7 @@ def test_the_foot_at_the_cursor_is_the_frame_of_the_file(
         expect(page.locator("#replay[data-waiting=false]")).to_have_count(1)
         page.keyboard.press("ArrowRight")
         shows(page, stored, row)
-    expect(page.locator("#replay-lag")).to_contain_text("the 100 ms behind it")
+    expect(page.locator("#replay-lag")).to_contain_text("100 ms of look-ahead")
 
 
 def test_the_frames_were_worth_comparing(stored: dict[str, np.ndarray]) -> None:
@@ -234,14 +239,14 @@ def test_of_a_long_session_few_slices_are_kept(session: Recording, open_page: Op
           const { Bins } = await import('/static/session/bins.js');
           const api = await import('/static/common/api.js');
           const whole = new Bins(await api.overview(id, { points: 50 }), { from: -1, to: 1e9 });
-          let come = () => {};
+          let loaded = () => {};
           const failed = (error) => { throw error; };
-          const samples = new Samples(id, whole, 1e9, { come: () => come(), failed });
+          const samples = new Samples(id, whole, 1e9, { loaded: () => loaded(), failed });
           let most = 0;
           for (let t = 0; t < whole.durationS; t += samples.sliceS) {
             while (!samples.at(t).known) {
-              const next = new Promise((done) => { come = done; });
-              samples.want(t, 0);
+              const next = new Promise((done) => { loaded = done; });
+              samples.request(t, 0);
               if (!samples.at(t).known) await next;
             }
             most = Math.max(most, samples.slices.size);
@@ -265,7 +270,7 @@ def test_without_a_frame_near_the_cursor_no_other_one_is_shown(
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 60)
     replay = page.locator("#replay")
     expect(replay).to_have_attribute("data-none", "true")
-    expect(page.locator("#replay-at")).to_have_text("No frame was recorded here.")
+    expect(page.locator("#replay-at")).to_have_text("No frame here")
     expect(page.locator("#grf")).to_have_attribute("data-value", "")
     expect(page.locator("#cop")).to_have_attribute("data-x-m", "")
     page.keyboard.press("ArrowRight")

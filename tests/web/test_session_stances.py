@@ -75,7 +75,7 @@ def opened(open_page: OpenPage, session: Recording, **options: Any) -> Page:
 def says(page: Page, stance: dict[str, Any]) -> None:
     """The headline tells of this one, with its intervals, and so does the table."""
     says = f"Stance {stance['number']} of {STANCES}"
-    expect(page.locator("#stance-says")).to_contain_text(says)
+    expect(page.locator("#stance-text")).to_contain_text(says)
     for figure, stem, factor, decimals, unit in FIGURES:
         value = f"{factor * stance[stem]:.{decimals}f}"
         half = f"{1.96 * factor * stance[SIGMAS[stem]]:.{decimals}f}"
@@ -137,7 +137,7 @@ def test_on_a_phone_the_peak_of_the_third_stance_is_three_taps_away(
 ) -> None:
     page = opened(open_page, hops, **PHONE)
     which = page.locator("#stance-which")
-    expect(which).to_have_text(f"{STANCES} stances: medians of {STANCES} whole")
+    expect(which).to_have_text(f"{STANCES} stances, median of {STANCES} whole")
     assert page.evaluate(_IN_SIGHT, ["#stance-line", 44])  # without scrolling
     for stance in stances[:3]:
         page.tap("#stance-next")
@@ -226,9 +226,9 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
     node.close()
     page = opened(open_page, session, **PHONE)
     page.tap("#stance-next")
-    expect(page.locator("#stance-says")).to_contain_text("its beginning is not there")
+    expect(page.locator("#stance-text")).to_contain_text("start not recorded")
     row = page.locator("#stances-rows tr").first
-    expect(row.get_by_text("its beginning is not there")).to_be_visible()
+    expect(row.get_by_text("start not recorded")).to_be_visible()
     page.tap("#stance-next")
     expect(page.locator("#stance-which")).to_have_text("Stance 2 of 2")
     expect(page.locator("#stance-flags")).to_be_empty()
@@ -239,8 +239,8 @@ def test_of_a_stance_that_was_not_seen_whole_the_line_says_so(
 def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> None:
     page = opened(open_page, hops, **PHONE)
     hint = page.locator("#readout-hint")
-    assert "Touch the plots" in hint.inner_text()
-    assert "press" not in hint.inner_text()
+    assert "Read values: touch" in hint.inner_text()
+    assert "wheel" not in hint.inner_text()
     for path in (f"/sessions/{hops.id}", "/nodes", "/"):
         page.goto(f"{hops.running.url}{path}")
         page.tap("#help")
@@ -248,7 +248,7 @@ def test_a_phone_is_not_told_of_keys(hops: Recording, open_page: OpenPage) -> No
         assert page.evaluate(_KEYS_SHOWN) == 0, path
         assert complaints(page) == []
     desk = opened(open_page, hops)
-    assert "press" in desk.locator("#readout-hint").inner_text()
+    assert "wheel" in desk.locator("#readout-hint").inner_text()
     desk.keyboard.press("?")
     assert desk.evaluate(_KEYS_SHOWN) > 6
 
@@ -307,7 +307,7 @@ def test_the_chosen_stance_is_exported_from_its_first_frame_to_its_last(
 ) -> None:
     page = opened(open_page, hops)
     choice = page.locator("#download-range")
-    expect(choice.locator("option")).to_have_text(["all of it"])
+    expect(choice.locator("option")).to_have_text(["whole session"])
     page.locator("#stances-rows tr").nth(2).click()
     says(page, stances[2])
     page.click("#export")

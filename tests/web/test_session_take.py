@@ -31,7 +31,7 @@ def test_the_others_of_a_take_come_in_the_same_file(take: Take, open_page: OpenP
     page = open_page(f"{take.running.url}/sessions/{take.sessions[0].id}?from=0&to=0.1")
     expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
     page.click("#downloads-more summary")
-    together = page.get_by_label("with the others of this take (right)")
+    together = page.get_by_label("whole take in one file (with right)")
     offered = page.locator("#download-list [data-format]:visible")
     everything = offered.count()
     together.check()

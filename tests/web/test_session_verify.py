@@ -21,18 +21,18 @@ def test_what_a_check_of_the_files_finds_is_said_in_plain_words(
     session = scripted.recorded("walk")
     page = open_page(f"{scripted.url}/sessions/{session.id}")
     page.click("#ledger-card summary")
-    expect(page.locator("#ledger")).to_contain_text("none is lost")
+    expect(page.locator("#ledger")).to_contain_text("complete from first to last")
     page.click("#verify")
     found = page.locator("#verified")
-    expect(found.locator("[data-whole=true]")).to_contain_text("it is what was sealed")
-    expect(found).to_contain_text(f"all {session.now()['frames']:,} frames were read again")
+    expect(found.locator("[data-whole=true]")).to_contain_text("are consistent.")
+    expect(found).to_contain_text(f"all {session.now()['frames']:,} frames read again")
     assert complaints(page) == []
     path = session.folder / "clock.parquet"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     page.click("#verify")
-    expect(found.locator("[data-whole=false]")).to_contain_text("something is wrong")
+    expect(found.locator("[data-whole=false]")).to_contain_text("files are damaged")
     expect(found.locator("li")).to_contain_text("clock.parquet")
     assert complaints(page) == []
 
@@ -43,7 +43,7 @@ def test_a_session_that_is_recorded_is_not_offered_to_be_checked(
     session = scripted.node.record(name="now")
     page = open_page(f"{scripted.url}/sessions/{session.id}")
     page.click("#ledger-card summary")
-    expect(page.locator("#ledger")).to_contain_text("not sealed yet")
+    expect(page.locator("#ledger")).to_contain_text("Not sealed yet")
     expect(page.locator("#verify")).to_be_hidden()
 
 
@@ -59,8 +59,8 @@ def test_of_a_session_whose_frames_are_damaged_the_page_says_so_and_what_to_do(
     with browser.new_context() as context:  # its console says 500, and is right
         page = context.new_page()
         page.goto(f"{scripted.url}/sessions/{session.id}")
-        expect(page.locator("#state")).to_have_text("its files are damaged")
-        expect(page.locator("#message")).to_contain_text("“Check its files now”")
+        expect(page.locator("#state")).to_have_text("files damaged")
+        expect(page.locator("#message")).to_contain_text("“Verify files”")
         page.click("#verify")
         expect(page.locator("#verified [data-whole=false]")).to_be_visible()
         expect(page.locator("#verified")).to_contain_text("frames.parquet")

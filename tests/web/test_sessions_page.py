@@ -1,4 +1,4 @@
-"""Sessions on the page: several at once, losses in words, marks that wait, the trash."""
+"""Sessions on the page: several at once, losses in words, markers that wait, the trash."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
             page.click("#record")
             expect(page.locator("#recordings")).to_contain_text(name)
         expect(page.locator("#recordings li")).to_have_count(2)
-        page.fill("#mark-label", "a stone")
-        page.click("#mark")
-        expect(page.locator("#notices")).to_contain_text("Marked")
+        page.fill("#marker-label", "a stone")
+        page.click("#marker")
+        expect(page.locator("#notices")).to_contain_text("Marker")
         page.get_by_role("button", name="Stop first").click()
         expect(page.locator("#recordings li")).to_have_count(1)
         expect(page.locator("#recordings")).to_contain_text("second")
@@ -47,26 +47,26 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
         assert [event["label"] for event in events] == ["a stone"]
 
 
-def test_a_mark_that_is_set_while_the_server_is_away_has_the_instant_of_the_press(
+def test_a_marker_that_is_set_while_the_server_is_away_has_the_instant_of_the_press(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.node.record(name="walk")
     with Play(scripted.node):
         page = open_page(scripted.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
-        expect(page.locator("#mark")).to_be_enabled()
+        expect(page.locator("#marker")).to_be_enabled()
         time.sleep(1.5)  # a heartbeat says what time it is
     scripted.running.stop()
     expect(page.locator("body")).to_have_attribute("data-live", "false")
-    page.fill("#mark-label", "a stone")
+    page.fill("#marker-label", "a stone")
     pressed_ns = time.time_ns()
-    page.click("#mark")
-    expect(page.locator("#waiting-marks")).to_contain_text("1 marker waits")
-    expect(page.locator("#waiting-marks")).to_contain_text("a stone")
-    expect(page.locator("#waiting-marks")).to_contain_text("closing it loses it")
+    page.click("#marker")
+    expect(page.locator("#waiting-markers")).to_contain_text("1 marker not sent yet")
+    expect(page.locator("#waiting-markers")).to_contain_text("a stone")
+    expect(page.locator("#waiting-markers")).to_contain_text("Closing this page loses it")
     time.sleep(1.5)
     scripted.running.start()
-    expect(page.locator("#waiting-marks")).to_be_hidden(timeout=15_000)
+    expect(page.locator("#waiting-markers")).to_be_hidden(timeout=15_000)
     [event] = scripted.running.http.get(f"{session.url}/events").json()["items"]
     assert event["label"] == "a stone"
     assert abs(event["t_ns"] - pressed_ns) < 1_000_000_000
@@ -107,13 +107,13 @@ def test_a_pending_session_says_what_it_waits_for_and_can_be_sealed_without_it(
     session = scripted.pending("walk")
     page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
-    expect(row).to_contain_text("100 frames are still with the node")
-    choose(page, row, "Seal without")
-    expect(page.locator("#ask-dialog")).to_contain_text("100 frames will be missing for good")
+    expect(row).to_contain_text("100 frames still on the node")
+    choose(page, row, "Abandon missing frames")
+    expect(page.locator("#ask-dialog")).to_contain_text("100 frames will be lost for good")
     page.get_by_role("button", name="Seal as lossy").click()
     expect(row.locator(".state")).to_have_text("lossy")
-    expect(row).to_contain_text("100 frames: sealed without them")
-    expect(open_menu(page, row).get_by_role("menuitem", name="Seal")).to_have_count(0)
+    expect(row).to_contain_text("100 frames: abandoned")
+    expect(open_menu(page, row).get_by_role("menuitem", name="Abandon")).to_have_count(0)
 
 
 def test_losses_troubles_and_what_is_behind_are_said_in_words(
@@ -128,11 +128,11 @@ def test_losses_troubles_and_what_is_behind_are_said_in_words(
         node.socket.send(json.dumps(status))
         page = open_page(scripted.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
-        expect(page.locator("#lost")).to_have_text("102, 3 not sampled")
-        expect(page.locator("#behind")).to_have_text("898 frames, catching up")
+        expect(page.locator("#lost")).to_have_text("102 lost, 3 not sampled")
+        expect(page.locator("#backlog")).to_have_text("898 frames")
         notes = page.locator("#notes")
-        expect(notes).to_contain_text("Lost 2 frames: the node's disk was full.")
-        expect(notes).to_contain_text("Lost 100 frames: the link was down for longer than")
+        expect(notes).to_contain_text("Lost 2 frames: node disk full.")
+        expect(notes).to_contain_text("Lost 100 frames: link down longer than")
         expect(notes).to_contain_text("The node's disk is full.")
 
 
@@ -165,21 +165,21 @@ def test_a_phone_has_room_for_several_recordings_and_all_buttons(
         expect(page.locator("body")).to_have_attribute("data-live", "true")
         expect(page.locator("#recordings li")).to_have_count(3)
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
-        for button in ("#tare", "#record", "#stop", "#mark"):
+        for button in ("#tare", "#record", "#stop", "#marker"):
             expect(page.locator(button)).to_be_in_viewport()
 
 
-def test_a_session_shows_how_many_marks_it_has_and_its_downloads_have_them(
+def test_a_session_shows_how_many_markers_it_has_and_its_downloads_have_them(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.recorded("walk")
     page = open_page(f"{scripted.url}/sessions")
-    marks = row_of(page, session).locator(".c-marks")
-    expect(marks).to_have_text("0")
+    markers = row_of(page, session).locator(".c-markers")
+    expect(markers).to_have_text("0")
     t_ns = int(session.column("t_ns")[3])
     body = {"label": "a stone", "t_ns": t_ns}
     assert scripted.running.http.post(f"{session.url}/events", json=body).status_code == 201
-    expect(marks).to_have_text("1")
+    expect(markers).to_have_text("1")
     for kind in ("parquet", "arrow", "csv"):
         with page.expect_download() as download:
             open_menu(page, row_of(page, session)).locator(f'[data-part="{kind}"]').click()

@@ -1,4 +1,4 @@
-// The calibration under way: what to do now, what the tile reads, and what is done.
+// Running calibration: instruction, present pressure, completed steps.
 
 import { decimalsOf, ticks } from "../common/axes.js";
 import { svg } from "../common/svg.js";
@@ -6,64 +6,64 @@ import { byId, el, number, setData, setText } from "../common/text.js";
 
 const TRACE_S = 20;
 const BIN_S = 0.25;
-const LEAST_KPA = 0.5; // noise of a tile at rest does not fill the picture
-const [LEFT_PX, RIGHT_PX, FOOT_PX] = [58, 10, 24]; // beside the trace and beneath it, for its labels
+const MIN_SPAN_KPA = 0.5; // noise at rest does not fill the plot
+const [LEFT_PX, RIGHT_PX, BOTTOM_PX] = [58, 10, 24]; // margins of the plot, for labels
 
-/** The weight of a marker, without its tolerance. @param {string} label */
+/** Return the weight of a marker label without its tolerance. @param {string} label */
 export const plainWeight = (label) => label.split(" +-")[0];
 
-/** The panel of the calibration under way. */
+/** Panel of the running calibration. */
 export class Guide {
-  /** @param {{onRepeat: () => void, onCancel: () => void}} does */
+  /** @param {{onRepeat: () => void, onCancel: () => void}} actions */
   constructor({ onRepeat, onCancel }) {
     this.element = byId("guide");
     this.shown = "";
-    this.longest = 1;
+    this.longestS = 1;
     byId("repeat").addEventListener("click", onRepeat);
     byId("cancel").addEventListener("click", onCancel);
   }
 
-  /** @param {Weighing | null} weighing @param {boolean} isConnected */
+  /** Draw the running calibration; null hides the panel. @param {Weighing | null} weighing @param {boolean} isConnected */
   draw(weighing, isConnected) {
-    const began = this.element.hidden && weighing !== null;
+    const wasHidden = this.element.hidden && weighing !== null;
     this.element.hidden = weighing === null;
     if (!weighing) return;
-    if (began) byId("prompt").focus();
+    if (wasHidden) byId("prompt").focus();
     const isFitting = weighing.state === "fitting";
     const at = weighing.tiles.findIndex((tile) => tile.serial === weighing.tile);
     const { held } = weighing.tiles[at];
-    const place = Math.min(held.length + 1, weighing.weights.length);
-    setData(byId("ask"), "step", isFitting ? "fitting" : weighing.step);
-    setText(byId("place"), isFitting ? weighing.name : `${weighing.tile}, weight ${place} of ${weighing.weights.length}`
+    const weightNumber = Math.min(held.length + 1, weighing.weights.length);
+    setData(byId("instruction"), "step", isFitting ? "fitting" : weighing.step);
+    setText(byId("progress"), isFitting ? weighing.name : `${weighing.tile}, weight ${weightNumber} of ${weighing.weights.length}`
       + (weighing.tiles.length > 1 ? `, tile ${at + 1} of ${weighing.tiles.length}` : ""));
-    setText(byId("prompt-text"), isFitting ? "Fitting: unload the tile" : weighing.prompt);
-    setText(byId("left"), weighing.left_s === null || isFitting ? "" : `: ${Math.ceil(weighing.left_s)} s`);
+    setText(byId("prompt-text"), isFitting ? "Fitting. Unload the tile" : weighing.prompt);
+    setText(byId("remaining"), weighing.left_s === null || isFitting ? "" : `: ${Math.ceil(weighing.left_s)} s`);
     this.drawBar(weighing, isFitting);
-    setText(byId("warning"), isConnected ? (weighing.warning ? `Once more: ${weighing.warning}` : "") : "The node is away: waiting for it");
-    const seen = weighing.left_s === null ? null : weighing.repeatability;
+    setText(byId("warning"), isConnected ? (weighing.warning ? `Step repeated: ${weighing.warning}` : "") : "Node offline: waiting for it");
+    const repeatability = weighing.left_s === null ? null : weighing.repeatability;
     setText(byId("pressure"), number(weighing.pressure_kpa ?? weighing.recent_kpa.at(-1), 2));
-    setText(byId("spread"), number(seen?.spread_kpa, 3));
-    setText(byId("settled"), seen ? signed(seen.settle_kpa, 2) : "–");
-    const repeated = weighing.weights[weighing.step === "holding" ? held.length : held.length - 1];
-    byId("repeat", HTMLButtonElement).disabled = isFitting || repeated === undefined;
-    setText(byId("repeat"), repeated === undefined ? "Repeat" : `Repeat ${plainWeight(repeated)}`);
+    setText(byId("spread"), number(repeatability?.spread_kpa, 3));
+    setText(byId("settled"), repeatability ? signed(repeatability.settle_kpa, 2) : "–");
+    const last = weighing.weights[weighing.step === "holding" ? held.length : held.length - 1];
+    byId("repeat", HTMLButtonElement).disabled = isFitting || last === undefined;
+    setText(byId("repeat"), last === undefined ? "Repeat" : `Repeat ${plainWeight(last)}`);
     drawTrace(byId("trace", SVGSVGElement), weighing);
     this.drawSteps(weighing, at, isFitting);
   }
 
-  /** @param {Weighing} weighing @param {boolean} isFitting */
+  /** Draw the remaining time of a step. @param {Weighing} weighing @param {boolean} isFitting */
   drawBar(weighing, isFitting) {
     const fill = byId("bar-fill");
     if (weighing.left_s === null || isFitting) {
-      this.longest = 0;
+      this.longestS = 0;
       fill.style.width = "";
       return;
     }
-    this.longest = Math.max(this.longest, weighing.left_s);
-    fill.style.width = `${100 * (1 - weighing.left_s / (this.longest || 1))}%`;
+    this.longestS = Math.max(this.longestS, weighing.left_s);
+    fill.style.width = `${100 * (1 - weighing.left_s / (this.longestS || 1))}%`;
   }
 
-  /** @param {Weighing} weighing @param {number} at @param {boolean} isFitting */
+  /** Draw tiles and weights with their state. @param {Weighing} weighing @param {number} at @param {boolean} isFitting */
   drawSteps(weighing, at, isFitting) {
     const key = JSON.stringify([weighing.session_id, at, weighing.tiles, isFitting]);
     if (key === this.shown) return;
@@ -72,21 +72,21 @@ export class Guide {
       const isNow = i === at && !isFitting;
       const done = `${tile.held.length} of ${weighing.weights.length}`;
       return el("li", { "data-state": isNow ? "now" : "" },
-        el("h2", {}, el("span", { text: tile.serial }), el("span", { cls: "seen", text: done })),
-        ...(isNow || tile.held.length ? [el("ol", {}, ...weighing.weights.map((weight, j) => step(weight, tile.held[j], isNow && j === tile.held.length)))] : []));
+        el("h2", {}, el("span", { text: tile.serial }), el("span", { cls: "value", text: done })),
+        ...(isNow || tile.held.length ? [el("ol", {}, ...weighing.weights.map((weight, j) => stepItem(weight, tile.held[j], isNow && j === tile.held.length)))] : []));
     }));
     this.element.querySelector("li[data-state=now] li[data-state=now]")?.scrollIntoView({ block: "nearest" });
   }
 }
 
-/** @param {string} weight @param {Repeatability | undefined} held @param {boolean} isNow */
-function step(weight, held, isNow) {
+/** Make the list item of a weight. @param {string} weight @param {Repeatability | undefined} held @param {boolean} isNow */
+function stepItem(weight, held, isNow) {
   const item = el("li", { "data-state": held ? "done" : isNow ? "now" : "next" }, el("span", { text: plainWeight(weight) }));
-  if (held) item.append(el("span", { cls: "seen", text: `${number(held.mean_kpa, 2)} kPa` }), el("span", { cls: "unseen", text: " done" }));
+  if (held) item.append(el("span", { cls: "value", text: `${number(held.mean_kpa, 2)} kPa` }), el("span", { cls: "unseen", text: " done" }));
   return item;
 }
 
-/** Pressure above the rest, or absolute before one, over the last seconds. @param {SVGSVGElement} box @param {Weighing} weighing */
+/** Draw the pressure of the last seconds: above the rest, or absolute before the first rest. @param {SVGSVGElement} box @param {Weighing} weighing */
 function drawTrace(box, { recent_kpa: recent, rest_kpa: rest }) {
   const [width, height] = [box.clientWidth, box.clientHeight];
   box.setAttribute("viewBox", `0 0 ${width} ${height}`);
@@ -96,8 +96,8 @@ function drawTrace(box, { recent_kpa: recent, rest_kpa: rest }) {
     return;
   }
   const middle = (Math.min(...kpa) + Math.max(...kpa)) / 2;
-  const half = Math.max(LEAST_KPA, Math.max(...kpa) - Math.min(...kpa)) / 2 * 1.15;
-  const y = (value) => (height - FOOT_PX) * (0.5 - (value - middle) / (2 * half));
+  const half = Math.max(MIN_SPAN_KPA, Math.max(...kpa) - Math.min(...kpa)) / 2 * 1.15;
+  const y = (value) => (height - BOTTOM_PX) * (0.5 - (value - middle) / (2 * half));
   const x = (ageS) => width - RIGHT_PX - (width - LEFT_PX - RIGHT_PX) * ageS / TRACE_S;
   const up = ticks(middle - half, middle + half, Math.max(2, height / 50));
   const grid = up.values.filter((value) => y(value) > 14).flatMap((value) => [
@@ -107,10 +107,10 @@ function drawTrace(box, { recent_kpa: recent, rest_kpa: rest }) {
   box.replaceChildren(
     ...grid,
     svg("polyline", { class: "line", points: kpa.map((value, i) => `${x((kpa.length - 1 - i) * BIN_S).toFixed(1)},${y(value).toFixed(1)}`).join(" ") }),
-    svg("text", { x: 8, y: height - 6 }, rest === null ? "kPa, absolute" : "kPa above the rest"),
+    svg("text", { x: 8, y: height - 6 }, rest === null ? "kPa, absolute" : "kPa above rest"),
     svg("text", { x: width - RIGHT_PX, y: height - 6, "text-anchor": "end" }, `last ${TRACE_S} s`),
   );
 }
 
-/** @param {number} value @param {number} decimals */
+/** Format a number with its sign. @param {number} value @param {number} decimals */
 export const signed = (value, decimals) => (value > 0 && Number(value.toFixed(decimals)) !== 0 ? "+" : "") + number(value, decimals);

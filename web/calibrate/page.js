@@ -1,4 +1,4 @@
-// The guided calibration of a node: set up, guided, looked at. The server has the state; this page asks for it.
+// Page of the guided calibration: form, instructions, result. The server holds the state; this page polls it.
 
 import * as api from "../common/api.js";
 import { helpWithKeys } from "../common/help.js";
@@ -12,43 +12,43 @@ import { Guide } from "./guide.js";
 import { Result } from "./result.js";
 import { Setup } from "./setup.js";
 
-const FRAMES_HZ = 1; // this page draws no frames
-const SOON_MS = 300; // while something is going on
-const LATER_MS = 2000;
+const FRAMES_HZ = 1; // this page shows no frames
+const POLL_RUNNING_MS = 300;
+const POLL_IDLE_MS = 2000;
 
 /** @type {Map<string, LiveNode>} */
 const nodes = new Map();
 /** @type {Weighing | null} */
 let weighing = null;
 let name = new URLSearchParams(location.search).get("node");
-let asked = 0; // answers to an older question are not shown
+let requests = 0; // responses to older requests are ignored
 /** @type {ReturnType<typeof setTimeout> | undefined} */
 let timer;
 
-const setup = new Setup((body) => act(() => api.startWeighing(chosen(), body)));
+const setup = new Setup((body) => run(() => api.startWeighing(selected(), body)));
 const guide = new Guide({
-  onRepeat: () => act(() => api.repeatWeight(chosen(), weighing?.session_id ?? "")),
-  onCancel: () => act(() => api.endWeighing(chosen(), weighing?.session_id ?? "")),
+  onRepeat: () => run(() => api.repeatWeight(selected(), weighing?.session_id ?? "")),
+  onCancel: () => run(() => api.endWeighing(selected(), weighing?.session_id ?? "")),
 });
 const result = new Result({
-  onAccept: (id) => act(async () => {
-    const { calibration } = await api.calibrationOf(chosen());
-    await api.assignCalibration(chosen(), id, calibration?.id ?? "none");
-    await api.endWeighing(chosen(), weighing?.session_id ?? "");
-    notice(`${chosen()} uses it from now on.`);
+  onAccept: (id) => run(async () => {
+    const { calibration } = await api.calibrationOf(selected());
+    await api.assignCalibration(selected(), id, calibration?.id ?? "none");
+    await api.endWeighing(selected(), weighing?.session_id ?? "");
+    notice(`${selected()} uses this calibration from the next frame.`);
   }),
-  onSave: () => act(async () => {
+  onSave: () => run(async () => {
     const { name: saved } = weighing?.result ?? { name: "" };
-    await api.endWeighing(chosen(), weighing?.session_id ?? "");
+    await api.endWeighing(selected(), weighing?.session_id ?? "");
     if (saved) notice(`Saved as “${saved}”.`);
   }),
-  onAgain: () => act(async () => {
+  onRestart: () => run(async () => {
     if (!weighing) return;
-    const { session_id: session, result: found, tiles, weights, method, reference, name: called } = weighing;
-    const body = { tiles: tiles.map((tile) => tile.serial), weights, method, reference, name: called };
-    const next = await api.startWeighing(chosen(), body);
-    if (found) await unlessRefused(api.deleteCalibration(found.calibration_id));
-    if (next.session_id !== session) result.forget();
+    const { session_id: session, result: oldResult, tiles, weights, method, reference, name: oldName } = weighing;
+    const body = { tiles: tiles.map((tile) => tile.serial), weights, method, reference, name: oldName };
+    const next = await api.startWeighing(selected(), body);
+    if (oldResult) await unlessRefused(api.deleteCalibration(oldResult.calibration_id));
+    if (next.session_id !== session) result.reset();
   }),
 });
 
@@ -58,23 +58,23 @@ const link = new Link({
     if (message.type === "hello") {
       nodes.clear();
       (message.nodes ?? []).forEach((node) => nodes.set(node.node, node));
-      choose();
-      look(); // the login may have ended with the server
+      selectNode();
+      look(); // the login may have ended
     } else if (message.type === "node") {
       nodes.set(message.node.node, message.node);
-      choose();
+      selectNode();
     }
   },
-  onChange: () => setText(byId("link-down"), link.open || !link.failures ? "" : "Link to the server is down; trying again."),
+  onChange: () => setText(byId("link-down"), link.open || !link.failures ? "" : "Server link down; reconnecting."),
 });
 
-/** Name of the node that is shown. */
-const chosen = () => name ?? "";
+/** Return the name of the selected node. */
+const selected = () => name ?? "";
 
-/** Keep the choice; else the first that is connected. */
-function choose() {
+/** Keep the selected node, else select a connected one. */
+function selectNode() {
   const all = [...nodes.values()];
-  const node = nodes.get(chosen()) ?? all.find((one) => one.connected) ?? all[0];
+  const node = nodes.get(selected()) ?? all.find((one) => one.connected) ?? all[0];
   const isOther = node?.node !== name;
   name = node?.node ?? null;
   const names = all.map((one) => one.node).sort();
@@ -82,54 +82,54 @@ function choose() {
   if (names.join("\n") !== [...select.options].map((option) => option.value).join("\n")) {
     select.replaceChildren(...names.map((one) => el("option", { value: one, text: one })));
   }
-  select.value = chosen();
+  select.value = selected();
   byId("node-choice").hidden = names.length < 2;
   byId("node-name").hidden = names.length > 1;
-  setText(byId("node-name"), chosen());
-  if (node) setup.take(node);
-  if (isOther || !weighing) ask();
+  setText(byId("node-name"), selected());
+  if (node) setup.update(node);
+  if (isOther || !weighing) poll();
 }
 
-/** Do what was pressed, and show what came of it. @param {() => Promise<unknown>} what */
-async function act(what) {
+/** Run an action, then update the page. @param {() => Promise<unknown>} action */
+async function run(action) {
   document.body.setAttribute("aria-busy", "true");
-  await quietly(what);
+  await quietly(action);
   document.body.removeAttribute("aria-busy");
-  await ask();
+  await poll();
 }
 
-/** Ask how far it is, now and again. */
-async function ask() {
+/** Poll the state of the calibration. */
+async function poll() {
   clearTimeout(timer);
-  const mine = ++asked;
+  const request = ++requests;
   if (name !== null && !document.hidden) {
-    const answer = await unlessRefused(api.weighingOf(name));
-    if (mine !== asked) return;
-    if (answer) show(answer.weighing);
+    const response = await unlessRefused(api.weighingOf(name));
+    if (request !== requests) return;
+    if (response) show(response.weighing);
   } else show(null);
-  const isUnderWay = weighing !== null && ["weighing", "fitting"].includes(weighing.state);
-  timer = setTimeout(ask, isUnderWay ? SOON_MS : LATER_MS);
+  const isRunning = weighing !== null && ["weighing", "fitting"].includes(weighing.state);
+  timer = setTimeout(poll, isRunning ? POLL_RUNNING_MS : POLL_IDLE_MS);
 }
 
-/** @param {Weighing | null} next */
+/** Show a state: form, instructions or result. @param {Weighing | null} next */
 function show(next) {
   if (document.hidden) return;
   weighing = next;
-  const node = nodes.get(chosen());
-  const isUnderWay = next !== null && ["weighing", "fitting"].includes(next.state);
+  const node = nodes.get(selected());
+  const isRunning = next !== null && ["weighing", "fitting"].includes(next.state);
   byId("no-node").hidden = Boolean(node) || !link.open;
   byId("setup").hidden = !node || next !== null;
-  guide.draw(isUnderWay ? next : null, node?.connected ?? true);
-  result.draw(next !== null && !isUnderWay ? next : null, chosen());
+  guide.draw(isRunning ? next : null, node?.connected ?? true);
+  result.draw(next !== null && !isRunning ? next : null, selected());
 }
 
 byId("node-select").addEventListener("change", () => {
   name = byId("node-select", HTMLSelectElement).value;
   history.replaceState(null, "", `?node=${encodeURIComponent(name)}`);
   show(null);
-  choose();
-  ask();
+  selectNode();
+  poll();
 });
-document.addEventListener("visibilitychange", () => document.hidden || ask());
+document.addEventListener("visibilitychange", () => document.hidden || poll());
 inSunlight();
 helpWithKeys();

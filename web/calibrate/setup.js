@@ -1,24 +1,24 @@
-// What is calibrated with what: tiles, reference, weights and tolerance.
+// Form of a calibration: tiles, reference, weights, tolerance.
 
 import { byId, el, setText } from "../common/text.js";
 
 const METHODS = {
   weights: {
-    hint: "Put them on a light, stiff plate on the dome. Add the mass of the plate.",
+    hint: "Put the weights on a light, stiff plate on the dome. Add the mass of the plate.",
     weights: "200 g, 500 g, 1 kg, 1.5 kg, 2 kg", within: "1",
   },
   scale: {
-    hint: "Zero the scale with the tile on it. Press with a clamp or a stand: no hand is steady enough.",
+    hint: "Zero the scale with the tile on it. Press with a clamp or a stand; a hand is not steady enough.",
     weights: "200 g, 500 g, 1 kg, 1.5 kg, 2 kg", within: "1",
   },
   sensor: {
-    hint: "Press with a spindle until the display shows the force.",
+    hint: "Press with a spindle until the sensor reads the force.",
     weights: "2 N, 5 N, 10 N, 15 N, 20 N", within: "1",
   },
 };
-const WEIGHT_S = 40; // with putting on, settling and taking off
+const WEIGHT_S = 40; // including loading, settling and unloading
 
-/** The form before a calibration. */
+/** Form that starts a calibration. */
 export class Setup {
   /** @param {(body: WeighingPlan) => void} onStart */
   constructor(onStart) {
@@ -26,7 +26,7 @@ export class Setup {
     this.weights = byId("weights", HTMLInputElement);
     this.within = byId("within", HTMLInputElement);
     /** @type {string[]} */
-    this.order = []; // ticked tiles
+    this.order = []; // selected tiles
     this.shown = "";
     this.method = "weights";
     this.useMethod();
@@ -34,7 +34,7 @@ export class Setup {
       event.preventDefault();
       onStart(this.body());
     });
-    this.form.addEventListener("input", () => this.write());
+    this.form.addEventListener("input", () => this.drawTexts());
     for (const radio of this.form.querySelectorAll("[name=method]")) {
       radio.addEventListener("change", () => {
         this.method = /** @type {HTMLInputElement} */ (radio).value;
@@ -43,59 +43,62 @@ export class Setup {
     }
   }
 
-  /** Offer the tiles of a node. @param {LiveNode} node */
-  take(node) {
+  /** Show the tiles of a node. @param {LiveNode} node */
+  update(node) {
     const serials = node.tiles.filter((tile) => !tile.reference).map((tile) => tile.serial);
     const key = [node.node, ...serials].join("\n");
     if (key === this.shown) return;
     this.shown = key;
     this.order = serials;
-    byId("tiles").replaceChildren(...serials.map((serial) => this.tile(serial)));
-    this.write();
+    byId("tiles").replaceChildren(...serials.map((serial) => this.tileBox(serial)));
+    this.drawTexts();
   }
 
-  /** @param {string} serial */
-  tile(serial) {
+  /** Make the checkbox of a tile. @param {string} serial */
+  tileBox(serial) {
     const box = el("input", { type: "checkbox", value: serial, checked: "" });
     box.addEventListener("change", () => {
       this.order = this.order.filter((one) => one !== serial);
       if (box.checked) this.order.push(serial);
     });
-    return el("label", {}, box, el("span", { text: serial }), el("span", { cls: "turn", "data-turn": serial }));
+    return el("label", {}, box, el("span", { text: serial }), el("span", { cls: "order", "data-order": serial }));
   }
 
+  /** Fill in hint and default weights of the selected reference. */
   useMethod() {
     const { hint, weights, within } = METHODS[this.method];
     setText(byId("method-hint"), hint);
     this.weights.value = weights;
     this.within.value = within;
-    this.write();
+    this.drawTexts();
   }
 
+  /** Weights of the form. */
   get list() {
     return this.weights.value.split(/[,;]/).map((one) => one.trim()).filter(Boolean);
   }
 
-  write() {
-    for (const turn of this.form.querySelectorAll("[data-turn]")) {
-      const at = this.order.indexOf(/** @type {HTMLElement} */ (turn).dataset.turn ?? "");
-      setText(turn, at < 0 || this.order.length < 2 ? "" : `${at + 1}.`);
+  /** Update order, duration and the start button. */
+  drawTexts() {
+    for (const label of this.form.querySelectorAll("[data-order]")) {
+      const at = this.order.indexOf(/** @type {HTMLElement} */ (label).dataset.order ?? "");
+      setText(label, at < 0 || this.order.length < 2 ? "" : `${at + 1}.`);
     }
     const [tiles, weights] = [this.order.length, this.list.length];
     byId("start", HTMLButtonElement).disabled = !tiles || !weights;
     const minutes = Math.max(1, Math.round(tiles * weights * WEIGHT_S / 60));
-    setText(byId("lasts"), tiles ? `${counted(tiles, "tile")}, ${counted(weights, "weight")}${tiles > 1 ? " each" : ""}: about ${counted(minutes, "minute")}` : "Tick a tile.");
+    setText(byId("time-needed"), tiles ? `${countText(tiles, "tile")}, ${countText(weights, "weight")}${tiles > 1 ? " each" : ""}: about ${countText(minutes, "minute")}` : "Select a tile.");
   }
 
-  /** @returns {WeighingPlan} */
+  /** Return the request body. @returns {WeighingPlan} */
   body() {
-    const said = (id) => byId(id, HTMLInputElement).value.trim();
+    const valueOf = (id) => byId(id, HTMLInputElement).value.trim();
     return {
       tiles: this.order, weights: this.list, within_percent: Number(this.within.value), method: this.method,
-      ...(said("reference") ? { reference: said("reference") } : {}), ...(said("name") ? { name: said("name") } : {}),
+      ...(valueOf("reference") ? { reference: valueOf("reference") } : {}), ...(valueOf("name") ? { name: valueOf("name") } : {}),
     };
   }
 }
 
-/** @param {number} count @param {string} what */
-const counted = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
+/** Return a count with its noun. @param {number} count @param {string} noun */
+const countText = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;

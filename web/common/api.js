@@ -1,7 +1,7 @@
-// REST calls: problem+json, and nothing the page does not need. Who we are is in a cookie: login.js.
+// REST client of the pages. The login is a cookie: login.js.
 
 import { askToLogIn } from "./login.js";
-import { parseAnswer, PATIENCE_S, Refusal, sendRequest } from "./request.js";
+import { parseResponse, TIMEOUT_S, Refusal, sendRequest } from "./request.js";
 
 export { Refusal };
 
@@ -9,29 +9,29 @@ const PREFIX = "/api/v1";
 const JSON_TYPE = "application/json";
 
 /**
- * Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. `stop` takes it back;
- * with `said` it is refused (412) if what is changed is not that any more.
+ * Call the API; resolve to the parsed response (null for 204), reject with a Refusal. `stop` aborts it;
+ * `said` is sent as If-Match: 412 if the resource has changed.
  * @param {string} method
  * @param {string} path
- * @param {{body?: any, stop?: AbortSignal | null, type?: string, said?: string | null, patienceS?: number}} [how]
+ * @param {{body?: any, stop?: AbortSignal | null, type?: string, said?: string | null, timeoutS?: number}} [how]
  */
-export async function call(method, path, { body, stop = null, type = JSON_TYPE, said = null, patienceS = PATIENCE_S } = {}) {
+export async function call(method, path, { body, stop = null, type = JSON_TYPE, said = null, timeoutS = TIMEOUT_S } = {}) {
   const headers = { Accept: type };
   if (said !== null) headers["If-Match"] = `"${said}"`;
   if (body !== undefined) headers["Content-Type"] = JSON_TYPE;
   const options = { method, headers, body: body === undefined || body instanceof Blob ? body : JSON.stringify(body) };
-  let { response, text } = await sendRequest(PREFIX + path, options, { patienceS, stop });
-  if (response.status === 401 && await askToLogIn()) ({ response, text } = await sendRequest(PREFIX + path, options, { patienceS, stop }));
+  let { response, text } = await sendRequest(PREFIX + path, options, { timeoutS, stop });
+  if (response.status === 401 && await askToLogIn()) ({ response, text } = await sendRequest(PREFIX + path, options, { timeoutS, stop }));
   if (response.status === 204) return null;
   if (response.ok && type !== JSON_TYPE) return text;
-  const answer = parseAnswer(response, text);
+  const answer = parseResponse(response, text);
   if (response.ok) return answer;
   throw new Refusal(String(answer?.detail || answer?.title || `The server refused (${response.status}).`), response.status);
 }
 
 const id = encodeURIComponent;
 /** @param {Record<string, string | number>} query */
-const asked = (query) => new URLSearchParams(Object.entries(query).map(([name, value]) => [name, String(value)]));
+const encoded = (query) => new URLSearchParams(Object.entries(query).map(([name, value]) => [name, String(value)]));
 export const recent = (node, seconds, before, tiles) =>
   call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, { body: {} });
@@ -44,10 +44,10 @@ export const calibrationOf = (node) => call("GET", `/nodes/${id(node)}/calibrati
 export const assignCalibration = (node, calibration, said) =>
   call("PUT", `/nodes/${id(node)}/calibration`, { body: { id: calibration }, said });
 /** @type {(node: string, said: string) => Promise<NodeCalibration>} */
-export const takeBackCalibration = (node, said) => call("DELETE", `/nodes/${id(node)}/calibration`, { said });
-/** @type {() => Promise<{items: Kept[]}>} */
+export const unassignCalibration = (node, said) => call("DELETE", `/nodes/${id(node)}/calibration`, { said });
+/** @type {() => Promise<{items: Calibration[]}>} */
 export const listCalibrations = () => call("GET", "/calibrations");
-/** As it is: its hashes are of its very digits. @type {(file: Blob) => Promise<Kept>} */
+/** Upload a file unchanged: its hash covers every byte. @type {(file: Blob) => Promise<Calibration>} */
 export const uploadCalibration = (file) => call("POST", "/calibrations", { body: file });
 export const deleteCalibration = (calibration) => call("DELETE", `/calibrations/${id(calibration)}`);
 /** @type {(node: string) => Promise<{weighing: Weighing | null}>} */
@@ -62,48 +62,48 @@ export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares
 export const startSession = (node, name) => call("POST", "/sessions", { body: { node, name } });
 /** @type {(session: string) => Promise<Session>} */
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
-/** @type {(session: string, event: object) => Promise<Mark>} */
-export const markEvent = (session, event) => call("POST", `/sessions/${id(session)}/events`, { body: event });
+/** @type {(session: string, marker: object) => Promise<Marker>} */
+export const addMarker = (session, marker) => call("POST", `/sessions/${id(session)}/events`, { body: marker });
 /** @type {(name: string) => Promise<Take>} */
 export const startTake = (name) => call("POST", "/takes", { body: { name } });
 /** @type {(take: string) => Promise<Take>} */
 export const getTake = (take) => call("GET", `/takes/${id(take)}`);
 /** @type {(take: string) => Promise<Take>} */
 export const stopTake = (take) => call("POST", `/takes/${id(take)}/stop`);
-/** @type {(take: string, event: object) => Promise<Take>} */
-export const markTake = (take, event) => call("POST", `/takes/${id(take)}/events`, { body: event });
+/** @type {(take: string, marker: object) => Promise<Take>} */
+export const addTakeMarker = (take, marker) => call("POST", `/takes/${id(take)}/events`, { body: marker });
 /** @type {(session: string) => Promise<Session>} */
 export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
-/** @type {(session: string) => Promise<{items: Mark[]}>} */
-export const listEvents = (session) => call("GET", `/sessions/${id(session)}/events`);
+/** @type {(session: string) => Promise<{items: Marker[]}>} */
+export const listMarkers = (session) => call("GET", `/sessions/${id(session)}/events`);
 export const listStances = (session) => call("GET", `/sessions/${id(session)}/stances`);
 export const stancesOverlay = (session) => call("GET", `/sessions/${id(session)}/stances/overlay`);
 export const listComparisons = (session) => call("GET", `/sessions/${id(session)}/comparisons`);
 export const getComparison = (session, name) => call("GET", `/sessions/${id(session)}/comparisons/${id(name)}`);
 export const comparisonSeries = (session, name, query, stop) =>
-  call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${asked(query)}`, { stop });
+  call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${encoded(query)}`, { stop });
 export const newestSessions = (limit) => call("GET", `/sessions?limit=${limit}`);
-/** @type {(session: string) => Promise<Dressed>} */
+/** @type {(session: string) => Promise<ArrayInfo>} */
 export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`);
 export const ledgerOf = (session) => call("GET", `/sessions/${id(session)}/ledger`);
-/** Every file of it is read: of a long one that takes its time. @type {(session: string) => Promise<Verified>} */
-export const verified = (session) => call("GET", `/sessions/${id(session)}/verification`, { patienceS: 300 });
+/** Verify all files on the server: slow for a long session. @type {(session: string) => Promise<Verified>} */
+export const verifyFiles = (session) => call("GET", `/sessions/${id(session)}/verification`, { timeoutS: 300 });
 /** @type {(session: string) => Promise<Clock>} */
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
 /** @type {(session: string, query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} */
 export const overview = (session, query, stop) =>
-  call("GET", `/sessions/${id(session)}/overview?${asked(query)}`, { stop });
-/** Some seconds of a session's frames, as CSV. */
+  call("GET", `/sessions/${id(session)}/overview?${encoded(query)}`, { stop });
+/** Return some seconds of a session's frames, as CSV. */
 export const samples = (session, query) =>
-  call("GET", `/sessions/${id(session)}/data?${asked({ format: "csv", marks: "false", ...query })}`, { type: "text/csv" });
+  call("GET", `/sessions/${id(session)}/data?${encoded({ format: "csv", marks: "false", ...query })}`, { type: "text/csv" });
 /** @type {(session: string, changes: object, said?: string | null) => Promise<Session>} */
 export const changeSession = (session, changes, said = null) =>
   call("PATCH", `/sessions/${id(session)}`, { body: changes, said });
-/** @type {(session: string, mark: string, changes: object, said: string) => Promise<Mark>} */
-export const changeMark = (session, mark, changes, said) =>
-  call("PATCH", `/sessions/${id(session)}/events/${id(mark)}`, { body: changes, said });
-export const removeMark = (session, mark, said) =>
-  call("DELETE", `/sessions/${id(session)}/events/${id(mark)}`, { said });
+/** @type {(session: string, marker: string, changes: object, said: string) => Promise<Marker>} */
+export const changeMarker = (session, marker, changes, said) =>
+  call("PATCH", `/sessions/${id(session)}/events/${id(marker)}`, { body: changes, said });
+export const removeMarker = (session, marker, said) =>
+  call("DELETE", `/sessions/${id(session)}/events/${id(marker)}`, { said });
 /** @type {(session: string) => Promise<Session>} */
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);
@@ -112,11 +112,11 @@ export const listTrash = () => call("GET", "/trash");
 export const restoreSession = (session) => call("POST", `/trash/${id(session)}/restore`);
 export const emptyTrash = () => call("DELETE", "/trash");
 /** @type {(query: {limit: number, cursor?: string, q?: string, complete?: string, node?: string}) => Promise<{items: Session[], next_cursor: string | null}>} */
-export const listSessions = (query) => call("GET", `/sessions?${asked(query)}`);
+export const listSessions = (query) => call("GET", `/sessions?${encoded(query)}`);
 export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).join(",")}`;
 export const listFormats = () => call("GET", "/formats");
-/** Of a download, with marks if there are any; Parquet without them is the sealed file itself. */
+/** Return the address of a download, with markers if there are any; Parquet without is the sealed file. */
 export const dataAddress = (session, format, part = "") =>
   `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marks ? "&marks=true" : ""}${part}`;
-/** Of a download of all sessions of a take. */
+/** Return the address of a download of a take. */
 export const takeDataAddress = (take, format, part = "") => `${PREFIX}/takes/${id(take)}/data?format=${format}${part}`;

@@ -1,7 +1,7 @@
-// What every plot on a canvas has: sharpness, colours of the style sheet, steps of axes, hatching.
+// Canvas plots: resolution, colours of the style sheet, ticks, hatching.
 
 /**
- * Fit a canvas to its box at the screen's own pixels; its context, in CSS pixels from then on.
+ * Fit a canvas to its box at the screen's resolution; return its context, in CSS pixels.
  * @param {HTMLCanvasElement} canvas
  * @param {number} width
  * @param {number} height
@@ -13,25 +13,25 @@ export function fit(canvas, width, height) {
     canvas.width = across;
     canvas.height = down;
   }
-  const context = paper(canvas);
+  const context = contextOf(canvas);
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.clearRect(0, 0, width, height);
   return context;
 }
 
 /** @param {HTMLCanvasElement} canvas */
-function paper(canvas) {
-  return /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d")); // null for other kinds of contexts only
+function contextOf(canvas) {
+  return /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d")); // null only for other kinds of contexts
 }
 
-/** A line of one pixel is sharp between two of them. @param {number} value */
+/** Return the position of a sharp line of one pixel. @param {number} value */
 export const crisp = (value) => Math.round(value) + 0.5;
 
 /**
- * Steps of 1, 2 or 5 times a power of ten that lie within an interval.
+ * Return ticks in steps of 1, 2 or 5 times a power of ten within an interval.
  * @param {number} low
  * @param {number} high
- * @param {number} most how many at most
+ * @param {number} most maximum count
  * @returns {{step: number, values: number[]}}
  */
 export function ticks(low, high, most) {
@@ -45,11 +45,11 @@ export function ticks(low, high, most) {
   return { step, values };
 }
 
-/** Decimals that tell two neighbouring steps apart. @param {number} step */
+/** Return the decimals that distinguish two ticks. @param {number} step */
 export const decimalsOf = (step) => Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9)));
 
 /**
- * Colours by the names of the style sheet's variables, as they are for this element now.
+ * Return current colours of an element by the style sheet's variables.
  * @param {Element} element
  * @param {string[]} names
  * @returns {Record<string, string>}
@@ -59,7 +59,7 @@ export function coloursOf(element, names) {
   return Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
 }
 
-/** Call when colours are others: at dusk, or in the sun. @param {() => void} then */
+/** Run `then` after a change of the colours. @param {() => void} then */
 export function whenColoursChange(then) {
   for (const query of ["(prefers-color-scheme: dark)", "(forced-colors: active)", "(prefers-contrast: more)"]) {
     matchMedia(query).addEventListener("change", then);
@@ -70,7 +70,7 @@ export function whenColoursChange(then) {
 const TILE_PX = 8;
 
 /**
- * Stripes as a fill: "/", "\\" or both ways, "x".
+ * Return a hatching as a fill: "/", "\\" or both, "x".
  * @param {CanvasRenderingContext2D} context
  * @param {string} colour
  * @param {string} way
@@ -79,7 +79,7 @@ export function hatching(context, colour, way) {
   const ratio = devicePixelRatio || 1;
   const tile = document.createElement("canvas");
   tile.width = tile.height = Math.round(TILE_PX * ratio);
-  const draw = paper(tile);
+  const draw = contextOf(tile);
   draw.scale(tile.width / TILE_PX, tile.height / TILE_PX);
   draw.strokeStyle = colour;
   draw.lineWidth = 1.2;

@@ -1,4 +1,4 @@
-// Status bits as Python names them: docs/formats.md says what each means.
+// Flags, named as in Python: docs/formats.md.
 
 export const TILE = { NO_ANSWER: 1, STALE: 2, RETRIED: 4, IMPLAUSIBLE: 8, OVER_RANGE: 16, NOT_CONVERTED: 32 };
 export const ESTIMATE = {

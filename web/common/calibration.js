@@ -1,5 +1,4 @@
-// The dialog of a node's calibration: which one is in use, which there are, and another one chosen or
-// uploaded. Loaded when it is opened.
+// Dialog of a node's calibration: current one, available ones, assign, upload. Loaded when opened.
 
 import * as api from "./api.js";
 import { el, localTime, setText } from "./text.js";
@@ -7,102 +6,102 @@ import { el, localTime, setText } from "./text.js";
 const SHOWN_TILES = 4;
 
 /**
- * Open it for a node as the server described it last.
+ * Open the dialog for a node.
  * @param {{node: string, tiles: Tile[]}} node
  */
 export async function openCalibration(node) {
   const dialog = new CalibrationDialog(node);
-  await dialog.doing(() => dialog.load());
+  await dialog.run(() => dialog.load());
 }
 
 class CalibrationDialog {
   /** @param {{node: string, tiles: Tile[]}} node */
   constructor({ node, tiles }) {
     this.node = node;
-    this.bearing = tiles.filter((tile) => !tile.reference).map((tile) => tile.serial);
+    this.loadSerials = tiles.filter((tile) => !tile.reference).map((tile) => tile.serial);
     /** @type {NodeCalibration | null} */
     this.used = null;
     this.inUse = el("p", { id: "calibration-used" });
-    this.back = el("button", { type: "button", cls: "small presses", id: "calibration-back", text: "Use the node’s own again" });
+    this.back = el("button", { type: "button", cls: "small presses", id: "calibration-back", text: "Use the node’s calibration" });
     this.back.hidden = true;
-    this.list = el("ul", { id: "calibrations", "aria-label": "Calibrations that the server keeps, newest first" });
-    this.none = el("p", { text: "The server keeps none yet. Calibrate with weights, or upload a file that “foottile calibrate” has written." });
+    this.list = el("ul", { id: "calibrations", "aria-label": "Calibrations on the server, newest first" });
+    this.none = el("p", { text: "None on the server yet. Calibrate with weights, or upload a file from “foottile calibrate”." });
     this.none.hidden = true;
-    this.said = el("p", { id: "calibration-said", role: "alert" });
+    this.message = el("p", { id: "calibration-said", role: "alert" });
     this.file = el("input", { type: "file", id: "calibration-file", accept: ".json,application/json" });
     const guided = el("a", { id: "calibration-guided", href: `/calibrate?node=${encodeURIComponent(node)}`, text: "Calibrate with weights …" });
-    const upload = el("label", { cls: "presses", text: "Upload a calibration file " }, this.file);
+    const upload = el("label", { cls: "presses", text: "Upload calibration file " }, this.file);
     this.element = el("dialog", { id: "calibration-dialog", "aria-labelledby": "calibration-title" },
       el("h2", { id: "calibration-title", text: `Calibration of ${node}` }), this.inUse, this.back,
-      el("p", { cls: "soft", text: "A choice counts from the next frame on; what is being recorded keeps what it began with." }),
-      this.none, this.list, guided, upload, this.said,
+      el("p", { cls: "soft", text: "Applies from the next frame. A running recording keeps its calibration." }),
+      this.none, this.list, guided, upload, this.message,
       el("form", { method: "dialog" }, el("p", { cls: "row" }, el("button", { type: "submit", value: "", autofocus: "", text: "Close" }))));
-    this.back.addEventListener("click", () => this.doing(() => this.takeBack()));
-    this.file.addEventListener("change", () => this.doing(() => this.upload()));
+    this.back.addEventListener("click", () => this.run(() => this.unassign()));
+    this.file.addEventListener("change", () => this.run(() => this.upload()));
     this.element.addEventListener("close", () => this.element.remove(), { once: true });
     document.body.append(this.element);
     this.element.showModal();
   }
 
-  /** Do something; a refusal is said here, in the server's words. @param {() => Promise<void>} what */
-  async doing(what) {
-    setText(this.said, "");
+  /** Run an action; show a refusal in the dialog. @param {() => Promise<void>} action */
+  async run(action) {
+    setText(this.message, "");
     this.element.setAttribute("aria-busy", "true");
     try {
-      await what();
+      await action();
     } catch (error) {
       if (!(error instanceof api.Refusal)) throw error;
-      setText(this.said, `Not done: ${error.message}`);
+      setText(this.message, `Not done: ${error.message}`);
     } finally {
       this.element.removeAttribute("aria-busy");
     }
   }
 
   async load() {
-    const [used, kept] = await Promise.all([api.calibrationOf(this.node), api.listCalibrations()]);
+    const [used, available] = await Promise.all([api.calibrationOf(this.node), api.listCalibrations()]);
     this.used = used;
     const { calibration, source, assigned_t_ns: assigned } = used;
-    const whose = source === "server" ? `chosen here on ${localTime(new Date(assigned / 1e6))}` : "said by the node itself";
-    setText(this.inUse, calibration ? `In use: “${calibration.name}”, scale ${calibration.absolute_scale}, ${whose}.`
-      : `None is in use: ${used.problem ?? "pressures only, no newtons."}`);
+    const origin = source === "server" ? `assigned on ${localTime(new Date(assigned / 1e6))}` : "from the node";
+    setText(this.inUse, calibration ? `In use: “${calibration.name}”, scale ${calibration.absolute_scale}, ${origin}.`
+      : `None in use: ${used.problem ?? "pressures only."}`);
     this.back.hidden = source !== "server";
-    this.none.hidden = kept.items.length > 0;
-    this.list.replaceChildren(...kept.items.map((one) => this.row(one)));
+    this.none.hidden = available.items.length > 0;
+    this.list.replaceChildren(...available.items.map((one) => this.row(one)));
   }
 
-  /** @param {Kept} kept */
-  row(kept) {
-    const isUsed = kept.id === this.used?.calibration?.id;
-    const any = kept.serials.includes("*");
-    const lacking = any ? [] : this.bearing.filter((serial) => !kept.serials.includes(serial));
-    const facts = [kept.date, any ? "any tile" : some(kept.serials), `scale ${kept.absolute_scale}`];
-    if (kept.mounted) facts.push("as mounted");
-    const fits = lacking.length ? `Does not fit: no curve of ${some(lacking)}` : "Has a curve of each tile";
-    const item = el("li", { "data-id": kept.id, "data-used": String(isUsed) },
-      el("div", {}, el("strong", { text: kept.name }), el("span", { text: facts.join(", ") }),
-        el("span", { cls: lacking.length ? "misfit" : "fit", text: fits })));
+  /** @param {Calibration} calibration */
+  row(calibration) {
+    const isUsed = calibration.id === this.used?.calibration?.id;
+    const any = calibration.serials.includes("*");
+    const missing = any ? [] : this.loadSerials.filter((serial) => !calibration.serials.includes(serial));
+    const facts = [calibration.date, any ? "any tile" : listOf(calibration.serials), `scale ${calibration.absolute_scale}`];
+    if (calibration.mounted) facts.push("mounted");
+    const fits = missing.length ? `Does not fit: no curve for ${listOf(missing)}` : "Covers all tiles";
+    const item = el("li", { "data-id": calibration.id, "data-used": String(isUsed) },
+      el("div", {}, el("strong", { text: calibration.name }), el("span", { text: facts.join(", ") }),
+        el("span", { cls: missing.length ? "misfit" : "fit", text: fits })));
     if (isUsed) item.append(el("span", { cls: "used", text: "in use" }));
-    else if (!lacking.length) {
-      const assign = el("button", { type: "button", cls: "small presses", text: "Use this", "aria-label": `Use ${kept.name} for ${this.node}` });
-      assign.addEventListener("click", () => this.doing(() => this.assign(kept)));
+    else if (!missing.length) {
+      const assign = el("button", { type: "button", cls: "small presses", text: "Use this", "aria-label": `Use ${calibration.name} for ${this.node}` });
+      assign.addEventListener("click", () => this.run(() => this.assign(calibration)));
       item.append(assign);
     }
     return item;
   }
 
-  /** What is in use as this dialog shows it: another choice by now is not overwritten. */
+  /** Calibration on display, sent as If-Match: a later assignment is not overwritten. */
   get shown() {
     return this.used?.calibration?.id ?? "none";
   }
 
-  /** @param {Kept} kept */
-  async assign(kept) {
-    await api.assignCalibration(this.node, kept.id, this.shown);
+  /** @param {Calibration} calibration */
+  async assign(calibration) {
+    await api.assignCalibration(this.node, calibration.id, this.shown);
     await this.load();
   }
 
-  async takeBack() {
-    await api.takeBackCalibration(this.node, this.shown);
+  async unassign() {
+    await api.unassignCalibration(this.node, this.shown);
     await this.load();
   }
 
@@ -112,14 +111,14 @@ class CalibrationDialog {
     try {
       await api.uploadCalibration(file);
     } finally {
-      this.file.value = ""; // the same one may be tried again
+      this.file.value = ""; // allows the same file again
     }
     await this.load();
   }
 }
 
-/** Serials, the first of many. @param {string[]} serials */
-function some(serials) {
+/** Return the first serials as text. @param {string[]} serials */
+function listOf(serials) {
   const shown = serials.slice(0, SHOWN_TILES).join(", ");
   return serials.length > SHOWN_TILES ? `${shown} and ${serials.length - SHOWN_TILES} more` : shown;
 }

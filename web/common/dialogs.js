@@ -1,16 +1,16 @@
-// Questions that stop the page until they are answered: are you sure, and what to say of a session.
+// Modal dialogs: confirm, and edit a session.
 
 import { el } from "./text.js";
 
 const ROWS = 4;
 
-/** Resolves to true if the user agrees. @param {string} title @param {string} text @param {string} yes */
+/** Ask for confirmation; resolve to true if confirmed. @param {string} title @param {string} text @param {string} yes */
 export async function ask(title, text, yes) {
-  return await answered("ask", title, [el("p", { id: "ask-text", text })], el("button", { type: "submit", value: "ok", id: "ask-yes", text: yes }), { doubts: true });
+  return await showDialog("ask", title, [el("p", { id: "ask-text", text })], el("button", { type: "submit", value: "ok", id: "ask-yes", text: yes }), { isRisky: true });
 }
 
 /**
- * Resolves to what was changed of a session, or null.
+ * Edit a session; resolve to the changes, or null.
  * @param {Session} session
  * @returns {Promise<Partial<Session> | null>}
  */
@@ -23,29 +23,29 @@ export async function edit(session) {
   fields.notes.value = session.notes;
   const labels = [
     el("label", { text: "Name " }, fields.name), el("label", { text: "Subject " }, fields.subject),
-    el("label", { text: "Tags, commas between " }, fields.tags), el("label", { text: "Notes " }, fields.notes),
+    el("label", { text: "Tags (comma-separated) " }, fields.tags), el("label", { text: "Notes " }, fields.notes),
   ];
   const save = el("button", { type: "submit", value: "ok", text: "Save" });
-  if (!await answered("edit", "About this session", labels, save)) return null;
-  const given = {
+  if (!await showDialog("edit", "Edit session", labels, save)) return null;
+  const entered = {
     name: fields.name.value.trim() || session.name, subject: fields.subject.value.trim(), notes: fields.notes.value,
     tags: fields.tags.value.split(",").map((tag) => tag.trim()).filter(Boolean),
   };
-  const changed = Object.entries(given).filter(([part, value]) => JSON.stringify(value) !== JSON.stringify(session[part]));
+  const changed = Object.entries(entered).filter(([part, value]) => JSON.stringify(value) !== JSON.stringify(session[part]));
   return changed.length ? Object.fromEntries(changed) : null;
 }
 
 /**
- * Made for this one answer: nothing of it is left on the page.
+ * Show a dialog once and remove it; resolve to true if confirmed.
  * @param {string} name
  * @param {string} title
  * @param {HTMLElement[]} content
  * @param {HTMLButtonElement} yes
- * @param {{doubts?: boolean}} [how] doubts: Enter alone is no
+ * @param {{isRisky?: boolean}} [how] isRisky: Enter cancels
  * @returns {Promise<boolean>}
  */
-function answered(name, title, content, yes, { doubts = false } = {}) {
-  const no = el("button", { type: "submit", value: "", formnovalidate: "", text: "Cancel", ...(doubts ? { autofocus: "" } : {}) });
+function showDialog(name, title, content, yes, { isRisky = false } = {}) {
+  const no = el("button", { type: "submit", value: "", formnovalidate: "", text: "Cancel", ...(isRisky ? { autofocus: "" } : {}) });
   const dialog = el("dialog", { id: `${name}-dialog`, "aria-labelledby": `${name}-title` },
     el("form", { method: "dialog" },
       el("h2", { id: `${name}-title`, text: title }), ...content, el("p", { cls: "row" }, yes, " ", no)));

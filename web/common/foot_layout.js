@@ -1,19 +1,19 @@
-// Where the tiles of a foot are in a picture: from the side (a line of tiles) or from above (a grid). Pure.
+// Positions of tiles in a picture: from the side (line of tiles) or from above (plan). Pure.
 
 const GRID_FROM_M = 0.005; // tiles spread wider than this in y are a grid
-const SAME_PLACE_M = 1e-6; // tiles that differ by no more stand in one row
+const SAME_PLACE_M = 1e-6; // tiles that differ by less are in one row
 
 /** @typedef {{x: number, y: number}} Point in pixels */
 
 const range = (values) => [Math.min(...values), Math.max(...values)];
 
-/** @param {Tile[]} tiles */
+/** Return true if the tiles spread in y: shown from above. @param {Tile[]} tiles */
 export function isPlan(tiles) {
   const [least, most] = range(tiles.map((tile) => tile.y_m));
   return most - least > GRID_FROM_M;
 }
 
-/** Distance of a tile to its nearest neighbour: sets the size of the domes. */
+/** Return the least distance of two tiles: sets the size of the domes. */
 function spacing(tiles, up) {
   let least = Infinity;
   tiles.forEach((a, i) => tiles.slice(0, i).forEach((b) => {
@@ -23,30 +23,31 @@ function spacing(tiles, up) {
   return Number.isFinite(least) ? least : 0.014;
 }
 
-/** Do squares as wide as the distance of neighbours lie beside each other, as on a grid? */
+/** Return true if squares as wide as the pitch do not overlap. */
 export function isGrid(tiles) {
   const pitch = spacing(tiles, (tile) => tile.y_m);
   const beside = (a, b) => Math.max(Math.abs(a.x_m - b.x_m), Math.abs(a.y_m - b.y_m)) > 0.98 * pitch;
   return isPlan(tiles) && tiles.every((a, i) => tiles.slice(0, i).every((b) => beside(a, b)));
 }
 
-/** @param {number[]} placesM @returns {number | null} */
+/** Return the coordinate that all places share, or null. @param {number[]} placesM @returns {number | null} */
 function commonPlace(placesM) {
   const [least, most] = range(placesM);
   return most - least <= SAME_PLACE_M ? least : null;
 }
 
+/** Layout of a foot in a box. */
 export class FootLayout {
   /**
    * @param {Tile[]} tiles
    * @param {object} box
    * @param {number} box.widthPx
    * @param {number} box.heightPx
-   * @param {number} box.roomPx of the height, for what is not the foot
-   * @param {number} [box.basePx] from the lower edge to the sole, seen from the side
-   * @param {boolean} [box.turns] a servo rolls it about the ankle
-   * @param {boolean} [box.toesUp] from above, forward is up and not to the right
-   * @param {number} [box.margin] around the outermost tiles, in distances of neighbours
+   * @param {number} box.roomPx height that the foot leaves free
+   * @param {number} [box.basePx] height of the sole over the lower edge, side view
+   * @param {boolean} [box.turns] a servo rotates it about the ankle
+   * @param {boolean} [box.toesUp] plan view: forward is up, not right
+   * @param {number} [box.margin] around the outermost tiles, in pitches
    */
   constructor(tiles, { widthPx, heightPx, roomPx, basePx = 74, turns = false, toesUp = false, margin: around = 0.9 }) {
     this.plan = isPlan(tiles);
@@ -54,9 +55,9 @@ export class FootLayout {
     const up = (tile) => (this.plan ? tile.y_m : tile.z_m);
     const [back, front] = range(tiles.map((tile) => tile.x_m));
     const [low, high] = range(tiles.map(up));
-    /** Between neighbours, in metres. */
+    /** Pitch of the tiles, m. */
     this.pitch = spacing(tiles, up);
-    /** From the rearmost tile to the foremost, in metres. */
+    /** Length from rear to front tile, m. */
     this.span = front - back;
     const margin = around * this.pitch;
     // Rolling by 10 degrees about the ankle must stay in the picture.
@@ -64,7 +65,7 @@ export class FootLayout {
     const spanX = front - back + 2 * (margin + roll);
     const spanUp = high - low + 2 * margin;
     const [across, down] = this.toesUp ? [spanUp, spanX] : [spanX, spanUp];
-    /** Pixels a metre. */
+    /** Pixels per metre. */
     this.scale = Math.min(widthPx / across, (heightPx - roomPx) / down, this.plan ? 4000 : 5000);
     this.widthPx = widthPx;
     this.heightPx = heightPx;
@@ -73,14 +74,14 @@ export class FootLayout {
     this.radiusPx = Math.min(0.44 * this.pitch * this.scale, 30);
     this.points = tiles.map((tile) => this.at(tile.x_m, up(tile)));
     const loaded = tiles.filter((tile) => !tile.reference);
-    /** Where the one row of loaded tiles stands along x and y, in metres; null: they measure the centre of pressure along it. */
+    /** Common x and y of the loaded tiles, in metres; null: tiles differ, so the centre of pressure is measured along that axis. */
     this.row = { x: commonPlace(loaded.map((tile) => tile.x_m)), y: commonPlace(loaded.map((tile) => tile.y_m)) };
     /** Tiles from heel to toe. */
     this.order = tiles.map((_, i) => i).sort((a, b) => tiles[a].x_m - tiles[b].x_m);
   }
 
   /**
-   * A place in the foot's frame; `upM` is y (to the left) from above, z from the side.
+   * Return the pixel of a position in the foot's frame; `upM` is y (left) in plan view, z from the side.
    * @returns {Point}
    */
   at(xM, upM) {
@@ -90,7 +91,7 @@ export class FootLayout {
   }
 
   /**
-   * The place in metres at which a centre of pressure is drawn: the coordinate that is not measured is that of the row.
+   * Return the position in metres at which a centre of pressure is drawn: a coordinate that is not measured is that of the row.
    * @param {number | null | undefined} xM
    * @param {number | null | undefined} yM
    * @returns {{x: number, y: number} | null} null: no centre of pressure
@@ -101,7 +102,7 @@ export class FootLayout {
     return x === null || y === null ? null : { x, y };
   }
 
-  /** The sole behind a line of tiles, open to the leg above, as an SVG path. */
+  /** Return the sole and the leg above it, as an SVG path. */
   sole() {
     const first = this.points[this.order[0]];
     const last = this.points[this.order.at(-1)];
@@ -116,7 +117,7 @@ export class FootLayout {
       + `L${last.x + edge} ${last.y}L${last.x + edge} ${last.y - edge}L${middle + leg} ${knee}V${top}`;
   }
 
-  /** Unit vector from the ground into the foot at tile i, from its neighbours on the line. */
+  /** Return the unit normal into the foot at tile i. */
   inward(i) {
     const k = this.order.indexOf(i);
     const a = this.points[this.order[Math.max(0, k - 1)]];
@@ -125,7 +126,7 @@ export class FootLayout {
     return length ? { x: (b.y - a.y) / length, y: -(b.x - a.x) / length } : { x: 0, y: -1 };
   }
 
-  /** Height of the line of tiles at a place across, so that a marker sits on the arc. */
+  /** Return the height of the line of tiles at x. */
   lineAt(xPx) {
     const line = this.order.map((i) => this.points[i]);
     if (line.length === 1) return line[0].y;

@@ -1,4 +1,4 @@
-// Axes around a small plot with numbers on both sides: its grid, its ticks and its units.
+// Frame of a small plot: grid, ticks, titles, units.
 
 import { crisp, decimalsOf, ticks } from "./axes.js";
 import { number } from "./text.js";
@@ -9,7 +9,7 @@ export const FRAME_COLOURS = ["page", "text", "soft", "edge", "grid", "series", 
 /** @typedef {{left: number, right: number, top: number, bottom: number}} Box */
 /** @typedef {{low: number, high: number}} Range */
 
-/** A little more than what is drawn. @returns {Range} */
+/** Return a range with a margin. @returns {Range} */
 export function roomy({ low, high }, share = 0.06) {
   if (!(high >= low)) return { low: 0, high: 1 };
   const room = Math.max(share * (high - low), 1e-9, high === low ? 0.5 : 0);
@@ -17,7 +17,7 @@ export function roomy({ low, high }, share = 0.06) {
 }
 
 /**
- * Draws the frame of a plot, and says where numbers are in it.
+ * Draw the frame of a plot; return the functions from values to pixels.
  * @param {CanvasRenderingContext2D} context
  * @param {Box} box
  * @param {{x: Range, y: Range, colours: Record<string, string>, xTitle?: string, yTitle?: string, xUnit?: string}} how
@@ -42,7 +42,7 @@ export function drawFrame(context, box, { x: xs, y: ys, colours, xTitle = "", yT
     line(context, crisp(x(value)), box.bottom, crisp(x(value)), box.bottom + 5, colours.edge);
     const unit = i === columns.values.length - 1 && xUnit ? ` ${xUnit}` : "";
     const text = number(value, decimalsOf(columns.step)) + unit;
-    const half = context.measureText(text).width / 2; // no further out than the canvas
+    const half = context.measureText(text).width / 2; // stay on the canvas
     context.fillText(text, Math.min(x(value), context.canvas.clientWidth - half - 1), box.bottom + 8);
   }
   line(context, crisp(box.left), box.top, crisp(box.left), box.bottom, colours.edge);
@@ -62,7 +62,7 @@ function line(context, x0, y0, x1, y1, colour) {
   context.stroke();
 }
 
-/** A line through what is known; where something is not it is broken. */
+/** Draw a line; null interrupts it. */
 export function drawCurve(context, xs, ys) {
   context.beginPath();
   let on = false;
@@ -75,7 +75,7 @@ export function drawCurve(context, xs, ys) {
   context.stroke();
 }
 
-/** An area between two lines of the same places; where something is not known there is none. */
+/** Draw the area between two lines; null interrupts it. */
 export function drawArea(context, xs, lows, highs) {
   let start = -1;
   for (let i = 0; i <= xs.length; i++) {

@@ -1,7 +1,8 @@
-// The help of a page: `?` opens it, so does its button.
+// Help dialog of a page: opened by `?` or its button.
 
 import { byId, isInside } from "./text.js";
 
+/** Bind key and button of the help. */
 export function helpWithKeys() {
   const dialog = byId("help-dialog", HTMLDialogElement);
   const open = () => { if (!dialog.open) dialog.showModal(); };

@@ -1,55 +1,56 @@
-// The websocket: reconnects for ever, measures the round trip, and hands on parsed messages.
+// Websocket: reconnects, measures the round trip, passes on parsed messages.
 
-import { enter, keptOut, letIn, look } from "./login.js";
+import { logInFromUrl, needsLogin, waitForLogin, look } from "./login.js";
 import { notice } from "./notices.js";
 
 const FIRST_WAIT_S = 0.3;
 const LONGEST_WAIT_S = 3;
 const STEADY_AFTER_MS = 2000;
 const PING_EVERY_MS = 1000;
-const BLOCKED_AFTER = 3; // attempts that HTTP requests survive and the websocket does not
-const BLOCKED = "the server answers, but its live link does not open: a proxy or a filter in between may not pass WebSockets";
-const SILENT_AFTER_MS = 5000; // no message at all, although a heartbeat comes each second
+const BLOCKED_AFTER = 3; // failed attempts while HTTP works
+const BLOCKED = "the server responds, but a proxy or filter may block WebSockets";
+const SILENT_AFTER_MS = 5000; // a heartbeat is due each second
 
+/** Live connection to the server. */
 export class Link {
-  /** `onMessage(message)` per message, `onChange()` when the link opens or closes; `rateHz`: of frames. */
+  /** `onMessage(message)` per message, `onChange()` at open and close; `rateHz`: of live messages. */
   constructor({ onMessage, onChange, rateHz = 30 }) {
     this.rateHz = rateHz;
     this.onMessage = onMessage;
     this.onChange = onChange;
     this.open = false;
     this.roundTripMs = null;
-    this.unansweredSinceMs = null; // when the oldest ping without an answer was sent
+    this.unansweredSinceMs = null; // send time of the oldest unanswered ping
     this.closeReason = "";
     this.socket = null;
     this.waitS = FIRST_WAIT_S;
     this.malformed = 0;
     this.retry = null;
-    this.failures = 0; // attempts in a row that did not open
-    this.software = null; // as this page found it first
-    enter().finally(() => this.connect());
+    this.failures = 0; // consecutive failed attempts
+    this.software = null; // version at the first connection
+    logInFromUrl().finally(() => this.connect());
     setInterval(() => this.ping(), PING_EVERY_MS);
-    // A phone back from sleep, or back in the WLAN, should not wait for the timer.
-    addEventListener("online", () => this.hurry());
-    document.addEventListener("visibilitychange", () => document.hidden || this.hurry());
-    // Put aside by the browser and taken out again, this page has a socket that may be dead without saying so.
-    addEventListener("pageshow", (event) => event.persisted && this.lost("this page was put aside"));
+    // After sleep or loss of the network reconnect at once.
+    addEventListener("online", () => this.reconnectNow());
+    document.addEventListener("visibilitychange", () => document.hidden || this.reconnectNow());
+    // A page restored from the browser's cache may have a dead socket.
+    addEventListener("pageshow", (event) => event.persisted && this.lost("page restored"));
   }
 
   async connect() {
     clearTimeout(this.retry);
     this.retry = null;
-    if (keptOut()) await letIn();
+    if (needsLogin()) await waitForLogin();
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}/api/v1/live?rate_hz=${this.rateHz}`, "foottile.v1");
     this.socket = socket;
     this.startedMs = performance.now();
-    this.heardMs = this.startedMs;
+    this.receivedMs = this.startedMs;
     socket.onopen = () => {
       if (socket !== this.socket) return;
       this.open = true;
       this.failures = 0;
-      this.heardMs = performance.now();
+      this.receivedMs = performance.now();
       this.unansweredSinceMs = null;
       this.onChange();
       this.ping();
@@ -63,7 +64,7 @@ export class Link {
   }
 
   receive(data) {
-    this.heardMs = performance.now();
+    this.receivedMs = performance.now();
     let message;
     try {
       message = JSON.parse(data);
@@ -74,8 +75,8 @@ export class Link {
       if (this.malformed++ === 0) console.warn("FootTile: a malformed message was ignored");
       return;
     }
-    // Only a connection that lasts proves the server well; one that opens and closes does not.
-    if (this.heardMs - this.startedMs > STEADY_AFTER_MS) this.waitS = FIRST_WAIT_S;
+    // Only a lasting connection resets the delay.
+    if (this.receivedMs - this.startedMs > STEADY_AFTER_MS) this.waitS = FIRST_WAIT_S;
     if (message.type === "pong") {
       const roundTripMs = performance.now() - message.t_ms;
       this.unansweredSinceMs = null;
@@ -87,18 +88,18 @@ export class Link {
     this.onMessage(message);
   }
 
-  /** Another version of the server may not understand the scripts of this one. */
+  /** Offer a reload after an update of the server. */
   checkSoftware(software) {
     this.software ??= software;
     if (software === this.software) return;
-    notice(`The server was changed from ${this.software} to ${software}, and this page is still the old one.`,
-      { press: ["Load again", () => location.reload()], stays: true });
+    notice(`Server updated from ${this.software} to ${software}. Reload this page.`,
+      { press: ["Reload", () => location.reload()], stays: true });
   }
 
   ping() {
     const nowMs = performance.now();
-    if (this.socket && nowMs - this.heardMs > SILENT_AFTER_MS) {
-      this.lost("the server fell silent");
+    if (this.socket && nowMs - this.receivedMs > SILENT_AFTER_MS) {
+      this.lost("no messages");
       return;
     }
     if (!this.open || this.socket.bufferedAmount > 10_000) return;
@@ -108,7 +109,7 @@ export class Link {
 
   lost(reason) {
     const socket = this.socket;
-    if (!this.open) this.explain(); // was it refused, because a login is needed?
+    if (!this.open) this.explain(); // may need a login
     this.socket = null;
     this.open = false;
     this.roundTripMs = null;
@@ -118,12 +119,13 @@ export class Link {
       socket.onclose = socket.onmessage = socket.onopen = null;
       socket.close();
     }
-    // Jitter, so that a room full of pages does not come back at one instant.
+    // Jitter spreads the reconnections of many pages.
     this.retry = setTimeout(() => this.connect(), this.waitS * 1000 * (0.75 + 0.5 * Math.random()));
     this.waitS = Math.min(LONGEST_WAIT_S, this.waitS * 2);
     this.onChange();
   }
 
+  /** Find the reason of a failed attempt. */
   async explain() {
     this.failures += 1;
     if (!await look() || this.open || this.failures < BLOCKED_AFTER) return;
@@ -131,11 +133,11 @@ export class Link {
     this.onChange();
   }
 
-  hurry() {
+  reconnectNow() {
     if (this.retry !== null && !this.socket) this.connect();
   }
 
-  /** The server has owed an answer for longer than a second. */
+  /** True if a ping is unanswered for more than a second. */
   get serverSilent() {
     return this.unansweredSinceMs !== null && performance.now() - this.unansweredSinceMs > 1000;
   }

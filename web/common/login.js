@@ -1,31 +1,30 @@
-// Getting in: a ticket or a token in the address, or a token typed in, becomes a cookie that no script can read.
+// Login: a ticket or token in the URL, or a typed token, becomes a cookie that scripts cannot read.
 
-import { parseAnswer, Refusal, sendRequest } from "./request.js";
+import { parseResponse, Refusal, sendRequest } from "./request.js";
 import { el, setText } from "./text.js";
 
 const PATH = "/api/v1/login";
-const WHERE = "Ask who started the server: “foottile invite”, on that computer, shows an address and a code to scan "
-  + "that let you in. Or type in the server's token.";
-const ASKED = `Anyone may watch; to tare, record or change something you have to log in. ${WHERE}`;
-const PRIVATE = `This server is private: to look you have to log in, too. ${WHERE}`;
-const ENDED = `Your login has ended: the server was started again, or 12 hours are over. ${WHERE}`;
-const VIEWER = `You came with a viewer's ticket: you may look, and not tare, record or change anything. ${WHERE}`;
-const NOT_KEPT = "The server let this browser in, and the browser did not keep that: it blocks cookies of this address. "
-  + "Allow them in its settings, or leave its private window; then load this page again.";
-const WRONG = `That is not this server's token. ${WHERE}`;
+const HOW = "For a login link run “foottile invite” on the server's computer, or enter the server's token.";
+const LOGIN_NEEDED = `Log in to tare, record or change sessions. ${HOW}`;
+const PRIVATE = `This server is private: log in to view. ${HOW}`;
+const ENDED = `Your login has ended: server restarted, or 12 hours passed. ${HOW}`;
+const VIEWER = `You are logged in as viewer (read-only). ${HOW}`;
+const COOKIE_BLOCKED = "Login accepted, but the browser blocks cookies of this address. "
+  + "Allow them, or leave the private window; then reload this page.";
+const WRONG = `That is not this server's token. ${HOW}`;
 
-/** What the server said last of who we are; null: it has not been reached. */
+/** Login state from the server; null: not received yet. */
 let state = null;
-let refused = ""; // why a ticket or token in the address was not taken
+let refused = ""; // why a ticket or token of the URL was refused
 let chip = null;
 
-/** May this page offer what changes something? Without a login yes: it asks for one when it is needed. */
-export const mayPress = () => state?.may !== "look";
-/** Is nothing shown before somebody logs in? */
-export const keptOut = () => Boolean(state?.private) && state.may === null;
+/** Return true if controls are shown: not to viewers. Without a login the page asks for one on use. */
+export const isOperator = () => state?.may !== "look";
+/** Return true if a private server requires a login. */
+export const needsLogin = () => Boolean(state?.private) && state.may === null;
 
-/** Take a ticket or token out of the address, where it would be shared by accident, and go in with it. */
-export async function enter() {
+/** Log in with a ticket or token of the URL, and remove it there, so that it is not shared by accident. */
+export async function logInFromUrl() {
   const fields = new URLSearchParams(location.hash.slice(1));
   const [ticket, token] = [fields.get("ticket"), fields.get("token")];
   if (ticket === null && token === null) {
@@ -40,40 +39,40 @@ export async function enter() {
   if (answer.ok) return;
   refused = answer.detail;
   await look();
-  if (state?.may) refused = ""; // in already: an address that is opened twice
+  if (state?.may) refused = ""; // logged in already: URL opened twice
   draw();
 }
 
-// An address that differs in this part only, opened in the same tab, loads nothing by itself.
+// A new fragment in the same tab does not load the page.
 addEventListener("hashchange", async () => {
   if (!/[#&](ticket|token)=/.test(location.hash)) return;
-  await enter();
+  await logInFromUrl();
   if (!refused) location.reload();
 });
 
-/** Ask the server who we are; while it is away nothing changes. Resolves to whether it answered. */
+/** Update the login state; resolve to true if the server responded. */
 export async function look() {
-  return (await ask("GET")).ok;
+  return (await request("GET")).ok;
 }
 
-/** Resolves when nobody is kept out any more: asks, and if that is cancelled waits until it is wanted. */
-export async function letIn() {
-  while (keptOut() && !await askToLogIn()) await new Promise((resolve) => chip.addEventListener("click", resolve, { once: true }));
+/** Ask for a login until there is one; after a cancel wait for a click. */
+export async function waitForLogin() {
+  while (needsLogin() && !await askToLogIn()) await new Promise((resolve) => chip.addEventListener("click", resolve, { once: true }));
 }
 
 let asking = null;
-/** One dialog at a time, however many calls were refused. Resolves to true if somebody logged in. */
+/** Show one login dialog for all refused calls; resolve to true after a login. */
 export function askToLogIn() {
-  asking ??= dialogUntilIn().finally(() => { asking = null; });
+  asking ??= dialogUntilLogin().finally(() => { asking = null; });
   return asking;
 }
 
-async function dialogUntilIn() {
-  if (!refused) await look(); // it may have ended since
-  let why = refused ? asSentence(refused) : state?.ended ? ENDED : state?.may === "look" ? VIEWER : keptOut() ? PRIVATE : ASKED;
+async function dialogUntilLogin() {
+  if (!refused) await look(); // may have ended
+  let why = refused ? asSentence(refused) : state?.ended ? ENDED : state?.may === "look" ? VIEWER : needsLogin() ? PRIVATE : LOGIN_NEEDED;
   refused = "";
   for (;;) {
-    const token = await typed(why);
+    const token = await enterToken(why);
     if (!token) return false;
     const answer = await logIn({}, token);
     if (answer.ok) return true;
@@ -81,7 +80,7 @@ async function dialogUntilIn() {
   }
 }
 
-function typed(why) {
+function enterToken(why) {
   const field = el("input", { id: "token-field", type: "password", autocomplete: "off" });
   const dialog = el("dialog", { id: "token-dialog", "aria-labelledby": "token-title" },
     el("form", { method: "dialog" },
@@ -99,19 +98,19 @@ function typed(why) {
   });
 }
 
-/** @param {string} text */
+/** Return text with a full stop. @param {string} text */
 const asSentence = (text) => (/[.!?]$/.test(text) ? text : `${text}.`);
 
 /** Log in, and check that the browser sends the cookie back. */
 async function logIn(body, token) {
-  const answer = await ask("POST", body, token);
+  const answer = await request("POST", body, token);
   if (!answer.ok) return answer;
-  const now = await ask("GET");
-  return now.ok && state.may === null ? { ok: false, status: 0, detail: NOT_KEPT } : now;
+  const now = await request("GET");
+  return now.ok && state.may === null ? { ok: false, status: 0, detail: COOKIE_BLOCKED } : now;
 }
 
-/** Ask for, or change, who we are; resolves to what came of it. */
-async function ask(method, body, token = null) {
+/** Get or change the login; resolve to the result. */
+async function request(method, body, token = null) {
   const headers = { Accept: "application/json" };
   if (body) headers["Content-Type"] = "application/json";
   if (token) headers.Authorization = `Bearer ${token}`;
@@ -119,7 +118,7 @@ async function ask(method, body, token = null) {
   try {
     let text;
     ({ response, text } = await sendRequest(PATH, { method, headers, body: body && JSON.stringify(body) }));
-    answer = parseAnswer(response, text);
+    answer = parseResponse(response, text);
   } catch (error) {
     if (!(error instanceof Refusal)) throw error;
     return { ok: false, status: error.status, detail: error.message };
@@ -130,16 +129,16 @@ async function ask(method, body, token = null) {
   return { ok: true };
 }
 
-/** What a person should know of their login stands beside the title; pressed, it asks for another one. */
+/** Show the login state beside the title; a click opens the dialog. */
 function draw() {
   document.body.dataset.may = state?.may ?? "";
-  const text = state?.ended ? "login ended" : refused ? "not logged in" : state?.may === "look" ? "viewer: looks only" : keptOut() ? "private" : "";
+  const text = state?.ended ? "login ended" : refused ? "not logged in" : state?.may === "look" ? "viewer (read-only)" : needsLogin() ? "private" : "";
   if (!chip) {
     chip = el("button", { type: "button", id: "login", cls: "small" });
     document.querySelector("header h1").after(chip);
     chip.addEventListener("click", async () => {
-      const sawNothing = keptOut();
-      if (await askToLogIn() && sawNothing) location.reload();
+      const wasLockedOut = needsLogin();
+      if (await askToLogIn() && wasLockedOut) location.reload();
     });
   }
   chip.hidden = !text;

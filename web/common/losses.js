@@ -1,25 +1,28 @@
-// Why frames are missing, in words: the reasons of the server's ledger.
+// Texts of the ledger's reasons for lost frames.
 
 const REASONS = {
-  disk_full: "the node's disk was full",
-  read_only: "the node's disk was read-only",
-  disk_slow: "the node's disk was too slow",
-  node_busy: "the node was too busy to keep them",
-  evicted: "the link was down for longer than the node could keep them",
-  corrupt: "damaged on the disk",
-  node_restarted: "the node came back without them",
-  given_up: "sealed without them",
-  refused: "refused by the server: no frame can be so",
+  disk_full: "node disk full",
+  read_only: "node disk read-only",
+  disk_slow: "node disk too slow",
+  node_busy: "node overloaded",
+  evicted: "link down longer than the node's buffer",
+  corrupt: "damaged on disk",
+  node_restarted: "node restarted without them",
+  given_up: "abandoned",
+  refused: "invalid, refused by the server",
 };
 
 const many = (count) => `${count.toLocaleString("en-GB")} frame${count === 1 ? "" : "s"}`;
 
-/** ["12 frames: the node's disk was full", ...], the greatest loss first. */
-export function lossesInWords(lost) {
+/**
+ * Return reason and text, such as ["disk_full", "12 frames: node disk full"], largest loss first.
+ * @returns {[string, string][]}
+ */
+export function lossTexts(lost) {
   return Object.entries(lost ?? {})
     .filter(([, count]) => count > 0)
     .sort((a, b) => b[1] - a[1])
-    .map(([reason, count]) => `${many(count)}: ${REASONS[reason] ?? reason.replaceAll("_", " ")}`);
+    .map(([reason, count]) => [reason, `${many(count)}: ${REASONS[reason] ?? reason.replaceAll("_", " ")}`]);
 }
 
 export { many as frames };

@@ -1,4 +1,4 @@
-// A menu that a button opens: one at a time, under its button, with the arrow keys; Escape or a tap beside it closes it.
+// Menu of a button: one at a time, arrow keys, closed by Escape or a tap outside.
 
 import { el } from "./text.js";
 
@@ -8,7 +8,7 @@ const GAP_PX = 4; // to the button, and to the edge of the window
 let shown = null;
 
 /**
- * A button that opens a menu. `items()` gives links and buttons at the time of the press.
+ * Make a button that opens a menu. `items()` returns its links and buttons when pressed.
  * @param {string} label of the button and of the menu
  * @param {() => HTMLElement[]} items
  */
@@ -22,7 +22,7 @@ export function menuButton(label, items) {
   return button;
 }
 
-/** Close the open menu, if there is one. @param {{refocus?: boolean}} [how] refocus: put the focus on its button */
+/** Close the open menu. @param {{refocus?: boolean}} [how] refocus: put the focus on its button */
 export function closeMenu({ refocus = false } = {}) {
   if (!shown) return;
   const { menu, button } = shown;
@@ -47,7 +47,7 @@ function openMenu(button, label, items) {
   items[0]?.focus();
 }
 
-/** Under the button, its right edges in line; above it where there is no room below. */
+/** Place the menu under the button, right-aligned; above it if there is no room. */
 function placeMenu(menu, at) {
   const { offsetWidth: widthPx, offsetHeight: heightPx } = menu;
   const below = at.bottom + GAP_PX;
@@ -61,7 +61,7 @@ function pressKey(event, items) {
   const next = { ArrowDown: at + 1, ArrowUp: at - 1, Home: 0, End: -1 }[event.key];
   if (next !== undefined) items.at(next % items.length).focus();
   else if (event.key === "Escape") closeMenu({ refocus: true });
-  else if (event.key === "Tab") return closeMenu({ refocus: true }); // the browser goes on from the button
+  else if (event.key === "Tab") return closeMenu({ refocus: true }); // the browser continues from the button
   else return;
   event.preventDefault();
 }

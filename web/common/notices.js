@@ -1,14 +1,14 @@
-// Results and refusals of what the user did: short, announced politely, few at a time.
+// Notices: results and refusals of actions.
 
 import { Refusal } from "./request.js";
 import { byId, el } from "./text.js";
 
-const GOOD_FOR_MS = 4000;
-const PRESS_FOR_MS = 10_000;
-const MOST = 2;
+const SHOWN_MS = 4000;
+const WITH_BUTTON_MS = 10_000;
+const NOTICES_MAX = 2;
 
 /**
- * Show a short text. `press`, the words of a button and what it does, is offered for as long as the notice stands.
+ * Show a notice. `press`: label and action of a button on it.
  * @param {string} text
  * @param {{bad?: boolean, press?: [string, () => unknown] | null, stays?: boolean}} [how]
  */
@@ -23,20 +23,20 @@ export function notice(text, { bad = false, press = null, stays = bad } = {}) {
   }
   item.append(close);
   close.addEventListener("click", () => item.remove());
-  // A refusal says what to do: it stays until it is dismissed or something newer is said.
+  // A refusal stays until it is dismissed or replaced.
   for (const old of box.querySelectorAll(".bad")) old.remove();
   box.append(item);
-  while (box.children.length > MOST) box.firstElementChild.remove();
-  if (!stays) setTimeout(() => item.remove(), press ? PRESS_FOR_MS : GOOD_FOR_MS);
+  while (box.children.length > NOTICES_MAX) box.firstElementChild.remove();
+  if (!stays) setTimeout(() => item.remove(), press ? WITH_BUTTON_MS : SHOWN_MS);
 }
 
-/** Show a refusal. Any other error is a fault of this page: thrown on, to guard.js. @param {unknown} error */
+/** Show a refusal; rethrow any other error, for guard.js. @param {unknown} error */
 export function showRefusal(error) {
   if (!(error instanceof Refusal)) throw error;
   notice(error.message, { bad: true });
 }
 
-/** Do something; a refusal is told, not thrown. */
-export async function quietly(doing) {
-  await Promise.resolve().then(doing).catch(showRefusal);
+/** Run an action; show a refusal as a notice. */
+export async function quietly(action) {
+  await Promise.resolve().then(action).catch(showRefusal);
 }

@@ -1,9 +1,9 @@
-// One HTTP request with a time limit. Each way to fail has its own words: a fault of this page is none of the server's.
+// HTTP request with a time limit. Each failure has its own text; a fault of this page is not reported as one of the server.
 
-export const PATIENCE_S = 10;
-const BROKE_OFF = "The server’s answer broke off. Try again.";
+export const TIMEOUT_S = 10;
+const INCOMPLETE = "The response is incomplete. Try again.";
 
-/** A refusal by the server, or no answer from it (`status` 0); `message` says what happened and what to do. */
+/** Refusal by the server, or no response (`status` 0); `message` states cause and remedy. */
 export class Refusal extends Error {
   constructor(message, status) {
     super(message);
@@ -13,7 +13,7 @@ export class Refusal extends Error {
 }
 
 /**
- * Resolve to `instead` where a Refusal holds nothing up.
+ * Resolve to `instead` after a Refusal.
  * @template T, U
  * @param {Promise<T>} pending
  * @param {U} [instead]
@@ -29,29 +29,29 @@ export async function unlessRefused(pending, instead = null) {
 }
 
 /**
- * Send a request; resolve to the response and its body as text. Rejects with a Refusal of status 0 if no whole answer
- * comes, and with an AbortError after `stop`. Any other error is a fault of this page, and is not caught here.
+ * Send a request; resolve to the response and its body as text. Reject with a Refusal of status 0 if the response is
+ * missing or incomplete, and with an AbortError after `stop`. Other errors are faults of this page.
  * @param {string} path
  * @param {RequestInit} options
- * @param {{patienceS?: number, stop?: AbortSignal | null}} [limits] `patienceS` holds until the body is whole
+ * @param {{timeoutS?: number, stop?: AbortSignal | null}} [limits] `timeoutS` includes the body
  */
-export async function sendRequest(path, options, { patienceS = PATIENCE_S, stop = null } = {}) {
-  // By hand: AbortSignal.any and the TimeoutError of AbortSignal.timeout are newer than our oldest browsers.
+export async function sendRequest(path, options, { timeoutS = TIMEOUT_S, stop = null } = {}) {
+  // By hand: AbortSignal.any and the TimeoutError of AbortSignal.timeout are newer than the oldest browsers.
   const limit = new AbortController();
   const abort = () => limit.abort();
   let isLate = false;
-  const timer = setTimeout(() => { isLate = true; abort(); }, 1e3 * patienceS);
+  const timer = setTimeout(() => { isLate = true; abort(); }, 1e3 * timeoutS);
   stop?.addEventListener("abort", abort);
   if (stop?.aborted) abort();
   try {
-    // Made first: from here on a TypeError is one of the network, by the specification of fetch.
+    // Request first: after it a TypeError is one of the network (specification of fetch).
     const request = new Request(path, { ...options, cache: "no-store", signal: limit.signal });
-    const response = await orRefusal(fetch(request), "The server cannot be reached. Is it running, and is this device in its network?");
-    return { response, text: await orRefusal(response.text(), BROKE_OFF) };
+    const response = await orRefusal(fetch(request), "The server cannot be reached. Check that it runs and that this device is in its network.");
+    return { response, text: await orRefusal(response.text(), INCOMPLETE) };
   } catch (error) {
-    if (isLate) throw new Refusal(`The server did not answer within ${patienceS} s. Try again.`, 0);
-    // Firefox breaks requests off when the page is left.
-    if (!limit.signal.aborted && /** @type {Error} */ (error).name === "AbortError") throw new Refusal(BROKE_OFF, 0);
+    if (isLate) throw new Refusal(`The server did not answer within ${timeoutS} s. Try again.`, 0);
+    // Firefox aborts requests when the page is left.
+    if (!limit.signal.aborted && /** @type {Error} */ (error).name === "AbortError") throw new Refusal(INCOMPLETE, 0);
     throw error;
   } finally {
     clearTimeout(timer);
@@ -60,21 +60,21 @@ export async function sendRequest(path, options, { patienceS = PATIENCE_S, stop 
 }
 
 /**
- * A failure of the network becomes a Refusal with these words.
+ * Turn a network failure into a Refusal.
  * @template T
  * @param {Promise<T>} pending
- * @param {string} words
+ * @param {string} text
  */
-async function orRefusal(pending, words) {
+async function orRefusal(pending, text) {
   try {
     return await pending;
   } catch (error) {
-    throw error instanceof TypeError ? new Refusal(words, 0) : error;
+    throw error instanceof TypeError ? new Refusal(text, 0) : error;
   }
 }
 
 /**
- * Load a module when it is wanted; a Refusal if its file does not come.
+ * Load a module on demand; reject with a Refusal if its file does not load.
  * @template T
  * @param {() => Promise<T>} load
  */
@@ -82,23 +82,23 @@ export async function loadModule(load) {
   try {
     return await load();
   } catch (error) {
-    // Chrome, Firefox and Safari have no kind of error for it, but words.
+    // Browsers have no error type for it, only a message.
     if (!/import\w+ (?:a )?module/i.test(String(error))) throw error;
-    throw new Refusal("A part of this page could not be loaded. Is the server running? Then load the page again.", 0);
+    throw new Refusal("A part of this page could not be loaded. Check that the server runs, then reload.", 0);
   }
 }
 
 /**
- * Parse an answer as JSON; a Refusal if it is none: something between this page and the server wrote it, or it was cut.
+ * Parse a response as JSON; throw a Refusal if it is cut or not from the server.
  * @param {Response} response
  * @param {string} text
  */
-export function parseAnswer(response, text) {
+export function parseResponse(response, text) {
   try {
     return JSON.parse(text);
   } catch {
     throw new Refusal(response.ok
-      ? "The answer is not one of FootTile’s server, or not all of it. If this network has a login page or a proxy, look there; then load this page again."
+      ? "The response is incomplete or not from a FootTile server. Check for a login page or proxy in this network, then reload."
       : `The server refused: ${response.status} ${response.statusText}`.trim() + ".", response.ok ? 0 : response.status);
   }
 }

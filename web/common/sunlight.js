@@ -1,10 +1,10 @@
-// The strongest contrast there is, for a screen in the sun: chosen on this device, for every page.
+// Sunlight mode: highest contrast, stored per device, for all pages.
 
 import { byId } from "./text.js";
 
 const KEY = "foottile.sunlight";
 
-/** Applies what was chosen; a page's button chooses. */
+/** Apply the stored mode and bind its button. */
 export function inSunlight() {
   const button = byId("sun");
   let chosen = false;
@@ -12,7 +12,7 @@ export function inSunlight() {
   const show = () => {
     document.documentElement.dataset.sunlight = String(chosen);
     button.setAttribute("aria-pressed", String(chosen));
-    document.dispatchEvent(new Event("foottile-colours")); // what is drawn reads its colours anew
+    document.dispatchEvent(new Event("foottile-colours")); // canvases read their colours again
   };
   button.addEventListener("click", () => {
     chosen = !chosen;

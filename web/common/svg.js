@@ -1,10 +1,11 @@
-// Elements of SVG, and their numbers.
+// SVG elements and attributes.
 
 import { printable } from "./text.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 
 /**
+ * Make an SVG element.
  * @template {keyof SVGElementTagNameMap} T
  * @param {T} tag
  * @param {Record<string, string | number>} [attributes]
@@ -18,7 +19,7 @@ export function svg(tag, attributes = {}, text = null) {
   return element;
 }
 
-/** Write only what changed. @param {Element} element @param {Record<string, string | number>} attributes */
+/** Set attributes that have changed. @param {Element} element @param {Record<string, string | number>} attributes */
 export function place(element, attributes) {
   for (const [name, value] of Object.entries(attributes)) {
     const text = typeof value === "number" ? value.toFixed(2) : value;

@@ -1,7 +1,7 @@
-// Small helpers for text and elements. All text from the server goes through textContent.
+// Helpers for text and elements. All text from the server goes through textContent.
 
 /**
- * The element of this id, which has to be there, and of this kind.
+ * Return the element of an id and type; throw if there is none.
  * @overload
  * @param {string} id
  * @returns {HTMLElement}
@@ -20,17 +20,17 @@ export function byId(id, kind = HTMLElement) {
   return element;
 }
 
-/** Did it happen in something of this selector? A dialog keeps the focus for a moment after it has closed: ask for `dialog[open]`. @param {Event} event @param {string} selector */
+/** Return true if an event occurred inside a selector. A closed dialog keeps the focus for a moment: use `dialog[open]`. @param {Event} event @param {string} selector */
 export const isInside = ({ target }, selector) => target instanceof Element && target.closest(selector) !== null;
 
-// Controls, formats (which turn the direction of text, or have no width) and halves of a character.
+// Control and format characters (direction, zero width) and lone surrogates.
 const UNPRINTABLE = /[\p{Cc}\p{Cf}\p{Cs}\u2028\u2029]/gu;
 const BLANK = /[\t\n\r]/; // shown as a space
 const JOINER = /[\u200c\u200d]/; // part of some scripts, and of emoji
 
 /**
- * Text as it may be shown: what has no picture of its own is spelt out, as `\x1b` or `\u202e`. For every name and
- * text of people, on the page and on canvas; what is sent back to the server stays as it is.
+ * Escape unprintable characters, as `\x1b` or `\u202e`. For all names and user texts on page and canvas, not for
+ * text sent to the server.
  * @param {string} text
  */
 export const printable = (text) => String(text).replace(UNPRINTABLE, (found, at) => {
@@ -42,10 +42,10 @@ export const printable = (text) => String(text).replace(UNPRINTABLE, (found, at)
 const SHOWN_ATTRIBUTES = new Set(["aria-label", "label", "placeholder", "title"]);
 
 /**
- * An element with class, text and children; never markup from a string.
+ * Make an element with class, text and children; never markup from a string.
  * @template {keyof HTMLElementTagNameMap} T
  * @param {T} tag
- * @param {{cls?: string, text?: string | null, [attribute: string]: any}} [says]
+ * @param {{cls?: string, text?: string | null, [attribute: string]: any}} [properties]
  * @param {...(Node | string)} children
  * @returns {HTMLElementTagNameMap[T]}
  */
@@ -59,7 +59,7 @@ export function el(tag, { cls = "", text = null, ...attributes } = {}, ...childr
 }
 
 /**
- * Write only what changed: thirty messages a second must not touch the DOM in vain.
+ * Set text if it has changed: thirty messages a second must not touch the DOM in vain.
  * @param {Element} element
  * @param {string} text
  */
@@ -67,7 +67,7 @@ export function setText(element, text) {
   const shown = printable(text);
   if (element.textContent === shown) return;
   const only = element.childNodes.length === 1 ? element.firstChild : null;
-  if (only instanceof Text && shown !== "") only.data = shown; // no new node per message
+  if (only instanceof Text && shown !== "") only.data = shown; // keeps the text node
   else element.textContent = shown;
 }
 
@@ -79,7 +79,7 @@ export function setData(element, name, value) {
 const MINUS = "\u2212";
 
 /**
- * A number with a fixed count of decimals; a true minus sign, and never "-0.0".
+ * Format a number with fixed decimals and a true minus sign, never "-0.0".
  * @param {number | null | undefined} value
  * @param {number} [decimals]
  */
@@ -90,13 +90,13 @@ export function number(value, decimals = 1) {
   return text.replace("-", MINUS);
 }
 
-/** A rate; tenths of many are of no use to anybody. @param {number} hz */
+/** Format a rate, with tenths below 100. @param {number} hz */
 export const perSecond = (hz) => number(hz, hz < 100 ? 1 : 0);
 
 /** @param {unknown} value @returns {value is number} */
 const isFiniteNumber = (value) => Number.isFinite(value);
 
-/** What a test reads: three decimals with an ASCII minus, or nothing. @param {number | null | undefined} value */
+/** Format for tests: three decimals, ASCII minus, or "". @param {number | null | undefined} value */
 export const plain = (value) => (isFiniteNumber(value) ? value.toFixed(3) : "");
 
 /** @param {number | null | undefined} seconds */
@@ -109,7 +109,7 @@ export function duration(seconds) {
   return hours ? `${hours}:${rest} h` : `${rest} min`;
 }
 
-/** "3 min", for ages that need no precision. @param {number} seconds */
+/** Format an age roughly: "3 min". @param {number} seconds */
 export function roughly(seconds) {
   if (seconds < 90) return `${Math.max(0, Math.round(seconds))} s`;
   if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
@@ -128,16 +128,16 @@ export function bytes(count) {
 /** @param {number} n */
 const two = (n) => String(n).padStart(2, "0");
 
-/** Local time, sortable: what a robotics notebook has. @param {Date} date */
+/** Format local time, sortable. @param {Date} date */
 export function localTime(date) {
   return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())} `
     + `${two(date.getHours())}:${two(date.getMinutes())}:${two(date.getSeconds())}`;
 }
 
-/** Copy a text to the clipboard; false: the browser does not let us. Its newer way exists in secure contexts only. @param {string} text */
+/** Copy text to the clipboard; return false if blocked. The newer API exists in secure contexts only. @param {string} text */
 export function copyText(text) {
   const before = document.activeElement;
-  const field = el("textarea", { cls: "unseen", "aria-label": "To be copied" });
+  const field = el("textarea", { cls: "unseen", "aria-label": "Text to copy" });
   field.value = text;
   document.body.append(field);
   field.select();

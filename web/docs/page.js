@@ -1,17 +1,17 @@
-// The API's description, drawn by Swagger UI from files of this server; a private one asks for a login first.
+// API reference, drawn by Swagger UI from files of this server; a private server requires a login first.
 
 import { call, Refusal } from "../common/api.js";
-import { enter, keptOut, letIn } from "../common/login.js";
+import { logInFromUrl, needsLogin, waitForLogin } from "../common/login.js";
 import { byId, setText } from "../common/text.js";
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
-const dress = () => document.documentElement.classList.toggle("dark-mode", dark.matches); // Swagger UI's own name
-dark.addEventListener("change", dress);
-dress();
+const setTheme = () => document.documentElement.classList.toggle("dark-mode", dark.matches); // name of Swagger UI
+dark.addEventListener("change", setTheme);
+setTheme();
 
 async function show() {
-  await enter();
-  if (keptOut()) await letIn();
+  await logInFromUrl();
+  if (needsLogin()) await waitForLogin();
   let spec;
   try {
     spec = await call("GET", "/openapi.json");
@@ -29,7 +29,7 @@ async function show() {
     docExpansion: "list",
     defaultModelsExpandDepth: 0,
     displayRequestDuration: true,
-    validatorUrl: null, // it would be another host's
+    validatorUrl: null, // would be on another host
     onComplete: () => { document.body.dataset.state = "shown"; },
   });
 }

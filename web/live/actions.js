@@ -1,28 +1,29 @@
-// Tare, Record, Stop, Marker: buttons, fields and shortcuts; what is being recorded.
+// Action bar: Tare, Record, Stop, Marker; fields, shortcuts and running recordings.
 
 import * as api from "../common/api.js";
-import { mayPress } from "../common/login.js";
+import { isOperator } from "../common/login.js";
 import { notice, showRefusal } from "../common/notices.js";
 import { byId, duration, el, isInside, localTime, setData, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
 
+/** Action bar of the live page. */
 export class Actions {
   /**
-   * `state` is the page's state; `marks` keeps marks until the server has them;
-   * `onSession(session)` takes every session an answer brings.
+   * `state` is the page's state; `markers` queues markers until the server has stored them;
+   * `onSession(session)` receives the session of each response.
    */
-  constructor(state, marks, onSession) {
+  constructor(state, markers, onSession) {
     this.state = state;
-    this.marks = marks;
+    this.markers = markers;
     this.onSession = onSession;
     this.busy = new Set();
-    this.rows = new Map(); // id of a recording -> its line
-    for (const name of ["tare", "undo", "record", "stop", "mark"]) {
+    this.rows = new Map(); // session id -> row
+    for (const name of ["tare", "undo", "record", "stop", "marker"]) {
       byId(name).addEventListener("click", () => this.run(name));
     }
-    this.field("mark-label", "mark");
-    this.field("session-name", "record");
+    this.bindField("marker-label", "marker");
+    this.bindField("session-name", "record");
     document.addEventListener("keydown", (event) => this.shortcut(event));
     const bar = byId("actions");
     byId("fields").addEventListener("click", () => {
@@ -34,8 +35,8 @@ export class Actions {
     new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
   }
 
-  /** Enter does it, Escape gives it up; both leave the field, or the next shortcut would be typed into it. */
-  field(id, name) {
+  /** Bind keys of a text field: Enter runs the action, Escape clears; both leave it, so that shortcuts work again. */
+  bindField(id, name) {
     const field = byId(id, HTMLInputElement);
     field.addEventListener("keydown", (event) => {
       if (event.isComposing) return;
@@ -46,25 +47,26 @@ export class Actions {
     });
   }
 
+  /** Run the action of a key. */
   shortcut(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
     if (isInside(event, "input, textarea, select, dialog[open], [contenteditable]")) return;
-    const name = { t: "tare", r: "record", s: "stop", m: "mark", p: "pause" }[event.key];
+    const name = { t: "tare", r: "record", s: "stop", m: "marker", p: "pause" }[event.key];
     if (!name) return;
     event.preventDefault();
     if (this[name]) this.run(name);
-    else byId(name).click(); // of another panel
+    else byId(name).click(); // button of another panel
   }
 
-  /** Run an action once at a time, and say what came of it. */
+  /** Run an action, once at a time, and show its result. */
   async run(name) {
     const button = byId(name, HTMLButtonElement);
-    if (!mayPress()) {
-      notice("this login may look, and not press. “viewer”, beside the title, says more.", { bad: true });
+    if (!isOperator()) {
+      notice("viewers cannot tare, record or set markers. To log in as operator, press “viewer” beside the title.", { bad: true });
       return;
     }
     if (button.disabled || button.hidden || this.busy.has(name)) {
-      if (name === "mark" && !this.running().length) notice("Markers belong to a recording: press Record first.", { bad: true });
+      if (name === "marker" && !this.running().length) notice("no recording is running. Press Record first.", { bad: true });
       else if (["record", "tare"].includes(name) && this.state.cannotRecord) notice(this.state.cannotRecord, { bad: true });
       return;
     }
@@ -83,18 +85,18 @@ export class Actions {
 
   async tare(node) {
     const tare = await api.tareNow(node.node);
-    this.undoable(tare.id);
-    node.tare = tare; // do not wait a second for the node's message
+    this.setUndo(tare.id);
+    node.tare = tare; // before the node's next message
     notice(`Tared ${node.node} from ${tare.frames} unloaded frames.`);
   }
 
   async undo(node) {
     const automatic = node.tare.source === "flight";
     await api.undoTare(node.node, node.tare.id);
-    this.undoable(null);
+    this.setUndo(null);
     notice(automatic
-      ? "Automatic tare undone: the one before it holds again, and no other comes until you press Tare."
-      : "Tare undone: the one before it holds again.");
+      ? "Automatic tare undone: previous tare restored. Automatic tare stays off until you press Tare."
+      : "Tare undone: previous tare restored.");
     byId("tare").focus();
   }
 
@@ -109,27 +111,28 @@ export class Actions {
     if (document.activeElement === document.body || document.activeElement === byId("record")) byId("stop").focus();
   }
 
-  /** Stop a recording; without one named, the newest that runs on the chosen node. */
+  /** Stop a recording; by default the latest of the selected node. */
   async stop(_node, id = this.running()[0].id) {
     const session = await api.stopSession(id);
     this.onSession(session);
     notice(session.state === "pending"
-      ? `Stopped “${session.name}”. It completes by itself when its last frames have come.`
+      ? `Stopped “${session.name}”. It is sealed once its last frames arrive.`
       : `Stopped “${session.name}”.`);
     this.draw();
     if (document.activeElement === document.body) byId("record").focus();
   }
 
-  async mark() {
+  async marker() {
     const pressedMs = this.state.serverNowMs();
-    const field = byId("mark-label", HTMLInputElement);
-    const label = field.value.trim() || "mark";
+    const field = byId("marker-label", HTMLInputElement);
+    const label = field.value.trim() || "marker";
     field.value = "";
-    const made = await this.marks.add(this.running(), label, pressedMs);
-    if (made.length) notice(`Marked “${label}”.`);
+    const sent = await this.markers.add(this.running(), label, pressedMs);
+    if (sent.length) notice(`Marker “${label}” set.`);
   }
 
-  undoable(id) {
+  /** Store the tare that this page may undo; null: none. */
+  setUndo(id) {
     try {
       if (id === null) sessionStorage.removeItem(UNDO_KEY);
       else sessionStorage.setItem(UNDO_KEY, id);
@@ -137,7 +140,7 @@ export class Actions {
     this.undoId = id;
   }
 
-  /** The recordings that run on the chosen node, newest first. */
+  /** Return the running recordings of the selected node, newest first. */
   running() {
     const all = [...this.state.recordings.values()].filter((session) => session.node === this.state.node?.node);
     return all.sort((a, b) => b.started_t_ns - a.started_t_ns);
@@ -146,19 +149,19 @@ export class Actions {
   draw() {
     const { node } = this.state;
     const running = this.running();
-    const why = this.state.cannotRecord;
-    byId("tare", HTMLButtonElement).disabled = byId("record", HTMLButtonElement).disabled = !node || Boolean(why);
+    const reason = this.state.cannotRecord;
+    byId("tare", HTMLButtonElement).disabled = byId("record", HTMLButtonElement).disabled = !node || Boolean(reason);
     const box = byId("cannot-record");
-    box.hidden = !why;
-    setText(box, why ? `Record and Tare wait: ${why[0].toLowerCase()}${why.slice(1)}` : "");
-    byId("stop", HTMLButtonElement).disabled = byId("mark", HTMLButtonElement).disabled = !running.length;
+    box.hidden = !reason;
+    setText(box, reason ? `Cannot record or tare: ${reason[0].toLowerCase()}${reason.slice(1)}` : "");
+    byId("stop", HTMLButtonElement).disabled = byId("marker", HTMLButtonElement).disabled = !running.length;
     setText(byId("record-text"), running.length ? "Record another" : "Record");
     if (this.undoId === undefined) {
       try { this.undoId = sessionStorage.getItem(UNDO_KEY); } catch { this.undoId = null; }
     }
     const tare = node?.tare;
-    const mine = this.undoId && tare?.id === this.undoId;
-    byId("undo").hidden = !(tare && !tare.undone && (mine || tare.source === "flight"));
+    const isOwn = this.undoId && tare?.id === this.undoId;
+    byId("undo").hidden = !(tare && !tare.undone && (isOwn || tare.source === "flight"));
     this.drawRecordings(running);
   }
 
@@ -167,14 +170,14 @@ export class Actions {
     box.hidden = !running.length;
     byId("last-session").hidden = Boolean(running.length || this.state.cannotRecord);
     setData(byId("actions"), "running", String(Boolean(running.length)));
-    // One button stands out: what comes next.
+    // Highlight the next action.
     byId("record").classList.toggle("primary", !running.length);
     byId("stop").classList.toggle("primary", Boolean(running.length));
     box.dataset.several = String(running.length > 1);
     const rows = new Map(running.map((session) => [session.id, this.rows.get(session.id) ?? this.row(session)]));
     this.rows = rows;
-    const wanted = [...rows.values()];
-    if (wanted.length !== box.children.length || wanted.some((row, i) => row !== box.children[i])) box.replaceChildren(...wanted);
+    const shown = [...rows.values()];
+    if (shown.length !== box.children.length || shown.some((row, i) => row !== box.children[i])) box.replaceChildren(...shown);
     for (const session of running) {
       const elapsedS = Math.max(0, (this.state.serverNowMs() - session.started_t_ns / 1e6) / 1000);
       const lost = Object.values(session.lost ?? {}).reduce((sum, count) => sum + count, 0);
@@ -188,7 +191,7 @@ export class Actions {
     }
   }
 
-  /** One line; each of several has its own button to stop it. */
+  /** Make the row of a recording, with its own Stop button. */
   row(session) {
     const stop = el("button", { type: "button", cls: "small", text: "Stop", "aria-label": `Stop ${session.name}` });
     stop.addEventListener("click", async () => {

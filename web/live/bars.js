@@ -1,4 +1,4 @@
-// One bar per tile, with the span of the summarised frames, so that no peak hides between messages.
+// One bar per tile, with min and max of the summarised frames, so that no peak is lost between messages.
 
 import { byId, el, number, plain, setData, setText } from "../common/text.js";
 import { Range } from "./range.js";
@@ -6,14 +6,15 @@ import { FAULT_STATES, hasFullScale, readTile, unitOf } from "./tile.js";
 import { Tracks } from "./tracks.js";
 
 const BELOW_ZERO = 0.1; // room below the zero line, as a share of full scale
-const PEAK_HOLD_MS = 1000; // a peak of one message would be gone in 33 ms
-const MOST_UPRIGHT = 16; // more tiles than this lie down in a compact grid
+const PEAK_HOLD_MS = 1000; // one message lasts 33 ms
+const UPRIGHT_MAX = 16; // more tiles: horizontal bars in a compact grid
 const UNIT_KEY = "foottile.unit";
 
 const share = (value, scale) => Math.min(0.993, Math.max(0.007, (value / scale + BELOW_ZERO) / (1 + BELOW_ZERO)));
 
+/** Bars of all tiles. */
 export class Bars {
-  /** @param {() => void} onUnit @param {Range} [range] up to which value the bars go */
+  /** @param {() => void} onUnit @param {Range} [range] full scale of the bars */
   constructor(onUnit, range = new Range()) {
     this.list = byId("bars");
     this.tracks = new Tracks();
@@ -22,9 +23,9 @@ export class Bars {
     this.key = "";
     this.tiles = null;
     this.onUnit = onUnit;
-    let kept = null;
-    try { kept = localStorage.getItem(UNIT_KEY); } catch { /* private window */ }
-    this.unit = kept === "kPa" ? "kPa" : "N";
+    let stored = null;
+    try { stored = localStorage.getItem(UNIT_KEY); } catch { /* private window */ }
+    this.unit = stored === "kPa" ? "kPa" : "N";
     this.shown = this.unit;
     byId("unit-kpa").addEventListener("click", () => this.choose("kPa"));
     byId("unit-n").addEventListener("click", () => this.choose("N"));
@@ -35,7 +36,7 @@ export class Bars {
   choose(unit) {
     this.unit = unit;
     try { localStorage.setItem(UNIT_KEY, unit); } catch { /* private window */ }
-    this.key = ""; // full scales change: build anew
+    this.key = ""; // full scales change: rebuild
     this.tiles = null;
     this.showUnit();
     this.onUnit();
@@ -46,7 +47,7 @@ export class Bars {
     byId("unit-n").setAttribute("aria-pressed", String(this.unit === "N"));
   }
 
-  /** Build the cells for the node's tiles; nothing happens while they stay the same. */
+  /** Build the cells of the node's tiles, if these have changed. */
   fit(node) {
     if (node.tiles === this.tiles && this.key.startsWith(this.shown)) return;
     this.tiles = node.tiles;
@@ -63,7 +64,7 @@ export class Bars {
     const count = this.cells.length;
     if (!count) return;
     const widthPx = this.list.clientWidth;
-    const compact = this.tracks.lying = count > MOST_UPRIGHT;
+    const compact = this.tracks.lying = count > UPRIGHT_MAX;
     let columns;
     if (compact) columns = widthPx >= 440 ? 8 : 4;
     else {
@@ -76,37 +77,37 @@ export class Bars {
     this.list.style.setProperty("--rows", String(Math.ceil(count / columns)));
   }
 
-  /** `isRead`: numbers are written, too. */
-  draw(node, frame, nowMs, isRead = true) {
+  /** Draw the bars; `writesText`: write the numbers, too. */
+  draw(node, frame, nowMs, writesText = true) {
     this.shown = hasPressuresOnly(frame) ? "kPa" : this.unit;
     this.fit(node);
-    this.range.see(node, frame, nowMs);
+    this.range.update(node, frame, nowMs);
     this.tracks.draw(this.cells.map((cell, i) => {
       setScale(cell, this.range.of(cell.tile, cell.unit), this.range.automatic);
       const reading = readTile(node, i, frame, this.shown);
       setData(cell.root, "value", plain(reading.value));
-      if (isRead) writeCell(cell, reading);
+      if (writesText) writeCell(cell, reading);
       return barOf(cell, reading, nowMs);
     }));
   }
 }
 
-/** Before the models are there no force is known: better pressures than nothing that moves. */
+/** Return true while models are compiled: pressures are there, forces are not. */
 const hasPressuresOnly = (frame) => Boolean(frame?.gauge_kpa?.some(Number.isFinite)) && !frame.force_n.some(Number.isFinite);
 
 function makeCell(tile, unitChosen) {
   const unit = unitOf(tile, unitChosen);
   const cell = {
     tile, unit, scale: null, peak: null, peakUntilMs: 0,
-    says: el("span", { cls: "says" }),
+    text: el("span", { cls: "says" }),
     value: el("span", { cls: "value", text: "–" }),
     sigma: el("span", { cls: "sigma" }),
   };
-  cell.says.append(cell.word = el("span"), cell.bound = el("span", { cls: "bound" }));
-  cell.track = el("div", { cls: "track" }, cell.says);
+  cell.text.append(cell.word = el("span"), cell.bound = el("span", { cls: "bound" }));
+  cell.track = el("div", { cls: "track" }, cell.text);
   cell.root = el("li", { cls: "tile", "data-serial": tile.serial, "data-state": "waiting", "data-value": "", "data-unit": unit },
     el("span", { cls: "serial", text: tile.serial }),
-    el("span", { cls: "scale", text: tile.reference ? "reference" : "" }),
+    el("span", { cls: "scale" }, ...(tile.reference ? [el("span", { cls: "word", text: "unloaded " }), "reference"] : [])),
     cell.track,
     el("span", { cls: "number" }, cell.value, el("span", { cls: "unit", text: ` ${unit}` })),
     cell.sigma);
@@ -115,16 +116,18 @@ function makeCell(tile, unitChosen) {
   return cell;
 }
 
-/** The value at the end of the track, which a tile of unknown range has only in an automatic range. */
+/** Write the scale of a bar; a tile of unknown range has one only in automatic range. */
 function setScale(cell, scale, automatic) {
   if (cell.scale === scale && cell.automatic === automatic) return;
   cell.scale = scale;
   cell.automatic = automatic;
   if (cell.tile.reference) return;
-  const said = automatic || hasFullScale(cell.tile, cell.unit);
-  cell.scaleText.replaceChildren(...(said ? [number(scale, scale < 100 && !automatic ? 1 : 0), el("span", { cls: "unit", text: ` ${cell.unit}` })] : []));
+  const isKnown = automatic || hasFullScale(cell.tile, cell.unit);
+  cell.scaleText.replaceChildren(...(isKnown
+    ? [el("span", { cls: "word", text: "scale " }), `0-${number(scale, scale % 1 ? 1 : 0)}`, el("span", { cls: "unit", text: ` ${cell.unit}` })] : []));
 }
 
+/** Write state, value and uncertainty of a tile. */
 function writeCell(cell, reading) {
   setData(cell.root, "state", reading.state);
   setData(cell.root, "fault", String(FAULT_STATES.has(reading.state)));
@@ -134,7 +137,7 @@ function writeCell(cell, reading) {
   setText(cell.sigma, reading.sigma === null ? "" : `± ${number(1.96 * reading.sigma)}`);
 }
 
-/** @returns {import("./tracks.js").Bar | null} */
+/** Return the bar of a reading; null: none. @returns {import("./tracks.js").Bar | null} */
 function barOf(cell, reading, nowMs) {
   const at = (value) => share(value, cell.scale);
   const zero = at(0);

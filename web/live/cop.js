@@ -1,4 +1,4 @@
-// The centre of pressure on the foot: where it is, its 95 % region, and where it was in the last seconds.
+// Centre of pressure on the foot: position, 95 % region and trail.
 
 import { ESTIMATE } from "../common/bits.js";
 import { place, svg } from "../common/svg.js";
@@ -8,50 +8,52 @@ import { whyNot } from "./grf.js";
 const Z95 = 1.96;
 const MM = 1000;
 const TRAIL_S = 2;
-const PARTS = 8; // of the trail, each paler than the one after it
-const GAP_S = 0.25; // the trail is not drawn across a longer one
-const TRAIL_EVERY_S = 0.06; // it is long, and what is new in it is next to the mark
+const PARTS = 8; // of the trail, older ones paler
+const GAP_S = 0.25; // longer gaps interrupt the trail
+const TRAIL_EVERY_S = 0.06; // costly, and its new end is next to the symbol
 
+/** COP symbol, uncertainty and trail. */
 export class Cop {
   /**
    * @param {import("../common/foot_layout.js").FootLayout} layout
-   * @param {{timeS: number, x: number | null, y: number | null}[]} past of the last seconds, oldest first: as of a picture of another size
+   * @param {{timeS: number, x: number | null, y: number | null}[]} past of the last seconds, oldest first, kept over a change of size
    */
   constructor(layout, past = []) {
     this.layout = layout;
     this.past = past;
     this.span = svg("path", { class: "cop-span" });
     this.area = svg("ellipse", { class: "cop-area" });
-    this.mark = svg("path", { class: "cop-mark" });
+    this.symbol = svg("path", { class: "cop-symbol" });
     this.halo = svg("path", { class: "cop-halo" });
     this.trail = Array.from({ length: PARTS }, (_, i) => svg("path", { class: "cop-trail", opacity: ((i + 1) / PARTS).toFixed(2) }));
     if (!layout.plan) this.trail.forEach((part) => part.classList.add("on-sole"));
-    this.parts = [...this.trail, this.halo, this.area, this.span, this.mark];
-    this.trailS = -Infinity; // of the frame that it was drawn with
+    this.parts = [...this.trail, this.halo, this.area, this.span, this.symbol];
+    this.trailS = -Infinity; // time of the trail as drawn
   }
 
-  draw(node, frame, isRead) {
+  draw(node, frame, writesText) {
     const note = byId("cop");
     const at = this.layout.copPlace(frame?.cop_x_m, frame?.cop_y_m);
     const shown = at !== null;
-    this.follow(frame, isRead);
-    for (const part of [this.mark, this.halo, this.span, this.area]) place(part, { visibility: shown ? "visible" : "hidden" });
+    this.updateTrail(frame, writesText);
+    for (const part of [this.symbol, this.halo, this.span, this.area]) place(part, { visibility: shown ? "visible" : "hidden" });
     const sigma = frame?.cop_sigma_x_m ?? null;
     setData(note, "xM", shown ? at.x.toFixed(6) : "");
     setData(note, "sigmaM", shown && sigma !== null ? sigma.toFixed(6) : "");
-    if (isRead) setText(note, shown ? this.words(frame) : `no COP: ${whyNoCop(node, frame, this.layout)}${frame?.contact === false ? this.lastInWords() : ""}`);
+    if (writesText) setText(note, shown ? this.text(frame) : `No COP: ${whyNoCop(node, frame, this.layout)}${frame?.contact === false ? this.lastText() : ""}`);
     if (!shown) return;
     if (this.layout.plan) this.drawPlan(frame, at);
     else this.drawSide(frame, at);
   }
 
-  words({ cop_x_m: x = null, cop_y_m: y = null, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null }) {
-    const across = this.layout.plan ? `, ${say("y", y, sigmaY)}` : "";
-    return `COP ${say("x", x, sigmaX)}${across} (95 %)`;
+  /** Return the position as text. */
+  text({ cop_x_m: x = null, cop_y_m: y = null, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null }) {
+    const across = this.layout.plan ? `, ${coordinateText("y", y, sigmaY)}` : "";
+    return `COP ${coordinateText("x", x, sigmaX)}${across} (95 %)`;
   }
 
-  /** In flight: where it was last. */
-  lastInWords() {
+  /** Return the last position before flight as text. */
+  lastText() {
     const last = this.past.findLast((one) => one.x !== null);
     if (!last) return "";
     const { plan, row } = this.layout;
@@ -66,10 +68,10 @@ export class Cop {
     const [across, along] = this.layout.toesUp ? [sigmaY, sigmaX] : [sigmaX, sigmaY];
     const area = { cx: at.x, cy: at.y, rx: halfPx(across), ry: halfPx(along) };
     place(this.area, area);
-    // Cross hairs outside the ellipse: a small uncertainty must stay visible too.
+    // Cross hairs outside the ellipse keep a small one visible.
     const d = hairs(at.x, at.y, area.rx, area.ry);
     place(this.halo, { d });
-    place(this.mark, { d });
+    place(this.symbol, { d });
   }
 
   drawSide(frame, { x }) {
@@ -81,16 +83,16 @@ export class Cop {
     const y = (at) => this.below(at);
     const line = layout.order.map((i) => layout.points[i].x).filter((at) => at > a && at < b).map((at) => `L${at} ${y(at) + 19}`).join("");
     place(this.span, { d: `M${a} ${y(a) + 12}V${y(a) + 26}M${a} ${y(a) + 19}${line}L${b} ${y(b) + 19}M${b} ${y(b) + 12}V${y(b) + 26}` });
-    place(this.mark, { d: `M${px} ${y(px) - 6}l8 15h-16z` });
+    place(this.symbol, { d: `M${px} ${y(px) - 6}l8 15h-16z` });
   }
 
-  /** Under the line of tiles. */
+  /** Return the height of the symbol, below the line of tiles. */
   below(xPx) {
     return this.layout.lineAt(xPx) + this.layout.radiusPx + 10;
   }
 
-  /** Where it was, oldest first, by the clock of the frames: a picture that is played back has it, too. */
-  follow(frame, isRead) {
+  /** Extend the trail, by the time stamps of the frames: replay has one, too. */
+  updateTrail(frame, writesText) {
     const { past, layout } = this;
     const nowS = timeOf(frame);
     if (nowS === null) past.length = 0;
@@ -100,7 +102,7 @@ export class Cop {
       while (past[0].timeS < nowS - TRAIL_S) past.shift();
     }
     setData(layout.plan ? this.area : this.span, "trail", String(past.length));
-    if (!isRead && nowS !== null && Math.abs(nowS - this.trailS) < TRAIL_EVERY_S) return;
+    if (!writesText && nowS !== null && Math.abs(nowS - this.trailS) < TRAIL_EVERY_S) return;
     this.trailS = nowS;
     const paths = Array.from({ length: PARTS }, () => []);
     past.forEach((one, i) => {
@@ -112,7 +114,7 @@ export class Cop {
     this.trail.forEach((part, i) => place(part, { d: paths[i].join("") }));
   }
 
-  /** From above where it was; from the side along the sole, under the tiles. */
+  /** Return a point of the trail: in plan view its position, from the side along the sole. */
   placeOf(one) {
     const at = this.layout.at(one.x, one.y);
     const y = this.layout.plan ? at.y : this.layout.lineAt(at.x) + this.layout.radiusPx;
@@ -122,19 +124,20 @@ export class Cop {
 
 const timeOf = (frame) => (!frame ? null : Number.isFinite(frame.t_ns) ? frame.t_ns / 1e9 : frame.timeS ?? null);
 
-const say = (name, value, sigma) => value === null ? `${name} not measured` : `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
+const coordinateText = (name, value, sigma) => value === null ? `${name} not measured` : `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
 
-/** A dot in the middle and four strokes around an ellipse. */
+/** Return a dot and four strokes around an ellipse. */
 const hairs = (x, y, rx, ry) => `M${x} ${y}h.1M${x - rx - 14} ${y}h10M${x + rx + 4} ${y}h10M${x} ${y - ry - 14}v10M${x} ${y + ry + 4}v10`;
 
+/** Return the reason for no COP. */
 function whyNoCop(node, frame, { row }) {
-  if (!frame) return "waiting for data";
+  if (!frame) return "no data";
   const bits = frame.estimate_status ?? 0;
   if (!node.tare || node.tare.undone) return "not tared";
   if (!node.calibration) return "no calibration";
   if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);
   if (frame.contact === false) return "no contact";
   if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
-  if (row.x !== null && row.y !== null) return "not measured by tiles at one place";
+  if (row.x !== null && row.y !== null) return "not measured: all tiles at one point";
   return "not determined";
 }

@@ -1,5 +1,5 @@
-// The foot as a picture: tiles coloured by force, from the side (a line of tiles) or from above with the
-// toes up (a heat map, if they lie on a grid), with the centre of pressure.
+// Foot: tiles coloured by force, from the side (line of tiles) or from above with toes up (heat map on a
+// grid), with the centre of pressure.
 
 import { FRAME } from "../common/bits.js";
 import { FootLayout, isGrid, isPlan } from "../common/foot_layout.js";
@@ -10,42 +10,47 @@ import { Cop } from "./cop.js";
 import { Range } from "./range.js";
 import { FAULT_STATES, readTile } from "./tile.js";
 
-const SIDE_PX = 42; // beside a foot from above: the legend to its left, where the toes are to its right
-const LOW_PX = 220; // a picture that is lower has little room under the foot
-const LIFT_PX = 12; // of the foot over the ground, in flight
-const NUMBERS_FROM_PX = 26; // of a square, for a number in it
+const SIDE_PX = 42; // left and right of a foot from above: legend, direction of the toes
+const LOW_PX = 220; // below: little room under the foot
+const LIFT_PX = 12; // over the ground in flight
+const NUMBERS_FROM_PX = 26; // width of a square that holds a number
+const KEY_PX = 18; // height of the legend of reference tiles
 
+/** SVG of the foot. */
 export class Foot {
-  /** @param {Range} [range] up to which force the colours go */
+  /** @param {Range} [range] full scale of the colours */
   constructor(range = new Range()) {
     this.root = byId("foot", SVGSVGElement);
     this.range = range;
     this.key = "";
     this.resized = () => {};
-    new ResizeObserver(() => this.anew()).observe(this.root);
+    new ResizeObserver(() => this.rebuild()).observe(this.root);
     for (const what of ["(prefers-color-scheme: dark)", "(prefers-contrast: more)"]) {
-      matchMedia(what).addEventListener("change", () => this.anew());
+      matchMedia(what).addEventListener("change", () => this.rebuild());
     }
-    document.addEventListener("foottile-colours", () => this.anew());
+    document.addEventListener("foottile-colours", () => this.rebuild());
   }
 
-  anew() {
+  /** Build again at the next drawing: size or colours have changed. */
+  rebuild() {
     this.key = "";
     this.resized();
   }
 
+  /** Build the picture, if the tiles have changed. */
   fit(node) {
     if (this.key && node.tiles === this.tiles) return;
     const key = JSON.stringify([node?.node, node?.tiles, Boolean(node?.servo)]);
     this.tiles = node?.tiles ?? [];
     if (key === this.key) return;
     this.key = key;
-    if (node?.node !== this.shown) this.cop = null; // its trail is of another foot
+    if (node?.node !== this.shown) this.cop = null; // the trail is of another foot
     this.shown = node?.node;
     this.plan = isPlan(this.tiles);
     this.grid = isGrid(this.tiles);
+    this.hasReference = this.tiles.some((tile) => tile.reference);
     setData(this.root, "grid", String(this.grid));
-    setText(byId("foot-title"), this.plan ? "Foot from above" : "Foot from the side");
+    setText(byId("foot-title"), this.plan ? "Top view" : "Side view");
     this.build(Boolean(node?.servo));
   }
 
@@ -55,21 +60,21 @@ export class Foot {
     this.root.setAttribute("viewBox", `0 0 ${widthPx} ${heightPx}`);
     this.shades = shadesOf(this.root);
     this.layout = new FootLayout(this.tiles, this.plan
-      ? { widthPx: widthPx - 2 * SIDE_PX, heightPx, roomPx: 6, toesUp: true, margin: this.grid ? 0.56 : 0.75 }
+      ? { widthPx: widthPx - 2 * SIDE_PX, heightPx, roomPx: this.hasReference ? 2 * KEY_PX : 6, toesUp: true, margin: this.grid ? 0.56 : 0.75 }
       : { widthPx, heightPx, turns, ...(heightPx < LOW_PX ? { roomPx: 76, basePx: 58 } : { roomPx: 108, basePx: 76 }) });
     this.turning = svg("g", this.plan ? { transform: `translate(${SIDE_PX} 0)` } : {});
     this.turning.append(this.plan ? this.outline() : svg("path", { class: "sole", d: this.layout.sole() }));
-    this.marks = this.tiles.map((tile, i) => this.mark(tile, i));
+    this.symbols = this.tiles.map((tile, i) => this.addSymbol(tile, i));
     this.cop = new Cop(this.layout, this.cop?.past);
     this.turning.append(...this.cop.parts);
     this.ground = svg("line", { class: "ground", x1: 0, x2: widthPx });
     const hint = this.plan
       ? [svg("text", { class: "hint", x: widthPx - 4, y: 18, "text-anchor": "end" }, "↑"), svg("text", { class: "hint", x: widthPx - 4, y: 34, "text-anchor": "end" }, "toes")]
       : [svg("text", { class: "hint", x: widthPx - 8, y: heightPx - 6, "text-anchor": "end" }, "forward →"), this.ground];
-    this.root.replaceChildren(...hint, this.legend(heightPx), this.turning);
+    this.root.replaceChildren(...hint, this.legend(heightPx), ...(this.hasReference ? [referenceKey(heightPx, this.grid)] : []), this.turning);
   }
 
-  /** Around the tiles from above. */
+  /** Return the outline around the tiles from above. */
   outline() {
     const { points, pitch, scale } = this.layout;
     const around = 0.54 * pitch * scale;
@@ -78,7 +83,7 @@ export class Foot {
     return svg("rect", { class: "sole", x: left, y: top, width: right - left, height: bottom - top, rx: 8 });
   }
 
-  /** Which colour is which force. */
+  /** Return the colour scale. */
   legend(heightPx) {
     const group = svg("g", { class: "heat-legend" });
     const [x, top, long] = [4, 24, Math.max(40, Math.min(120, heightPx / 3))];
@@ -91,45 +96,46 @@ export class Foot {
     return group;
   }
 
-  mark(tile, i) {
+  /** Add the symbol of a tile: dome, force arrow, fault cross, name. */
+  addSymbol(tile, i) {
     const { x, y } = this.layout.points[i];
     const cell = this.layout.pitch * this.layout.scale;
     const r = this.grid ? 0.46 * cell : this.layout.radiusPx;
-    const group = svg("g", { class: "mark" });
+    const group = svg("g", { class: "tile-symbol" });
     const dome = this.grid
       ? svg("rect", { class: "dome", x: x - r, y: y - r, width: 2 * r, height: 2 * r, rx: 0.12 * cell })
       : svg("circle", { class: "dome", cx: x, cy: y, r });
     const cross = svg("path", { class: "cross", d: `M${x - r} ${y - r}L${x + r} ${y + r}M${x - r} ${y + r}L${x + r} ${y - r}` });
     const arrow = svg("path", { class: "arrow" });
-    const says = svg("text", { class: "name", x, y: y + 4, "text-anchor": "middle" }, this.grid ? "" : tile.serial);
+    const label = svg("text", { class: "name", x, y: y + 4, "text-anchor": "middle" }, this.grid ? "" : tile.serial);
     group.append(dome, arrow, cross, svg("title", {}, tile.serial));
-    if (r >= 13) group.append(says);
+    if (r >= 13) group.append(label);
     this.turning.append(group);
     setData(group, "reference", String(Boolean(tile.reference)));
-    return { group, dome, arrow, says: this.grid && cell >= NUMBERS_FROM_PX ? says : null, name: says };
+    return { group, dome, arrow, number: this.grid && cell >= NUMBERS_FROM_PX ? label : null, name: label };
   }
 
-  /** `isRead`: numbers are written, too. */
-  draw(node, frame, isRead = true) {
+  /** Draw a frame; `writesText`: write the numbers, too. */
+  draw(node, frame, writesText = true) {
     this.fit(node);
-    this.range.see(node, frame, performance.now());
-    const most = this.range.ofAll;
-    setText(this.top, `${number(most, most < 10 && most % 1 ? 1 : 0)} N`);
+    this.range.update(node, frame, performance.now());
+    const fullScale = this.range.foot;
+    setText(this.top, `${number(fullScale, fullScale < 10 && fullScale % 1 ? 1 : 0)} N`);
     this.turn(node, frame);
-    if (isRead) this.writeAngle(node, frame);
-    this.marks.forEach((mark, i) => this.drawTile(mark, i, readTile(node, i, frame, "N"), most, isRead));
-    this.cop.draw(node, frame, isRead);
+    if (writesText) this.writeAngle(node, frame);
+    this.symbols.forEach((symbol, i) => this.drawTile(symbol, i, readTile(node, i, frame, "N"), fullScale, writesText));
+    this.cop.draw(node, frame, writesText);
   }
 
-  drawTile({ group, dome, arrow, says, name }, i, reading, most, isRead) {
+  drawTile({ group, dome, arrow, number: label, name }, i, reading, fullScale, writesText) {
     const fault = FAULT_STATES.has(reading.state);
     setData(group, "state", fault ? "fault" : reading.state);
     const known = reading.value !== null && !this.tiles[i].reference;
-    const share = reading.state === "saturated" ? 1 : known ? Math.max(0, reading.value / most) : 0;
+    const share = reading.state === "saturated" ? 1 : known ? Math.max(0, reading.value / fullScale) : 0;
     const { fill, ink } = known ? shadeOf(this.shades, share) : { fill: "none", ink: "" };
     place(dome, { fill });
     place(name, { fill: known ? ink : "currentColor" });
-    if (says && isRead) setText(says, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
+    if (label && writesText) setText(label, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
     if (!this.plan) this.drawArrow(arrow, i, Math.min(1, share));
   }
 
@@ -153,17 +159,18 @@ export class Foot {
     label.hidden = !node.servo;
     const angle = frame?.angle_rad ?? null;
     const stale = Boolean((frame?.frame_status ?? 0) & FRAME.SERVO_STALE);
-    const degrees = angle === null ? "no angle" : `${angle > 0 ? "+" : ""}${number((angle * 180) / Math.PI)}°`;
+    const degrees = angle === null ? "unknown" : `${angle > 0 ? "+" : ""}${number((angle * 180) / Math.PI)}°`;
     const turnless = Boolean((frame?.frame_status ?? 0) & FRAME.SERVO_TURN_UNKNOWN);
-    setText(label, stale ? `${degrees} servo stale` : turnless ? `${degrees} servo turn unknown` : degrees);
+    setText(label, `Foot angle ${degrees}${stale ? ", servo stale" : turnless ? ", servo turn unknown" : ""}`);
     setData(label, "stale", String(stale));
     setData(label, "known", String(angle !== null));
   }
 
+  /** Rotate the foot to the servo's angle and put the ground below it. */
   turn(node, frame) {
     if (this.plan) return;
     const angle = frame?.angle_rad ?? null;
-    // Clockwise on the screen: the tiles in front come down, so contact moves forward.
+    // Clockwise on the screen: the front comes down, so contact moves forward.
     const turn = node.servo && angle !== null ? angle : 0;
     const { layout } = this;
     const { x: cx, y: cy } = layout.at(0, 0); // the ankle
@@ -172,4 +179,13 @@ export class Foot {
     const y = lowest + layout.radiusPx + (frame?.contact === false ? LIFT_PX : 0);
     place(this.ground, { y1: y, y2: y });
   }
+}
+
+/** Return the legend of reference tiles: their dashed symbol and its meaning. */
+function referenceKey(heightPx, isGrid) {
+  const y = heightPx - 6;
+  const symbol = isGrid ? svg("rect", { x: 5, y: y - 10, width: 11, height: 11, rx: 1 }) : svg("circle", { cx: 10.5, cy: y - 4.5, r: 5.5 });
+  const group = svg("g", { class: "reference-key" });
+  group.append(symbol, svg("text", { class: "hint", x: 22, y }, "unloaded reference"));
+  return group;
 }

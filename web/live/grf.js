@@ -1,11 +1,12 @@
-// The ground reaction force as one big number with its uncertainty, or what it is at least.
+// Ground reaction force with its uncertainty, or its lower bound.
 
 import { ESTIMATE } from "../common/bits.js";
 import { byId, number, plain, setData, setText } from "../common/text.js";
 
+/** Show the GRF of a frame. */
 export function drawGrf(node, frame) {
   const value = Number.isFinite(frame?.grf_n) ? frame.grf_n : null;
-  // A foot does not pull: a bound below zero is one of zero.
+  // A foot does not pull: the bound is never below zero.
   const atLeast = value === null && Number.isFinite(frame?.grf_at_least_n) ? Math.max(0, Math.floor(frame.grf_at_least_n * 10) / 10) : null;
   const bits = frame?.estimate_status ?? 0;
   const assumed = node.calibration?.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE;
@@ -19,29 +20,30 @@ export function drawGrf(node, frame) {
   drawContact(byId("contact"), frame);
 }
 
-/** Contact, flight or neither, in words and by the style of `.contact`. */
+/** Show contact, flight or unknown, as text and by the style of `.contact`. */
 export function drawContact(element, frame) {
   const contact = frame?.contact ?? null;
   setData(element, "contact", contact === null ? "" : String(contact));
   setText(element, contact === null ? "contact unknown" : contact ? "contact" : "flight");
 }
 
+/** Return the reason for no GRF. */
 export function whyNot(node, frame) {
-  if (!frame) return "waiting";
+  if (!frame) return "no data";
   if (!node.tare || node.tare.undone) return "not tared";
   if (!node.calibration) return "no calibration";
   const bearing = node.tiles.map((tile, i) => ({ tile, i })).filter(({ tile }) => !tile.reference);
   const missing = bearing.filter(({ i }) => !Number.isFinite(frame.force_n?.[i]));
+  if (missing.length === bearing.length && bearing.some(({ i }) => Number.isFinite(frame.gauge_kpa?.[i]))) return "no estimate";
   const saturated = bearing.filter(({ i }) => frame.saturated?.[i]);
-  const said = [named(missing, bearing, "missing"), named(saturated, bearing, "beyond its range", "beyond their range")].filter(Boolean);
-  return said.length ? said.join(", ") : "no value";
+  const reasons = [tilesText(missing, bearing, "missing"), tilesText(saturated, bearing, "saturated")].filter(Boolean);
+  return reasons.length ? reasons.join(", ") : "no value";
 }
 
-/** "T03 missing"; of many only how many. */
-function named(which, bearing, what, whatOfMany = what) {
+/** Return "T03 missing", or "4 tiles missing" for three and more. */
+function tilesText(which, bearing, what) {
   if (!which.length) return "";
-  const says = which.length === 1 ? what : whatOfMany;
-  if (which.length === bearing.length) return `all tiles ${says}`;
+  if (which.length === bearing.length) return `all tiles ${what}`;
   const names = which.length < 3 ? which.map(({ tile }) => tile.serial).join(", ") : `${which.length} tiles`;
-  return `${names} ${says}`;
+  return `${names} ${what}`;
 }

@@ -1,37 +1,38 @@
-// What the server remembers of the time before, asked for when the trace could begin with it.
+// History: the seconds before the first live message, from the server.
 //
-// It is asked for up to the first number of a live message that has just come, so that both join by
-// number; of a node that is away, up to its end.
+// It ends before the first frame number of the latest live message, so that both join by number; for
+// an offline node it ends with the stream.
 
 import * as api from "../common/api.js";
 
+/** Requests history when the trace has a hole. */
 export class History {
-  /** `present()` is the stream that is shown now, by its boot_id. */
-  constructor(points, present) {
+  /** `currentStream()` returns the boot_id of the stream on display. */
+  constructor(points, currentStream) {
     this.points = points;
-    this.present = present;
-    this.wanted = true;
-    this.tiles = null; // what of each tile was asked for last
+    this.currentStream = currentStream;
+    this.isRequested = true;
+    this.tiles = null; // tile column of the last request
   }
 
-  /** The picture has a hole: it was just opened, the link was down, or more time is to be seen. */
-  want() {
-    this.wanted = true;
+  /** Request history with the next message: page opened, link restored, or longer window. */
+  request() {
+    this.isRequested = true;
   }
 
-  /** Called with each message, and without one while there is none; `tiles`: what is drawn of each, or null. */
-  async see(node, frame, seconds, nowMs, tiles) {
-    if (tiles && tiles !== this.tiles) this.wanted = true;
-    if (!this.wanted || (node.connected && !frame)) return;
-    this.wanted = false;
+  /** Load history if requested; runs with each message, or without one while there is none. `tiles`: column per tile, or null. */
+  async update(node, frame, seconds, nowMs, tiles) {
+    if (tiles && tiles !== this.tiles) this.isRequested = true;
+    if (!this.isRequested || (node.connected && !frame)) return;
+    this.isRequested = false;
     this.tiles = tiles;
     try {
       const recent = await api.recent(node.node, seconds, frame?.seq_first, tiles);
-      if (recent.boot_id !== this.present()) return;
-      this.points.precede(recent, frame?.seq_first, nowMs);
-      if (recent.tiles) this.points.precedeTiles(recent.tiles, tiles, frame?.seq_first);
+      if (recent.boot_id !== this.currentStream()) return;
+      this.points.addHistory(recent, frame?.seq_first, nowMs);
+      if (recent.tiles) this.points.addTileHistory(recent.tiles, tiles, frame?.seq_first);
     } catch (error) {
-      if (!(error instanceof api.Refusal)) throw error; // without it the trace begins empty
+      if (!(error instanceof api.Refusal)) throw error; // the trace starts empty
     }
   }
 }

@@ -1,10 +1,11 @@
-// The newest session of the chosen node while none is recorded: a link to it, and its state.
+// Latest session of the selected node: link and state, while none is recorded.
 
 import * as api from "../common/api.js";
 import { unlessRefused } from "../common/request.js";
 import { byId, duration, el } from "../common/text.js";
-import { plainState } from "../sessions/state.js";
+import { stateText } from "../sessions/state.js";
 
+/** Line about the latest session. */
 export class LastSession {
   constructor() {
     this.box = byId("last-session");
@@ -13,27 +14,27 @@ export class LastSession {
   }
 
   clear() {
-    /** @type {Map<string, Session | null>} by node; null: it has none, or the answer is on its way */
+    /** @type {Map<string, Session | null>} by node; null: none, or requested */
     this.newest = new Map();
   }
 
-  /** @param {Session} session */
-  take(session) {
-    const known = this.newest.get(session.node);
-    if (known && known.id !== session.id && known.started_t_ns > session.started_t_ns) return;
-    if (known?.id === session.id && known.state === "sealed" && session.state !== "sealed") return; // an answer that the link has overtaken
+  /** Store a session if it is the latest of its node. @param {Session} session */
+  update(session) {
+    const stored = this.newest.get(session.node);
+    if (stored && stored.id !== session.id && stored.started_t_ns > session.started_t_ns) return;
+    if (stored?.id === session.id && stored.state === "sealed" && session.state !== "sealed") return; // outdated response
     this.newest.set(session.node, session);
   }
 
-  /** A session was deleted: its node is asked for again. @param {string} id */
+  /** Remove a deleted session; its node is requested again. @param {string} id */
   drop(id) {
     for (const [node, session] of this.newest) if (session?.id === id) this.newest.delete(node);
   }
 
   async load(node) {
     this.newest.set(node, null);
-    const answer = await unlessRefused(api.listSessions({ limit: 1, node })); // the page shows that the server is away
-    answer?.items.forEach((session) => this.take(session));
+    const answer = await unlessRefused(api.listSessions({ limit: 1, node })); // the page shows that the server is down
+    answer?.items.forEach((session) => this.update(session));
   }
 
   draw(node) {
@@ -44,7 +45,7 @@ export class LastSession {
     this.key = key;
     this.box.replaceChildren("Not recording", ...(session ? [
       ". Last: ", el("a", { href: `/sessions/${encodeURIComponent(session.id)}`, text: session.name || session.id }),
-      ` ${duration(session.duration_s)}, ${plainState(session)[0]}`,
+      ` ${duration(session.duration_s)}, ${stateText(session)[0]}`,
     ] : []));
   }
 }

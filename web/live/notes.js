@@ -1,79 +1,84 @@
-// Plain notes about what to trust. They change seldom: an estimate's flag is held so it can be read.
+// Warnings about the values on display. A flag is held for some seconds, so that it can be read.
 
 import { ESTIMATE, FRAME, TILE } from "../common/bits.js";
-import { lossesInWords } from "../common/losses.js";
+import { lossTexts } from "../common/losses.js";
 import { byId, el, localTime, number, roughly, setData, setText } from "../common/text.js";
-import { helpOf, whyOf } from "./why.js";
+import { helpOf, keyOf, whyOf } from "./why.js";
 
 const HOLD_MS = 3000;
-const FIRST_MS = 3000; // what is said so soon after the page was opened may be older
+const FIRST_MS = 3000; // a warning this soon after opening may be older
 
-// A chip throws an outlier now and then, which is no suction: this flag has to stay for a while.
-const BELOW_RANGE = "Below the calibrated range: suction, or an old tare.";
+/** @typedef {{key: string, id: string, text: string}} Note `key`: reason and help; `id`: same note, other text */
+
+// A chip has an outlier now and then: this flag counts only if it stays.
+const BELOW_RANGE = "Below the calibrated range: suction or an old tare.";
 const SETTLE_MESSAGES = 15;
-/** @type {[bit: number, text: string][]} */
+/** @type {[bit: number, key: string, text: string][]} */
 const FROM_ESTIMATE = [
-  [ESTIMATE.TILE_MISSING, "Tile missing: of the force only a lower bound is known, and no COP."],
-  [ESTIMATE.STUCK, "A tile repeats one reading: its force is not known. Unplug it and plug it in again."],
-  [ESTIMATE.CLIPPED, "A tile reads no further than some pressure within its range: force is at least this."],
-  [ESTIMATE.BASELINE_LOST, "A tile reads too little without a load, or has warmed or cooled: force is less certain. Lift the foot, press Tare; if it comes back, the dome may leak."],
-  [ESTIMATE.AFTER_SATURATION, "After a load that was not seen, force is less certain for a while."],
-  [ESTIMATE.OVER_RATED, "Above the 115 kPa the chip is rated for, yet calibrated."],
+  [ESTIMATE.TILE_MISSING, "tile_missing", "Tile missing: force is a lower bound, no COP."],
+  [ESTIMATE.STUCK, "stuck", "A tile repeats one reading: its force is unknown. Unplug and replug it."],
+  [ESTIMATE.BASELINE_LOST, "baseline_lost", "Zero of a tile has dropped: force is less certain. Lift the foot, press Tare; if it recurs, the dome may leak."],
+  [ESTIMATE.AFTER_SATURATION, "after_saturation", "Force is less certain after saturation."],
+  [ESTIMATE.OVER_RATED, "over_rated", "Above the rated 115 kPa, within the calibration."],
 ];
-/** @type {[bit: number, text: string][]} */
+/** @type {[bit: number, key: string, text: string][]} */
 const FROM_FRAME = [
-  [FRAME.BUS_FAULT, "Bus fault: the node cannot read all tiles. Check its cable and supply."],
-  [FRAME.OVERRUN, "The node is late: some frames are not sampled."],
+  [FRAME.BUS_FAULT, "bus_fault", "Bus fault: the node cannot read all tiles. Check cable and supply."],
+  [FRAME.OVERRUN, "overrun", "The node is late: some frames are not sampled."],
 ];
 
-/** Texts of what is doubtful about a node and its frames, held long enough to be read. */
+/** Current warnings of a node and its frames, each held long enough to be read. */
 export class Warnings {
   constructor() {
-    this.seenMs = new Map(); // text of a flag -> when it was last set
-    this.belowShare = 0; // of the last half second's messages
+    /** @type {Map<string, Note & {seenMs: number}>} by id */
+    this.flagged = new Map();
+    this.belowShare = 0; // of the messages of the last half second
   }
 
   clear() {
     this.belowShare = 0;
-    this.seenMs.clear();
+    this.flagged.clear();
   }
 
-  /** Called per message, so that a flag between two drawings counts. */
-  see(node, frame, nowMs) {
-    const mark = (text) => this.seenMs.set(text, nowMs);
+  /** Collect the flags of a message, also of those between two drawings. */
+  addFrame(node, frame, nowMs) {
+    const flag = (key, text, id = key) => this.flagged.set(id, { key, id, text, seenMs: nowMs });
     const below = frame.estimate_status & ESTIMATE.EXTRAPOLATED ? 1 : 0;
     this.belowShare += (below - this.belowShare) / SETTLE_MESSAGES;
-    if (this.belowShare > 0.5) mark(BELOW_RANGE);
-    for (const [bit, text] of FROM_ESTIMATE) if (frame.estimate_status & bit) mark(text);
-    for (const [bit, text] of FROM_FRAME) if (frame.frame_status & bit) mark(text);
+    if (this.belowShare > 0.5) flag("below_range", BELOW_RANGE);
+    for (const [bit, key, text] of FROM_ESTIMATE) if (frame.estimate_status & bit) flag(key, text);
+    for (const [bit, key, text] of FROM_FRAME) if (frame.frame_status & bit) flag(key, text);
     node.tiles.forEach((tile, i) => {
-      if (frame.status?.[i] & TILE.OVER_RANGE && !frame.saturated?.[i]) mark(`${tile.serial} is out of the chip's range of 50 to 115 kPa.`);
+      const isOverRange = frame.status?.[i] & TILE.OVER_RANGE;
+      if (isOverRange && !frame.saturated?.[i]) flag("over_range", `${tile.serial} is outside the chip's range of 50 to 115 kPa.`, `over_range ${tile.serial}`);
+      if (frame.estimate_status & ESTIMATE.CLIPPED && frame.saturated?.[i] && !isOverRange) flag("clipped", clippedText(tile, frame.gauge_kpa?.[i]), `clipped ${tile.serial}`);
     });
   }
 
-  /** Those that stand now. @returns {string[]} */
+  /** Return the current warnings. @returns {Note[]} */
   list(node, frame, nowMs, serverNowMs) {
-    const texts = standing(node, frame, serverNowMs);
-    for (const [text, seenMs] of this.seenMs) {
-      if (nowMs - seenMs > HOLD_MS) this.seenMs.delete(text);
-      else texts.push(text);
+    const notes = nodeWarnings(node, frame, serverNowMs);
+    for (const [id, note] of this.flagged) {
+      if (nowMs - note.seenMs > HOLD_MS) this.flagged.delete(id);
+      else notes.push(note);
     }
-    return texts;
+    return notes;
   }
 }
 
+/** List of warnings on the live page, and the line of facts. */
 export class Notes {
   constructor() {
     this.list = byId("notes");
     this.warnings = new Warnings();
-    this.items = new Map(); // of what is said -> its element
+    this.items = new Map(); // id of a note -> element
     this.more = byId("notes-more");
-    this.unfolded = false;
+    this.isExpanded = false;
     this.more.addEventListener("click", () => {
-      this.unfolded = !this.unfolded;
+      this.isExpanded = !this.isExpanded;
       this.fold();
     });
-    this.beganMs = performance.now(); // what is there at first may have been there before
+    this.beganMs = performance.now(); // first warnings may be older
   }
 
   clear() {
@@ -82,93 +87,98 @@ export class Notes {
     this.beganMs = performance.now();
   }
 
-  see(node, frame, nowMs) {
-    this.warnings.see(node, frame, nowMs);
+  addFrame(node, frame, nowMs) {
+    this.warnings.addFrame(node, frame, nowMs);
   }
 
-  /** `problems`: what the server found damaged; said without a node, too. */
+  /** Draw warnings and facts. `problems`: damaged files on the server, shown without a node, too. */
   draw(node, frame, nowMs, serverNowMs, problems = []) {
     const notes = [
       ...(node ? this.warnings.list(node, frame, nowMs, serverNowMs) : []),
-      ...problems.map((problem) => sentence(`damaged on the server: ${problem}`)),
+      ...problems.map((problem) => makeNote("damaged", sentence(`damaged on the server: ${problem}`), `damaged ${problem}`)),
     ];
     const items = new Map();
-    for (const text of notes) {
-      const same = items.has(kindOf(text)) ? text : kindOf(text);
-      const one = this.items.get(same) ?? item(text, nowMs - this.beganMs < FIRST_MS);
-      setText(one.querySelector(".note-text"), text);
-      items.set(same, one);
+    for (const note of notes) {
+      const element = this.items.get(note.id) ?? makeItem(note, nowMs - this.beganMs < FIRST_MS);
+      setText(element.querySelector(".note-text"), note.text);
+      items.set(note.id, element);
     }
     this.items = items;
-    const wanted = [...items.values()];
-    // What stands stays: it may be open, or have the focus.
-    for (const old of [...this.list.children]) if (!wanted.includes(old)) old.remove();
-    wanted.forEach((one, i) => { if (this.list.children[i] !== one) this.list.insertBefore(one, this.list.children[i] ?? null); });
+    const shown = [...items.values()];
+    // Keep elements: one may be open, or have the focus.
+    for (const old of [...this.list.children]) if (!shown.includes(old)) old.remove();
+    shown.forEach((one, i) => { if (this.list.children[i] !== one) this.list.insertBefore(one, this.list.children[i] ?? null); });
     this.fold();
     setText(byId("facts"), node ? facts(node, frame, serverNowMs) : "");
   }
 
-  /** The first in one line, and a count of the others: what is measured stays where it is. */
+  /** Show the first warning in one line and the number of others, so that the cards below do not move. */
   fold() {
     const more = this.items.size - 1;
-    if (more < 1) this.unfolded = false;
-    setData(this.list, "folded", String(!this.unfolded));
+    if (more < 1) this.isExpanded = false;
+    setData(this.list, "folded", String(!this.isExpanded));
     this.more.hidden = more < 1;
-    this.more.setAttribute("aria-expanded", String(this.unfolded));
-    setText(this.more, this.unfolded ? "Only the first" : `${more} more`);
+    this.more.setAttribute("aria-expanded", String(this.isExpanded));
+    setText(this.more, this.isExpanded ? "Show less" : `${more} more`);
   }
 }
 
-/** What counts up is still the same note. */
-const kindOf = (text) => (/^(Lost|Tare) /.test(text) ? text.replace(/\d[\d,.]*/g, "#") : text);
+/** @param {string} key @param {string} text @param {string} [id] @returns {Note} */
+const makeNote = (key, text, id = key) => ({ key, id, text });
 
-/** A note with the time since when it stands; opened, it is shown in full, with two sentences on why. */
-function item(text, mayBeOlder) {
+/** Make the element of a note: text and start time; opened, reason and remedy. */
+function makeItem({ key, text }, mayBeOlder) {
   const clock = localTime(new Date()).slice(11);
-  const since = el("time", { text: mayBeOlder ? ` since ${clock} or before` : ` since ${clock}` });
-  const why = whyOf(text);
-  const says = el("span", { cls: "note-text", text });
-  const help = helpOf(text);
-  const link = help ? el("a", { href: help, target: "_blank", text: "What to do" }) : "";
-  const [ask, answer] = why ? [[el("span", { cls: "ask", text: "why?" })], [el("p", {}, `${why} `, link)]] : [[], []];
-  return el("li", {}, el("details", {}, el("summary", {}, says, since, " ", ...ask), ...answer));
+  const since = el("time", { text: mayBeOlder ? ` since ${clock} or earlier` : ` since ${clock}` });
+  const why = whyOf(key);
+  const label = el("span", { cls: "note-text", text });
+  const help = helpOf(key);
+  const link = help ? el("a", { href: help, target: "_blank", text: "Troubleshooting" }) : "";
+  const [ask, answer] = why ? [[el("span", { cls: "ask", text: "Why?" })], [el("p", {}, `${why} `, link)]] : [[], []];
+  return el("li", {}, el("details", {}, el("summary", {}, label, since, " ", ...ask), ...answer));
 }
 
-function standing(node, frame, serverNowMs) {
+/** Return warnings from the node's description and the frame's lasting flags. @returns {Note[]} */
+function nodeWarnings(node, frame, serverNowMs) {
   const notes = [];
+  const add = (key, text, id = key) => notes.push(makeNote(key, text, id));
   const bits = frame?.estimate_status ?? 0;
   const tare = node.tare && !node.tare.undone ? node.tare : null;
-  if (!node.calibration) notes.push(said("No calibration", node.calibration_problem || "pressures only, no newtons."));
+  if (!node.calibration) add("no_calibration", withReason("No calibration", node.calibration_problem || "pressures only."));
   else if (node.calibration.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE) {
-    notes.push("Scale assumed, not measured: newtons are not to be trusted.");
+    add("scale_assumed", "Scale assumed: newtons are approximate.");
   }
-  if (bits & ESTIMATE.TARE_LOST) notes.push("Tare lost: no force is known.");
-  if (!tare) notes.push(said("Not tared", node.tare_problem || "lift the foot off the ground and press Tare."));
+  if (bits & ESTIMATE.TARE_LOST) add("tare", "Tare lost: forces unknown.", "tare_lost");
+  if (!tare) add("tare", withReason("Not tared", node.tare_problem || "lift the foot and press Tare."));
   else {
-    if (node.tare_problem) notes.push(`Tare: ${node.tare_problem}.`);
-    // In the server's words; the flag alone says as much while a node's description is on its way.
+    if (node.tare_problem) add("tare_doubt", `Tare: ${node.tare_problem}.`, "tare_problem");
+    // The flag alone while the node's description is not there yet.
     const doubts = node.tare_warnings ?? [];
-    for (const doubt of doubts) notes.push(`Tare in doubt: ${doubt}.`);
-    if (!doubts.length && bits & ESTIMATE.TARE_OLD) notes.push(`Tare in doubt (${tareAge(tare, serverNowMs)} old): lift the foot, press Tare.`);
+    doubts.forEach((doubt, i) => add("tare_doubt", `Tare in doubt: ${doubt}.`, `tare_doubt ${i}`));
+    if (!doubts.length && bits & ESTIMATE.TARE_OLD) add("tare_doubt", `Tare in doubt (${tareAge(tare, serverNowMs)} old): lift the foot, press Tare.`);
   }
-  for (const trouble of node.troubles ?? []) notes.push(sentence(trouble));
-  for (const loss of lossesInWords(node.lost)) notes.push(`Lost ${loss}.`);
-  if (node.storage_problem) notes.push(`Nothing is being kept by the server: ${node.storage_problem}`);
-  // An emulated node runs on this machine, and its date is nobody's concern.
-  if (node.clock_set === false && !node.emulated) notes.push("Clock of the node not set: dates may be wrong.");
+  for (const warning of node.troubles ?? []) add(keyOf(warning), sentence(warning), warning);
+  for (const [reason, text] of lossTexts(node.lost)) add("lost", `Lost ${text}.`, `lost ${reason}`);
+  if (node.storage_problem) add("storage", `The server cannot record: ${node.storage_problem}`);
+  // An emulated node has the clock of this machine.
+  if (node.clock_set === false && !node.emulated) add("clock", "The node's clock is not set: dates may be wrong.");
   return notes;
 }
 
-/** The reason, without saying twice what it begins with. */
-const said = (what, why) => (why.toLowerCase().startsWith(what.toLowerCase()) ? why[0].toUpperCase() + why.slice(1) : `${what}: ${why}`);
+/** Return "What: reason", without repeating what the reason starts with. */
+const withReason = (what, why) => (why.toLowerCase().startsWith(what.toLowerCase()) ? why[0].toUpperCase() + why.slice(1) : `${what}: ${why}`);
 
 const sentence = (text) => `${text[0]?.toUpperCase() ?? ""}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
+/** Return the text of a clipped tile. @param {Tile} tile @param {number | null | undefined} gaugeKpa */
+const clippedText = ({ serial }, gaugeKpa) => `${serial} stops rising ${Number.isFinite(gaugeKpa) ? `above ${number(gaugeKpa, 0)} kPa` : "below its range"}: force is a lower bound.`;
+
 const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);
 
-const SOURCES = { lead: "at the start", unloaded: "by hand", recognised: "recognised in flight", flight: "by itself in flight" };
-const FOLLOWS = { paused: "no automatic tare, one was undone: press Tare to allow it again", off: "automatic tare off" };
+const SOURCES = { unloaded: "manual", recognised: "recognised in flight", flight: "automatic in flight" };
+const FOLLOWS = { paused: "automatic tare paused after an undo: press Tare to resume it", off: "automatic tare off" };
 
+/** Return the line of facts about tare, calibration and clock. */
 function facts(node, frame, serverNowMs) {
   const tare = node.tare && !node.tare.undone ? node.tare : null;
   const parts = [];
@@ -176,8 +186,8 @@ function facts(node, frame, serverNowMs) {
   const perHour = node.drift?.grf_n_per_hour;
   if (Number.isFinite(perHour) && Math.abs(perHour) >= 0.1) parts.push(`zero drifts ${number(perHour)} N/h`);
   if (FOLLOWS[node.auto_tare]) parts.push(FOLLOWS[node.auto_tare]);
-  if (node.calibration) parts.push(`calibration “${node.calibration.name}”${node.calibration.absolute_scale === "measured" ? ", in newtons" : ", scale assumed"}`);
-  if (!node.clock) parts.push("clock offset not measured yet");
-  if (frame && frame.frame_status & FRAME.LEAD) parts.push("unloaded lead-in of the scene");
+  if (node.calibration) parts.push(node.calibration.absolute_scale === "measured" ? "calibrated in newtons" : "scale assumed");
+  if (!node.clock) parts.push("clock offset unknown");
+  if (frame && frame.frame_status & FRAME.LEAD) parts.push("unloaded lead-in");
   return parts.join(" · ");
 }

@@ -1,58 +1,58 @@
-// When the page draws: a message is one picture, and what can only be read is written less often.
+// Drawing pace: one drawing per message, text less often.
 //
-// A picture costs the same whether it shows something new or not, so no display frame is asked for
-// in between. Numbers that change thirty times a second cannot be read, and to lay out their text
-// costs more than all that is drawn.
+// A drawing costs the same with and without news, so none is requested in between. Nobody reads
+// numbers that change thirty times a second, and their layout costs more than all drawing.
 
-const ANYWAY_MS = 50; // without messages time goes on, too: the trace moves, and is late in grey
-const READ_MS = 200; // five times a second
+const IDLE_MS = 50; // without messages the trace still moves
+const TEXT_MS = 200;
 
+/** Requests at most one drawing per display frame. */
 export class Pace {
   /** @param {() => void} draw */
   constructor(draw) {
     this.draw = draw;
-    this.asked = false;
+    this.requested = false;
     this.timer = 0;
   }
 
-  /** There is something to draw in the next display frame; a hidden page has none. */
-  ask() {
-    if (this.asked) return;
-    this.asked = true;
+  /** Draw in the next display frame; a hidden page has none. */
+  request() {
+    if (this.requested) return;
+    this.requested = true;
     clearTimeout(this.timer);
     requestAnimationFrame(() => {
-      this.asked = false;
-      this.timer = setTimeout(() => this.ask(), ANYWAY_MS);
+      this.requested = false;
+      this.timer = setTimeout(() => this.request(), IDLE_MS);
       this.draw();
     });
   }
 }
 
-/** Whether the numbers of a frame are to be written now. */
-export class Reading {
+/** Decides whether to write the numbers of a frame now. */
+export class TextPace {
   constructor() {
-    this.again();
+    this.reset();
   }
 
-  /** Next time, whatever was written: they are shown in another way. */
-  again() {
+  /** Write next time in any case: the display has changed. */
+  reset() {
     this.node = this.frame = undefined;
-    this.kind = "";
+    this.state = "";
     this.writtenMs = 0;
   }
 
-  /** At once where another thing is to be said, such as a fault; another value of the same waits its turn. */
+  /** Return true at once for another state, such as a fault; for another value of the same state every `TEXT_MS`. */
   isDue(node, frame, nowMs) {
     if (node === this.node && frame === this.frame) return false;
-    const kind = kindOf(frame);
-    if (node === this.node && kind === this.kind && nowMs - this.writtenMs < READ_MS) return false;
-    [this.node, this.frame, this.kind, this.writtenMs] = [node, frame, kind, nowMs];
+    const state = stateOf(frame);
+    if (node === this.node && state === this.state && nowMs - this.writtenMs < TEXT_MS) return false;
+    [this.node, this.frame, this.state, this.writtenMs] = [node, frame, state, nowMs];
     return true;
   }
 }
 
-/** What can be said of a frame, but for the values. @param {Frame | null} frame */
-function kindOf(frame) {
+/** Return the state of a frame without its values. @param {Frame | null} frame */
+function stateOf(frame) {
   if (!frame) return "";
   const known = (value) => (Number.isFinite(value) ? 1 : 0);
   const list = (name, of) => frame[name]?.map(of).join("") ?? "";

@@ -1,29 +1,30 @@
-// A picture that stands still while data go on, and says so.
+// Pause of the display while acquisition continues.
 
 import { byId, localTime, setText } from "../common/text.js";
 
+/** Pause button, and the frame that stays on display. */
 export class Pause {
-  /** `onChange()` when it begins or ends. */
+  /** `onChange()` runs at pause and resume. */
   constructor(onChange) {
     this.onChange = onChange;
-    this.held = null; // the frame that is shown, and when it was
-    this.newest = null; // gives the newest frame
-    for (const name of ["pause", "go-on"]) byId(name).addEventListener("click", () => this.toggle());
+    this.held = null; // frame on display, and its time
+    this.latest = null; // returns the latest frame
+    for (const name of ["pause", "resume"]) byId(name).addEventListener("click", () => this.toggle());
   }
 
   toggle() {
-    if (this.held) return this.goOn();
-    const frame = this.newest?.();
-    if (!frame) return; // there is no picture
+    if (this.held) return this.resume();
+    const frame = this.latest?.();
+    if (!frame) return; // nothing to hold
     this.held = { frame, nowMs: performance.now() };
-    setText(byId("paused-text"), `Paused at ${localTime(new Date()).slice(11)}. The picture stands still; data and recordings go on.`);
+    setText(byId("paused-text"), `Paused at ${localTime(new Date()).slice(11)}. Acquisition and recording continue.`);
     this.show();
   }
 
-  goOn() {
+  resume() {
     if (!this.held) return;
     this.held = null;
-    const back = document.activeElement === byId("go-on");
+    const back = document.activeElement === byId("resume");
     this.show();
     if (back) byId("pause").focus();
   }

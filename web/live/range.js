@@ -1,19 +1,20 @@
-// Up to which value bars and colours go: what each tile bears, or what the foot bears just now.
+// Full scale of bars and colours: rated load of each tile, or the present load.
 
 import { setText } from "../common/text.js";
 import { isPlan } from "../common/foot_layout.js";
 import { fullScale } from "./tile.js";
 
 const STEPS = [1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 150, 200, 300, 500, 1000];
-const SHRINK_AFTER_MS = 4000; // a scale that follows every step of the robot cannot be read
+const SHRINK_AFTER_MS = 4000; // longer than a step of the robot
 const KEY = "foottile.range";
 
+/** Fixed or automatic range. */
 export class Range {
-  /** `button` changes it, if there is one; `onChange()` when another was chosen. */
+  /** `button` toggles the range; `onChange()` runs afterwards. */
   constructor(button = null, onChange = () => {}) {
     this.button = button;
     this.chosen = null;
-    this.tops = { N: following(), kPa: following() };
+    this.tops = { N: autoScale(), kPa: autoScale() };
     if (!button) return;
     try { this.chosen = localStorage.getItem(KEY); } catch { /* private window */ }
     button.addEventListener("click", () => {
@@ -24,37 +25,37 @@ export class Range {
     });
   }
 
-  /** Once for each drawing. Fixed unless another was chosen, but for grids, where neighbours are compared. */
-  see(node, frame, nowMs) {
-    const asked = this.chosen ?? (this.button && node.tiles.length && isPlan(node.tiles) ? "automatic" : "fixed");
-    this.automatic = asked === "automatic";
+  /** Update with each drawing. Default: fixed; on grids automatic, to compare neighbours. */
+  update(node, frame, nowMs) {
+    const mode = this.chosen ?? (this.button && node.tiles.length && isPlan(node.tiles) ? "automatic" : "fixed");
+    this.automatic = mode === "automatic";
     this.full = Math.max(0, ...node.tiles.filter((tile) => !tile.reference).map((tile) => fullScale(tile, "N")));
-    this.tops.N.see(frame?.force_max_n, nowMs);
-    this.tops.kPa.see(frame?.gauge_max_kpa, nowMs);
+    this.tops.N.update(frame?.force_max_n, nowMs);
+    this.tops.kPa.update(frame?.gauge_max_kpa, nowMs);
     this.show();
   }
 
   show() {
-    if (this.button) setText(this.button, this.automatic ? "Range: automatic" : "Range: fixed");
+    if (this.button) setText(this.button, this.automatic ? "Range: auto" : "Range: fixed");
   }
 
-  /** Of the bar of a tile. */
+  /** Return the full scale of a tile's bar. */
   of(tile, unit) {
     return this.automatic ? this.tops[unit].value : fullScale(tile, unit);
   }
 
-  /** Of all tiles' colours, in newtons. */
-  get ofAll() {
+  /** Full scale of the foot's colours, newtons. */
+  get foot() {
     return this.automatic ? this.tops.N.value : this.full;
   }
 }
 
-/** The top of a scale: up at once, down only after a while. */
-export function following() {
+/** Return a scale that grows at once and shrinks after a delay. */
+export function autoScale() {
   return {
     value: STEPS[0],
     smallerSinceMs: null,
-    see(values, nowMs) {
+    update(values, nowMs) {
       const most = Math.max(0, ...(values ?? []).filter(Number.isFinite));
       const need = STEPS.find((step) => step >= most) ?? STEPS.at(-1);
       if (need >= this.value) this.smallerSinceMs = null;

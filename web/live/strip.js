@@ -1,25 +1,26 @@
-// A picture over time that only moves: what was drawn is shifted by whole pixels, and what is new is added.
+// Scrolling picture over time: old pixels are shifted, new points are added.
 
-const AHEAD_S = 0.25; // room for what is dated later than now, by clocks that are not quite one
+const AHEAD_S = 0.25; // margin for time stamps after now: clocks differ a little
 
+/** Off-screen canvas that scrolls. */
 export class Strip {
   constructor() {
     this.canvas = document.createElement("canvas");
     this.context = this.canvas.getContext("2d");
-    /** Of what the picture is; of another one it begins anew. */
+    /** Key of the content; another key clears the picture. */
     this.key = "";
     this.endS = 0;
     this.drawnS = -Infinity;
   }
 
   /**
-   * @param {{timeS: number}[]} points oldest first; those that were drawn stay as they are
+   * @param {{timeS: number}[]} points oldest first; drawn ones do not change
    * @param {object} how
-   * @param {number} how.endS what is at the right edge
-   * @param {number} how.windowS from the left edge to the right
+   * @param {number} how.endS time at the right edge
+   * @param {number} how.windowS time from left to right edge
    * @param {number} how.widthPx
    * @param {number} how.heightPx
-   * @param {string} how.key another one if points before `drawnS` have changed, or how they are drawn
+   * @param {string} how.key changes with points before `drawnS` and with their style
    * @param {(context: CanvasRenderingContext2D, i: number, x: (timeS: number) => number) => void} draw point i
    */
   draw(points, { endS, windowS, widthPx, heightPx, key }, draw) {
@@ -49,7 +50,7 @@ export class Strip {
     this.drawnS = points.at(-1)?.timeS ?? -Infinity;
   }
 
-  /** The window, with its left upper corner at a place of another canvas. */
+  /** Copy the window to another canvas, upper left corner at (left, top). */
   show(context, left, top, widthPx, heightPx) {
     const ratio = devicePixelRatio || 1;
     context.drawImage(this.canvas, 0, 0, widthPx * ratio, heightPx * ratio, left, top, widthPx, heightPx);

@@ -1,4 +1,4 @@
-// The history of a node's tares: when, why, and whether it was undone. Loaded when it is opened.
+// Tares of a node: time, reason, state. Loaded when opened.
 
 import * as api from "../common/api.js";
 import { showRefusal } from "../common/notices.js";
@@ -6,6 +6,7 @@ import { byId, el, localTime, number, setText } from "../common/text.js";
 
 const SHOWN = 20;
 
+/** List of tares. */
 export class Tares {
   constructor() {
     this.card = byId("tares-card", HTMLDetailsElement);
@@ -13,13 +14,13 @@ export class Tares {
     this.card.addEventListener("toggle", () => { this.shown = ""; });
   }
 
-  /** Called often; asks the server only while it is open, and for what it does not show yet. */
+  /** Load the list while it is open and outdated; cheap to call. */
   draw(node) {
     this.card.hidden = !node;
     if (!node || !this.card.open) return;
-    const wanted = `${node.node} ${node.tare?.id} ${node.auto_tare}`;
-    if (wanted === this.shown) return;
-    this.shown = wanted;
+    const key = `${node.node} ${node.tare?.id} ${node.auto_tare}`;
+    if (key === this.shown) return;
+    this.shown = key;
     this.load(node);
   }
 
@@ -35,13 +36,13 @@ export class Tares {
 }
 
 function row(tare, items) {
-  const inForce = !tare.undone && items.find((other) => !other.undone)?.id === tare.id;
-  const state = tare.undone ? ", undone" : inForce ? ", in force" : "";
+  const isActive = !tare.undone && items.find((other) => !other.undone)?.id === tare.id;
+  const state = tare.undone ? ", undone" : isActive ? ", active" : "";
   return el("li", { text: `${localTime(new Date(tare.t_ns / 1e6))} ${tare.reason}${state}` });
 }
 
 function legend(items, drift) {
-  const all = `${items.length} in all, newest first`;
+  const all = `${items.length}, newest first`;
   const known = drift.kpa_per_hour.filter(Number.isFinite);
   if (!known.length) return all;
   const most = known.reduce((a, b) => (Math.abs(b) > Math.abs(a) ? b : a));

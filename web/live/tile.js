@@ -1,4 +1,4 @@
-// What one tile has to say in one unit: a value, a bound, or the plain reason why there is none.
+// Reading of one tile in one unit: value, bound, or the reason for none.
 
 import { TILE } from "../common/bits.js";
 
@@ -13,27 +13,27 @@ const FAULTS = [
 ];
 export const FAULT_STATES = new Set(FAULTS.map(([, state]) => state));
 
-/** The unit a tile is shown in: a reference tile bears no load, so it has no newtons. */
+/** Return the unit of a tile: a reference tile bears no load, so it has no newtons. */
 export const unitOf = (tile, unit) => (tile.reference ? "kPa" : unit);
 
-const given = (tile, unit) => (unit === "kPa" ? tile.range_kpa?.[1] : tile.full_scale_n);
-export const hasFullScale = (tile, unit) => given(tile, unit) > 0;
+const ratedScale = (tile, unit) => (unit === "kPa" ? tile.range_kpa?.[1] : tile.full_scale_n);
+export const hasFullScale = (tile, unit) => ratedScale(tile, unit) > 0;
 
 export function fullScale(tile, unit) {
-  return hasFullScale(tile, unit) ? given(tile, unit) : FALLBACK[unit];
+  return hasFullScale(tile, unit) ? ratedScale(tile, unit) : FALLBACK[unit];
 }
 
 const at = (list, i) => (Number.isFinite(list?.[i]) ? list[i] : null);
 
 /**
- * {state, text, bound, value, low, high, sigma, unit}: `value` is null unless the state is "ok";
- * `text` is what to say instead of a number, `bound` what a saturated tile bears at least.
+ * Return {state, text, bound, value, low, high, sigma, unit}: `value` is null unless the state is "ok";
+ * `text` replaces the number, `bound` is the lower bound of a saturated tile.
  */
 export function readTile(node, i, frame, unitChosen) {
   const tile = node.tiles[i];
   const unit = unitOf(tile, unitChosen);
   const none = (state, text, bound = "") => ({ state, text, bound, value: null, low: null, high: null, sigma: null, unit });
-  if (!frame || !Number.isFinite(frame.status?.[i])) return none("waiting", "waiting");
+  if (!frame || !Number.isFinite(frame.status?.[i])) return none("waiting", "no data");
 
   for (const [bit, state, text] of FAULTS) if (frame.status[i] & bit) return none(state, text);
 
@@ -42,7 +42,7 @@ export function readTile(node, i, frame, unitChosen) {
   if (value === null) {
     if (!node.tare || node.tare.undone) return none("not_tared", "not tared");
     if (unit === "N" && (!node.calibration || !tile.full_scale_n)) return none("no_calibration", "no calibration");
-    return none("waiting", "waiting");
+    return none("waiting", "no value");
   }
   const [low, high, sigma] = unit === "kPa"
     ? [frame.gauge_min_kpa, frame.gauge_max_kpa, null]
@@ -53,9 +53,9 @@ export function readTile(node, i, frame, unitChosen) {
   };
 }
 
-/** Rounded down: of a force what the server says; of a pressure the range's end or what was read. */
+/** Return the lower bound, rounded down: force from the server; pressure from range end or reading. */
 function lowerBound(tile, unit, value) {
-  const bound = unit === "kPa" ? Math.max(given(tile, unit) ?? -Infinity, value ?? -Infinity) : value;
+  const bound = unit === "kPa" ? Math.max(ratedScale(tile, unit) ?? -Infinity, value ?? -Infinity) : value;
   if (!Number.isFinite(bound)) return "";
   return unit === "kPa" ? (Math.floor(bound * 10) / 10).toFixed(1) : String(Math.floor(bound));
 }

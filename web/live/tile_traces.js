@@ -1,4 +1,4 @@
-// Each tile over the last seconds: rows of traces, or of colours where there are too many for that.
+// Each tile over time: rows of traces, or of colours for many tiles.
 
 import { coloursOf, fit, whenColoursChange } from "../common/axes.js";
 import { shadeOf, shadesOf } from "../common/heat.js";
@@ -8,10 +8,11 @@ import { Strip } from "./strip.js";
 import { unitOf } from "./tile.js";
 
 const KEY = "foottile.tiles-as";
-const EVERY_MS = 60; // many rows cost more than one
-const ROW_PX = 16; // less has no room for a trace
-const [LEFT_PX, RIGHT_PX] = [50, 10]; // as the trace of the force above
+const EVERY_MS = 60; // many rows cost much
+const ROW_PX = 16; // lower rows are drawn as colours
+const [LEFT_PX, RIGHT_PX] = [50, 10]; // as the GRF trace
 
+/** Traces of all tiles on one canvas. */
 export class TileTraces {
   /** @param {import("./range.js").Range} range @param {() => void} onChange */
   constructor(range, onChange) {
@@ -22,8 +23,8 @@ export class TileTraces {
     this.colours = null;
     this.shades = [];
     whenColoursChange(() => { this.colours = null; });
-    this.past = null; // what the strip was begun with
-    this.begun = 0;
+    this.history = null; // history in the strip
+    this.restarts = 0;
     this.shown = false;
     this.drawnMs = 0;
     try { this.shown = localStorage.getItem(KEY) === "traces"; } catch { /* private window */ }
@@ -39,8 +40,8 @@ export class TileTraces {
     this.show();
   }
 
-  /** What of each tile is drawn, as the API calls it; null: they are not shown so. */
-  wants(unit) {
+  /** Return the API column of the traces; null: not shown. */
+  column(unit) {
     if (!this.shown) return null;
     return unit === "N" ? "force_n" : "gauge_kpa";
   }
@@ -54,22 +55,22 @@ export class TileTraces {
 
   /**
    * @param {{tiles: Tile[]}} node
-   * @param {{points: TilePoint[], tilesPast: TilePoint[], endS: number, windowS: number, live: boolean}} seen what the force is drawn of
+   * @param {{points: TilePoint[], tileHistory: TilePoint[], endS: number, windowS: number, live: boolean}} shown points of the GRF trace
    * @param {number} nowMs
    * @param {string} unitChosen
    */
-  draw(node, { points, tilesPast, endS, windowS, live }, nowMs, unitChosen) {
+  draw(node, { points, tileHistory, endS, windowS, live }, nowMs, unitChosen) {
     if (!this.shown || nowMs - this.drawnMs < EVERY_MS) return;
     this.drawnMs = nowMs;
     const { canvas } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width || !height) return;
     const context = fit(canvas, width, height);
-    this.range.see(node, points.at(-1)?.tiles, nowMs);
+    this.range.update(node, points.at(-1)?.tiles, nowMs);
     if (!this.colours) this.readColours();
     const colours = live ? this.colours : { ...this.colours, fill: this.colours.stale, band: this.colours.stale };
-    const heard = points.filter((point) => point.tiles);
-    const known = [...tilesPast.filter((point) => point.timeS > endS - windowS), ...heard];
+    const recent = points.filter((point) => point.tiles);
+    const known = [...tileHistory.filter((point) => point.timeS > endS - windowS), ...recent];
     const box = { width: width - RIGHT_PX - LEFT_PX, height, rowPx: height / node.tiles.length };
     const rows = node.tiles.map((tile, i) => {
       const unit = unitOf(tile, unitChosen);
@@ -81,7 +82,7 @@ export class TileTraces {
     context.textAlign = "right";
     context.textBaseline = "middle";
     rows.forEach(({ tile, top }, i) => { if (box.rowPx >= 9 || i % 4 === 0) context.fillText(printable(tile.serial), LEFT_PX - 5, top + box.rowPx / 2); });
-    if (box.rowPx < ROW_PX) this.drawColours(rows, known, tilesPast, { endS, windowS, ...box });
+    if (box.rowPx < ROW_PX) this.drawColours(rows, known, tileHistory, { endS, windowS, ...box });
     else this.drawTraces(rows, known, { endS, windowS, ...box }, colours);
   }
 
@@ -122,7 +123,7 @@ export class TileTraces {
     }
     context.strokeStyle = colours.fill;
     context.lineWidth = 1.5;
-    // Of the time before, least and greatest are known, and not which came last.
+    // History has min and max, not the latest value.
     for (const run of runs(points, (point) => (of(point, "") === null ? of(point, "max_") : null))) {
       for (const which of ["max_", "min_"]) {
         context.beginPath();
@@ -138,17 +139,17 @@ export class TileTraces {
     }
   }
 
-  /** The greatest value of each span, as the colour of its time. */
-  drawColours(rows, points, tilesPast, { endS, windowS, width, height, rowPx }) {
+  /** Draw the max of each span as a colour. */
+  drawColours(rows, points, tileHistory, { endS, windowS, width, height, rowPx }) {
     const { strip, shades } = this;
-    if (tilesPast !== this.past) [this.past, this.begun] = [tilesPast, this.begun + 1];
-    const key = [this.begun, shades.map(({ fill }) => fill), ...rows.map(({ tile, unit, most }) => `${tile.serial} ${most} ${unit}`)].join();
+    if (tileHistory !== this.history) [this.history, this.restarts] = [tileHistory, this.restarts + 1];
+    const key = [this.restarts, shades.map(({ fill }) => fill), ...rows.map(({ tile, unit, most }) => `${tile.serial} ${most} ${unit}`)].join();
     strip.draw(points, { endS, windowS, widthPx: width, heightPx: height, key }, (context, k, x) => {
       const to = x(points[k].timeS);
       const from = points[k].gap || !k ? to - 2 : x(points[k - 1].timeS);
       for (const { of, top, most } of rows) {
         const value = of(points[k], "max_");
-        if (value === null) continue; // not known: nothing is drawn
+        if (value === null) continue; // unknown
         context.fillStyle = shadeOf(shades, value / most).fill;
         context.fillRect(from, top, to - from + 0.5, rowPx - 0.5);
       }

@@ -1,4 +1,4 @@
-// The ground reaction force of the last seconds, on a canvas: drawn anew when it has moved by half a pixel.
+// GRF trace on a canvas: drawn again after each half pixel of motion.
 
 import { coloursOf, whenColoursChange } from "../common/axes.js";
 import { byId, setData } from "../common/text.js";
@@ -9,24 +9,25 @@ const WINDOWS_S = [5, 10, 30, 60];
 const WINDOW_KEY = "foottile.window";
 const STEPS_N = [1, 2, 3, 4, 5, 10, 15, 20, 30, 50, 100, 200, 500, 1000, 2000, 5000, 10000];
 const [LEFT_PX, RIGHT_PX] = [50, 10]; // of the axes
-const SHRINK_AFTER_MS = 4000; // a scale that follows every step of the robot cannot be read
+const SHRINK_AFTER_MS = 4000; // longer than a step of the robot
 
+/** GRF over the last seconds. */
 export class Trace {
-  /** `onWindow()` when another length of time was chosen. */
+  /** `onWindow()` runs after a change of the window. */
   constructor(onWindow) {
     this.canvas = byId("trace", HTMLCanvasElement);
     this.context = this.canvas.getContext("2d");
     this.axes = new TraceAxes();
     this.still = matchMedia("(prefers-reduced-motion: reduce)");
     this.points = new Points();
-    this.held = null; // while paused: the points as they were then, and when that was
+    this.held = null; // while paused: points and time of the pause
     this.drawnMs = 0;
     this.stepN = 5;
     this.fitsSmallerSinceMs = null;
     this.choice = byId("trace-window", HTMLSelectElement);
-    let kept = null;
-    try { kept = localStorage.getItem(WINDOW_KEY); } catch { /* private window */ }
-    this.windowS = WINDOWS_S.includes(Number(kept)) ? Number(kept) : 10;
+    let stored = null;
+    try { stored = localStorage.getItem(WINDOW_KEY); } catch { /* private window */ }
+    this.windowS = WINDOWS_S.includes(Number(stored)) ? Number(stored) : 10;
     this.choice.value = String(this.windowS);
     this.choice.addEventListener("change", () => {
       this.windowS = Number(this.choice.value);
@@ -61,17 +62,17 @@ export class Trace {
     this.points.add(frame, nowMs);
   }
 
-  /** Keep the picture as it is; points are still taken. */
+  /** Hold the picture; points are still added. */
   pause(nowMs) {
-    this.held = { points: [...this.points.all], tilesPast: this.points.tilesPast, offsetS: this.points.offsetS, nowMs };
+    this.held = { points: [...this.points.all], tileHistory: this.points.tileHistory, offsetS: this.points.offsetS, nowMs };
   }
 
-  goOn() {
+  resume() {
     this.held = null;
     this.drawnMs = 0;
   }
 
-  /** Up at once, down only after a while: the scale stands still while the foot walks. */
+  /** Return the scale: grows at once, shrinks after a delay. */
   scale(points, nowMs) {
     let high = 0;
     let low = 0;
@@ -89,7 +90,7 @@ export class Trace {
     return { top: 5 * this.stepN, bottom: -0.6 * this.stepN < 1.03 * low ? -0.6 * this.stepN : -this.stepN };
   }
 
-  /** Drawn if it is time to: what of, else null. */
+  /** Draw if due; return the points on display, else null. */
   draw(nowMs, live) {
     if (!this.canvas.width || !this.canvas.height) return null;
     if (devicePixelRatio !== this.ratio) this.resize(); // moved to another screen
@@ -121,7 +122,7 @@ export class Trace {
     context.beginPath();
     context.rect(box.left, box.top - 4, box.right - box.left, box.bottom - box.top + 4);
     context.clip();
-    // By itself: a peak shows, too, where the newest frame of its span has no force.
+    // Band alone: shows a peak even if the latest frame of its span has no force.
     context.fillStyle = colours.band;
     for (const run of runs(points, (point) => point.high)) {
       context.beginPath();
@@ -142,15 +143,15 @@ export class Trace {
     let someBound = false;
     for (const run of runs(points, (point) => point.bound)) {
       someBound = true;
-      this.above(run.map((point) => [x(point.timeS), y(point.bound)]), box.top - 4);
+      this.drawBound(run.map((point) => [x(point.timeS), y(point.bound)]), box.top - 4);
     }
     context.restore();
     setData(byId("trace-legend"), "bound", String(someBound));
-    return { points, tilesPast: (this.held ?? this.points).tilesPast, endS, windowS, live };
+    return { points, tileHistory: (this.held ?? this.points).tileHistory, endS, windowS, live };
   }
 
-  /** A bound: the force is on its line or anywhere in the stripes above. */
-  above(line, top) {
+  /** Draw a lower bound: line, and hatching above. */
+  drawBound(line, top) {
     const { context, colours } = this;
     const left = line[0][0] - 1;
     const right = line.at(-1)[0] + 1;

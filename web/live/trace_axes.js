@@ -1,10 +1,11 @@
-// What stands still behind the trace of the force: on a canvas of its own, drawn when it is another.
+// Axes of the GRF trace, on a canvas of their own that is drawn only after a change.
 
 import { crisp, fit } from "../common/axes.js";
 import { byId } from "../common/text.js";
 
 const TICKS_S = { 5: 1, 10: 1, 30: 5, 60: 10 };
 
+/** Axes behind the trace. */
 export class TraceAxes {
   constructor() {
     this.canvas = byId("trace-axes", HTMLCanvasElement);
@@ -14,7 +15,7 @@ export class TraceAxes {
   /**
    * @param {{width: number, height: number, ratio: number}} size in pixels
    * @param {{left: number, right: number, top: number, bottom: number}} box
-   * @param {{top: number, bottom: number, windowS: number}} range of newtons, and of seconds
+   * @param {{top: number, bottom: number, windowS: number}} scale in newtons, window in seconds
    * @param {Record<string, string>} colours
    */
   draw(size, box, { top, bottom, windowS }, colours) {

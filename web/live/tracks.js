@@ -1,18 +1,19 @@
-// The bars themselves, on one canvas over the tracks of all tiles: boxes that grow and shrink would be
-// laid out anew thirty times a second.
+// Bars on one canvas over the tracks of all tiles: elements of changing size would need a layout thirty
+// times a second.
 
 import { coloursOf, fit, whenColoursChange } from "../common/axes.js";
 import { byId } from "../common/text.js";
 
 /**
- * What is drawn on a track, each as a share of it.
+ * Positions on a track, as shares of it.
  * @typedef {{zero: number, value?: number, low?: number, high?: number, peak?: number}} Bar
  */
 
-/** Thickness in pixels, places across as shares: of bars that stand, and of those that lie. */
+/** Style of vertical and horizontal bars: thickness in pixels, positions across as shares. */
 const UPRIGHT = { edge: 2, zero: 2, line: 4, peak: 4, peakFrom: 0.8, bandFrom: 0.25, bandTo: 0.75 };
 const LYING = { edge: 1, zero: 1, line: 3, peak: 2, peakFrom: 0.6, bandFrom: 0.25, bandTo: 0.75 };
 
+/** Canvas of the bars. */
 export class Tracks {
   constructor() {
     this.canvas = byId("tracks", HTMLCanvasElement);
@@ -23,7 +24,7 @@ export class Tracks {
     this.boxes = [];
     this.lying = false;
     this.width = this.height = 0;
-    // Measured when something has moved, for to ask while words are written would lay them out at once.
+    // Measured after a change of size: to measure while texts are written would force a layout.
     this.sizes = new ResizeObserver(() => this.measure());
     whenColoursChange(() => {
       this.colours = null;
@@ -52,7 +53,7 @@ export class Tracks {
     this.draw(this.bars);
   }
 
-  /** @param {(Bar | null)[]} bars of the tiles; null: none, for there is something else to say */
+  /** @param {(Bar | null)[]} bars of the tiles; null: none */
   draw(bars) {
     this.bars = bars;
     if (!this.width || !this.height) return; // traces are shown instead

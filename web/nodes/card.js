@@ -1,4 +1,4 @@
-// One node among others: is it live, what does it bear, how good is its link, what is recorded on it.
+// Card of a node: live state, force, link quality, recording, warnings.
 
 import { quietly } from "../common/notices.js";
 import { ReplacementWarning } from "../common/replacement.js";
@@ -6,27 +6,28 @@ import { loadModule } from "../common/request.js";
 import { duration, el, number, perSecond, plain, roughly, setData, setText } from "../common/text.js";
 import { drawContact, whyNot } from "../live/grf.js";
 import { Warnings } from "../live/notes.js";
-import { plainState } from "../sessions/state.js";
+import { stateText } from "../sessions/state.js";
 import { SmallFoot } from "./small_foot.js";
 import { SmallTrace } from "./small_trace.js";
 
 const FROZEN_AFTER_MS = 600;
-const BEHIND_S = 0.5; // what is on its way in good order is not behind
+const SHOWN_BACKLOG_S = 0.5; // less is in transit
 const SLOW = 0.9;
-const NOTES_MOST = 3;
-const NODE_KEY = "foottile.node"; // the one that the page of one node shows
+const WARNINGS_MAX = 3;
+const NODE_KEY = "foottile.node"; // node on the live page
 
+/** Card of a node. */
 export class Card {
   constructor(name) {
     this.node = null;
     this.frame = null;
     this.frameMs = null;
-    this.beat = null;
+    this.heartbeat = null;
     this.fresh = false;
-    this.refused = ""; // what was not done on it, and why
+    this.refused = ""; // failed action and its reason
     this.warnings = new Warnings();
-    this.session = null; // the newest that is, or was, recorded on it while this page is open
-    const link = el("a", { href: "/", text: name, title: "Show this node by itself" });
+    this.session = null; // latest session since this page was opened
+    const link = el("a", { href: "/", text: name, title: "Live page of this node" });
     link.addEventListener("click", () => {
       try { localStorage.setItem(NODE_KEY, name); } catch { /* private window */ }
     });
@@ -42,9 +43,9 @@ export class Card {
     const strip = el("canvas", { cls: "node-trace", role: "img", "aria-label": `Ground reaction force of ${name} over the last 10 seconds` });
     this.trace = new SmallTrace(strip, () => this.node.boot_id);
     const facts = el("dl", { cls: "node-facts" });
-    this.facts = Object.fromEntries(["Frames/s", "Lost", "Behind"].map((title) => {
+    this.facts = Object.fromEntries(["Frames/s", "Losses", "Backlog"].map((title) => {
       const value = el("dd");
-      const row = el("div", {}, el("dt", { text: title }), value);
+      const row = el("div", {}, el("dt", { text: title, cls: title === "Losses" ? "unseen" : "" }), value);
       facts.append(row);
       return [title, { row, value }];
     }));
@@ -55,16 +56,17 @@ export class Card {
     }));
     this.replacement = new ReplacementWarning();
     this.notes = part("ul", "node-notes");
-    this.told = part("p", "node-session");
+    this.sessionLine = part("p", "node-session");
     this.element = el("li", { cls: "node", "data-node": name },
       el("div", { cls: "node-head" }, el("h2", {}, link), this.state),
       el("div", { cls: "node-grf" }, el("p", {}, this.bound, this.value, " ", this.unit), this.contact, this.sigma),
-      canvas, strip, el("div", { cls: "node-more" }, facts, this.calibration, this.replacement.element, this.notes, this.told));
+      canvas, strip, el("div", { cls: "node-more" }, facts, this.calibration, this.replacement.element, this.notes, this.sessionLine));
   }
 
-  take(node) {
-    if (this.node && this.node.boot_id !== node.boot_id) { // it restarted
-      this.frame = this.frameMs = this.beat = null;
+  /** Store the node's description. */
+  update(node) {
+    if (this.node && this.node.boot_id !== node.boot_id) { // new stream
+      this.frame = this.frameMs = this.heartbeat = null;
       this.warnings.clear();
       this.trace.clear();
     }
@@ -72,10 +74,10 @@ export class Card {
     this.fresh = true;
   }
 
-  see(frame) {
+  addFrame(frame) {
     this.frame = frame;
     this.frameMs = performance.now();
-    this.warnings.see(this.node, frame, this.frameMs);
+    this.warnings.addFrame(this.node, frame, this.frameMs);
     this.trace.add(this.node, frame, this.frameMs);
     this.fresh = true;
   }
@@ -90,7 +92,7 @@ export class Card {
     this.fresh = true;
   }
 
-  /** Foot and trace, when there is something new of them. */
+  /** Draw foot and trace, if there is a new frame. */
   draw() {
     if (!this.fresh || !this.node) return;
     this.fresh = false;
@@ -98,13 +100,13 @@ export class Card {
     this.trace.draw(performance.now());
   }
 
-  /** All that is text; `linkOpen`: is the server there? */
+  /** Write all texts; `linkOpen`: the server is connected. */
   write(nowMs, serverNowMs, linkOpen) {
     const { node, frame } = this;
     const live = linkOpen && this.isLive(nowMs);
     setData(this.element, "live", String(live));
-    const [word, cls] = this.stateInWords(live, nowMs, serverNowMs, linkOpen);
-    setText(this.state, word);
+    const [text, cls] = this.liveText(live, nowMs, serverNowMs, linkOpen);
+    setText(this.state, text);
     if (this.state.className !== `state ${cls}`) this.state.className = `state ${cls}`;
 
     const grf = Number.isFinite(frame?.grf_n) ? frame.grf_n : null;
@@ -124,36 +126,36 @@ export class Card {
     this.writeSession();
   }
 
-  stateInWords(live, nowMs, serverNowMs, linkOpen) {
+  liveText(live, nowMs, serverNowMs, linkOpen) {
     if (live) return ["live", "live"];
-    if (linkOpen && !this.node.connected) return ["away", "away"];
+    if (linkOpen && !this.node.connected) return ["offline", "away"];
     const sinceMs = this.frameMs !== null ? nowMs - this.frameMs
       : this.node.last_seen_t_ns ? serverNowMs - this.node.last_seen_t_ns / 1e6 : null;
     return [sinceMs === null ? "no data yet" : `no data for ${roughly(sinceMs / 1000)}`, "away"];
   }
 
   writeFacts(node) {
-    const beat = this.beat ?? {};
+    const heartbeat = this.heartbeat ?? {};
     const fact = (title, text, bad) => {
       setText(this.facts[title].value, text);
       setData(this.facts[title].value, "bad", String(bad));
     };
-    const rateHz = node.connected ? beat.rate_hz ?? node.rate_hz : null;
+    const rateHz = node.connected ? heartbeat.rate_hz ?? node.rate_hz : null;
     const of = rateHz !== null && rateHz <= node.nominal_rate_hz ? ` of ${perSecond(node.nominal_rate_hz)}` : "";
     const slow = rateHz !== null && rateHz < SLOW * node.nominal_rate_hz;
     fact("Frames/s", `${perSecond(rateHz ?? NaN)}${of}`, slow);
-    const lost = beat.lost_frames ?? node.lost_frames ?? 0;
-    const missed = beat.missed_slots ?? node.missed_slots ?? 0;
-    fact("Lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} not sampled`, lost > 0 || slow);
-    const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;
-    this.facts.Behind.row.hidden = behind < BEHIND_S * (node.nominal_rate_hz || 400);
-    fact("Behind", `${behind.toLocaleString("en-GB")} frames`, false);
+    const lost = heartbeat.lost_frames ?? node.lost_frames ?? 0;
+    const missed = heartbeat.missed_slots ?? node.missed_slots ?? 0;
+    fact("Losses", `${lost.toLocaleString("en-GB")} lost, ${missed.toLocaleString("en-GB")} not sampled`, lost > 0 || slow);
+    const backlog = heartbeat.backlog_frames ?? node.backlog_frames ?? 0;
+    this.facts.Backlog.row.hidden = backlog < SHOWN_BACKLOG_S * (node.nominal_rate_hz || 400);
+    fact("Backlog", `${backlog.toLocaleString("en-GB")} frames`, false);
   }
 
-  /** @param {string[]} all */
+  /** @param {import("../live/notes.js").Note[]} all */
   writeNotes(all) {
-    const shown = all.slice(0, NOTES_MOST);
-    if (all.length > NOTES_MOST) shown.push(`and ${all.length - NOTES_MOST} more: they are on its own page`);
+    const shown = all.slice(0, WARNINGS_MAX).map(({ text }) => text);
+    if (all.length > WARNINGS_MAX) shown.push(`and ${all.length - WARNINGS_MAX} more on its live page`);
     const key = JSON.stringify([this.refused, shown]);
     if (key === this.notesKey) return;
     this.notesKey = key;
@@ -167,15 +169,15 @@ export class Card {
     const recording = session?.state === "recording";
     setData(this.element, "recording", String(recording));
     if (!session) return;
-    const [short, long] = plainState(session);
+    const [short, long] = stateText(session);
     const key = JSON.stringify([session.id, session.name, short, long, recording ? Math.floor(session.duration_s) : session.frames, session.marks]);
     if (key === this.sessionKey) return;
     this.sessionKey = key;
-    const marks = session.marks ? `, ${session.marks} mark${session.marks === 1 ? "" : "s"}` : "";
+    const markers = session.marks ? `, ${session.marks} marker${session.marks === 1 ? "" : "s"}` : "";
     const frames = `${session.frames.toLocaleString("en-GB")} frames`;
-    const said = recording ? `recording, ${duration(Math.floor(session.duration_s))}` : `${short}, ${frames}`;
-    this.told.replaceChildren(
-      el("a", { href: `/sessions/${encodeURIComponent(session.id)}`, text: session.name || session.id }), ` ${said}${marks}`,
+    const state = recording ? `recording, ${duration(Math.floor(session.duration_s))}` : `${short}, ${frames}`;
+    this.sessionLine.replaceChildren(
+      el("a", { href: `/sessions/${encodeURIComponent(session.id)}`, text: session.name || session.id }), ` ${state}${markers}`,
       ...(long && !recording ? [el("span", { cls: "why", text: ` ${long}` })] : []));
   }
 }

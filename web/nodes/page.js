@@ -1,4 +1,4 @@
-// The page of all nodes: a card for each, and what is recorded on all of them together.
+// Page of all nodes: one card each, and recordings on all of them.
 
 import { helpWithKeys } from "../common/help.js";
 import { Link } from "../common/link.js";
@@ -8,7 +8,7 @@ import { byId, setText } from "../common/text.js";
 import { Card } from "./card.js";
 import { Takes } from "./take.js";
 
-const RATE_HZ = 10; // a glance at many, and a phone's battery
+const RATE_HZ = 10; // saves a phone's battery
 const EVERY_MS = 200;
 
 const cards = new Map(); // by name of the node
@@ -17,40 +17,40 @@ let serverAheadMs = 0;
 
 const takes = new Takes({
   recordings,
-  cannotRecord: () => (!link.open ? "The link to the server is down." : [...cards.values()].some(({ node }) => node.connected) ? "" : "No node is connected."),
+  cannotRecord: () => (!link.open ? "The server link is down." : [...cards.values()].some(({ node }) => node.connected) ? "" : "No node is connected."),
   serverNowMs: () => Date.now() + serverAheadMs,
-  onSession: takeSession,
+  onSession: updateSession,
   connected: () => [...cards.values()].map(({ node }) => node).filter((node) => node.connected).map((node) => node.node),
-  onRefused: (what, failed) => cards.forEach((card, name) => { card.refused = failed[name] ? `${what}: ${failed[name]}` : ""; }),
+  onRefused: (action, failed) => cards.forEach((card, name) => { card.refused = failed[name] ? `${action}: ${failed[name]}` : ""; }),
 });
 
 const handlers = {
   hello(message) {
     const names = new Set((message.nodes ?? []).map((node) => node.node));
     for (const name of cards.keys()) if (!names.has(name)) cards.delete(name);
-    (message.nodes ?? []).forEach(takeNode);
+    (message.nodes ?? []).forEach(updateNode);
     recordings.clear();
-    (message.recording ?? []).forEach(takeSession);
+    (message.recording ?? []).forEach(updateSession);
     arrange();
-    takes.marks.send(); // the server is back
-    look(); // and may know us no more
+    takes.markers.send(); // the server is connected again
+    look(); // the login may have ended
   },
   node({ node }) {
     const isNew = !cards.has(node.node);
-    takeNode(node);
+    updateNode(node);
     if (isNew) arrange();
   },
-  session: ({ session }) => takeSession(session),
-  counted: ({ sessions }) => Object.entries(sessions).forEach(([id, counted]) => {
+  session: ({ session }) => updateSession(session),
+  counted: ({ sessions }) => Object.entries(sessions).forEach(([id, progress]) => {
     const session = recordings.get(id);
-    if (session) takeSession({ ...session, ...counted });
+    if (session) updateSession({ ...session, ...progress });
   }),
   deleted: ({ session_id: id }) => {
     recordings.delete(id);
     for (const card of cards.values()) if (card.session?.id === id) card.session = null;
   },
-  heartbeat: ({ nodes }) => cards.forEach((card, name) => { card.beat = nodes?.[name] ?? null; }),
-  frame: (frame) => cards.get(frame.node)?.see(frame),
+  heartbeat: ({ nodes }) => cards.forEach((card, name) => { card.heartbeat = nodes?.[name] ?? null; }),
+  frame: (frame) => cards.get(frame.node)?.addFrame(frame),
 };
 
 const link = new Link({
@@ -64,24 +64,24 @@ const link = new Link({
   onChange: () => {},
 });
 
-function takeNode(node) {
+function updateNode(node) {
   if (!cards.has(node.node)) cards.set(node.node, new Card(node.node));
-  cards.get(node.node).take(node);
+  cards.get(node.node).update(node);
 }
 
-function takeSession(session) {
+function updateSession(session) {
   if (session.state === "recording") recordings.set(session.id, session);
   else recordings.delete(session.id);
   const card = cards.get(session.node);
   if (!card) return;
   const shown = card.session;
-  // Of several the one that is being recorded is shown, else the newest that this page has heard of.
+  // Show the running recording, else the latest session.
   const running = [...recordings.values()].filter((one) => one.node === session.node).sort((a, b) => b.started_t_ns - a.started_t_ns)[0];
   if (running) card.session = running;
   else if (!shown || shown.id === session.id || session.started_t_ns >= shown.started_t_ns) card.session = session;
 }
 
-/** Cards in the order of their names. */
+/** Sort the cards by name. */
 function arrange() {
   const names = [...cards.keys()].sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
   byId("cards").replaceChildren(...names.map((name) => cards.get(name).element));
@@ -96,7 +96,7 @@ function write() {
   byId("no-nodes").hidden = Boolean(all.length) || !link.open;
   const down = byId("link-down");
   down.hidden = link.open || !link.failures && !all.length;
-  setText(down, link.open ? "" : `Link to the server is down${link.closeReason ? ` (${link.closeReason})` : ""}; trying again.`);
+  setText(down, link.open ? "" : `Server link down${link.closeReason ? ` (${link.closeReason})` : ""}; reconnecting.`);
   takes.draw();
 }
 

@@ -1,4 +1,4 @@
-// A foot as large as a stamp: tiles shaded by their force, and the centre of pressure. On a canvas, for there are many.
+// Small foot on a canvas: tiles shaded by force, and the centre of pressure.
 
 import { FootLayout, isPlan } from "../common/foot_layout.js";
 import { shadeOf, shadesOf } from "../common/heat.js";
@@ -7,10 +7,11 @@ import { Range } from "../live/range.js";
 import { FAULT_STATES, readTile } from "../live/tile.js";
 
 const Z95 = 1.96;
-const LEGEND_PX = 40; // beside a foot from above
-const NARROW_PX = 240; // of a card on a phone: the legend would lie on the foot
-const NUMBERS_FROM_PX = 10; // of a tile's radius
+const LEGEND_PX = 40; // left of a foot from above
+const NARROW_PX = 240; // card on a phone: half the legend's margin
+const NUMBERS_FROM_PX = 10; // radius of a tile that holds a number
 
+/** Foot of a card. */
 export class SmallFoot {
   /** @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
@@ -19,11 +20,11 @@ export class SmallFoot {
     this.key = "";
     this.colours = null;
     this.layout = null;
-    this.range = new Range(); // fixed: up to the rated load
+    this.range = new Range(); // fixed: rated load
     new ResizeObserver(() => { this.key = ""; }).observe(canvas);
   }
 
-  /** The colours of the page have changed. */
+  /** Read the colours again. */
   recolour() {
     this.colours = null;
   }
@@ -41,7 +42,7 @@ export class SmallFoot {
     canvas.height = Math.round(this.heightPx * ratio);
     this.ratio = ratio;
     const { widthPx, heightPx } = this;
-    const room = isPlan(node.tiles) ? { roomPx: 8 } : { roomPx: 0.4 * heightPx, basePx: 0.4 * heightPx }; // for the COP, below
+    const room = isPlan(node.tiles) ? { roomPx: 8 } : { roomPx: 0.4 * heightPx, basePx: 0.4 * heightPx }; // room for the COP
     this.leftPx = isPlan(node.tiles) ? LEGEND_PX : widthPx < NARROW_PX ? LEGEND_PX / 2 : 0;
     const box = { widthPx: widthPx - 2 * this.leftPx, heightPx, ...room, turns: Boolean(node.servo), toesUp: true };
     this.layout = new FootLayout(node.tiles, box);
@@ -65,14 +66,14 @@ export class SmallFoot {
     if (!this.colours) this.readColours();
     context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     context.clearRect(0, 0, this.widthPx, this.heightPx);
-    this.range.see(node, frame, performance.now());
+    this.range.update(node, frame, performance.now());
     this.drawLegend();
     context.save();
     context.translate(this.leftPx, 0);
     if (!layout.plan && node.servo && Number.isFinite(frame?.angle_rad)) {
       const ankle = layout.at(0, 0);
       context.translate(ankle.x, ankle.y);
-      context.rotate(frame.angle_rad); // clockwise: the tiles in front come down
+      context.rotate(frame.angle_rad); // clockwise: the front comes down
       context.translate(-ankle.x, -ankle.y);
     }
     if (this.sole) this.stroke(this.sole, this.colours.edge, 1.5, this.colours.track);
@@ -81,7 +82,7 @@ export class SmallFoot {
     context.restore();
   }
 
-  /** Which colour is which force: a fixed scale, up to the rated load. */
+  /** Draw the colour scale, up to the rated load. */
   drawLegend() {
     const { context, colours } = this;
     const [top, long] = [18, Math.min(70, 0.5 * this.heightPx)];
@@ -97,7 +98,7 @@ export class SmallFoot {
     context.font = "600 12px system-ui, sans-serif";
     context.textAlign = "left";
     context.textBaseline = "alphabetic";
-    context.fillText(`${number(this.range.ofAll, 0)} N`, 0, 12);
+    context.fillText(`${number(this.range.foot, 0)} N`, 0, 12);
     context.fillText("0", 14, top + long);
   }
 
@@ -108,11 +109,11 @@ export class SmallFoot {
     const { state, value } = readTile(node, i, frame, "N");
     const fault = FAULT_STATES.has(state);
     const isKnown = value !== null && !tile.reference;
-    const share = state === "saturated" ? 1 : isKnown ? value / this.range.ofAll : 0;
+    const share = state === "saturated" ? 1 : isKnown ? value / this.range.foot : 0;
     const shade = shadeOf(colours.shades, share);
     context.fillStyle = fault ? colours.badFill : shade.fill;
     context.strokeStyle = fault ? colours.bad : state === "saturated" ? colours.warn : colours.text;
-    context.lineWidth = state === "saturated" ? 3 : r < 8 ? 0.75 : 1.5; // small ones would be all line
+    context.lineWidth = state === "saturated" ? 3 : r < 8 ? 0.75 : 1.5; // thin on small tiles
     context.setLineDash(tile.reference || !["ok", "saturated"].includes(state) ? [3, 3] : []);
     context.beginPath();
     context.arc(x, y, r, 0, 2 * Math.PI);
@@ -135,7 +136,7 @@ export class SmallFoot {
     context.stroke();
   }
 
-  /** Under the line of tiles as an arrow with its 95 % bar; from above as a cross in its ellipse. */
+  /** Draw the COP: from the side an arrow with its 95 % bar, from above a dot in its ellipse. */
   drawCop(frame) {
     const { context, colours, layout } = this;
     const place = layout.copPlace(frame?.cop_x_m, frame?.cop_y_m);
@@ -148,7 +149,7 @@ export class SmallFoot {
     if (layout.plan) {
       const { x, y } = layout.at(place.x, place.y);
       const [across, along] = [frame.cop_sigma_y_m, frame.cop_sigma_x_m].map((sigma_m) => Math.max(4, half(sigma_m)));
-      context.ellipse(x, y, across, along, 0, 0, 2 * Math.PI); // toes are up
+      context.ellipse(x, y, across, along, 0, 0, 2 * Math.PI); // toes up
       context.stroke();
       context.beginPath();
       context.arc(x, y, 3, 0, 2 * Math.PI);

@@ -1,38 +1,39 @@
-// The ground reaction force of the last ten seconds as a strip, on a card: line of the newest, band from min to max.
+// GRF of the last 10 s on a card: line of latest values, min-max band.
 
 import { coloursOf, crisp, fit } from "../common/axes.js";
 import { History } from "../live/history.js";
 import { Points, runs } from "../live/points.js";
-import { following } from "../live/range.js";
+import { autoScale } from "../live/range.js";
 
 const WINDOW_S = 10;
 const [LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX] = [46, 4, 8, 6];
 
+/** GRF strip of a card. */
 export class SmallTrace {
-  /** @param {HTMLCanvasElement} canvas @param {() => string} stream that is shown now, by its boot_id */
+  /** @param {HTMLCanvasElement} canvas @param {() => string} stream boot_id on display */
   constructor(canvas, stream) {
     this.canvas = canvas;
     this.points = new Points();
-    this.past = new History(this.points, stream);
-    this.top = following();
+    this.history = new History(this.points, stream);
+    this.top = autoScale();
     this.colours = null;
   }
 
-  /** The colours of the page have changed. */
+  /** Read the colours again. */
   recolour() {
     this.colours = null;
   }
 
-  /** The node restarted: what is drawn is of another stream. */
+  /** Clear the strip: the node started another stream. */
   clear() {
     this.points.clear();
-    this.past.want();
+    this.history.request();
   }
 
   add(node, frame, nowMs) {
     this.points.periodS = 1 / (node.nominal_rate_hz || 400);
     this.points.add(frame, nowMs);
-    this.past.see(node, frame, WINDOW_S, nowMs, null);
+    this.history.update(node, frame, WINDOW_S, nowMs, null);
   }
 
   draw(nowMs) {
@@ -43,7 +44,7 @@ export class SmallTrace {
     const context = fit(this.canvas, width, height);
     const endS = this.points.all.at(-1)?.timeS ?? 0;
     const points = this.points.all.filter(({ timeS }) => timeS > endS - WINDOW_S);
-    this.top.see(points.flatMap(({ high, bound }) => [high, bound]), nowMs);
+    this.top.update(points.flatMap(({ high, bound }) => [high, bound]), nowMs);
     const top = this.top.value;
     const box = { left: LEFT_PX, right: width - RIGHT_PX, top: TOP_PX, bottom: height - BOTTOM_PX };
     const x = ({ timeS }) => box.right - ((endS - timeS) / WINDOW_S) * (box.right - box.left);
@@ -69,7 +70,7 @@ export class SmallTrace {
     }
     context.lineWidth = 1.5;
     context.lineJoin = "round";
-    // Where no force is known its lower bound is dashed.
+    // Dashed: lower bound.
     for (const [colour, dashes, valueOf] of /** @type {[string, number[], (point: any) => number][]} */ ([
       [colours.fill, [], (point) => point.grf], [colours["warn-line"], [5, 3], (point) => point.bound],
     ])) {

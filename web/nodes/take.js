@@ -1,34 +1,35 @@
-// Record, mark and stop all: one request to the server, which answers for each node. Tare all: one request a node.
+// Record, marker and stop for all nodes: one request, with a result per node. Tare all: one request per node.
 
 import * as api from "../common/api.js";
-import { mayPress } from "../common/login.js";
+import { isOperator } from "../common/login.js";
 import { notice, quietly, showRefusal } from "../common/notices.js";
 import { byId, duration, isInside, localTime, setData, setText } from "../common/text.js";
-import { Marks } from "../live/marks.js";
+import { MarkerQueue } from "../live/markers.js";
 
-const KEYS = { r: "record-all", m: "mark-all", s: "stop-all", t: "tare-all" };
+const KEYS = { r: "record-all", m: "marker-all", s: "stop-all", t: "tare-all" };
 
+/** Action bar of all nodes. */
 export class Takes {
   /**
    * @param {object} page
-   * @param {Map<string, Session>} page.recordings sessions that are being recorded, by id
-   * @param {() => string} page.cannotRecord why not now, or nothing
+   * @param {Map<string, Session>} page.recordings running recordings, by id
+   * @param {() => string} page.cannotRecord reason, or ""
    * @param {() => number} page.serverNowMs
-   * @param {(session: Session) => void} page.onSession takes every session an answer brings
+   * @param {(session: Session) => void} page.onSession receives the sessions of each response
    * @param {() => string[]} page.connected names of the nodes that are connected
-   * @param {(what: string, failed: Object<string, string>) => void} page.onRefused takes what was not done on which nodes, and why
+   * @param {(what: string, failed: Object<string, string>) => void} page.onRefused receives a failed action and the reason per node
    */
   constructor(page) {
     this.page = page;
     this.busy = new Set();
-    this.markedOn = 0; // nodes, of the newest mark; 0 if it failed on one
-    this.marks = new Marks(async (id, event) => {
-      const take = await api.markTake(id, event);
-      this.markedOn = this.told(take, "not marked") ? take.sessions.length : 0;
+    this.markedNodes = 0; // nodes with the latest marker; 0 if it failed on one
+    this.markers = new MarkerQueue(async (id, event) => {
+      const take = await api.addTakeMarker(id, event);
+      this.markedNodes = this.showFailures(take, "marker not set") ? take.sessions.length : 0;
     });
-    this.does = { "record-all": () => this.record(), "mark-all": () => this.mark(), "stop-all": () => this.stop(), "tare-all": () => this.tare() };
-    for (const id of Object.keys(this.does)) byId(id).addEventListener("click", () => this.run(id));
-    for (const [field, id] of [["take-name", "record-all"], ["take-label", "mark-all"]]) {
+    this.actions = { "record-all": () => this.record(), "marker-all": () => this.setMarker(), "stop-all": () => this.stop(), "tare-all": () => this.tare() };
+    for (const id of Object.keys(this.actions)) byId(id).addEventListener("click", () => this.run(id));
+    for (const [field, id] of [["take-name", "record-all"], ["take-label", "marker-all"]]) {
       const input = byId(field, HTMLInputElement);
       input.addEventListener("keydown", (event) => {
         if (event.isComposing || !["Enter", "Escape"].includes(event.key)) return;
@@ -47,31 +48,31 @@ export class Takes {
     new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
   }
 
-  /** The newest take of which something is being recorded: its id and these sessions; or null. */
+  /** Return the latest running take with its sessions, or null. */
   running() {
-    const taken = [...this.page.recordings.values()].filter((session) => session.take);
-    if (!taken.length) return null;
-    const newest = taken.reduce((a, b) => (b.started_t_ns > a.started_t_ns ? b : a));
-    return { id: newest.take, name: newest.name, sessions: taken.filter((session) => session.take === newest.take) };
+    const sessions = [...this.page.recordings.values()].filter((session) => session.take);
+    if (!sessions.length) return null;
+    const newest = sessions.reduce((a, b) => (b.started_t_ns > a.started_t_ns ? b : a));
+    return { id: newest.take, name: newest.name, sessions: sessions.filter((session) => session.take === newest.take) };
   }
 
-  /** Do something once at a time, and say what came of it. */
+  /** Run an action, once at a time, and show its result. */
   async run(id) {
     const button = byId(id, HTMLButtonElement);
-    if (!mayPress()) {
-      notice("this login may look, and not press. “viewer”, beside the title, says more.", { bad: true });
+    if (!isOperator()) {
+      notice("viewers cannot tare, record or set markers. To log in as operator, press “viewer” beside the title.", { bad: true });
       return;
     }
     if (button.disabled || this.busy.has(id)) {
       if (id === "tare-all") notice(this.page.cannotRecord(), { bad: true });
-      else if (id === "record-all") notice(this.running() ? "Stop what is being recorded first." : this.page.cannotRecord(), { bad: true });
-      else notice("Nothing is being recorded on all nodes: press Record all first.", { bad: true });
+      else if (id === "record-all") notice(this.running() ? "stop the running recording first." : this.page.cannotRecord(), { bad: true });
+      else notice("no recording on all nodes is running. Press Record all first.", { bad: true });
       return;
     }
     this.busy.add(id);
     button.setAttribute("aria-busy", "true");
     try {
-      await this.does[id]();
+      await this.actions[id]();
     } catch (error) {
       showRefusal(error);
     } finally {
@@ -87,29 +88,29 @@ export class Takes {
     const take = await api.startTake(name);
     field.value = "";
     this.page.onRefused("Not recorded", take.failed);
-    if (this.told(take, "not recorded")) notice(`Recording “${name}” on ${nodes(take.sessions.length)}.`);
+    if (this.showFailures(take, "not recorded")) notice(`Recording “${name}” on ${nodes(take.sessions.length)}.`);
     if (document.activeElement === document.body) byId("stop-all").focus();
   }
 
-  async mark() {
+  async setMarker() {
     const pressedMs = this.page.serverNowMs();
     const field = byId("take-label", HTMLInputElement);
-    const label = field.value.trim() || "mark";
+    const label = field.value.trim() || "marker";
     field.value = "";
-    const made = await this.marks.add([this.running()], label, pressedMs);
-    if (made.length && this.markedOn) notice(`Marked “${label}” on ${nodes(this.markedOn)}.`);
+    const sent = await this.markers.add([this.running()], label, pressedMs);
+    if (sent.length && this.markedNodes) notice(`Marker “${label}” set on ${nodes(this.markedNodes)}.`);
   }
 
   async stop() {
     const take = await api.stopTake(this.running().id);
-    this.page.onRefused("", {}); // what was said of this take is over
-    if (!this.told(take, "not stopped")) return;
-    const open = take.sessions.filter((session) => session.state === "pending").length;
-    notice(`Stopped on ${nodes(take.sessions.length)}.${open ? ` ${open === 1 ? "One completes" : `${open} complete`} when the last frames have come.` : ""}`);
+    this.page.onRefused("", {});
+    if (!this.showFailures(take, "not stopped")) return;
+    const pending = take.sessions.filter((session) => session.state === "pending").length;
+    notice(`Stopped on ${nodes(take.sessions.length)}.${pending ? ` ${pending === 1 ? "One is" : `${pending} are`} sealed once the last frames arrive.` : ""}`);
     if (document.activeElement === document.body) byId("record-all").focus();
   }
 
-  /** Each node by itself: one that is loaded is refused, and the others are tared. */
+  /** Tare each node by itself: a loaded one does not keep the others from it. */
   async tare() {
     const names = this.page.connected();
     const answers = await Promise.allSettled(names.map((name) => api.tareNow(name)));
@@ -126,25 +127,25 @@ export class Takes {
       notice(`Tare undone on ${nodes(tared.length)}.`);
     });
     const press = /** @type {[string, () => unknown] | null} */ (tared.length ? ["Undo", undo] : null);
-    const why = Object.entries(failed).map(([name, text]) => `${name} is not tared: ${text}`).join(". ");
-    if (why) notice(`${why}${tared.length ? ` ${nodes(tared.length)} tared.` : ""}`, { bad: true, press });
+    const reasons = Object.entries(failed).map(([name, text]) => `${name} not tared: ${text}`).join(". ");
+    if (reasons) notice(`${reasons}${tared.length ? ` ${nodes(tared.length)} tared.` : ""}`, { bad: true, press });
     else notice(`Tared ${nodes(tared.length)}.`, { press });
   }
 
-  /** Take over what an answer brings; says where it was not done. Returns whether it was done everywhere. */
-  told(take, what) {
+  /** Store the sessions of a response and show on which nodes the action failed; return true if on none. */
+  showFailures(take, what) {
     take.sessions.forEach(this.page.onSession);
     const failed = Object.entries(take.failed);
-    if (failed.length) notice(`${failed.map(([node, why]) => `${node} is ${what}: ${why}`).join(". ")}`, { bad: true });
+    if (failed.length) notice(failed.map(([node, reason]) => `${node} ${what}: ${reason}`).join(". "), { bad: true });
     return !failed.length;
   }
 
   draw() {
     const take = this.running();
-    const why = take ? "" : this.page.cannotRecord();
-    byId("record-all", HTMLButtonElement).disabled = Boolean(take || why);
+    const reason = take ? "" : this.page.cannotRecord();
+    byId("record-all", HTMLButtonElement).disabled = Boolean(take || reason);
     byId("tare-all", HTMLButtonElement).disabled = Boolean(this.page.cannotRecord());
-    byId("stop-all", HTMLButtonElement).disabled = byId("mark-all", HTMLButtonElement).disabled = !take;
+    byId("stop-all", HTMLButtonElement).disabled = byId("marker-all", HTMLButtonElement).disabled = !take;
     setData(byId("actions"), "running", String(Boolean(take)));
     byId("record-all").classList.toggle("primary", !take);
     byId("stop-all").classList.toggle("primary", Boolean(take));
@@ -154,7 +155,7 @@ export class Takes {
       const lost = take.sessions.flatMap((session) => Object.values(session.lost ?? {})).reduce((sum, count) => sum + count, 0);
       setText(byId("take-running"), `“${take.name}” on ${nodes(take.sessions.length)}, ${duration(Math.floor(longest))}, ${lost.toLocaleString("en-GB")} frames lost`);
     }
-    setText(byId("take-why"), take ? "" : why ? `Record all waits: ${why[0].toLowerCase()}${why.slice(1)}` : "Not recording");
+    setText(byId("take-why"), take ? "" : reason ? `Cannot record: ${reason[0].toLowerCase()}${reason.slice(1)}` : "Not recording");
   }
 }
 

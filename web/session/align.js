@@ -1,41 +1,42 @@
-// By what two sessions can be laid over one another, and by how much that moves the other one. Pure.
+// Alignments of two sessions, and the time shift of each. Pure.
 
 import { offsetAt } from "./clock.js";
 
 /**
+ * Return the possible alignments, start first.
  * @param {{beginNs: number, durationS: number, stances: {from: number, begun: boolean}[],
- *   marks: {label: string, timeS: number}[], offset: (tNs: number, ofServer: boolean) => number | null}} own
+ *   markers: {label: string, timeS: number}[], offset: (tNs: number, ofServer: boolean) => number | null}} own
  * @param {{beginNs: number, durationS: number, stances: {begin_t_ns: number, begun: boolean}[],
  *   events: {label: string, t_ns: number}[], clock: Clock | null}} other
- * @returns {{key: string, says: string, because: string, shiftS: number}[]} the start first
+ * @returns {{key: string, label: string, meaning: string, shiftS: number}[]}
  */
 export function alignments(own, other) {
-  const found = [{ key: "start", says: "start", because: "both begin at the same time", shiftS: 0 }];
+  const found = [{ key: "start", label: "start", meaning: "same start", shiftS: 0 }];
   const mine = own.stances.find((stance) => stance.begun);
   const theirs = other.stances.find((stance) => stance.begun);
   if (mine && theirs) {
     found.push({
-      key: "contact", says: "first contact", because: "the first contact that was seen to begin is at the same time in both",
+      key: "contact", label: "first contact", meaning: "same first contact",
       shiftS: mine.from - (theirs.begin_t_ns - other.beginNs) * 1e-9,
     });
   }
   const offsetOf = (tNs, ofServer) => (other.clock ? offsetAt(other.clock, tNs, ofServer) : null);
   const labels = new Set();
   for (const event of other.events) {
-    const mark = own.marks.find(({ label }) => label === event.label);
-    if (!mark || labels.has(event.label)) continue; // the first of its name counts
+    const marker = own.markers.find(({ label }) => label === event.label);
+    if (!marker || labels.has(event.label)) continue; // the first of each label
     labels.add(event.label);
     const theirsS = (event.t_ns - (offsetOf(event.t_ns, true) ?? 0) - other.beginNs) * 1e-9;
     found.push({
-      key: `mark:${event.label}`, says: `mark “${event.label}”`, because: `the first mark “${event.label}” is at the same time in both`,
-      shiftS: mark.timeS - theirsS,
+      key: `marker:${event.label}`, label: `marker “${event.label}”`, meaning: `same first marker “${event.label}”`,
+      shiftS: marker.timeS - theirsS,
     });
   }
   const [mineNs, theirsNs] = [own.offset(own.beginNs, false), offsetOf(other.beginNs, false)];
   if (mineNs !== null && theirsNs !== null) {
     const shiftS = (other.beginNs + theirsNs - own.beginNs - mineNs) * 1e-9;
     if (shiftS < own.durationS && shiftS + other.durationS > 0) { // else they were not recorded together
-      found.push({ key: "clock", says: "clock", because: "what was at the same time by the server's clock is at the same time here", shiftS });
+      found.push({ key: "clock", label: "clock", meaning: "same server clock", shiftS });
     }
   }
   return found;

@@ -1,20 +1,21 @@
-// What is drawn over the plots of a session: another session, or a reference, at this session's time.
+// Overlay on the plots of a session: another session or a reference, on this session's time axis.
 
 import { number, setData } from "../common/text.js";
 import { Bins } from "./bins.js";
 import { Loader } from "./load.js";
 import { drawSeries } from "./series.js";
 
-const NEAR_S = 0.05; // further away from an instant a number is not one of it
+const NEAR_S = 0.05; // a reading further from the cursor does not belong to it
 
 /** @typedef {import("./view.js").View} View */
 
+/** Data of the overlay. */
 export class Beside {
   /**
    * @param {object} how
    * @param {string} how.name for the legend
-   * @param {Record<string, [string, string]>} how.columns least and greatest, by the panel they are drawn in
-   * @param {(query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} how.ask for bins, in its own time
+   * @param {Record<string, [string, string]>} how.columns min and max column by panel
+   * @param {(query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} how.ask requests bins, on its own time axis
    * @param {() => void} how.onChange
    * @param {(error: Error) => void} how.onError
    */
@@ -22,15 +23,16 @@ export class Beside {
     this.name = name;
     this.columns = columns;
     this.ask = ask;
-    this.shiftS = 0; // this session's time less its own
+    this.shiftS = 0; // this session's time minus its own
     this.detail = null;
     this.hasTiles = false;
-    this.loader = new Loader((query, stop) => this.asked(query, stop), (bins) => {
+    this.loader = new Loader((query, stop) => this.request(query, stop), (bins) => {
       this.detail = bins;
       onChange();
     }, onError);
   }
 
+  /** Load the whole series. */
   async begin(widthPx) {
     this.answer = await this.ask({ points: Math.max(50, Math.round(widthPx / 2)) });
     this.durationS = this.answer.duration_s;
@@ -38,8 +40,7 @@ export class Beside {
   }
 
   /**
-   * Its tiles are drawn over those of this session that have the same serial; if none has, as of another foot with as many
-   * tiles, in their order.
+   * Match tiles by serial; if no serial matches and the counts are equal (another foot), by order.
    * @param {string[]} serials of this session
    */
   matchTiles(serials) {
@@ -52,20 +53,20 @@ export class Beside {
     this.hasTiles = "force_n_0_max" in this.answer.columns;
   }
 
-  /** Moved by so many seconds against this session. */
+  /** Shift the overlay by some seconds. */
   move(shiftS) {
     this.shiftS = shiftS;
     this.detail = null;
-    this.loader.forget();
+    this.loader.abort();
     this.whole = new Bins(shifted(this.answer, shiftS), { from: -Infinity, to: Infinity });
   }
 
   /**
-   * In its own time; of what it does not reach to nobody has to be asked.
+   * Request bins on its own time axis; outside of it return none.
    * @param {OverviewQuery} query
    * @param {AbortSignal} [stop]
    */
-  async asked({ points, start_s: startS, end_s: endS }, stop) {
+  async request({ points, start_s: startS, end_s: endS }, stop) {
     const [begin, end] = [startS - this.shiftS, endS - this.shiftS];
     if (end <= 0 || begin > this.durationS) return shifted(emptied(this.answer), this.shiftS);
     return shifted(await this.ask({ points, start_s: Math.max(0, begin), end_s: end }, stop), this.shiftS);
@@ -91,21 +92,21 @@ export class Beside {
   }
 
   /**
-   * Its force at an instant, as the readout shows numbers.
+   * Return its force at an instant, for the readout.
    * @returns {[string, string, string][]}
    */
   readings(view, timeS) {
     const bins = this.best(view);
     const i = bins.at(timeS);
     if (i < 0 || !this.columns.grf) return [];
-    const there = timeS >= bins.first[i] - NEAR_S && timeS <= bins.edge(i) + NEAR_S;
+    const isNear = timeS >= bins.first[i] - NEAR_S && timeS <= bins.edge(i) + NEAR_S;
     const [low, high] = this.columns.grf.map((name) => bins.columns[name][i]);
-    const value = !there || low === null || high === null ? "–" : low === high ? `${number(high)} N` : `${number(low)} to ${number(high)} N`;
+    const value = !isNear || low === null || high === null ? "–" : low === high ? `${number(high)} N` : `${number(low)} to ${number(high)} N`;
     return [["beside", this.name, value]];
   }
 
-  /** Its numbers in view, for whoever reads them from the page. */
-  tell(view, box) {
+  /** Write its numbers in view to data attributes. */
+  writeData(view, box) {
     const bins = this.best(view);
     const [begin, end] = bins.within(view);
     const found = this.extremes("grf", view);

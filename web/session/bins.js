@@ -1,9 +1,9 @@
-// Bins of a session as GET /sessions/ID/overview answers, and what they say of some time.
+// Bins of a session, from GET /sessions/ID/overview.
 
 /** @typedef {import("./view.js").View} View */
 
-/** First place in a rising list at which `value` is not above. */
-function placeOf(list, value) {
+/** Return the first index of a sorted list whose element is not below `value`. */
+function lowerBound(list, value) {
   let [low, high] = [0, list.length];
   while (low < high) {
     const middle = (low + high) >> 1;
@@ -13,10 +13,11 @@ function placeOf(list, value) {
   return low;
 }
 
+/** Min and max per interval. */
 export class Bins {
   /**
    * @param {Overview} overview
-   * @param {View} covers the time that was asked for
+   * @param {View} covers requested interval
    */
   constructor(overview, covers) {
     this.columns = overview.columns;
@@ -28,53 +29,53 @@ export class Bins {
     this.beginNs = overview.begin_t_ns;
     this.axis = overview.time_axis;
     this.serials = overview.serials;
-    this.provisional = Boolean(overview.provisional); // it is not sealed yet
-    this.behind = Boolean(overview.behind); // there are more frames than these
+    this.provisional = Boolean(overview.provisional); // not sealed
+    this.behind = Boolean(overview.behind); // estimation is not complete
     this.covers = covers;
     this.estimated = "grf_n_min" in overview.columns;
   }
 
-  /** Frames that were taken a second, those that were lost among them; null of too few. */
+  /** Sampling rate, lost frames included; null: too few frames. */
   get rateHz() {
-    let [taken, lastedS] = [0, 0];
+    let [sampled, lastedS] = [0, 0];
     for (let i = 0, begin = 0; i < this.count; i++) {
-      taken += this.columns.frames[i] + this.columns.missing[i];
+      sampled += this.columns.frames[i] + this.columns.missing[i];
       if (i + 1 < this.count && this.columns.part[i + 1] === this.columns.part[i]) continue;
       lastedS += this.last[i] - this.first[begin];
-      taken -= 1; // a part lasts from its first frame to its last
+      sampled -= 1; // a part lasts from its first frame to its last
       begin = i + 1;
     }
-    return taken > 0 && lastedS > 0 ? taken / lastedS : null;
+    return sampled > 0 && lastedS > 0 ? sampled / lastedS : null;
   }
 
   has(name) { return Boolean(this.columns[name]?.some((value) => value !== null)); }
 
   contains(view) { return this.covers.from <= view.from && this.covers.to >= view.to; }
 
-  /** Bins that have something of this time: from, up to but not including. */
+  /** Return the index range [begin, end) of the bins in a view. */
   within(view) {
-    return [placeOf(this.last, view.from), placeOf(this.first, view.to + 1e-9)];
+    return [lowerBound(this.last, view.from), lowerBound(this.first, view.to + 1e-9)];
   }
 
-  /** The bin nearest to an instant; -1 if there is none. */
+  /** Return the index of the nearest bin; -1: none. */
   at(timeS) {
     if (!this.count) return -1;
-    const next = Math.min(this.count - 1, placeOf(this.last, timeS));
+    const next = Math.min(this.count - 1, lowerBound(this.last, timeS));
     if (next === 0 || this.first[next] <= timeS) return next;
     return timeS - this.last[next - 1] <= this.first[next] - timeS ? next - 1 : next;
   }
 
-  /** Where a bin's column ends: at the next one, or with its last frame if that is not its neighbour. */
+  /** Return the end of a bin: start of an adjacent next bin, else its last frame. */
   edge(i) {
-    return i + 1 < this.count && this.follows(i + 1) ? this.first[i + 1] : this.last[i];
+    return i + 1 < this.count && this.isAdjacent(i + 1) ? this.first[i + 1] : this.last[i];
   }
 
-  /** No frame is missing between this bin and the one before it, as far as is known. */
-  follows(i) {
+  /** Return true if no frame is missing between a bin and the previous one. */
+  isAdjacent(i) {
     return i > 0 && this.columns.part[i] === this.columns.part[i - 1] && this.columns.missing[i] === 0;
   }
 
-  /** Least of one column and greatest of another, and where that is; null if nothing is known. */
+  /** Return min of one column, max of another, and the index of the max; null: no values. */
   extremes(lowName, highName, begin, end) {
     const [lows, highs] = [this.columns[lowName], this.columns[highName]];
     let found = null;

@@ -1,7 +1,7 @@
-// Marks are in the server's UTC, frames in their node's: from one to the other by GET /sessions/ID/clock. Pure.
+// Offset between the server's clock (markers) and the node's (frames), from GET /sessions/ID/clock. Pure.
 
 /**
- * Server's UTC minus the node's, by the stretch of measurements that is nearest; null if none was made.
+ * Return the server's UTC minus the node's, from the nearest stretch of measurements; null: not measured.
  * @param {{streams: {stretches: {begin_t_ns: number | null, end_t_ns: number | null, offset_ns: number,
  *   drift_ppm: number | null}[]}[]}} summary
  * @param {number} tNs an instant @param {boolean} ofServer by the server's clock, else by the node's

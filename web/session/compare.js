@@ -1,4 +1,4 @@
-// Chooses what is drawn beside a session: a reference it was compared with, or another session.
+// Selection of the overlay: a reference of an earlier comparison, or another session.
 
 import * as api from "../common/api.js";
 import { notice, quietly, showRefusal } from "../common/notices.js";
@@ -7,29 +7,30 @@ import { byId, el, localTime, number, setText } from "../common/text.js";
 import { Beside } from "./beside.js";
 import { alignments } from "./align.js";
 import { drawReport } from "./report.js";
-import { clockOn, stancesOn } from "./time_axis.js";
+import { moveClock, moveStances } from "./time_axis.js";
 
-const SESSIONS_MOST = 50; // older ones by their link
-const SAME = ["grf", "cop-x", "cop-y", "angle"];
+const SESSIONS_MAX = 50; // older ones by URL
+const SHARED = ["grf", "cop-x", "cop-y", "angle"];
 const STEMS = { grf: "grf_n", "cop-x": "cop_x_m", "cop-y": "cop_y_m", angle: "angle_rad" };
 const REFERENCE = {
   grf: ["reference_grf_n_min", "reference_grf_n_max"], difference: ["error_n_min", "error_n_max"],
   "cop-x": ["reference_cop_x_m_min", "reference_cop_x_m_max"], "cop-y": ["reference_cop_y_m_min", "reference_cop_y_m_max"],
 };
 
-/** "trial 3, right": a name that tells it from this session, whose name may be the same. */
+/** Return a name that differs from this session's, such as "trial 3, right". */
 function nameOf(other, session) {
   const name = `${other.name || other.id}, ${other.node}`;
   const isSame = other.name === session.name && other.node === session.node;
   return isSame ? `${name}, ${localTime(new Date(other.started_t_ns / 1e6))}` : name;
 }
 
+/** Controls of the overlay. */
 export class Compare {
   /**
    * @param {{id: string}} session
    * @param {import("./plotted.js").Plotted} page
    * @param {(tNs: number, ofServer: boolean) => number | null} offset of this session's node
-   * @param {{name: string}[]} references that it was compared with
+   * @param {{name: string}[]} references of earlier comparisons
    */
   constructor(session, page, offset, references) {
     this.session = session;
@@ -39,82 +40,82 @@ export class Compare {
     this.choice = byId("beside", HTMLSelectElement);
     this.align = byId("beside-align", HTMLSelectElement);
     this.choice.addEventListener("change", () => quietly(() => this.choose(this.choice.value)));
-    this.align.addEventListener("change", () => { this.moveTo(this.align.value); this.link(); });
+    this.align.addEventListener("change", () => { this.moveTo(this.align.value); this.updateUrl(); });
   }
 
   async begin() {
-    const sessions = await unlessRefused(api.newestSessions(SESSIONS_MOST), { items: [] });
+    const sessions = await unlessRefused(api.newestSessions(SESSIONS_MAX), { items: [] });
     const others = sessions.items.filter((one) => one.id !== this.session.id && one.state === "sealed" && one.sha256);
-    const asked = new URLSearchParams(location.search);
-    const wanted = asked.has("against") ? `against:${asked.get("against")}` : asked.has("with") ? `with:${asked.get("with")}` : "";
+    const query = new URLSearchParams(location.search);
+    const wanted = query.has("against") ? `against:${query.get("against")}` : query.has("with") ? `with:${query.get("with")}` : "";
     const group = (label, options) => (options.length ? [el("optgroup", { label }, ...options)] : []);
     const references = this.references.map((one) => el("option", { value: `against:${one.name}`, text: one.name }));
     const known = others.map((one) => el("option", { value: `with:${one.id}`, text: `${one.name || one.id}, ${one.node}, ${localTime(new Date(one.started_t_ns / 1e6))}` }));
-    if (wanted.startsWith("with:") && !others.some((one) => `with:${one.id}` === wanted)) { // an older one, by its link
+    if (wanted.startsWith("with:") && !others.some((one) => `with:${one.id}` === wanted)) { // an older one, by URL
       known.push(el("option", { value: wanted, text: wanted.slice(5) }));
     }
-    this.choice.replaceChildren(el("option", { value: "", text: "nothing" }),
-      ...group("References, by foottile compare", references), ...group("Other sessions", known));
+    this.choice.replaceChildren(el("option", { value: "", text: "none" }),
+      ...group("References (foottile compare)", references), ...group("Other sessions", known));
     byId("beside-choice").hidden = false;
-    if (!references.length && !known.length) this.say("There is no other session that is sealed, and foottile compare has kept nothing with this one.");
+    if (!references.length && !known.length) this.showText("No other sealed session, and no result of foottile compare.");
     if (!wanted) return;
     this.choice.value = wanted;
-    await this.choose(wanted, asked.get("align"));
+    await this.choose(wanted, query.get("align"));
   }
 
   async choose(wanted, align = null) {
     this.wanted = wanted;
     this.show(null);
-    this.page.layBeside(null);
+    this.page.setOverlay(null);
     byId("report-card").hidden = true;
     byId("align-choice").hidden = true;
-    this.say("");
-    this.link();
+    this.showText("");
+    this.updateUrl();
     try {
       if (wanted.startsWith("against:")) await this.against(wanted.slice(8));
       else if (wanted.startsWith("with:")) await this.with(wanted.slice(5), align);
     } catch (error) {
       if (!(error instanceof api.Refusal)) throw error;
-      this.say(error.message);
+      this.showText(error.message);
     }
   }
 
-  /** A reference: at this session's time already. */
+  /** Show a reference; it has this session's time axis. */
   async against(name) {
     const wanted = this.wanted;
     const found = await api.getComparison(this.session.id, name);
     if (wanted !== this.wanted) return;
     drawReport(found);
-    if (!found.has_series) return this.say("It was made by an older version, or is too long to be drawn: only its figures are there.");
+    if (!found.has_series) return this.showText("Figures only: the comparison has no series (older version, or too long).");
     const beside = this.beside(name, REFERENCE, (query, stop) => api.comparisonSeries(this.session.id, name, query, stop));
     await beside.begin(this.page.plots.plotWidth);
     if (wanted === this.wanted) this.show(beside);
   }
 
-  /** Another session: moved as is chosen. */
+  /** Show another session, aligned as selected. */
   async with(id, align) {
     const wanted = this.wanted;
     const [other, stances, events, clock] = await Promise.all([
-      api.getSession(id), unlessRefused(api.listStances(id)), unlessRefused(api.listEvents(id)), unlessRefused(api.clockOf(id)),
+      api.getSession(id), unlessRefused(api.listStances(id)), unlessRefused(api.listMarkers(id)), unlessRefused(api.clockOf(id)),
     ]);
-    const columns = Object.fromEntries(SAME.map((key) => [key, [`${STEMS[key]}_min`, `${STEMS[key]}_max`]]));
+    const columns = Object.fromEntries(SHARED.map((key) => [key, [`${STEMS[key]}_min`, `${STEMS[key]}_max`]]));
     const beside = this.beside(nameOf(other, this.session), columns, (query, stop) => api.overview(id, query, stop));
     await beside.begin(this.page.plots.plotWidth);
     if (wanted !== this.wanted) return;
     beside.matchTiles(this.page.plots.whole.serials);
-    for (const key of SAME) if (!(columns[key][0] in beside.answer.columns)) delete beside.columns[key];
-    if (!Object.keys(beside.columns).length) return this.say("It has no estimates: there is nothing to draw beside this one.");
+    for (const key of SHARED) if (!(columns[key][0] in beside.answer.columns)) delete beside.columns[key];
+    if (!Object.keys(beside.columns).length) return this.showText("The other session has no estimates.");
     const { plots } = this.page;
     this.ways = alignments(
-      { beginNs: plots.whole.beginNs, durationS: this.page.durationS, stances: plots.stances, marks: plots.marks, offset: this.offset },
+      { beginNs: plots.whole.beginNs, durationS: this.page.durationS, stances: plots.stances, markers: plots.markers, offset: this.offset },
       { beginNs: beside.answer.begin_t_ns, durationS: beside.durationS,
-        stances: stancesOn(beside.answer.time_axis, stances ?? []), events: events?.items ?? [],
-        clock: clockOn(beside.answer.time_axis, other.parts, clock) },
+        stances: moveStances(beside.answer.time_axis, stances ?? []), events: events?.items ?? [],
+        clock: moveClock(beside.answer.time_axis, other.parts, clock) },
     );
-    this.align.replaceChildren(...this.ways.map((way) => el("option", { value: way.key, text: way.says })));
+    this.align.replaceChildren(...this.ways.map((way) => el("option", { value: way.key, text: way.label })));
     byId("align-choice").hidden = false;
     this.drawn = beside;
-    this.page.layBeside({ id, name: beside.name });
+    this.page.setOverlay({ id, name: beside.name });
     this.moveTo(this.ways.some((way) => way.key === align) ? align : this.ways[0].key);
     this.show(beside);
   }
@@ -130,8 +131,8 @@ export class Compare {
     const way = this.ways.find((one) => one.key === key);
     this.align.value = key;
     this.drawn.move(way.shiftS);
-    const shift = way.shiftS === 0 ? "not moved" : `moved by ${number(way.shiftS, 3)} s`;
-    this.say(`${this.drawn.name} is ${shift}: ${way.because}.`, way.shiftS);
+    const shift = way.shiftS === 0 ? "not shifted" : `shifted by ${number(way.shiftS, 3)} s`;
+    this.showText(`${this.drawn.name}: ${shift} (${way.meaning}).`, way.shiftS);
     this.page.redraw();
   }
 
@@ -140,18 +141,18 @@ export class Compare {
     plots.beside = beside;
     if (plots.whole) plots.show(plots.whole);
     this.page.redraw();
-    if (beside) this.link();
+    if (beside) this.updateUrl();
   }
 
-  say(text, shiftS = null) {
-    const line = byId("beside-says");
+  showText(text, shiftS = null) {
+    const line = byId("beside-summary");
     line.hidden = !text;
     line.dataset.shiftS = shiftS === null ? "" : String(shiftS);
     setText(line, text);
   }
 
-  /** The address says it, too. */
-  link() {
+  /** Write the selection to the URL. */
+  updateUrl() {
     const fields = new URLSearchParams(location.search);
     for (const name of ["with", "against", "align"]) fields.delete(name);
     const [kind, ...rest] = (this.wanted ?? "").split(":");

@@ -1,4 +1,4 @@
-// Paths of the centre of pressure of several stances on the foot: a butterfly.
+// COP paths of several stances on the foot (butterfly diagram).
 
 import { fit } from "../common/axes.js";
 import { FootLayout } from "../common/foot_layout.js";
@@ -8,8 +8,9 @@ import { byId, el, printable, setData, setText } from "../common/text.js";
 const HIT_PX = 14;
 const PLAN_PX = 420;
 const SIDE_PX = 320;
-const SHADES = 24; // of time or of stances: neighbours are not told apart by eye
+const SHADES = 24; // of time or stances; finer steps are invisible
 
+/** Plot of the COP paths. */
 export class CopPaths {
   /** @param {() => void} onChange @param {(curve: {number: number}) => void} onGo */
   constructor(onChange, onGo) {
@@ -37,15 +38,15 @@ export class CopPaths {
 
   /**
    * @param {{number: number} | null} chosen
-   * @param {{percent: number[], copX: (number | null)[], copY: (number | null)[]} | null} frames of it
+   * @param {{percent: number[], copX: (number | null)[], copY: (number | null)[]} | null} frames of the selected stance
    * @param {import("./stance_overlay.js").Curve | null | undefined} hovered
-   * @param {{percent: number[], overlaid: number, spread: object} | null} beside stances of another session
+   * @param {{percent: number[], overlaid: number, spread: object} | null} beside overlay of another session
    */
   draw(colours, chosen, frames, hovered, beside = null) {
     const width = this.canvas.parentElement.clientWidth;
     if (!this.known || width < 100) return;
     const { plan, place } = this.layOut(width, colours);
-    setText(byId("cop-title"), plan ? "Centre of pressure on the foot, from above" : "Centre of pressure along the foot, over each stance");
+    setText(byId("cop-title"), plan ? "COP on the foot, from above" : "COP along the foot, over the stance");
     setData(this.canvas, "plan", String(plan));
     const { context } = this;
     const { curves, points } = this.answer;
@@ -103,14 +104,14 @@ export class CopPaths {
       };
       return { plan: true, place };
     }
-    // A line of tiles says nothing across it: time is the other axis.
+    // A line of tiles measures one axis: the other is time.
     const radius = Math.min(11, 0.42 * layout.pitch * ((width - 60) / (layout.span + 2 * layout.pitch)));
     const box = { left: 46, right: width - 14, top: 24, bottom: height - 74 };
     const xs = this.tiles.map((tile) => 1e3 * tile.x_m);
     const margin = 1e3 * layout.pitch;
     const { x, y } = drawFrame(context, box, {
       x: { low: Math.min(...xs) - margin, high: Math.max(...xs) + margin }, y: { low: 0, high: 100 },
-      colours, xUnit: "mm", yTitle: "% of the stance",
+      colours, xUnit: "mm", yTitle: "% of stance",
     });
     const points = this.tiles.map((tile) => ({ x: x(1e3 * tile.x_m), y: box.bottom + 40 }));
     this.drawTiles(points, Math.max(4, radius), colours);
@@ -137,7 +138,7 @@ export class CopPaths {
     context.setLineDash([]);
   }
 
-  /** Which way it goes, and how long ten millimetres are. */
+  /** Draw direction and a 10 mm scale bar. */
   drawScale(layout, width, height, colours) {
     const { context } = this;
     context.fillStyle = colours.soft;
@@ -159,7 +160,7 @@ export class CopPaths {
     context.fillText("10 mm", left, top - 6);
   }
 
-  /** All paths a percentage at a time: as many strokes as there are shades. */
+  /** Draw all paths shade by shade, so that strokes are few. */
   drawByTime(paths, along, shade) {
     const { context } = this;
     for (let one = 0; one < SHADES; one++) {
@@ -178,7 +179,7 @@ export class CopPaths {
     }
   }
 
-  /** A ring where a path begins, a dot where it ends. */
+  /** Draw a ring at the start and a dot at the end of a path. */
   drawEnds([xs, ys], colours) {
     const { context } = this;
     const first = ys.findIndex((value) => value !== null);
@@ -200,7 +201,7 @@ export class CopPaths {
     const what = this.by === "time" ? ["first contact", "lift-off"] : ["first stance", "last stance"];
     const items = [
       ["shades", `${what[0]} to ${what[1]}`],
-      ["ends", `○ begins, ● ends: ${frames ? `stance ${chosen.number}` : "the mean, where half of them have a COP"}`],
+      ["ends", `○ start, ● end: ${frames ? `stance ${chosen.number}` : "mean, where half of the stances have a COP"}`],
     ];
     const list = byId("cop-legend");
     const key = JSON.stringify(items);
@@ -223,7 +224,7 @@ export class CopPaths {
   }
 }
 
-/** The mean path where half of the stances have a COP at least: of a few it would jump from one to another. */
+/** Return the mean path where at least half of the stances have a COP: with fewer it would jump. */
 const meanOf = ({ overlaid, spread }) =>
   [spread.cop_x_m, spread.cop_y_m].map(({ mean, count }) => mean.map((value, i) => (2 * count[i] >= overlaid ? value : null)));
 
@@ -237,7 +238,7 @@ function placesOf(along, xsM, ysM, place) {
   return [xs, ys];
 }
 
-/** From one colour of the style sheet over another to a third. */
+/** Return a function from a share to a colour of the style sheet's heat scale. */
 function shadesOf(colours) {
   const stops = ["heat-1", "heat-2", "heat-3"].map((name) => rgbOf(colours[name]));
   return (share) => {

@@ -1,19 +1,13 @@
-// What a session is: name, node, when, how long, whether it is complete, and what people said of it.
+// Header of a session: name, state, facts, labels and notes.
 
 import { byId, duration, el, localTime, perSecond, setText } from "../common/text.js";
-import { plainState } from "../sessions/state.js";
-
-const WORDS = {
-  complete: "complete: all its frames are here",
-  lossy: "frames are missing",
-  incomplete: "not complete",
-};
+import { stateText } from "../sessions/state.js";
 
 /**
- * "434 of 449 frames/s, 292 slots not sampled": what the node reached of its rate.
+ * Return the achieved rate, such as "434 of 449 frames/s, 292 slots not sampled".
  * @param {Session} session @param {import("./bins.js").Bins | null} whole @param {number | null} nominalHz
  */
-export function rateWords(session, whole, nominalHz) {
+export function rateText(session, whole, nominalHz) {
   const hz = whole?.rateHz ?? null;
   if (hz === null || nominalHz === null) return "";
   const missed = session.missed_slots;
@@ -22,26 +16,27 @@ export function rateWords(session, whole, nominalHz) {
 }
 
 /**
+ * Draw the header.
  * @param {Session} session
- * @param {import("./bins.js").Bins | null} whole of all of it, once that is there
- * @param {number | null} nominalHz rate of its node
+ * @param {import("./bins.js").Bins | null} whole bins of the whole session, once loaded
+ * @param {number | null} nominalHz rate of the node
  */
 export function drawHeader(session, whole = null, nominalHz = null) {
   setText(byId("name"), session.name || session.id);
-  const [short, long, weight] = plainState(session);
+  const [short, long, weight] = stateText(session);
   const state = byId("state");
   state.className = `state ${weight}`;
-  setText(state, WORDS[short] ?? short);
+  setText(state, short);
   setText(byId("state-why"), session.state === "sealed" ? long : "");
   const facts = [
     ["Node", session.node],
     ["Started", localTime(new Date(session.started_t_ns / 1e6))],
     ["Duration", duration(session.duration_s)],
     ["Frames", session.frames.toLocaleString("en-GB")],
-    ["Rate", rateWords(session, whole, nominalHz)],
+    ["Rate", rateText(session, whole, nominalHz)],
     ["Parts", session.parts.length > 1 ? String(session.parts.length) : ""],
     ["Scene", session.scene],
-    ["Scale", session.absolute_scale === "assumed" ? "assumed: newtons are not to be trusted" : ""],
+    ["Scale", session.absolute_scale === "assumed" ? "assumed: newtons are approximate" : ""],
     ["Subject", session.subject],
     ["Tags", session.tags.map((tag) => `#${tag}`).join(" ")],
     ["Notes", session.notes],

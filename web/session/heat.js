@@ -1,4 +1,4 @@
-// Forces of many tiles as colours: a row for each, and what the colours mean.
+// Forces of many tiles as colours, one row per tile, with a colour scale.
 
 import { crisp } from "../common/axes.js";
 import { number, printable } from "../common/text.js";
@@ -6,7 +6,7 @@ import { drawHeat } from "./series.js";
 
 const STOPS = ["heat-0", "heat-1", "heat-2", "heat-3"];
 
-/** @param {import("./plots.js").Plots} plots */
+/** Draw the rows. @param {import("./plots.js").Plots} plots */
 export function drawTiles(plots, context, panel, box, view, x) {
   const { colours, whole } = plots;
   const counts = !whole.estimated;
@@ -28,7 +28,7 @@ export function drawTiles(plots, context, panel, box, view, x) {
   context.textBaseline = "middle";
   const every = Math.max(1, Math.ceil(13 / rowPx));
   for (let i = 0; i < rows; i += every) context.fillText(printable(serials[i]), box.left - 6, box.top + (i + 0.5) * rowPx);
-  // What the colours mean, at the right of the title.
+  // Colour scale, right of the title.
   const bar = { left: box.right - 130, right: box.right - 60, top: box.top - 14, bottom: box.top - 4 };
   const blend = context.createLinearGradient(bar.left, 0, bar.right, 0);
   stops.forEach((stop, i) => blend.addColorStop(i / (stops.length - 1), stop));
@@ -42,7 +42,7 @@ export function drawTiles(plots, context, panel, box, view, x) {
   context.fillText(`${number(plots.heat.high, decimals)} ${counts ? "" : panel.unit}`, bar.right + 5, bar.top + 6);
 }
 
-/** Of the whole session, so that a colour means the same at every zoom. */
+/** Return the range over the whole session: colours do not depend on the zoom. */
 function heatRange(bins, counts) {
   let [low, high] = [Infinity, -Infinity];
   bins.serials.forEach((_, i) => {

@@ -1,45 +1,46 @@
-// What became of every frame of a session, and how that is proven, in plain words.
+// Integrity of a session: ledger and verification as texts.
 
 import * as api from "../common/api.js";
-import { frames, lossesInWords } from "../common/losses.js";
+import { frames, lossTexts } from "../common/losses.js";
 import { byId, bytes, el, localTime, setText } from "../common/text.js";
 
-/** @returns {string[]} sentences */
-export function ledgerInWords(ledger, session) {
-  const said = [];
+/** Return the ledger as sentences. @returns {string[]} */
+export function ledgerTexts(ledger, session) {
+  const texts = [];
   const total = (name) => ledger.parts.reduce((sum, part) => sum + part[name], 0);
-  said.push(`${frames(total("recorded"))} ${total("recorded") === 1 ? "is" : "are"} in it.`);
+  texts.push(`${frames(total("recorded"))} recorded.`);
   const pending = total("pending");
-  if (pending) said.push(`${frames(pending)} more are still with the node.`);
-  for (const loss of lossesInWords(session.lost)) said.push(`Lost for good: ${loss}.`);
-  if (session.tail_frames_max) said.push(`At most ${frames(session.tail_frames_max)} more may have been taken at an end that the node could not tell.`);
-  if (ledger.missed_slots) said.push(`${ledger.missed_slots.toLocaleString("en-GB")} slot${ledger.missed_slots === 1 ? " was" : "s were"} not sampled: the node was late. They never were frames, have no number, and are not lost.`);
-  if (ledger.parts.length > 1) said.push(`The node was started again: the session has ${ledger.parts.length} parts.`);
-  if (ledger.complete) said.push("Every number from the first frame to the last is accounted for, and none is lost.");
+  if (pending) texts.push(`${frames(pending)} still on the node.`);
+  for (const [, text] of lossTexts(session.lost)) texts.push(`Lost: ${text}.`);
+  if (session.tail_frames_max) texts.push(`Up to ${frames(session.tail_frames_max)} at the end may be lost (power failure).`);
+  if (ledger.missed_slots) texts.push(`${ledger.missed_slots.toLocaleString("en-GB")} slot${ledger.missed_slots === 1 ? "" : "s"} not sampled (node late). They have no frame number and do not count as lost.`);
+  if (ledger.parts.length > 1) texts.push(`Node restarted: ${ledger.parts.length} parts.`);
+  if (ledger.complete) texts.push("Frame numbers are complete from first to last.");
   if (session.sha256) {
-    said.push(`Its file, ${bytes(session.bytes)}, is sealed: SHA-256 ${session.sha256}. What is shown here was held against checksums as it was read. “Check its files now” has the server read all of them again; “foottile pull” and “foottile verify” do the same on your own computer.`);
-  } else said.push("It is not sealed yet: nothing of this is final.");
-  return said;
+    texts.push(`Sealed file: ${bytes(session.bytes)}, SHA-256 ${session.sha256}. Data on this page were verified by checksum. “Verify files” reads all files again on the server; “foottile pull” and “foottile verify” do so on your computer.`);
+  } else texts.push("Not sealed yet: these figures are provisional.");
+  return texts;
 }
 
 /**
- * What a check of the files has found: in a sentence, and in detail.
+ * Return the result of a verification: summary and details.
  * @param {Verified} found @param {Session} session @param {Date} at
- * @returns {{whole: boolean, says: string, details: string[]}}
+ * @returns {{whole: boolean, summary: string, details: string[]}}
  */
-export function verifiedInWords(found, session, at) {
+export function verificationTexts(found, session, at) {
   const whole = !found.problems.length && found.sha256 === session.sha256;
   const read = frames(found.parts.reduce((sum, part) => sum + part.recorded, 0));
   const when = localTime(at).slice(-8);
   if (!whole) {
-    const other = found.problems.length ? [] : ["the file of frames is another one than this page is about: load the page again"];
-    return { whole, says: `Checked at ${when}: something is wrong with its files. Keep them as they are; a copy may be whole.`, details: [...found.problems, ...other, ...found.unproven] };
+    const other = found.problems.length ? [] : ["the file of frames has changed since this page was loaded: reload"];
+    return { whole, summary: `Checked at ${when}: files are damaged. Keep them; a copy may be intact.`, details: [...found.problems, ...other, ...found.unproven] };
   }
-  const proven = session.sha256 ? `all ${read} were read again. Frames, ledger, marks, clock, stances and hashes agree with one another` : "not one frame was recorded, and its files agree with one another";
-  const rest = found.unproven.length ? ". What they cannot show:" : ": it is what was sealed.";
-  return { whole, says: `Checked at ${when}: ${proven}${rest}`, details: found.unproven };
+  const proven = session.sha256 ? `all ${read} read again; frames, ledger, markers, clock, stances and hashes are consistent` : "no frames; files are consistent";
+  const rest = found.unproven.length ? ". Not verifiable:" : ".";
+  return { whole, summary: `Verified at ${when}: ${proven}${rest}`, details: found.unproven };
 }
 
+/** Card of ledger and verification. */
 export class LedgerCard {
   constructor() {
     this.card = byId("ledger-card", HTMLDetailsElement);
@@ -57,11 +58,11 @@ export class LedgerCard {
     if (grown) this.load();
   }
 
-  /** Its files could not be read: what was sealed as complete may be so no more. */
-  doubt() {
+  /** Show that files could not be read. */
+  showDamage() {
     const state = byId("state");
     state.className = "state bad";
-    setText(state, "its files are damaged");
+    setText(state, "files damaged");
     this.card.open = true;
   }
 
@@ -69,7 +70,7 @@ export class LedgerCard {
     if (!this.card.open) return;
     let lines;
     try {
-      lines = ledgerInWords(await api.ledgerOf(this.session.id), this.session);
+      lines = ledgerTexts(await api.ledgerOf(this.session.id), this.session);
     } catch (error) {
       if (!(error instanceof api.Refusal)) throw error;
       lines = [error.message];
@@ -77,18 +78,18 @@ export class LedgerCard {
     byId("ledger").replaceChildren(...lines.map((text) => el("li", { text })));
   }
 
-  /** The server reads all of its files again. */
+  /** Let the server read all files again. */
   async verify() {
     const [button, box] = [byId("verify", HTMLButtonElement), byId("verified")];
     if (button.hasAttribute("aria-busy")) return;
     button.setAttribute("aria-busy", "true");
     box.replaceChildren(el("p", { text: `Reading ${frames(this.session.frames)} …` }));
     try {
-      const { whole, says, details } = verifiedInWords(await api.verified(this.session.id), this.session, new Date());
-      box.replaceChildren(el("p", { text: says, "data-whole": String(whole) }), el("ul", {}, ...details.map((text) => el("li", { text }))));
+      const { whole, summary, details } = verificationTexts(await api.verifyFiles(this.session.id), this.session, new Date());
+      box.replaceChildren(el("p", { text: summary, "data-whole": String(whole) }), el("ul", {}, ...details.map((text) => el("li", { text }))));
     } catch (error) {
       if (!(error instanceof api.Refusal)) throw error;
-      box.replaceChildren(el("p", { text: `Not checked: ${error.message}` }));
+      box.replaceChildren(el("p", { text: `Not verified: ${error.message}` }));
     } finally {
       button.removeAttribute("aria-busy");
     }

@@ -1,48 +1,49 @@
-// Asks the server for bins of what is in view; a question that is out of date is taken back.
+// Requests of bins for the visible range; outdated requests are aborted.
 
 import { Bins } from "./bins.js";
 
-const WAIT_MS = 60; // a wheel turns on: only where it stops is asked for
+const WAIT_MS = 60; // debounce of the wheel
 const MARGIN = 0.15; // of the view, on both sides
-const VALUES_MOST = 120_000; // an answer has up to four times as many
+const VALUES_MAX = 120_000; // a response has up to four times as many
 
-/** @param {number} widthPx @param {number} tiles */
+/** Return the number of bins to request. @param {number} widthPx @param {number} tiles */
 export const pointsFor = (widthPx, tiles) =>
-  Math.round(Math.max(50, Math.min(0.6 * widthPx, VALUES_MOST / (20 + 3 * tiles), 2000)));
+  Math.round(Math.max(50, Math.min(0.6 * widthPx, VALUES_MAX / (20 + 3 * tiles), 2000)));
 
+/** Loads bins. */
 export class Loader {
   /**
-   * @param {(query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} question
+   * @param {(query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} request
    * @param {(bins: Bins) => void} onBins @param {(error: Error) => void} onError
    */
-  constructor(question, onBins, onError) {
-    this.question = question;
+  constructor(request, onBins, onError) {
+    this.request = request;
     this.onBins = onBins;
     this.onError = onError;
-    this.asked = null; // what the newest answer or question is about
+    this.key = null; // of the latest request
     this.stopping = null;
     this.timer = null;
-    this.busy = false; // finer bins are on their way
+    this.busy = false; // finer bins are requested
   }
 
   async whole(widthPx) {
-    const answer = await this.question({ points: pointsFor(widthPx, 8) });
+    const answer = await this.request({ points: pointsFor(widthPx, 8) });
     return new Bins(answer, { from: -Infinity, to: Infinity });
   }
 
-  /** What was asked for is out of date. */
-  forget() {
+  /** Abort the request. */
+  abort() {
     clearTimeout(this.timer);
     this.stopping?.abort();
-    this.stopping = this.asked = null;
+    this.stopping = this.key = null;
     this.busy = false;
   }
 
-  /** Bins of a view, soon: none are asked for if `best` has the frames themselves already. */
+  /** Request bins of a view after a delay, unless `best` has single frames already. */
   want(view, widthPx, best) {
     const key = `${view.from} ${view.to} ${widthPx}`;
-    if (key === this.asked) return;
-    this.asked = key;
+    if (key === this.key) return;
+    this.key = key;
     clearTimeout(this.timer);
     this.stopping?.abort();
     this.stopping = null;
@@ -56,7 +57,7 @@ export class Loader {
     const margin = MARGIN * (view.to - view.from);
     const covers = { from: Math.max(0, view.from - margin), to: view.to + margin };
     try {
-      const answer = await this.question({
+      const answer = await this.request({
         points: pointsFor(widthPx * (1 + 2 * MARGIN), best.serials.length), start_s: covers.from, end_s: covers.to,
       }, stopping.signal);
       if (stopping.signal.aborted) return;
@@ -65,7 +66,7 @@ export class Loader {
     } catch (error) {
       if (stopping.signal.aborted) return;
       this.busy = false;
-      this.asked = null; // the next move asks again
+      this.key = null; // the next move requests again
       this.onError(/** @type {Error} */ (error));
     }
   }

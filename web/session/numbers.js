@@ -1,21 +1,22 @@
-// The same as the plots, as a table: for who does not see them, and for who wants the numbers.
+// Visible range as a table.
 
 import * as api from "../common/api.js";
 import { byId, el, setText } from "../common/text.js";
 import { Bins } from "./bins.js";
-import { flagsInWords } from "./flags.js";
+import { flagTexts } from "./flags.js";
 import { readingsOf } from "./readout.js";
 
-const POINTS = 12; // rows at least, where there are as many frames
+const POINTS = 12; // rows, at least if there are as many frames
 const SETTLED_MS = 400;
 
+/** Table of the visible range. */
 export class Numbers {
   constructor(id) {
     this.id = id;
     this.shown = "";
   }
 
-  /** The view's numbers, if anyone looks at them. */
+  /** Load the numbers of the view, if the table is open. */
   draw(view, panels) {
     const key = `${view.from} ${view.to}`;
     if (!byId("numbers-card", HTMLDetailsElement).open || key === this.shown) return;
@@ -35,8 +36,8 @@ export class Numbers {
     }
     if (key !== this.shown) return;
     const bins = new Bins(answer, view);
-    const rows = Array.from({ length: bins.count }, (_, i) => ({ readings: readingsOf(bins, i, panels), flags: flagsInWords(bins, i).join(", ") }));
-    const names = (rows[0]?.readings ?? []).map(([, name]) => name).concat("To know");
+    const rows = Array.from({ length: bins.count }, (_, i) => ({ readings: readingsOf(bins, i, panels), flags: flagTexts(bins, i).join(", ") }));
+    const names = (rows[0]?.readings ?? []).map(([, name]) => name).concat("Notes");
     byId("numbers-head").replaceChildren(...names.map((name) => el("th", { scope: "col", text: name })));
     byId("numbers-rows").replaceChildren(...rows.map(({ readings, flags }) =>
       el("tr", {}, ...readings.map(([, , value]) => el("td", { text: value })), el("td", { text: flags }))));

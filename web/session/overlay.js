@@ -1,13 +1,13 @@
-// What lies over all plots: stances with their numbers, marks, and the axis of time.
+// Over all plots: stances with numbers, markers, time axis.
 
 import { crisp, decimalsOf, ticks } from "../common/axes.js";
 import { number, printable } from "../common/text.js";
 
 /** @typedef {import("./plots.js").Plots} Plots */
 
-export const HEAD_PX = 38; // marks and the numbers of stances
+export const HEAD_PX = 38; // markers and stance numbers
 
-/** An instant as a label: seconds, or minutes and seconds from a minute on. */
+/** Format a time: seconds, from 60 s on minutes and seconds. */
 export function timeLabel(timeS, step) {
   const decimals = decimalsOf(step);
   const rounded = Number(timeS.toFixed(decimals));
@@ -17,8 +17,8 @@ export function timeLabel(timeS, step) {
   return `${minutes}:${rest.padStart(decimals ? decimals + 3 : 2, "0")}`;
 }
 
-/** The same with its unit: "59.99 s", "1:00.00 min". */
-export function timeWords(timeS, step) {
+/** Format a time with its unit: "59.99 s", "1:00.00 min". */
+export function timeText(timeS, step) {
   const label = timeLabel(timeS, step);
   return `${label} ${label.includes(":") ? "min" : "s"}`;
 }
@@ -39,7 +39,7 @@ export function drawStances(plots, context, view, x, bottom, current) {
     const middle = (left + right) / 2;
     const text = String(stance.number);
     const half = context.measureText(text).width / 2;
-    if (middle - half < freeFrom) return; // numbers must not lie on each other
+    if (middle - half < freeFrom) return; // no overlap
     freeFrom = middle + half + 6;
     context.fillStyle = i === current ? colours.text : colours.soft;
     context.fillText(text, middle, HEAD_PX - 6);
@@ -47,7 +47,7 @@ export function drawStances(plots, context, view, x, bottom, current) {
 }
 
 /**
- * A mark on the greatest force of each stance, with its number where the stance has room for it.
+ * Draw a triangle at the peak of each stance, with its value if there is room.
  * @param {Plots} plots @param {{left: number, right: number, top: number}} box @param {(value: number) => number} y
  */
 export function drawPeaks(plots, context, view, x, box, y) {
@@ -93,22 +93,22 @@ export function drawTime(plots, context, view, x, bottom) {
   context.textBaseline = "top";
   for (const [i, value] of values.entries()) {
     context.textAlign = "center";
-    const text = (i === values.length - 1 ? timeWords : timeLabel)(value, step);
+    const text = (i === values.length - 1 ? timeText : timeLabel)(value, step);
     const half = context.measureText(text).width / 2;
     context.fillText(text, Math.min(plots.width - half - 1, Math.max(half + 1, x(value))), bottom + 8);
   }
 }
 
-/** Flags with what is written on them, as far as there is room. */
-export function drawMarks(plots, context, view, x, bottom) {
+/** Draw the markers' flags, labels as far as there is room. */
+export function drawMarkers(plots, context, view, x, bottom) {
   const { colours } = plots;
   context.textAlign = "left";
   context.textBaseline = "middle";
   let freeFrom = -Infinity;
   plots.flags = [];
-  for (const mark of plots.marks) {
-    if (mark.timeS < view.from || mark.timeS > view.to) continue;
-    const at = crisp(x(mark.timeS));
+  for (const marker of plots.markers) {
+    if (marker.timeS < view.from || marker.timeS > view.to) continue;
+    const at = crisp(x(marker.timeS));
     context.strokeStyle = colours.text;
     context.lineWidth = 1.5;
     context.setLineDash([4, 3]);
@@ -117,10 +117,10 @@ export function drawMarks(plots, context, view, x, bottom) {
     context.lineTo(at, bottom);
     context.stroke();
     context.setLineDash([]);
-    const label = [...printable(mark.label)];
+    const label = [...printable(marker.label)];
     let text = label.length > 24 ? `${label.slice(0, 23).join("")}…` : label.join("");
     let width = context.measureText(text).width + 10;
-    const before = at + width > plots.width; // no room on the right: the flag hangs to the left
+    const before = at + width > plots.width; // no room on the right: flag to the left
     if ((before ? at - width : at) < freeFrom) { text = ""; width = 8; }
     const left = before ? at - width : at - 1;
     freeFrom = left + width + 2;
@@ -128,11 +128,11 @@ export function drawMarks(plots, context, view, x, bottom) {
     context.fillRect(left, 0, width, 16);
     context.fillStyle = colours.page;
     context.fillText(text, left + 5, 8.5);
-    plots.flags.push({ id: mark.id, left, right: left + width });
+    plots.flags.push({ id: marker.id, left, right: left + width });
   }
 }
 
-/** The mark whose flag is at a place; null: there is none. @param {Plots} plots */
+/** Return the id of the marker whose flag is at a position; null: none. @param {Plots} plots */
 export function flagAt(plots, px, py) {
   const inside = plots.flags.filter(({ left, right }) => py <= 20 && px >= left - 4 && px <= right + 4);
   return inside.at(-1)?.id ?? null;

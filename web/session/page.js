@@ -1,51 +1,52 @@
-// The page of one session: asks for it, and plots what there is; for as long as it is not sealed, again and again.
+// Page of a session: loads and plots it, repeatedly until it is sealed.
 
 import * as api from "../common/api.js";
 import { edit } from "../common/dialogs.js";
 import { helpWithKeys } from "../common/help.js";
-import { enter } from "../common/login.js";
+import { logInFromUrl } from "../common/login.js";
 import { notice, quietly } from "../common/notices.js";
 import { unlessRefused } from "../common/request.js";
 import { inSunlight } from "../common/sunlight.js";
 import { byId, printable, setText } from "../common/text.js";
-import { plainState } from "../sessions/state.js";
+import { stateText } from "../sessions/state.js";
 import { drawHeader } from "./header.js";
 import { LedgerCard } from "./ledger.js";
 import { Plotted } from "./plotted.js";
 
-const AGAIN_MS = 1000;
+const REFRESH_MS = 1000;
 
 const id = decodeURIComponent(location.pathname.split("/").pop());
 let plotted = null;
-let now = null; // the session as it was last heard of
+let current = null; // latest version of the session
 const ledger = new LedgerCard();
 
-async function look() {
+/** Load the session; again until it is sealed. */
+async function refresh() {
   let session;
   try {
     session = await api.getSession(id);
   } catch (error) {
     if (!(error instanceof api.Refusal)) throw error;
     document.body.dataset.state = "refused";
-    if (error.status === 404) say("There is no such session", `Session “${id}” is not on this server. It may be in the trash.`);
-    else say("This session cannot be shown", error.message);
-    if (error.status === 0 || error.status >= 500) setTimeout(look, 3 * AGAIN_MS); // it may be back soon
+    if (error.status === 404) showMessage("Session not found", `No session “${id}” on this server. It may be in the trash.`);
+    else showMessage("Session unavailable", error.message);
+    if (error.status === 0 || error.status >= 500) setTimeout(refresh, 3 * REFRESH_MS); // retry
     return;
   }
   document.title = printable(`${session.name} – FootTile`);
-  now = session;
-  drawNow();
+  current = session;
+  drawSessionHeader();
   byId("edit").hidden = false;
   ledger.show(session);
-  plotted ??= new Plotted(session, drawNow);
+  plotted ??= new Plotted(session, drawSessionHeader);
   if (session.state !== "sealed") {
-    say(session.state === "recording" ? "Being recorded" : "Not sealed yet", [WHY[session.state] ?? session.problem ?? "", plainState(session)[1]].join(" ").trim());
+    showMessage(session.state === "recording" ? "Recording" : "Not sealed", [STATE_TEXTS[session.state] ?? session.problem ?? "", stateText(session)[1]].join(" ").trim());
     byId("message").dataset.small = "true";
-    // Before its first frames there is nothing to plot.
+    // Without frames there is nothing to plot.
     await unlessRefused(plotted.load(session));
-    if (plotted.plots.whole?.behind) setText(byId("message-text"), `${byId("message-text").textContent} Not all of it is shown yet: the server is estimating the rest.`);
+    if (plotted.plots.whole?.behind) setText(byId("message-text"), `${byId("message-text").textContent} Estimation is catching up; the rest follows.`);
     document.body.dataset.state = session.state;
-    setTimeout(look, AGAIN_MS);
+    setTimeout(refresh, REFRESH_MS);
     return;
   }
   byId("message").hidden = true;
@@ -56,48 +57,48 @@ async function look() {
     if (!(error instanceof api.Refusal)) throw error;
     document.body.dataset.state = "refused";
     const damaged = error.status === 500;
-    if (damaged) ledger.doubt();
-    say("Its numbers cannot be shown", damaged ? `Something is wrong with its files; “Check its files now”, above, says what. The server's words: ${error.message}` : error.message);
-    if (error.status === 0) setTimeout(look, 3 * AGAIN_MS);
+    if (damaged) ledger.showDamage();
+    showMessage("Data unavailable", damaged ? `Files are damaged: ${error.message} For details press “Verify files” above.` : error.message);
+    if (error.status === 0) setTimeout(refresh, 3 * REFRESH_MS);
   }
 }
 
-/** What people say of it. Who was overtaken by somebody else is told, and shown what they wrote. */
-async function change() {
-  const before = now;
+/** Edit labels and notes. After a conflict show the reason and the other version. */
+async function editSession() {
+  const before = current;
   const changes = await edit(before);
   if (!changes) return;
   try {
-    now = await api.changeSession(id, changes, before.said);
+    current = await api.changeSession(id, changes, before.said);
   } catch (error) {
     if (!(error instanceof api.Refusal) || error.status !== 412) throw error;
     notice(error.message, { bad: true });
-    now = await api.getSession(id);
+    current = await api.getSession(id);
   }
-  document.title = printable(`${now.name} – FootTile`);
-  drawNow();
+  document.title = printable(`${current.name} – FootTile`);
+  drawSessionHeader();
 }
 
-/** What it is, as far as that is known by now. */
-function drawNow() {
-  drawHeader(now, plotted?.plots.whole ?? null, plotted?.replay.array?.nominal_rate_hz ?? null);
+/** Draw the header with what is loaded. */
+function drawSessionHeader() {
+  drawHeader(current, plotted?.plots.whole ?? null, plotted?.replay.array?.nominal_rate_hz ?? null);
 }
 
-byId("edit").addEventListener("click", () => quietly(change));
+byId("edit").addEventListener("click", () => quietly(editSession));
 
-function say(title, text) {
+function showMessage(title, text) {
   byId("message").hidden = false;
   delete byId("message").dataset.small;
   setText(byId("message-title"), title);
   setText(byId("message-text"), text);
 }
 
-const WHY = {
-  recording: "This session is still being recorded: what is shown is provisional until it is sealed.",
-  pending: "This session has been stopped, and something of it is still with its node. What is shown is provisional.",
-  sealing: "This session is being written. What is shown is provisional for a moment yet.",
+const STATE_TEXTS = {
+  recording: "Values are provisional until the session is sealed.",
+  pending: "Stopped; frames are still on the node. Values are provisional.",
+  sealing: "Writing files. Values are provisional.",
 };
 
 inSunlight();
 helpWithKeys();
-enter().then(() => quietly(look));
+logInFromUrl().then(() => quietly(refresh));

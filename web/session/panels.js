@@ -1,9 +1,9 @@
-// Which plots a session has, one above the other: by what is known in it.
+// Plots of a session, from its columns.
 
-const HEAT_FROM = 9; // tiles: more rows of traces than this are not read
+const HEAT_FROM = 9; // tiles; more traces are not readable
 const FORCE_PX = 180;
 const PLACE_PX = 76;
-const TITLE_PX = 19; // above a plot; a tile's name is in its own
+const TITLE_PX = 19; // above a plot; tiles have it inside
 
 /**
  * @typedef {object} Panel
@@ -11,21 +11,22 @@ const TITLE_PX = 19; // above a plot; a tile's name is in its own
  * @property {string} title
  * @property {string} unit
  * @property {"series" | "heat"} kind
- * @property {[string, string]} [columns] least and greatest
- * @property {[string, string]} [band] an interval around it
- * @property {string} [note] behind the title
- * @property {string} [bound] what it is at least
- * @property {string} [group] panels of a group have one scale
+ * @property {[string, string]} [columns] min and max
+ * @property {[string, string]} [band] interval around it
+ * @property {string} [note] after the title
+ * @property {string} [bound] column of the lower bound
+ * @property {string} [group] panels with a common scale
  * @property {number} [factor] from the column's unit to the one shown
- * @property {boolean} [force] stretches in which forces are doubtful are shown over it
- * @property {boolean} [zero] zero is always in sight
- * @property {boolean} [besideOnly] its numbers are of what is beside the session
+ * @property {boolean} [force] faults of forces are drawn over it
+ * @property {boolean} [zero] the scale contains zero
+ * @property {boolean} [besideOnly] shows the overlay only
  * @property {number} height
- * @property {number} head room above it, for its title
+ * @property {number} head space for the title
  * @property {number} [tile]
  */
 
 /**
+ * Return the panels from top to bottom.
  * @param {import("./bins.js").Bins} bins of the whole session
  * @param {boolean | null} asHeat tiles as colours; null: by their number
  * @param {import("./beside.js").Beside | null} [beside]
@@ -42,35 +43,35 @@ export function panelsOf(bins, asHeat, beside = null) {
   }
   if (bins.estimated && beside?.columns.difference) {
     panels.push({
-      key: "difference", title: `Ours less ${beside.name}`, unit: "N", kind: "series", columns: beside.columns.difference,
+      key: "difference", title: `FootTile minus ${beside.name}`, unit: "N", kind: "series", columns: beside.columns.difference,
       besideOnly: true, zero: true, height: PLACE_PX, head: TITLE_PX,
     });
   }
   const [stem, unit] = bins.estimated ? ["force_n", "N"] : ["padc", "counts"];
   const names = (i) => /** @type {[string, string]} */ ([`${stem}_${i}_min`, `${stem}_${i}_max`]);
-  // Of a tile that measures the air there is no force; of one that has failed this is to be seen.
+  // Reference tiles have no force; failed tiles are shown.
   const known = tiles.map((_, i) => i).filter((i) => bins.has(names(i)[1]) || bins.columns[`status_${i}`].some(Boolean));
   if (asHeat ?? tiles.length >= HEAT_FROM) {
     panels.push({
-      key: "tiles", title: bins.estimated ? "Force on each tile" : "Raw counts of each tile, fewer under load",
+      key: "tiles", title: bins.estimated ? "Force per tile" : "Raw counts per tile (fall under load)",
       unit, kind: "heat", force: true, height: Math.min(420, Math.max(90, tiles.length * (tiles.length > 24 ? 7 : 14))), head: TITLE_PX,
     });
     if (bins.estimated && beside?.hasTiles) {
       const rows = beside.answer.serials.length;
       panels.push({
-        key: "beside-tiles", title: `Force on each tile, ${beside.name}`, unit: "N", kind: "heat", besideOnly: true,
+        key: "beside-tiles", title: `Force per tile, ${beside.name}`, unit: "N", kind: "heat", besideOnly: true,
         height: Math.min(420, Math.max(90, rows * (rows > 24 ? 7 : 14))), head: TITLE_PX,
       });
     }
   } else {
-    const height = Math.max(46, Math.min(FORCE_PX, 220 / known.length)); // alone it has room
+    const height = Math.max(46, Math.min(FORCE_PX, 220 / known.length)); // high if alone
     known.forEach((i, at) => panels.push({
       key: `tile-${i}`, title: tiles[i], unit, kind: "series", columns: names(i), group: "tiles", force: true,
       zero: bins.estimated, height, head: at ? 7 : 18, tile: i,
     }));
   }
-  for (const [axis, title] of [["x", "Centre of pressure, forward"], ["y", "Centre of pressure, to the left"]]) {
-    if (!bins.estimated || !moves(bins, `cop_${axis}_m`)) continue;
+  for (const [axis, title] of [["x", "COP forward"], ["y", "COP left"]]) {
+    if (!bins.estimated || !isVariable(bins, `cop_${axis}_m`)) continue;
     panels.push({
       key: `cop-${axis}`, title, unit: "mm", factor: 1e3, kind: "series",
       columns: [`cop_${axis}_m_min`, `cop_${axis}_m_max`], band: [`cop_${axis}_low_m_min`, `cop_${axis}_high_m_max`],
@@ -79,18 +80,18 @@ export function panelsOf(bins, asHeat, beside = null) {
   }
   if (bins.estimated && bins.has("angle_rad_min")) {
     panels.push({
-      key: "angle", title: "Angle of the foot", unit: "°", factor: 180 / Math.PI, kind: "series",
+      key: "angle", title: "Foot angle", unit: "°", factor: 180 / Math.PI, kind: "series",
       columns: ["angle_rad_min", "angle_rad_max"], height: PLACE_PX, head: TITLE_PX,
     });
   }
   return panels;
 }
 
-/** A row of tiles does not measure the centre of pressure across it. */
+/** Return a note if a coordinate of the COP is not measured: across a single row of tiles. */
 const unmeasured = (bins, axis) => (bins.has(`cop_${axis}_m_max`) ? {} : { note: `COP ${axis} not measured: tiles in one row` });
 
-/** On a line of tiles one coordinate is always the same: that is no plot. */
-function moves(bins, stem) {
+/** Return true if a coordinate changes: on a line of tiles one is constant. */
+function isVariable(bins, stem) {
   const found = bins.extremes(`${stem}_min`, `${stem}_max`, 0, bins.count);
   return found !== null && found.high - found.low > 1e-6;
 }

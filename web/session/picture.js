@@ -1,11 +1,11 @@
-// The plots as a picture to keep, with what they are of written above them.
+// Plots as a PNG file with a title.
 
 import { coloursOf } from "../common/axes.js";
 import { localTime, printable } from "../common/text.js";
 
 const HEAD_PX = 34;
 
-/** @param {import("./plots.js").Plots} plots */
+/** Download the picture. @param {import("./plots.js").Plots} plots */
 export function savePicture(plots, session) {
   const ratio = plots.canvas.width / plots.width;
   const canvas = document.createElement("canvas");

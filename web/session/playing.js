@@ -1,17 +1,18 @@
-// Time that goes on while a session is played: by the display's clock, at some speed. Knows no data.
+// Playback clock. Independent of data.
 
 export const SPEEDS = [0.1, 0.25, 1, 4];
-const LEAP_MOST_MS = 250; // the display stood still: nobody has seen what would have been shown
-const CALM_MS = 500; // between pictures, where less motion was asked for
+const LEAP_MAX_MS = 250; // after a stall of the display
+const CALM_MS = 500; // between pictures with reduced motion
 
+/** Moves the cursor at a speed. */
 export class Playing {
   /**
    * @param {object} on
-   * @param {() => number} on.at where the cursor is, in seconds
-   * @param {() => number} on.end where the session ends
-   * @param {() => boolean} on.ready are the next frames there?
-   * @param {(timeS: number) => void} on.go
-   * @param {() => void} on.changed it began, or ended
+   * @param {() => number} on.at cursor, s
+   * @param {() => number} on.end end of the session, s
+   * @param {() => boolean} on.ready the next frames are loaded
+   * @param {(timeS: number) => void} on.go moves the cursor
+   * @param {() => void} on.changed started or stopped
    */
   constructor(on) {
     this.on = on;
@@ -46,7 +47,7 @@ export class Playing {
     if (this.calm.matches && this.lastMs !== null && sinceMs < CALM_MS) return;
     this.lastMs = nowMs;
     if (!sinceMs || !this.on.ready()) return;
-    const leapMs = Math.min(sinceMs, this.calm.matches ? 2 * CALM_MS : LEAP_MOST_MS);
+    const leapMs = Math.min(sinceMs, this.calm.matches ? 2 * CALM_MS : LEAP_MAX_MS);
     const toS = Math.min(this.on.end(), this.on.at() + this.speed * leapMs * 1e-3);
     this.on.go(toS);
     if (toS >= this.on.end()) this.stop();

@@ -1,9 +1,9 @@
-// All plots of a session over one time axis, on one canvas; the cursor is on another above it.
+// All plots of a session over one time axis on one canvas; the cursor is on another.
 
 import { coloursOf, crisp, decimalsOf, fit, hatching, ticks, whenColoursChange } from "../common/axes.js";
 import { byId, number, printable, setData } from "../common/text.js";
 import { KINDS, stretchesOf } from "./flags.js";
-import { HEAD_PX, drawMarks, drawPeaks, drawStances, drawTime } from "./overlay.js";
+import { HEAD_PX, drawMarkers, drawPeaks, drawStances, drawTime } from "./overlay.js";
 import { drawTiles } from "./heat.js";
 import { panelsOf } from "./panels.js";
 import { scalesOf } from "./scales.js";
@@ -11,7 +11,7 @@ import { drawBand, drawBound, drawSeries } from "./series.js";
 
 const AXIS_PX = 26;
 const FOOT_PX = 6;
-const ROOM_PX = 200; // of the window, for what is above and below the plots
+const ROOM_PX = 200; // of the window, above and below the plots
 const RIGHT_PX = 12;
 const FONT = "600 12px system-ui, sans-serif";
 const NAMES = [
@@ -20,6 +20,7 @@ const NAMES = [
 ];
 const CONTACT = 2;
 
+/** Canvas of the plots. */
 export class Plots {
   constructor() {
     this.box = byId("plots");
@@ -27,17 +28,17 @@ export class Plots {
     this.over = byId("cursor-canvas", HTMLCanvasElement);
     this.whole = null;
     this.detail = null;
-    this.marks = [];
+    this.markers = [];
     this.stances = [];
-    this.beside = null; // drawn over it
-    this.name = ""; // of the session, beside another
+    this.beside = null; // overlay
+    this.name = ""; // of the session, with an overlay
     this.asHeat = null;
-    this.heat = null; // least and greatest of its colours
-    this.flags = []; // of marks, where they were drawn
+    this.heat = null; // range of the colours
+    this.flags = []; // positions of the markers' flags
     this.panels = [];
     /** @type {Record<string, string> | null} */
     this.colours = null;
-    this.drawn = []; // where each panel is, and its scale
+    this.drawn = []; // position and scale of each panel
     whenColoursChange(() => { this.colours = null; this.changed(); });
     this.changed = () => {};
   }
@@ -56,7 +57,7 @@ export class Plots {
     return HEAD_PX + AXIS_PX + FOOT_PX + this.panels.reduce((sum, panel) => sum + panel.head + this.scaled(panel), 0);
   }
 
-  /** On a high screen plots are higher, so that all of them are in sight where that is possible. */
+  /** Return the height of a panel: plots fill the screen, if possible. */
   scaled(panel) {
     const all = this.panels.reduce((sum, one) => sum + one.height, 0);
     const heads = HEAD_PX + AXIS_PX + this.panels.reduce((sum, one) => sum + one.head, 0);
@@ -73,12 +74,12 @@ export class Plots {
     return view.from + share * (view.to - view.from);
   }
 
-  /** The finest bins that have all of a view. */
+  /** Return the finest bins that cover a view. */
   best(view) {
     return this.detail?.contains(view) ? this.detail : this.whole;
   }
 
-  /** What is drawn, and from which time to which: old bins are scaled while new ones are on their way. */
+  /** Return bins with the interval to draw: coarse bins until fine ones are loaded. */
   layers(view) {
     const { detail, whole } = this;
     const covers = detail?.covers;
@@ -114,7 +115,7 @@ export class Plots {
     const force = this.drawn.find(({ panel }) => panel.key === "grf");
     if (force) drawPeaks(this, context, view, x, force.box, force.y);
     drawTime(this, context, view, x, bottom);
-    drawMarks(this, context, view, x, bottom);
+    drawMarkers(this, context, view, x, bottom);
     setData(this.box, "framesInBin", String(this.best(view).framesInBin));
     setData(this.box, "kinds", this.shownKinds.map(({ key }) => key).join(" "));
   }
@@ -135,7 +136,7 @@ export class Plots {
         context.beginPath();
         context.rect(x(from), box.top - 3, x(to) - x(from), box.bottom - box.top + 6);
         context.clip();
-        // One bin more on both sides, so that lines run to the edges.
+        // One bin more on both sides: lines run to the edges.
         const [b, e] = [Math.max(0, begin - 1), Math.min(bins.count, end + 1)];
         if (panel.key === "grf") this.drawContact(context, bins, b, e, x, box);
         const isCop = panel.key.startsWith("cop");
@@ -158,7 +159,7 @@ export class Plots {
     context.beginPath();
     context.rect(box.left, box.top - 3, box.right - box.left, box.bottom - box.top + 6);
     context.clip();
-    context.globalAlpha = panel.besideOnly ? 1 : 0.7; // ours stays in sight where both are the same
+    context.globalAlpha = panel.besideOnly ? 1 : 0.7; // keep ours visible below
     this.beside.draw(context, panel.key, view, x, y, panel.besideOnly ? this.colours.text : this.colours.other);
     context.restore();
   }
@@ -201,7 +202,7 @@ export class Plots {
     context.stroke();
   }
 
-  /** Contact as a strip at the foot of the plot of the force. */
+  /** Draw contact as a strip below the GRF. */
   drawContact(context, bins, begin, end, x, box) {
     context.fillStyle = this.colours.contact;
     for (let i = begin; i < end; i++) {
@@ -250,7 +251,7 @@ export class Plots {
     }
   }
 
-  /** One cursor over all plots, and the stretch that is being chosen. */
+  /** Draw the cursor and the range that is being selected. */
   drawCursor(view, timeS, chosen = null) {
     if (!this.whole) return;
     this.colours ??= coloursOf(this.box, NAMES);

@@ -1,32 +1,33 @@
-// A sealed session: which time is shown, where the cursor is, and all that follows from these.
+// View state of a session: visible range, cursor, and what depends on them.
 
 import * as api from "../common/api.js";
-import { mayPress } from "../common/login.js";
+import { isOperator } from "../common/login.js";
 import { notice, quietly, showRefusal } from "../common/notices.js";
 import { loadModule, unlessRefused } from "../common/request.js";
 import { byId, copyText, setText } from "../common/text.js";
 import { offsetAt } from "./clock.js";
-import { axisWords, clockOn, stancesOn } from "./time_axis.js";
+import { axisText, moveClock, moveStances } from "./time_axis.js";
 import { Downloads } from "./downloads.js";
-import { listen } from "./gestures.js";
+import { bindGestures } from "./gestures.js";
 import { drawLegend } from "./legend.js";
 import { Loader } from "./load.js";
-import { Marks } from "./marks.js";
+import { Markers } from "./markers.js";
 import { Numbers } from "./numbers.js";
 import { flagAt } from "./overlay.js";
 import { savePicture } from "./picture.js";
 import { Plots } from "./plots.js";
 import { Readout, drawSummary } from "./readout.js";
 import { Replay } from "./replay.js";
-import { Stances, placed } from "./stances.js";
+import { Stances, withSeconds } from "./stances.js";
 import * as views from "./view.js";
 
 const KEY_ZOOM = 1.5;
 const SETTLED_MS = 250;
-const COLOURS_AT = 9; // in what is compared to know whether something has to be drawn
+const COLOURS_AT = 9; // index in the key of a drawing
 
+/** Plots, cursor, markers, stances, replay and downloads of a session. */
 export class Plotted {
-  /** @param {Session} session @param {() => void} onArray its array is known */
+  /** @param {Session} session @param {() => void} onArray runs once the tiles are loaded */
   constructor(session, onArray) {
     this.session = session;
     this.onArray = onArray;
@@ -35,16 +36,16 @@ export class Plotted {
     this.plots = new Plots();
     this.plots.changed = () => this.draw();
     this.plots.name = `${session.name || session.id}, ${session.node}`;
-    this.other = null; // beside it
+    this.other = null; // session of the overlay
     this.readout = new Readout();
     this.numbers = new Numbers(session.id);
     this.stances = new Stances((index) => { this.goTo(index); this.stances.bringIntoView(); });
-    this.marks = new Marks(session.id, {
-      go: (timeS) => this.goToMark(timeS), cursor: () => this.cursorS,
-      changed: () => { this.plots.marks = this.marks.placed; this.draw(); },
+    this.markers = new Markers(session.id, {
+      go: (timeS) => this.goToMarker(timeS), cursor: () => this.cursorS,
+      changed: () => { this.plots.markers = this.markers.placed; this.draw(); },
     });
     this.loader = new Loader(
-      (query, stop) => api.overview(session.id, query, stop), (bins) => this.take(bins), showRefusal);
+      (query, stop) => api.overview(session.id, query, stop), (bins) => this.showDetail(bins), showRefusal);
     this.replay = new Replay({
       at: () => this.cursorS ?? this.view.from, go: (timeS) => this.cursorTo(timeS),
       changed: () => this.draw(), failed: showRefusal,
@@ -54,28 +55,28 @@ export class Plotted {
     this.drawing = 0;
   }
 
-  /** Draws what there is; again for as long as the session grows, and once it is sealed. @param {Session} session */
+  /** Load and draw; again while the session grows and once it is sealed. @param {Session} session */
   async load(session) {
     const first = !this.view;
     const sealed = session.state === "sealed";
-    if (first) byId("plots-card").hidden = false; // its width says how finely to ask
+    if (first) byId("plots-card").hidden = false; // its width sets the number of bins
     const whole = await this.loader.whole(byId("plots").clientWidth).catch((error) => {
       if (first) byId("plots-card").hidden = true;
       throw error;
     });
     const grown = this.session.marks !== session.marks || whole.estimated !== this.plots.whole?.estimated;
     this.session = session;
-    this.takeWhole(whole);
+    this.showWhole(whole);
     if (first) {
       this.listen();
       const offer = () => { this.downloads.offer(this.plots.whole); this.drawLinks(); };
       quietly(async () => { await this.downloads.load(session, offer); offer(); });
     }
     this.draw();
-    if (first || sealed || grown) await this.loadBeside(whole, sealed);
+    if (first || sealed || grown) await this.loadRest(whole, sealed);
   }
 
-  takeWhole(whole) {
+  showWhole(whole) {
     const all = this.view && views.isWhole(this.view, this.durationS);
     this.durationS = whole.durationS;
     if (!this.view) {
@@ -84,9 +85,9 @@ export class Plotted {
     } else this.view = all ? views.whole(this.durationS) : views.clamped(this.view, this.durationS);
     this.plots.show(whole);
     this.plots.heat = null;
-    if (!whole.provisional) { // what was asked for before is of something else
+    if (!whole.provisional) { // older bins are provisional
       this.plots.detail = null;
-      this.loader.asked = null;
+      this.loader.key = null;
     }
     const tiles = whole.serials.length;
     byId("as-heat").hidden = tiles < 2 || tiles > 32;
@@ -94,28 +95,28 @@ export class Plotted {
     this.replay.open(this.session.id, whole);
   }
 
-  /** What may be missing holds no plot up. */
-  async loadBeside(whole, sealed) {
+  /** Load the rest: the plots do not wait for it. */
+  async loadRest(whole, sealed) {
     const [array, stances, events, summary] = await Promise.all([
       unlessRefused(api.arrayOf(this.session.id)),
       whole.estimated && sealed ? unlessRefused(api.listStances(this.session.id)) : null,
-      unlessRefused(api.listEvents(this.session.id)), unlessRefused(api.clockOf(this.session.id)),
+      unlessRefused(api.listMarkers(this.session.id)), unlessRefused(api.clockOf(this.session.id)),
     ]);
-    if (array) this.replay.dress(array);
+    if (array) this.replay.setArray(array);
     this.onArray();
-    const clock = clockOn(whole.axis, this.session.parts, summary);
-    setText(byId("axis-says"), axisWords(whole.axis));
-    this.plots.stances = placed(stancesOn(whole.axis, stances ?? []), whole.beginNs);
+    const clock = moveClock(whole.axis, this.session.parts, summary);
+    setText(byId("axis-note"), axisText(whole.axis));
+    this.plots.stances = withSeconds(moveStances(whole.axis, stances ?? []), whole.beginNs);
     this.stances.show(this.plots.stances);
     quietly(() => this.showOverlay());
     const offset = (tNs, ofServer) => (clock && offsetAt(clock, tNs, ofServer));
-    this.marks.show(events?.items ?? [], whole.beginNs, offset);
-    this.plots.marks = this.marks.placed;
+    this.markers.show(events?.items ?? [], whole.beginNs, offset);
+    this.plots.markers = this.markers.placed;
     this.draw();
     if (sealed) quietly(() => this.showCompare(offset));
   }
 
-  /** What may be drawn beside it: its modules come when somebody asks, or a reference is there already. */
+  /** Offer an overlay; its modules load on request, or if there is a reference. */
   async showCompare(offset) {
     const references = (await unlessRefused(api.listComparisons(this.session.id), { items: [] })).items;
     const open = async () => {
@@ -132,29 +133,29 @@ export class Plotted {
     }));
   }
 
-  /** Stances one upon another: its modules come only where there are stances. */
+  /** Show the stance overlay; its modules load only if there are stances. */
   async showOverlay() {
     if (!this.plots.stances.length) return;
     const { StanceOverlay } = await loadModule(() => import("./stance_overlay.js"));
     this.overlay = new StanceOverlay(this.session.id, this.plots.stances, (index) => this.goTo(index));
-    quietly(() => this.overlay.layBeside(this.other));
+    quietly(() => this.overlay.setOverlay(this.other));
   }
 
-  /** Another session, whose stances are drawn beside ours; null: none. @param {{id: string, name: string} | null} other */
-  layBeside(other) {
+  /** Set the session whose stances are overlaid; null: none. @param {{id: string, name: string} | null} other */
+  setOverlay(other) {
     this.other = other;
-    quietly(() => this.overlay?.layBeside(other));
+    quietly(() => this.overlay?.setOverlay(other));
   }
 
   listen() {
     const { plots } = this;
     const time = (px) => plots.timeAt(px, this.view);
     const scale = () => (this.view.to - this.view.from) / plots.plotWidth;
-    listen(byId("plots"), {
+    bindGestures(byId("plots"), {
       point: (px, hovering = false) => { if (!hovering || !this.replay.playing.going) this.point(time(px)); },
-      grab: (px, py) => { const id = flagAt(plots, px, py); return id !== null && mayPress() && this.marks.grab(id); },
-      drag: (px) => this.marks.drag(time(px)),
-      drop: (px) => this.marks.drop(px === null ? null : time(px)),
+      grab: (px, py) => { const id = flagAt(plots, px, py); return id !== null && isOperator() && this.markers.grab(id); },
+      drag: (px) => this.markers.drag(time(px)),
+      drop: (px) => this.markers.drop(px === null ? null : time(px)),
       choosing: (from, to) => { this.chosen = [time(from), time(to)]; this.draw(); },
       choose: (from, to) => {
         this.chosen = null;
@@ -172,13 +173,13 @@ export class Plotted {
       earlier: () => this.move(-0.5), later: () => this.move(0.5),
       "stance-before": () => this.step(-1), "stance-next": () => this.step(1),
       "as-heat": () => this.toggleHeat(), "copy-link": () => this.copyLink(),
-      export: () => { this.downloads.wantStance(); this.drawLinks(); },
+      export: () => { this.downloads.selectStance(); this.drawLinks(); },
       picture: () => savePicture(plots, this.session),
     };
     for (const [name, act] of Object.entries(buttons)) byId(name).addEventListener("click", act);
-    byId("mark-here").addEventListener("submit", (event) => {
+    byId("marker-here").addEventListener("submit", (event) => {
       event.preventDefault();
-      quietly(() => this.marks.add(this.cursorS ?? this.middle));
+      quietly(() => this.markers.add(this.cursorS ?? this.middle));
     });
     byId("numbers-card", HTMLDetailsElement).addEventListener("toggle", () => this.draw());
     new ResizeObserver(() => this.draw()).observe(byId("plots"));
@@ -189,31 +190,31 @@ export class Plotted {
   show(view) {
     this.view = views.clamped(view, this.durationS);
     byId("plots").dataset.settled = "false";
-    this.linkSoon();
+    this.updateUrlSoon();
     this.draw();
   }
 
-  /** Not at every turn of a wheel: browsers allow few changes of the address in some time. */
-  linkSoon() {
+  /** Update the URL after a pause: browsers limit its changes. */
+  updateUrlSoon() {
     clearTimeout(this.linking);
-    this.linking = setTimeout(() => this.link(), SETTLED_MS);
+    this.linking = setTimeout(() => this.updateUrl(), SETTLED_MS);
   }
 
-  /** The address is that of what is shown. */
-  link() {
+  /** Write range and cursor to the URL. */
+  updateUrl() {
     clearTimeout(this.linking);
     history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS, location.search, this.cursorS));
   }
 
   copyLink() {
-    this.link();
+    this.updateUrl();
     const copied = copyText(location.href);
-    notice(copied ? "Link copied: to this view, with stance and cursor." : `Not copied: the link is ${location.href}`, { bad: !copied });
+    notice(copied ? "Link copied (range, stance, cursor)." : `copying is blocked. Link: ${location.href}`, { bad: !copied });
   }
 
   showAll() { this.show(views.whole(this.durationS)); }
 
-  /** About the cursor, if it is in sight. */
+  /** Zoom about the cursor, if visible. */
   zoom(factor) {
     const { view, cursorS } = this;
     const about = cursorS !== null && cursorS >= view.from && cursorS <= view.to ? cursorS : this.middle;
@@ -224,18 +225,18 @@ export class Plotted {
 
   point(timeS) {
     this.cursorS = timeS;
-    this.linkSoon();
+    this.updateUrlSoon();
     this.draw();
   }
 
-  /** The cursor is here; where it leaves the view, that follows by as much as is seen of it. */
+  /** Move the cursor; the view follows by 0.9 of its width. */
   cursorTo(timeS) {
     this.cursorS = timeS;
     const { view } = this;
     const beyond = Math.max(0, timeS - view.to) - Math.max(0, view.from - timeS);
     if (beyond) this.show(views.moved(view, beyond + Math.sign(beyond) * 0.9 * (view.to - view.from), this.durationS));
     else {
-      this.linkSoon();
+      this.updateUrlSoon();
       this.draw();
     }
   }
@@ -249,7 +250,7 @@ export class Plotted {
     this.show(views.around(stance.from, stance.to, this.durationS));
   }
 
-  goToMark(timeS) {
+  goToMarker(timeS) {
     this.cursorS = timeS;
     const half = Math.min(1, (this.view.to - this.view.from) / 2);
     this.show({ from: timeS - half, to: timeS + half });
@@ -270,11 +271,11 @@ export class Plotted {
       ArrowLeft: () => this.replay.walk(-1, event.shiftKey), ArrowRight: () => this.replay.walk(1, event.shiftKey),
     };
     if (!onButton) acts[" "] = () => this.replay.toggle();
-    if (event.target.closest?.("#stances-scroll, .scroll")) { // there they scroll the table
+    if (event.target.closest?.("#stances-scroll, .scroll")) { // they scroll the table there
       delete acts.ArrowLeft;
       delete acts.ArrowRight;
     }
-    // These scroll the page, too: only on the plots they are ours.
+    // They scroll the page, too: handled on the plots only.
     if (event.target === byId("plots")) {
       Object.assign(acts, { Home: () => this.showAll(), PageUp: () => this.move(-0.5), PageDown: () => this.move(0.5) });
     } else if (!onButton) acts.Home = () => this.showAll();
@@ -282,12 +283,12 @@ export class Plotted {
     return event.key in acts;
   }
 
-  take(bins) {
+  showDetail(bins) {
     this.plots.detail = bins;
     this.draw();
   }
 
-  /** What is beside it is another, or has moved. */
+  /** Draw again: the overlay has changed. */
   redraw() {
     this.drawnKey = null;
     this.draw();
@@ -309,7 +310,7 @@ export class Plotted {
     box.dataset.to = view.to.toFixed(4);
     this.stances.follow(this.cursorS, this.replay.playing.going);
     this.overlay?.follow(this.replay.playing.going ? -1 : this.stances.current);
-    const drawnKey = [view.from, view.to, plots.width, plots.whole, plots.detail, this.marks.version, plots.stances.length, plots.asHeat,
+    const drawnKey = [view.from, view.to, plots.width, plots.whole, plots.detail, this.markers.version, plots.stances.length, plots.asHeat,
       this.stances.current, plots.colours, devicePixelRatio];
     if (drawnKey.some((one, i) => one !== this.drawnKey?.[i])) {
       plots.draw(view, this.stances.current);
@@ -322,29 +323,29 @@ export class Plotted {
     plots.beside?.want(view, plots.plotWidth);
     const bins = plots.best(view);
     box.dataset.settled = String(!this.loader.busy && !plots.beside?.loader.busy);
-    plots.beside?.tell(view, box);
+    plots.beside?.writeData(view, box);
     drawSummary(bins, view, byId("summary"));
-    const sentence = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels,
+    const text = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels,
       this.cursorS === null ? [] : plots.beside?.readings(view, this.cursorS));
     this.replay.draw();
-    if (!this.replay.playing.going) this.tellCursor(sentence); // sixty times a second nobody can hear
+    if (!this.replay.playing.going) this.describeCursor(text); // not while playing: too fast for a screen reader
     byId("as-heat").setAttribute("aria-pressed", String(plots.panels.some((panel) => panel.kind === "heat")));
-    setText(byId("mark-at"), `${this.cursorS === null ? "in the middle of the view" : "at the cursor"}`);
+    setText(byId("marker-at"), this.cursorS === null ? "at mid-view" : "at cursor");
     this.drawLinks();
     this.numbers.draw(view, plots.panels);
   }
 
-  tellCursor(sentence) {
+  describeCursor(text) {
     const box = byId("plots");
     box.setAttribute("aria-valuemin", "0");
     box.setAttribute("aria-valuemax", this.durationS.toFixed(3));
     box.setAttribute("aria-valuenow", (this.cursorS ?? this.middle).toFixed(3));
-    box.setAttribute("aria-valuetext", sentence || byId("summary").textContent);
+    box.setAttribute("aria-valuetext", text || byId("summary").textContent);
   }
 
-  /** Downloads of all, of what is in view, or of the chosen stance. */
+  /** Update the download links. */
   drawLinks() {
-    const session = { ...this.session, marks: this.plots.marks.length };
+    const session = { ...this.session, marks: this.plots.markers.length };
     const stance = this.stances.stances[this.stances.current];
     this.downloads.draw(session, this.view, views.isWhole(this.view, this.durationS), stance);
   }

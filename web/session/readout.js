@@ -1,12 +1,12 @@
-// The numbers at the cursor, and what is in view, in words.
+// Values at the cursor, and a summary of the visible range.
 
 import { byId, el, number, setData, setText } from "../common/text.js";
-import { flagsInWords } from "./flags.js";
-import { timeWords } from "./overlay.js";
+import { flagTexts } from "./flags.js";
+import { timeText } from "./overlay.js";
 
-const TILES_MOST = 8;
+const TILES_MAX = 8;
 
-/** "3.1" of a single frame, "1.2 to 3.1" of several. */
+/** Return "3.1" of a single frame, "1.2 to 3.1" of several. */
 function span(bins, i, [lowName, highName], factor = 1, decimals = 1) {
   const [low, high] = [bins.columns[lowName]?.[i] ?? null, bins.columns[highName]?.[i] ?? null];
   if (low === null || high === null) return null;
@@ -17,35 +17,35 @@ function span(bins, i, [lowName, highName], factor = 1, decimals = 1) {
 function grfAt(bins, i) {
   const value = span(bins, i, ["grf_n_min", "grf_n_max"]);
   const bound = bins.columns.grf_at_least_n_max[i];
-  if (value === null) return bound > 0 ? `at least ${number(bound)} N` : "not known";
+  if (value === null) return bound > 0 ? `at least ${number(bound)} N` : "unknown";
   const [low, high] = [bins.columns.grf_low_n_min[i], bins.columns.grf_high_n_max[i]];
   if (low === null || high === null) return `${value} N`;
   if (bins.framesInBin === 1) return `${value} N ± ${number((high - low) / 2)}`;
   return `${value} N (95 %: ${number(low)} to ${number(high)})`;
 }
 
-/** " ± 1.2" of a single frame. */
+/** Return the half width of the 95 % interval, of a single frame. */
 function copHalf(bins, i, axis) {
   const [low, high] = [bins.columns[`cop_${axis}_low_m_min`][i], bins.columns[`cop_${axis}_high_m_max`][i]];
   return bins.framesInBin > 1 || low === null || high === null ? "" : ` ± ${number(500 * (high - low))}`;
 }
 
-const CONTACT_WORDS = { 1: "no", 2: "yes", 4: "not known", 3: "begins or ends", 5: "no, or not known", 6: "yes, or not known", 7: "begins or ends" };
+const CONTACT_TEXTS = { 1: "no", 2: "yes", 4: "unknown", 3: "changes", 5: "no or unknown", 6: "yes or unknown", 7: "changes" };
 
 /**
- * What is known at a bin, of all that has a plot.
+ * Return the values of a bin for all panels.
  * @param {import("./panels.js").Panel[]} panels
  * @returns {[string, string, string][]} key, name, value
  */
 export function readingsOf(bins, i, panels) {
   const shown = new Set(panels.map((panel) => panel.key));
   const many = bins.columns.frames[i];
-  const time = timeWords(bins.first[i], 0.001);
+  const time = timeText(bins.first[i], 0.001);
   /** @type {[string, string, string][]} */
   const found = [["time", "Time", many > 1 ? `${time}, ${many} frames` : time]];
   if (bins.estimated) {
     found.push(["grf", "GRF", grfAt(bins, i)]);
-    found.push(["contact", "Contact", CONTACT_WORDS[bins.columns.contact[i]] ?? "–"]);
+    found.push(["contact", "Contact", CONTACT_TEXTS[bins.columns.contact[i]] ?? "–"]);
     for (const [axis, name] of [["x", "COP forward"], ["y", "COP left"]]) {
       const place = span(bins, i, [`cop_${axis}_m_min`, `cop_${axis}_m_max`], 1e3);
       if (shown.has(`cop-${axis}`)) found.push([`cop-${axis}`, name, place === null ? "–" : `${place} mm${copHalf(bins, i, axis)}`]);
@@ -68,7 +68,7 @@ function tilesAt(bins, i) {
   const names = (tile) => [`${stem}_${tile}_min`, `${stem}_${tile}_max`];
   const order = bins.serials.map((_, tile) => tile);
   const greatest = (tile) => bins.columns[names(tile)[bins.estimated ? 1 : 0]][i] ?? (bins.estimated ? -Infinity : Infinity);
-  if (order.length <= TILES_MOST) {
+  if (order.length <= TILES_MAX) {
     return order.map((tile) => {
       const value = span(bins, i, names(tile), 1, decimals);
       return [`tile-${tile}`, bins.serials[tile], value === null ? "–" : `${value} ${unit}`];
@@ -79,16 +79,17 @@ function tilesAt(bins, i) {
   return [["tiles", "Most loaded", `${text} ${unit}`]];
 }
 
+/** List of values at the cursor. */
 export class Readout {
   constructor() {
     this.list = byId("readout");
     this.cells = new Map();
   }
 
-  /** @returns {string} the same in a sentence, for who hears the page */
+  /** Draw the values; return them as a sentence for screen readers. */
   draw(bins, i, panels, beside = []) {
     const readings = i < 0 ? [] : [...readingsOf(bins, i, panels), ...beside];
-    const flags = i < 0 ? [] : flagsInWords(bins, i);
+    const flags = i < 0 ? [] : flagTexts(bins, i);
     byId("readout-hint").hidden = i >= 0;
     for (const key of this.cells.keys()) {
       if (readings.some(([one]) => one === key)) continue;
@@ -109,20 +110,20 @@ export class Readout {
   }
 }
 
-/** What is in view, as a sentence, and its numbers for whoever reads them from the page. */
+/** Write the summary of the visible range, and its numbers as data attributes. */
 export function drawSummary(bins, view, box) {
   const [begin, end] = bins.within(view);
-  const time = (timeS) => timeWords(timeS, 0.01);
+  const time = (timeS) => timeText(timeS, 0.01);
   const frames = bins.sum("frames", begin, end);
   const parts = [`${time(view.from)} to ${time(view.to)}: ${frames.toLocaleString("en-GB")} frames`];
   const missing = bins.sum("missing", begin, end);
   if (missing) parts.push(`${missing.toLocaleString("en-GB")} lost`);
   const grf = bins.estimated ? bins.extremes("grf_n_min", "grf_n_max", begin, end) : null;
-  if (grf) parts.push(`GRF ${number(grf.low)} to ${number(grf.high)} N, greatest at ${time(bins.first[grf.at])}`);
+  if (grf) parts.push(`GRF ${number(grf.low)} to ${number(grf.high)} N, max at ${time(bins.first[grf.at])}`);
   const unknown = bins.estimated ? bins.sum("grf_unknown", begin, end) : 0;
-  if (unknown) parts.push(`GRF not known in ${unknown.toLocaleString("en-GB")} frames`);
-  if (!bins.estimated) parts.push("there are no estimates: these are raw counts");
-  parts.push(bins.framesInBin === 1 ? "every frame is drawn" : `up to ${bins.framesInBin} frames in a column, from least to greatest`);
+  if (unknown) parts.push(`GRF unknown in ${unknown.toLocaleString("en-GB")} frames`);
+  if (!bins.estimated) parts.push("no estimates, raw counts");
+  parts.push(bins.framesInBin === 1 ? "every frame drawn" : `${bins.framesInBin} frames per pixel column, min to max`);
   setText(box, `${parts.join(", ")}.`);
   setData(box, "grfMax", grf ? String(grf.high) : "");
   setData(box, "grfMin", grf ? String(grf.low) : "");

@@ -1,30 +1,31 @@
-// The foot at the cursor: the live view's pictures, fed with a session's own frames, and played.
+// Replay: the live page's foot and bars with the session's frames.
 
 import { Bars } from "../live/bars.js";
 import { Foot } from "../live/foot.js";
 import { drawGrf } from "../live/grf.js";
 import { Range } from "../live/range.js";
 import { byId, el, number, setData, setText } from "../common/text.js";
-import { timeWords } from "./overlay.js";
+import { timeText } from "./overlay.js";
 import { Playing, SPEEDS } from "./playing.js";
 import { Samples } from "./samples.js";
 
-const AHEAD_S = 1.5; // of the display's time: what is asked for before it is needed
-const SPEED_WORDS = { 0.1: "0.1×", 0.25: "0.25×", 1: "1×", 4: "4×" };
+const AHEAD_S = 1.5; // prefetch, in time of the display
+const SPEED_TEXTS = { 0.1: "0.1×", 0.25: "0.25×", 1: "1×", 4: "4×" };
 const JUMP_S = 0.1;
 
+/** Foot at the cursor, and the player. */
 export class Replay {
   /**
    * @param {object} on
-   * @param {() => number} on.at where the cursor is, or where playing would begin
-   * @param {(timeS: number) => void} on.go puts the cursor there, and the view with it
-   * @param {() => void} on.changed something has to be drawn
+   * @param {() => number} on.at cursor, or start of playback, s
+   * @param {(timeS: number) => void} on.go moves cursor and view
+   * @param {() => void} on.changed requests a drawing
    * @param {(error: Error) => void} on.failed
    */
   constructor(on) {
     this.on = on;
     this.samples = null;
-    /** @type {Dressed | null} */
+    /** @type {ArrayInfo | null} */
     this.array = null;
     this.range = this.foot = this.bars = null;
     this.walking = Promise.resolve();
@@ -34,7 +35,7 @@ export class Replay {
     });
     byId("play").addEventListener("click", () => this.toggle());
     byId("speeds").append(...SPEEDS.map((speed) => {
-      const button = el("button", { type: "button", cls: "small", text: SPEED_WORDS[speed], "data-speed": String(speed), "aria-label": `${speed} times` });
+      const button = el("button", { type: "button", cls: "small", text: SPEED_TEXTS[speed], "data-speed": String(speed), "aria-label": `${speed} times` });
       button.addEventListener("click", () => { this.playing.speed = speed; this.drawControls(); });
       return button;
     }));
@@ -42,7 +43,7 @@ export class Replay {
   }
 
   /**
-   * Again whenever the session has grown, or was sealed.
+   * Open a session; again after it has grown or was sealed.
    * @param {string} id @param {import("./bins.js").Bins} whole
    */
   open(id, whole) {
@@ -50,43 +51,43 @@ export class Replay {
     if (before?.provisional && whole.provisional && before.estimated === whole.estimated) this.samples.grow(whole);
     else {
       const rateHz = whole.sum("frames", 0, whole.count) / Math.max(1e-3, whole.durationS);
-      this.samples = new Samples(id, whole, rateHz, { come: this.on.changed, failed: this.on.failed });
+      this.samples = new Samples(id, whole, rateHz, { loaded: this.on.changed, failed: this.on.failed });
       this.shown = null;
     }
     byId("replay").hidden = false;
     setData(byId("stage"), "replay", "true");
     for (const part of ["replay-foot", "bars-card"]) byId(part).hidden = !whole.estimated;
-    this.sayLag();
+    this.writeLag();
   }
 
-  /** @param {Dressed} array of GET /sessions/ID/array: until it is there the foot is not drawn */
-  dress(array) {
+  /** Set tiles and calibration; the foot is drawn from then on. @param {ArrayInfo} array of GET /sessions/ID/array */
+  setArray(array) {
     this.array = array;
-    this.sayLag();
+    this.writeLag();
     if (!this.samples.whole.estimated) return;
-    // Estimated frames have a tare and a calibration, whatever is known of these.
+    // Estimated frames have a tare and a calibration.
     this.node = { ...array, tare: {}, calibration: array.calibration ?? {} };
-    const again = () => { this.shown = null; this.on.changed(); };
-    this.range ??= new Range(byId("range"), again);
+    const redraw = () => { this.shown = null; this.on.changed(); };
+    this.range ??= new Range(byId("range"), redraw);
     this.foot ??= new Foot(this.range);
-    this.foot.resized = again;
-    this.bars ??= new Bars(again, this.range);
-    again();
+    this.foot.resized = redraw;
+    this.bars ??= new Bars(redraw, this.range);
+    redraw();
   }
 
-  sayLag() {
+  writeLag() {
     const { whole } = this.samples;
     const { lag_ms: lagMs = null, estimates_problem: problem = null } = this.array ?? { lag_ms: null, estimates_problem: null };
-    const looks = lagMs === null ? "" : `each takes notice of the ${number(lagMs, 0)} ms behind it.`;
-    let text = looks && `Forces as they are stored: ${looks}`;
-    if (whole.provisional) text = looks && `Provisional forces, as they are live: ${looks} They are estimated once more when the session is sealed, with more of what follows.`;
-    if (!whole.estimated) text = problem || !whole.provisional ? `There are no forces: ${problem ?? "they were not estimated"}.` : "";
+    const lookAhead = lagMs === null ? "" : `use ${number(lagMs, 0)} ms of look-ahead.`;
+    let text = lookAhead && `Stored forces ${lookAhead}`;
+    if (whole.provisional) text = lookAhead && `Provisional forces ${lookAhead} Sealing estimates them again with more.`;
+    if (!whole.estimated) text = problem || !whole.provisional ? `No forces: ${problem ?? "not estimated"}.` : "";
     setText(byId("replay-lag"), text);
   }
 
   toggle() { if (this.samples) this.playing.toggle(); }
 
-  /** From frame to frame, or by some time; one key after the other. */
+  /** Step by a frame, or jump by some time; keys are handled in order. */
   walk(by, jump) {
     if (!this.samples) return;
     if (this.playing.going) this.playing.stop();
@@ -98,25 +99,25 @@ export class Replay {
       return this.on.go(await samples.step(toS, 0));
     });
     step.catch(this.on.failed);
-    this.walking = step.catch(() => {}); // the next key has its step all the same
+    this.walking = step.catch(() => {}); // an error does not stop later steps
   }
 
   draw() {
     const { samples } = this;
     if (!samples) return;
     const timeS = this.on.at();
-    samples.want(timeS, this.playing.going ? AHEAD_S * this.playing.speed : 0);
+    samples.request(timeS, this.playing.going ? AHEAD_S * this.playing.speed : 0);
     const { known, frame } = samples.at(timeS);
     const panel = byId("replay");
     setData(panel, "waiting", String(!known));
-    if (!known) return; // what was shown stays until it is there
+    if (!known) return; // keep the picture until it is loaded
     const key = frame ? `${frame.timeS} ${frame.seq}` : "none";
     if (key === this.shown) return;
     this.shown = key;
     setData(panel, "none", String(!frame));
     setData(panel, "timeS", frame ? String(frame.timeS) : "");
     setData(panel, "seq", frame ? String(frame.seq) : "");
-    setText(byId("replay-at"), frame ? `${timeWords(frame.timeS, 0.001)}, frame ${frame.seq.toLocaleString("en-GB")}` : "No frame was recorded here.");
+    setText(byId("replay-at"), frame ? `${timeText(frame.timeS, 0.001)}, frame ${frame.seq.toLocaleString("en-GB")}` : "No frame here");
     if (!this.node) return;
     this.foot.draw(this.node, frame);
     this.bars.draw(this.node, frame, performance.now());

@@ -1,15 +1,15 @@
-// Frames of a session as they are stored, a slice at a time: asked for ahead, kept in bounded memory.
+// Stored frames of a session in slices: prefetched, in bounded memory.
 
 import * as api from "../common/api.js";
 
-const VALUES_IN_SLICE = 20_000; // read from text in some milliseconds: no picture waits for it
+const VALUES_IN_SLICE = 20_000; // parsed within milliseconds
 const SLICE_MOST_S = 1;
 const SLICE_LEAST_S = 0.05;
-const KEPT = 48; // slices: eight megabytes at most
-const AT_ONCE = 3; // questions to the server
-const AGAIN_MS = 2000; // after one that was refused
-const UNSETTLED_S = 1; // at the end of a session that is still recorded: estimates look ahead
-const APART_S = 0.1; // a frame further away than this is not that of an instant
+const SLICES_MAX = 48; // 8 MB at most
+const REQUESTS_MAX = 3;
+const RETRY_MS = 2000;
+const UNSETTLED_S = 1; // end of a running recording: look-ahead changes its estimates
+const APART_S = 0.1; // a frame further away does not belong to an instant
 
 const BY_TILE = ["status", "force_n", "force_sigma_n", "gauge_kpa"];
 const BY_FRAME = [
@@ -19,7 +19,7 @@ const BY_FRAME = [
 const RAW = ["seq", "frame_status", "status"];
 
 /**
- * The columns of CSV as numbers; what is not known is NaN.
+ * Parse the columns of CSV; unknown values are NaN.
  * @param {string} csv
  * @returns {Record<string, Float64Array>}
  */
@@ -36,7 +36,7 @@ export function columnsOf(csv) {
   return Object.fromEntries(names.map((name, i) => [name, values[i]]));
 }
 
-/** The frame of a row, in the words of a live message. @returns {Frame} */
+/** Return the frame of a row, with the fields of a live message. @returns {Frame} */
 function frameOf({ timeS, columns }, row, tiles) {
   const one = (name) => { const value = columns[name]?.[row]; return Number.isFinite(value) ? value : null; };
   const each = (name) => Array.from({ length: tiles }, (_, i) => one(`${name}_${i}`));
@@ -50,8 +50,8 @@ function frameOf({ timeS, columns }, row, tiles) {
   return frame;
 }
 
-/** First place in a rising list at which `value` is not above. */
-function placeOf(list, value) {
+/** Return the first index of a sorted list whose element is not below `value`. */
+function lowerBound(list, value) {
   let [low, high] = [0, list.length];
   while (low < high) {
     const middle = (low + high) >> 1;
@@ -61,37 +61,38 @@ function placeOf(list, value) {
   return low;
 }
 
+/** Cache of slices. */
 export class Samples {
   /**
    * @param {string} id
-   * @param {import("./bins.js").Bins} whole bins of the whole session: they say where there are frames
-   * @param {number} rateHz about how many frames a second there are
-   * @param {{come: () => void, failed: (error: Error) => void}} tell
+   * @param {import("./bins.js").Bins} whole bins of the whole session: they show where frames are
+   * @param {number} rateHz approximate frame rate
+   * @param {{loaded: () => void, failed: (error: Error) => void}} on
    */
-  constructor(id, whole, rateHz, tell) {
+  constructor(id, whole, rateHz, on) {
     this.id = id;
     this.whole = whole;
-    this.tell = tell;
+    this.on = on;
     this.tiles = whole.serials.length;
     this.names = ["time_s", ...(whole.estimated ? [...BY_FRAME, ...BY_TILE] : RAW)];
     const values = whole.estimated ? BY_TILE.length * this.tiles + BY_FRAME.length : this.tiles + 2;
     this.sliceS = Math.round(1e3 * Math.min(SLICE_MOST_S, Math.max(SLICE_LEAST_S, VALUES_IN_SLICE / (values * rateHz)))) * 1e-3;
-    this.slices = new Map(); // by number: what came, or the promise of it
+    this.slices = new Map(); // number -> slice, or its promise
     this.notBeforeMs = 0; // after a refusal
   }
 
-  /** The session has grown: what was its end is asked for again. */
+  /** Update after the session has grown: its former end is loaded again. */
   grow(whole) {
     const missing = (bins) => bins.sum("missing", 0, bins.count);
-    // Frames that came late have their place between the others, and change what is behind them.
+    // Late frames lie between others and change later estimates.
     const settled = missing(whole) < missing(this.whole) ? 0 : this.numberOf(this.whole.durationS - UNSETTLED_S);
     for (const number of [...this.slices.keys()]) if (number >= settled) this.slices.delete(number);
     this.whole = whole;
   }
 
   /**
-   * The frame of an instant: the nearest one, unless it is too far away.
-   * @returns {{known: boolean, frame: Frame | null}} not known: it is on its way
+   * Return the nearest frame, unless it is too far away.
+   * @returns {{known: boolean, frame: Frame | null}} not known: not loaded yet
    */
   at(timeS) {
     const own = this.numberOf(timeS);
@@ -103,7 +104,7 @@ export class Samples {
       const slice = this.slices.get(number);
       known &&= Boolean(slice?.timeS);
       if (!slice?.timeS) continue;
-      const next = placeOf(slice.timeS, timeS);
+      const next = lowerBound(slice.timeS, timeS);
       for (const row of [next - 1, next]) {
         const apart = Math.abs(slice.timeS[row] - timeS);
         if (apart <= APART_S && !(best?.apart <= apart)) best = { apart, slice, row };
@@ -112,62 +113,62 @@ export class Samples {
     return { known, frame: known && best ? frameOf(best.slice, best.row, this.tiles) : null };
   }
 
-  /** How far an instant is from the nearer end of its slice. */
+  /** Return the distance of an instant to the nearer edge of its slice. */
   toEdge(timeS) {
     const into = timeS - this.numberOf(timeS) * this.sliceS;
     return Math.min(into, this.sliceS - into);
   }
 
-  /** Slices begin at whole nanoseconds: so both sides have a frame in the same one. */
+  /** Return the slice of an instant; slices start at whole nanoseconds, as on the server. */
   numberOf(timeS) {
     const place = (s) => Math.floor(Math.round(s * 1e9) / Math.round(this.sliceS * 1e9));
     return Math.min(place(this.whole.durationS), Math.max(0, place(timeS)));
   }
 
-  /** Ask for what is about an instant, and for some time behind it. */
-  want(timeS, aheadS) {
+  /** Request the slices around an instant and ahead of it. */
+  request(timeS, aheadS) {
     const [first, now] = [this.numberOf(timeS - APART_S), this.numberOf(timeS)];
-    const last = Math.min(this.numberOf(timeS + Math.max(APART_S, aheadS)), now + KEPT - 4);
-    const wanted = [now, ...Array.from({ length: last - first + 1 }, (_, i) => first + i).filter((n) => n !== now)];
-    this.forgetBut(wanted, now);
-    for (const number of wanted) {
-      if (this.asking >= AT_ONCE || performance.now() < this.notBeforeMs) return;
-      if (!this.slices.has(number)) this.load(number).catch(this.tell.failed);
+    const last = Math.min(this.numberOf(timeS + Math.max(APART_S, aheadS)), now + SLICES_MAX - 4);
+    const needed = [now, ...Array.from({ length: last - first + 1 }, (_, i) => first + i).filter((n) => n !== now)];
+    this.dropOthers(needed, now);
+    for (const number of needed) {
+      if (this.pendingCount >= REQUESTS_MAX || performance.now() < this.notBeforeMs) return;
+      if (!this.slices.has(number)) this.load(number).catch(this.on.failed);
     }
   }
 
-  get asking() { return [...this.slices.values()].filter((slice) => slice instanceof Promise).length; }
+  get pendingCount() { return [...this.slices.values()].filter((slice) => slice instanceof Promise).length; }
 
-  /** Is all that `want` asks for there? */
+  /** Return true if all requested slices are loaded. */
   has(timeS, aheadS) {
     for (let n = this.numberOf(timeS); n <= this.numberOf(timeS + aheadS); n++) if (!this.slices.get(n)?.timeS) return false;
     return true;
   }
 
-  forgetBut(wanted, now) {
-    const others = [...this.slices.keys()].filter((number) => !wanted.includes(number) && this.slices.get(number).timeS);
+  dropOthers(needed, now) {
+    const others = [...this.slices.keys()].filter((number) => !needed.includes(number) && this.slices.get(number).timeS);
     others.sort((a, b) => Math.abs(b - now) - Math.abs(a - now));
-    for (const number of others.slice(0, Math.max(0, this.slices.size - KEPT))) this.slices.delete(number);
+    for (const number of others.slice(0, Math.max(0, this.slices.size - SLICES_MAX))) this.slices.delete(number);
   }
 
   /** @returns {Promise<{timeS: Float64Array, columns: Record<string, Float64Array>}>} */
   load(number) {
-    const kept = this.slices.get(number);
-    if (kept) return Promise.resolve(kept);
-    const asked = this.ask(number).then((slice) => {
-      if (this.slices.get(number) === asked) this.slices.set(number, slice); // else it has grown meanwhile
-      this.tell.come();
+    const stored = this.slices.get(number);
+    if (stored) return Promise.resolve(stored);
+    const request = this.fetch(number).then((slice) => {
+      if (this.slices.get(number) === request) this.slices.set(number, slice); // else outdated
+      this.on.loaded();
       return slice;
     }, (error) => {
       this.slices.delete(number);
-      this.notBeforeMs = performance.now() + AGAIN_MS;
+      this.notBeforeMs = performance.now() + RETRY_MS;
       throw error;
     });
-    this.slices.set(number, asked);
-    return asked;
+    this.slices.set(number, request);
+    return request;
   }
 
-  async ask(number) {
+  async fetch(number) {
     const columns = columnsOf(await api.samples(this.id, {
       columns: this.names.join(","), start_s: number * this.sliceS, end_s: (number + 1) * this.sliceS,
     }));
@@ -175,8 +176,7 @@ export class Samples {
   }
 
   /**
-   * The instant of the frame that is so many frames behind the nearest one to an instant, or before it;
-   * at the session's ends, that of its first or last frame.
+   * Return the time of the frame `by` frames from the nearest one, at most the first or last frame.
    */
   async step(timeS, by) {
     let number = this.numberOf(timeS);
@@ -193,23 +193,23 @@ export class Samples {
     return slice.timeS[row];
   }
 
-  /** The next slice that has frames; null: there is none. */
+  /** Return the next slice with frames; null: none. */
   after(number) {
     const { first, last } = this.whole;
     const edgeS = (number + 1) * this.sliceS;
-    const bin = placeOf(last, edgeS);
+    const bin = lowerBound(last, edgeS);
     return bin < last.length ? Math.max(number + 1, this.numberOf(first[bin])) : null;
   }
 
   before(number) {
     const { first, last } = this.whole;
-    const bin = placeOf(first, number * this.sliceS) - 1;
+    const bin = lowerBound(first, number * this.sliceS) - 1;
     return bin >= 0 && number > 0 ? Math.min(number - 1, this.numberOf(last[bin])) : null;
   }
 }
 
-/** Of a rising list, the place of what is nearest to a value. */
+/** Return the index of the element nearest to a value in a sorted list. */
 function nearest(list, value) {
-  const next = placeOf(list, value);
+  const next = lowerBound(list, value);
   return next === list.length || (next > 0 && value - list[next - 1] <= list[next] - value) ? next - 1 : next;
 }

@@ -1,11 +1,11 @@
-// From where to where the axis of each plot goes. Pure.
+// Axis ranges of the plots. Pure.
 
-const PEAK_PX = 24; // above a peak, for its mark and number
+const PEAK_PX = 24; // above a peak, for its triangle and value
 
 /** @typedef {{low: number, high: number, empty?: boolean}} Scale */
 
 /**
- * Least and greatest of what is in view; panels of a group share theirs.
+ * Return the range of each panel in view; panels of a group share one.
  * @param {import("./plots.js").Plots} plots @param {import("./view.js").View} view
  * @returns {Map<string, Scale>} by group, or key
  */

@@ -1,14 +1,14 @@
-// Draws numbers over time: columns from least to greatest, or the frames themselves, or colours.
+// Series over time: min-max columns, single frames, or colours.
 
 /**
- * Stretches of bins in which nothing is missing and the numbers are known.
- * @returns {Generator<[number, number]>} from, up to but not including
+ * Yield index ranges [begin, end) of adjacent bins with values.
+ * @returns {Generator<[number, number]>}
  */
 function* runs(bins, begin, end, known) {
   let start = -1;
   for (let i = begin; i < end; i++) {
     const here = known(i);
-    if (start >= 0 && (!here || !bins.follows(i))) {
+    if (start >= 0 && (!here || !bins.isAdjacent(i))) {
       yield [start, i];
       start = -1;
     }
@@ -17,7 +17,7 @@ function* runs(bins, begin, end, known) {
   if (start >= 0) yield [start, end];
 }
 
-/** The outline around least and greatest of a run: steps, or from frame to frame. */
+/** Trace the outline of min and max of a run: steps, or from frame to frame. */
 function outline(context, bins, [start, stop], x, y, lows, highs) {
   const stepped = bins.framesInBin > 1;
   context.beginPath();
@@ -32,7 +32,7 @@ function outline(context, bins, [start, stop], x, y, lows, highs) {
   context.closePath();
 }
 
-/** A band between two columns, such as an interval. */
+/** Draw a band between two columns, such as an interval. */
 export function drawBand(context, bins, begin, end, x, y, [lowName, highName], colour) {
   const [lows, highs] = [bins.columns[lowName], bins.columns[highName]];
   context.fillStyle = colour;
@@ -42,7 +42,7 @@ export function drawBand(context, bins, begin, end, x, y, [lowName, highName], c
   }
 }
 
-/** One quantity: columns from its least to its greatest, so that no peak hides; frames as dots and lines. */
+/** Draw a quantity: min-max columns keep every peak; single frames as dots and lines. */
 export function drawSeries(context, bins, begin, end, x, y, [lowName, highName], colour) {
   const [lows, highs] = [bins.columns[lowName], bins.columns[highName]];
   context.fillStyle = context.strokeStyle = colour;
@@ -71,7 +71,7 @@ export function drawSeries(context, bins, begin, end, x, y, [lowName, highName],
   }
 }
 
-/** A bound where the quantity itself is not known: it is on this line or above. */
+/** Draw the lower bound where the quantity is unknown. */
 export function drawBound(context, bins, begin, end, x, y, name, colour) {
   const [bounds, unknown] = [bins.columns[name], bins.columns.grf_unknown];
   context.strokeStyle = colour;
@@ -87,7 +87,7 @@ export function drawBound(context, bins, begin, end, x, y, name, colour) {
 
 const SHADES = 64;
 
-/** Colours from the first to the last of some stops, as [r, g, b] each. */
+/** Return colours between stops, as RGBA bytes. */
 function shadesOf(context, stops) {
   const strip = document.createElement("canvas");
   strip.width = SHADES;
@@ -101,9 +101,9 @@ function shadesOf(context, stops) {
 }
 
 /**
- * A row of colours for each tile: in every column of pixels the greatest value of its bins.
- * @param {{names: string[], low: number, high: number, stops: string[]}} how `names` of the columns
- *   of greatest values, in the order of the rows; `high` may be below `low` (counts fall with pressure)
+ * Draw a row of colours per tile: max of the bins in each pixel column.
+ * @param {{names: string[], low: number, high: number, stops: string[]}} how `names` of the max
+ *   columns, one per row; `high` may be below `low` (counts fall with pressure)
  */
 export function drawHeat(context, bins, begin, end, x, box, how) {
   const width = Math.max(1, Math.round(box.right - box.left));
@@ -122,7 +122,7 @@ export function drawHeat(context, bins, begin, end, x, box, how) {
       for (let at = from; at <= to; at++) if (!(best[at] >= share)) best[at] = share;
     }
     for (let at = 0; at < width; at++) {
-      if (Number.isNaN(best[at])) continue; // not known: nothing is drawn
+      if (Number.isNaN(best[at])) continue; // unknown
       const shade = 4 * Math.round(Math.min(1, Math.max(0, best[at])) * (SHADES - 1));
       const pixel = 4 * (row * width + at);
       for (let part = 0; part < 3; part++) picture.data[pixel + part] = shades[shade + part];

@@ -1,4 +1,4 @@
-// Whole stances one upon another: GRF and COP over 0 to 100 % of their duration, and a click goes to one.
+// Overlay of whole stances: GRF and COP over 0 to 100 % of their duration; a click shows one.
 
 import * as api from "../common/api.js";
 import { coloursOf, fit, whenColoursChange } from "../common/axes.js";
@@ -8,12 +8,13 @@ import { byId, el, number, setData, setText } from "../common/text.js";
 import { CopPaths } from "./cop_paths.js";
 
 const HIT_PX = 18;
-const FRAMES_MOST = 4000; // of the stance that was chosen: bins of a longer one, from least to greatest
+const FRAMES_MAX = 4000; // of the selected stance; a longer one is binned
 const HEIGHT_PX = 320;
-const RESTS_MS = 250; // of a cursor
+const RESTS_MS = 250; // of the cursor, before its stance is loaded
 
 /** @typedef {{number: number, grf_n: (number | null)[], cop_x_m: (number | null)[], cop_y_m: (number | null)[]}} Curve */
 
+/** Plots of the overlay. */
 export class StanceOverlay {
   /**
    * @param {string} id of the session
@@ -26,14 +27,14 @@ export class StanceOverlay {
     this.onGo = onGo;
     this.canvas = byId("overlay-canvas", HTMLCanvasElement);
     this.resting = 0;
-    this.other = null; // another session, whose stances are asked for
-    this.beside = null; // what came of it
-    this.chosen = null; // number of a stance, and its frames
-    this.hover = null; // number of a curve, and the percentage
+    this.other = null; // other session
+    this.beside = null; // its mean and spread
+    this.chosen = null; // selected stance and its frames
+    this.hover = null; // curve and percentage under the pointer
     this.paths = new CopPaths(() => this.draw(), (curve) => this.go(curve.number));
     const card = byId("overlay-card");
     card.hidden = false;
-    // Nobody waits for what is out of sight.
+    // Load only when scrolled into view.
     const seen = new IntersectionObserver((entries) => {
       if (!entries.some((entry) => entry.isIntersecting)) return;
       seen.disconnect();
@@ -55,13 +56,13 @@ export class StanceOverlay {
     this.answer = answer;
     this.percent = percentOf(answer.points);
     this.paths.show(array.tiles, answer);
-    setText(byId("overlay-says"), this.sentence());
+    setText(byId("overlay-summary"), this.summary());
     byId("overlay-plots").hidden = answer.overlaid === 0;
     this.draw();
   }
 
-  /** Mean and spread of another session's stances beside ours; null: of none. @param {{id: string, name: string} | null} other */
-  async layBeside(other) {
+  /** Show mean and spread of another session's stances; null: none. @param {{id: string, name: string} | null} other */
+  async setOverlay(other) {
     this.other = other;
     this.beside = null;
     this.draw();
@@ -74,20 +75,21 @@ export class StanceOverlay {
 
   refused(error) {
     if (!(error instanceof api.Refusal)) throw error;
-    setText(byId("overlay-says"), error.message);
+    setText(byId("overlay-summary"), error.message);
     byId("overlay-plots").hidden = true;
   }
 
-  sentence() {
+  /** Return which stances are overlaid. */
+  summary() {
     const { whole, overlaid, not_whole: cut, too_short: short, curves } = this.answer;
     const many = (n, what) => `${n.toLocaleString("en-GB")} ${what}${n === 1 ? "" : "s"}`;
-    if (!overlaid) return "No stance was seen whole: there is nothing to lay one upon another.";
-    const parts = [`${many(whole, "whole stance")}, each from its first frame in contact to its last.`];
-    const of = overlaid < whole ? `${overlaid.toLocaleString("en-GB")} that lie evenly as well` : "all";
-    if (curves.length < whole) parts.push(`${curves.length} of them are drawn one by one, evenly over the session; mean and spread are of ${of}.`);
-    if (cut) parts.push(`${many(cut, "stance")} not seen whole ${cut === 1 ? "is" : "are"} left out.`);
-    if (short) parts.push(`${many(short, "stance")} of a single frame ${short === 1 ? "is" : "are"} left out.`);
-    if (overlaid === 1) parts.push("Of one stance there is no spread.");
+    if (!overlaid) return "No whole stance to overlay.";
+    const parts = [`${many(whole, "whole stance")}, first to last frame in contact.`];
+    const of = overlaid < whole ? `${overlaid.toLocaleString("en-GB")}, evenly spaced` : "all";
+    if (curves.length < whole) parts.push(`${curves.length} curves drawn, evenly spaced over the session; mean and SD of ${of}.`);
+    if (cut) parts.push(`${many(cut, "incomplete stance")} left out.`);
+    if (short) parts.push(`${many(short, "single-frame stance")} left out.`);
+    if (overlaid === 1) parts.push("One stance: no SD.");
     return parts.join(" ");
   }
 
@@ -96,14 +98,14 @@ export class StanceOverlay {
     if (index >= 0) this.onGo(index);
   }
 
-  /** The stance that the cursor is in, once it rests there; -1: none. */
+  /** Select the stance at the cursor once it rests; -1: none. */
   follow(index) {
     clearTimeout(this.resting);
     if (index < 0 || this.stances[index].number === this.chosen?.number) return;
     this.resting = setTimeout(() => this.choose(index), RESTS_MS);
   }
 
-  /** The stance that the page went to: drawn frame by frame over all others. */
+  /** Select a stance: drawn frame by frame over all others. */
   async choose(index) {
     const stance = this.stances[index];
     this.chosen = { number: stance.number, whole: stance.is_whole, bins: null };
@@ -111,7 +113,7 @@ export class StanceOverlay {
     const { chosen } = this;
     try {
       const answer = await api.overview(this.id, {
-        points: FRAMES_MOST, start_s: Math.max(0, stance.from - 1e-7), end_s: stance.to + 1e-6, columns: "grf_n,cop_x_m,cop_y_m",
+        points: FRAMES_MAX, start_s: Math.max(0, stance.from - 1e-7), end_s: stance.to + 1e-6, columns: "grf_n,cop_x_m,cop_y_m",
       });
       chosen.bins = answer.columns;
       chosen.framesInBin = answer.frames_in_bin;
@@ -142,7 +144,7 @@ export class StanceOverlay {
     const frames = this.frames();
     const range = rangeOf([low, high, mean, ...theirs, ...answer.curves.map((curve) => curve.grf_n), ...(frames ? [frames.low, frames.high] : [])]);
     const { x, y } = drawFrame(context, box, {
-      x: { low: 0, high: 100 }, y: roomy(range), colours, xUnit: "%", xTitle: "of the stance", yTitle: "Ground reaction force, N",
+      x: { low: 0, high: 100 }, y: roomy(range), colours, xUnit: "%", xTitle: "of stance", yTitle: "Ground reaction force, N",
     });
     this.y = y;
     const xs = this.percent.map(x);
@@ -188,24 +190,24 @@ export class StanceOverlay {
       drawCurve(context, [at, at], [box.top, box.bottom]);
     }
     this.paths.draw(colours, this.chosen, frames, this.hover?.curve, this.beside);
-    this.drawWords();
+    this.writeTexts();
   }
 
-  drawWords() {
+  writeTexts() {
     const { answer, chosen, hover } = this;
     const { mean, sd, count } = answer.spread.grf_n;
     const at = hover?.at ?? mean.reduce((best, value, i) => (value > (mean[best] ?? -Infinity) ? i : best), 0);
     const spread = sd[at] === null ? "" : ` ± ${number(sd[at])}`;
     const where = `at ${number(this.percent[at], 0)} %`;
-    const said = hover
-      ? `${hover.curve ? `Stance ${hover.curve.number}: ${number(hover.curve.grf_n[at] ?? NaN)} N ${where}; mean` : `Mean ${where}:`} ${number(mean[at] ?? NaN)}${spread} N of ${count[at].toLocaleString("en-GB")}`
-      : `The mean is greatest ${where}: ${number(mean[at] ?? NaN)}${spread} N`;
-    setText(byId("overlay-at"), said);
+    const text = hover
+      ? `${hover.curve ? `Stance ${hover.curve.number}: ${number(hover.curve.grf_n[at] ?? NaN)} N ${where}; mean` : `Mean ${where}:`} ${number(mean[at] ?? NaN)}${spread} N (n = ${count[at].toLocaleString("en-GB")})`
+      : `Mean has its maximum ${where}: ${number(mean[at] ?? NaN)}${spread} N`;
+    setText(byId("overlay-at"), text);
     const items = [["single", "single stances"], ["mean", "mean"]];
-    if (answer.overlaid > 1) items.push(["spread", "± one standard deviation over stances"]);
-    if (this.beside) items.push(["beside", `${this.beside.name}: mean ± one standard deviation over ${this.beside.overlaid.toLocaleString("en-GB")} stances`]);
+    if (answer.overlaid > 1) items.push(["spread", "± 1 SD over stances"]);
+    if (this.beside) items.push(["beside", `${this.beside.name}: mean ± 1 SD over ${this.beside.overlaid.toLocaleString("en-GB")} stances`]);
     if (chosen) {
-      const how = !chosen.whole ? " was not seen whole: it has no place here" : chosen.framesInBin > 1 ? ", from least to greatest" : ", frame by frame";
+      const how = !chosen.whole ? " is incomplete: not drawn" : chosen.framesInBin > 1 ? ", min-max" : ", frame by frame";
       items.push(["chosen", `stance ${chosen.number}${how}`]);
     }
     const list = byId("overlay-legend");
@@ -216,7 +218,7 @@ export class StanceOverlay {
     list.replaceChildren(...items.map(([name, text]) => el("li", { "data-kind": name }, el("i", { cls: `swatch over-${name}`, "aria-hidden": "true" }), text)));
   }
 
-  /** The stance that was chosen, over its own duration; null: there is none, or not yet. */
+  /** Return the frames of the selected stance over its duration; null: none, or not loaded. */
   frames() {
     const bins = this.chosen?.whole ? this.chosen.bins : null;
     if (!bins?.t_first_s.length) return null;
@@ -248,10 +250,10 @@ export class StanceOverlay {
 
 const percentOf = (points) => Array.from({ length: points }, (_, i) => (100 * i) / (points - 1));
 
-/** Mean less and plus one standard deviation. */
+/** Return mean minus and plus one standard deviation. */
 const bandOf = ({ mean, sd }) => [-1, 1].map((sign) => mean.map((value, i) => (value === null || sd[i] === null ? null : value + sign * sd[i])));
 
-/** Zero is always in sight: that is where a stance begins. */
+/** Return the range of all series, with zero. */
 function rangeOf(series) {
   const range = { low: 0, high: 0 };
   for (const values of series) {

@@ -1,37 +1,38 @@
-// Stances: a table of when the foot stood, and how hard, and the one that the cursor is in, in words above the plots.
+// Stances: table, and figures of the one at the cursor.
 
 import { byId, el, number, setData, setText } from "../common/text.js";
-import { estimateWords } from "./flags.js";
-import { timeWords } from "./overlay.js";
+import { estimateTexts } from "./flags.js";
+import { timeText } from "./overlay.js";
 
-const FORCE_SEEN_PX = 280; // head, the plot of the force, and the buttons that stay below it on a phone
-const AT_ONCE = 200; // an hour of walking has thousands
-const EDGE_S = 1e-9; // of times that were added up
-const ORDINARY = ~(4 | 8 | 16 | 64); // outliers, gaps (said by number), COP at the edges, scale of the session
+const FORCE_SEEN_PX = 280; // head, GRF plot, and the buttons below it on a phone
+const ROWS_MAX = 200; // per page
+const EDGE_S = 1e-9; // rounding
+const ORDINARY = ~(4 | 8 | 16 | 64); // outliers, gaps (counted below), COP at the edges, assumed scale
 
-/** In seconds after the session's first frame. */
-export function placed(stances, beginNs) {
+/** Return stances with times in seconds after the first frame. */
+export function withSeconds(stances, beginNs) {
   return stances.map((stance) => ({
     ...stance, from: (stance.begin_t_ns - beginNs) * 1e-9, to: (stance.end_t_ns - beginNs) * 1e-9,
     peakS: stance.peak_t_ns === null ? null : (stance.peak_t_ns - beginNs) * 1e-9,
   }));
 }
 
+/** Return the faults of a stance as text. */
 function flagsOf(stance) {
-  const words = estimateWords(stance.estimate_status & ORDINARY);
-  if (!stance.begun) words.push("its beginning is not there");
-  if (!stance.ended) words.push("its end is not there");
-  if (stance.missing_frames) words.push(`${stance.missing_frames} frames not there`);
-  if (stance.unknown_frames) words.push(`${stance.unknown_frames} frames without a GRF`);
-  return words.join(", ");
+  const texts = estimateTexts(stance.estimate_status & ORDINARY);
+  if (!stance.begun) texts.push("start not recorded");
+  if (!stance.ended) texts.push("end not recorded");
+  if (stance.missing_frames) texts.push(`${stance.missing_frames} frames missing`);
+  if (stance.unknown_frames) texts.push(`${stance.unknown_frames} frames without a GRF`);
+  return texts.join(", ");
 }
 
-/** The one that an instant is in; -1: none. Stances rise in time. */
+/** Return the index of the stance at an instant; -1: none. Stances are sorted by time. */
 export function stanceAt(stances, timeS) {
   return timeS === null ? -1 : stances.findIndex(({ from, to }) => timeS >= from - EDGE_S && timeS <= to + EDGE_S);
 }
 
-/** The next or previous one of the cursor's; without a cursor the first or last in view. */
+/** Return the next or previous stance of the cursor; without a cursor the first or last in view. */
 export function neighbour(stances, by, cursorS, view) {
   const here = stanceAt(stances, cursorS);
   if (here >= 0) return here + by;
@@ -41,15 +42,15 @@ export function neighbour(stances, by, cursorS, view) {
 
 const Z95 = 1.96;
 
-/** What a stance is told by: name, head of its column, value and sigma, factor to the unit shown, decimals. */
+/** Figures of a stance: label, value and sigma field, factor to the unit, decimals. */
 const FIGURES = [
-  { key: "peak", says: "Peak force", value: "peak_grf_n", sigma: "peak_sigma_n", unit: "N", factor: 1, decimals: 1 },
-  { key: "duration", says: "Contact", value: "duration_s", sigma: "duration_sigma_s", unit: "ms", factor: 1e3, decimals: 0 },
-  { key: "impulse", says: "Impulse", value: "impulse_n_s", sigma: "impulse_sigma_n_s", unit: "N\u00a0s", factor: 1, decimals: 2 },
-  { key: "travel", says: "COP travel", value: "cop_x_range_m", sigma: "cop_x_range_sigma_m", unit: "mm", factor: 1e3, decimals: 1 },
+  { key: "peak", label: "Peak force", value: "peak_grf_n", sigma: "peak_sigma_n", unit: "N", factor: 1, decimals: 1 },
+  { key: "duration", label: "Contact time", value: "duration_s", sigma: "duration_sigma_s", unit: "ms", factor: 1e3, decimals: 0 },
+  { key: "impulse", label: "Impulse", value: "impulse_n_s", sigma: "impulse_sigma_n_s", unit: "N\u00a0s", factor: 1, decimals: 2 },
+  { key: "travel", label: "COP travel", value: "cop_x_range_m", sigma: "cop_x_range_sigma_m", unit: "mm", factor: 1e3, decimals: 1 },
 ];
 
-/** "25.6" and "± 1.0", the half of its 95 % interval; the latter empty where it is not known. */
+/** Return value and half width of the 95 % interval, such as "25.6" and "± 1.0". */
 function figureOf(stance, { value, sigma, factor, decimals }) {
   const [of, sigmaOf] = [stance[value] ?? null, stance[sigma] ?? null];
   return [
@@ -58,7 +59,7 @@ function figureOf(stance, { value, sigma, factor, decimals }) {
   ];
 }
 
-/** The median of each figure over whole stances, as if it were a stance. */
+/** Return the median of each figure over stances, as a stance. */
 export function medianOf(stances) {
   const middle = (name) => {
     const values = stances.map((stance) => stance[name]).filter((value) => value !== null).sort((a, b) => a - b);
@@ -68,6 +69,7 @@ export function medianOf(stances) {
   return Object.fromEntries(FIGURES.map(({ value }) => [value, middle(value)]));
 }
 
+/** Table of stances. */
 export class Stances {
   /** @param {(index: number) => void} onGo */
   constructor(onGo) {
@@ -75,9 +77,9 @@ export class Stances {
     this.body = byId("stances-rows");
     this.stances = [];
     this.current = -1;
-    this.says = byId("stance-says");
+    this.line = byId("stance-text");
     this.figures = new Map(FIGURES.map(({ key }) => [key, el("dd")]));
-    byId("stance-figures").replaceChildren(...FIGURES.map(({ key, says }) => el("div", { "data-figure": key }, el("dt", { text: says }), this.figures.get(key))));
+    byId("stance-figures").replaceChildren(...FIGURES.map(({ key, label }) => el("div", { "data-figure": key }, el("dt", { text: label }), this.figures.get(key))));
     byId("stances-more").addEventListener("click", () => this.add());
   }
 
@@ -91,19 +93,19 @@ export class Stances {
 
   add() {
     const have = this.body.children.length;
-    for (const [i, stance] of this.stances.slice(have, have + AT_ONCE).entries()) this.body.append(this.row(stance, have + i));
+    for (const [i, stance] of this.stances.slice(have, have + ROWS_MAX).entries()) this.body.append(this.row(stance, have + i));
     byId("stances-more").hidden = this.body.children.length >= this.stances.length;
   }
 
   row(stance, index) {
-    const go = el("button", { type: "button", cls: "small", text: String(stance.number), "aria-label": `${stance.number}: show this stance` });
+    const go = el("button", { type: "button", cls: "small", text: String(stance.number), "aria-label": `Show stance ${stance.number}` });
     const row = el("tr", { role: "row", "data-stance": String(stance.number) },
       el("td", { role: "cell" }, go),
       ...FIGURES.map((figure) => {
         const [value, interval] = figureOf(stance, figure);
         return el("td", { role: "cell" }, `${value} `, el("small", { text: interval }));
       }),
-      el("td", { role: "cell", text: timeWords(stance.from, 0.01) }),
+      el("td", { role: "cell", text: timeText(stance.from, 0.01) }),
       el("td", { role: "cell", cls: "why", text: flagsOf(stance) }));
     row.addEventListener("click", () => this.onGo(index));
     return row;
@@ -114,10 +116,10 @@ export class Stances {
     if (next in this.stances) this.onGo(next);
   }
 
-  /** The one that the cursor is in is said, and marked in the table. */
+  /** Show the stance at the cursor, and highlight it in the table. */
   follow(timeS, isPlaying) {
     const index = stanceAt(this.stances, timeS);
-    this.say(this.stances[index], isPlaying);
+    this.showFigures(this.stances[index], isPlaying);
     if (index === this.current) return;
     this.current = index;
     while (index >= this.body.children.length) this.add();
@@ -125,19 +127,19 @@ export class Stances {
     const row = /** @type {HTMLElement | undefined} */ (this.body.children[index]);
     row?.setAttribute("aria-current", "true");
     if (!row) return;
-    // Within its own box: the plots must stay in sight.
+    // Scroll the table only: the plots stay visible.
     const box = byId("stances-scroll");
     const [top, bottom] = [row.offsetTop, row.offsetTop + row.offsetHeight];
     if (top - 40 < box.scrollTop) box.scrollTop = top - 40;
     else if (bottom > box.scrollTop + box.clientHeight) box.scrollTop = bottom - box.clientHeight;
   }
 
-  say(stance, isPlaying) {
-    this.says.setAttribute("aria-live", isPlaying ? "off" : "polite"); // at four times the speed nobody can listen
+  showFigures(stance, isPlaying) {
+    this.line.setAttribute("aria-live", isPlaying ? "off" : "polite"); // too fast for a screen reader
     const many = this.stances.length.toLocaleString("en-GB");
     const whole = this.stances.filter((one) => one.is_whole);
     const all = `${many} stance${many === "1" ? "" : "s"}`;
-    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : whole.length > 1 ? `${all}: medians of ${whole.length.toLocaleString("en-GB")} whole` : all);
+    setText(byId("stance-which"), stance ? `Stance ${stance.number} of ${many}` : whole.length > 1 ? `${all}, median of ${whole.length.toLocaleString("en-GB")} whole` : all);
     byId("stance-level").hidden = !stance;
     const shown = stance ?? medianOf(whole);
     for (const figure of FIGURES) {
@@ -145,10 +147,10 @@ export class Stances {
       setText(this.figures.get(figure.key), [value, interval && `${interval}`, figure.unit].filter(Boolean).join("\u00a0"));
     }
     setText(byId("stance-flags"), stance ? flagsOf(stance) : "");
-    setData(this.says, "stance", stance ? String(stance.number) : "");
+    setData(this.line, "stance", stance ? String(stance.number) : "");
   }
 
-  /** Seen from a row, too, what is gone to has to come into view: its words, and the force below them. */
+  /** Scroll figures and GRF into view. */
   bringIntoView() {
     const line = byId("stance-line");
     const seenToPx = byId("plots").getBoundingClientRect().top + FORCE_SEEN_PX;

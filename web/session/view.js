@@ -1,10 +1,10 @@
-// Which time of a session is shown: seconds after its first frame, always within it. Pure.
+// Visible range of a session, seconds after its first frame. Pure.
 
-export const LEAST_S = 0.02; // some frames of any array
+export const LEAST_S = 0.02; // a few frames
 
 /** @typedef {{from: number, to: number}} View */
 
-/** @returns {View} as near as can be to what was asked for */
+/** Return the nearest valid view. @returns {View} */
 export function clamped({ from, to }, durationS) {
   const all = Math.max(durationS, LEAST_S);
   const span = Math.min(all, Math.max(LEAST_S, to - from));
@@ -17,7 +17,7 @@ export const whole = (durationS) => clamped({ from: 0, to: durationS }, duration
 
 export const isWhole = (view, durationS) => view.to - view.from >= Math.max(durationS, LEAST_S) * (1 - 1e-9);
 
-/** `factor` below 1 shows less time; what is at `aboutS` stays where it is. */
+/** Return a zoomed view: `factor` below 1 shows less time, `aboutS` stays in place. */
 export function zoomed(view, factor, aboutS, durationS) {
   const span = Math.max(LEAST_S, (view.to - view.from) * factor);
   const share = (aboutS - view.from) / (view.to - view.from);
@@ -26,13 +26,13 @@ export function zoomed(view, factor, aboutS, durationS) {
 
 export const moved = (view, byS, durationS) => clamped({ from: view.from + byS, to: view.to + byS }, durationS);
 
-/** Some time with a little of what is before and behind it. */
+/** Return a view of an interval with a margin. */
 export function around(fromS, toS, durationS) {
   const margin = Math.max(0.3 * (toS - fromS), 0.05);
   return clamped({ from: fromS - margin, to: toS + margin }, durationS);
 }
 
-/** The view that a link states; the whole session if it states none. */
+/** Return the view of a URL; default: whole session. */
 export function fromLink(search, durationS) {
   const fields = new URLSearchParams(search);
   const number = (name, otherwise) => {
@@ -43,15 +43,15 @@ export function fromLink(search, durationS) {
   return from < to ? clamped({ from, to }, durationS) : whole(durationS);
 }
 
-/** The cursor that a link states; null if it states none. */
+/** Return the cursor of a URL; null: none. */
 export function cursorFromLink(search, durationS) {
   const timeS = Number.parseFloat(new URLSearchParams(search).get("at") ?? "");
   return timeS >= 0 && timeS <= durationS ? timeS : null;
 }
 
 /**
- * "?from=1.25&to=2.5&at=1.5", or nothing for the whole session without a cursor; what else the address asks for stays.
- * The chosen stance is the one that the cursor is in.
+ * Return the query of a view, such as "?from=1.25&to=2.5&at=1.5"; other fields of `search` stay.
+ * The selected stance is the one at the cursor.
  */
 export function toLink(view, durationS, search = "", cursorS = null) {
   const fields = new URLSearchParams(search);

@@ -1,20 +1,21 @@
-// Several sessions chosen: downloaded as one zip file, or moved to the trash.
+// Selected sessions: download as one zip file, or move to the trash.
 
 import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, bytes, el, setText } from "../common/text.js";
 
-const ZIP_MOST = 1000; // as many as the server takes
+const ZIP_MAX = 1000; // limit of the server
 
 const many = (count) => `${count} session${count === 1 ? "" : "s"}`;
 
+/** Selection of sessions in the list. */
 export class Chosen {
   /**
    * @param {object} of
-   * @param {HTMLInputElement} of.all the box that chooses all of `shown()`
+   * @param {HTMLInputElement} of.all box that selects all of `shown()`
    * @param {() => Session[]} of.shown
-   * @param {(session: Session) => void} of.onSession as the list has them
+   * @param {(session: Session) => void} of.onSession updates the list
    * @param {(id: string) => void} of.onDeleted
    */
   constructor({ all, shown, onSession, onDeleted }) {
@@ -36,7 +37,7 @@ export class Chosen {
     });
   }
 
-  /** The box in a session's row. @param {Session} session */
+  /** Make the box of a session's row. @param {Session} session */
   pick(session) {
     const box = el("input", { type: "checkbox", "data-part": "pick", "aria-label": `Select ${session.name || session.id}` });
     box.checked = this.ids.has(session.id);
@@ -48,7 +49,7 @@ export class Chosen {
     return box;
   }
 
-  /** The box of a take. @param {Session[]} sessions */
+  /** Make the box of a take. @param {Session[]} sessions */
   pickAll(sessions) {
     const box = el("input", { type: "checkbox", "data-part": "pick-take", "aria-label": `Select the take ${sessions[0].name}` });
     box.addEventListener("change", () => {
@@ -62,7 +63,7 @@ export class Chosen {
     return box;
   }
 
-  /** Those that are chosen and still listed. */
+  /** Sessions that are selected and listed. */
   get sessions() {
     return this.shown().filter(({ id }) => this.ids.has(id));
   }
@@ -83,10 +84,10 @@ export class Chosen {
     const sealed = chosen.filter(({ state }) => state === "sealed");
     const size = sealed.reduce((sum, session) => sum + (session.bytes ?? 0), 0);
     const left = chosen.length - sealed.length;
-    setText(byId("chosen-text"), `${chosen.length} selected${left ? `, ${left} not sealed yet and not in a zip file` : ""}`);
+    setText(byId("chosen-text"), `${chosen.length} selected${left ? `, ${left} not sealed (not in the zip)` : ""}`);
     const zip = byId("chosen-zip", HTMLAnchorElement);
-    const can = sealed.length > 0 && sealed.length <= ZIP_MOST;
-    setText(zip, can ? `Download ${many(sealed.length)} as zip, ${bytes(size)}` : sealed.length ? `At most ${ZIP_MOST} in a zip file` : "Nothing to download");
+    const can = sealed.length > 0 && sealed.length <= ZIP_MAX;
+    setText(zip, can ? `Download ${many(sealed.length)} as zip, ${bytes(size)}` : sealed.length ? `Zip: ${ZIP_MAX} sessions at most` : "No sealed session selected");
     if (can) zip.href = api.zipAddress(sealed.map(({ id }) => id));
     else zip.removeAttribute("href");
   }
@@ -94,9 +95,9 @@ export class Chosen {
   async delete() {
     const chosen = this.sessions.filter(({ state }) => state === "sealed" || state === "pending");
     const left = this.sessions.length - chosen.length;
-    if (!chosen.length) return notice("What is being recorded cannot be deleted: stop it first.", { bad: true });
+    if (!chosen.length) return notice("a running recording cannot be deleted. Stop it first.", { bad: true });
     const sure = await ask(`Move ${many(chosen.length)} to the trash?`,
-      `They can be restored until it is emptied.${left ? ` ${many(left)} that ${left === 1 ? "is" : "are"} being recorded stay${left === 1 ? "s" : ""}.` : ""}`,
+      `They can be restored until the trash is emptied.${left ? ` ${left} running recording${left === 1 ? " is" : "s are"} not deleted.` : ""}`,
       `Delete ${many(chosen.length)}`);
     if (!sure) return null;
     const gone = [];

@@ -1,24 +1,25 @@
-// The list of sessions: newest first or as searched for, those of a take together, more as one scrolls.
+// List of sessions: newest first, filtered, grouped by take, loaded while scrolling.
 
 import * as api from "../common/api.js";
 import { ask, edit } from "../common/dialogs.js";
 import { frames } from "../common/losses.js";
-import { mayPress } from "../common/login.js";
+import { isOperator } from "../common/login.js";
 import { menuButton } from "../common/menu.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, el, setData, setText } from "../common/text.js";
 import { Chosen } from "./chosen.js";
 import { counts, head, makeRow, makeTakeRow } from "./row.js";
-import { plainState } from "./state.js";
+import { stateText } from "./state.js";
 
-const MOST = 5000; // a page left open for weeks must not grow without end
-const [FIRST, MORE] = [20, 100]; // in an answer
-const AHEAD_PX = 800; // of the end of the list the next are asked for
+const SESSIONS_MAX = 5000; // bounds a page left open for weeks
+const [FIRST, MORE] = [20, 100]; // sessions per response
+const AHEAD_PX = 800; // before the end of the list the next are requested
 const TYPING_MS = 200;
-const COMPARED_MOST = 6; // in a menu
+const COMPARED_MAX = 6; // in a menu
 
+/** List of sessions. */
 export class Sessions {
-  /** `onSession(session)` takes what an answer brings, `onDeleted(id)` what was moved to the trash. */
+  /** `onSession(session)` receives sessions of responses, `onDeleted(id)` those moved to the trash. */
   constructor({ onSession, onDeleted }) {
     this.onSession = onSession;
     this.onDeleted = onDeleted;
@@ -26,14 +27,14 @@ export class Sessions {
     this.more = byId("sessions-more");
     this.sessions = new Map();
     this.rows = new Map();
-    this.keys = new WeakMap(); // session -> all that is said of it, to tell what changed
+    this.keys = new WeakMap(); // session -> its JSON, to detect changes
     this.cursor = null;
-    this.asked = 0;
-    this.since = null; // what was told of sessions while the newest are asked for: id -> session or null
+    this.requests = 0;
+    this.since = null; // updates during a request: id -> session or null
     /** @type {{q?: string, complete?: string}} */
-    this.wanted = {}; // as the server is asked
-    this.takeRows = new Map(); // id of a take -> its row and what it shows
-    this.all = el("input", { type: "checkbox", "aria-label": "Select all that are listed" });
+    this.filter = {}; // query of the server
+    this.takeRows = new Map(); // take id -> row and key
+    this.all = el("input", { type: "checkbox", "aria-label": "Select all" });
     this.head = head(this.all);
     this.chosen = new Chosen({ all: this.all, onSession, onDeleted, shown: () => [...this.sessions.values()] });
     this.more.addEventListener("click", () => this.load(this.cursor));
@@ -42,36 +43,36 @@ export class Sessions {
     let typing = null;
     field.addEventListener("input", () => {
       clearTimeout(typing);
-      typing = setTimeout(() => this.want("q", field.value.trim()), TYPING_MS);
+      typing = setTimeout(() => this.setFilter("q", field.value.trim()), TYPING_MS);
     });
     const whole = byId("sessions-complete", HTMLSelectElement);
-    whole.addEventListener("change", () => this.want("complete", whole.value));
+    whole.addEventListener("change", () => this.setFilter("complete", whole.value));
     const asked = new URLSearchParams(location.search);
     field.value = asked.get("q")?.trim() ?? "";
     whole.value = asked.get("complete") ?? "";
     if (whole.selectedIndex < 0) whole.value = "";
-    for (const [what, value] of [["q", field.value], ["complete", whole.value]]) if (value) this.wanted[what] = value;
+    for (const [what, value] of [["q", field.value], ["complete", whole.value]]) if (value) this.filter[what] = value;
   }
 
-  /** List only what has this; with an empty value whatever it is. */
-  want(what, value) {
-    if (value === (this.wanted[what] ?? "")) return;
-    if (value) this.wanted[what] = value;
-    else delete this.wanted[what];
-    const query = String(new URLSearchParams(this.wanted));
+  /** Filter the list; an empty value removes the filter. */
+  setFilter(name, value) {
+    if (value === (this.filter[name] ?? "")) return;
+    if (value) this.filter[name] = value;
+    else delete this.filter[name];
+    const query = String(new URLSearchParams(this.filter));
     history.replaceState(null, "", location.pathname + (query ? `?${query}` : ""));
     this.reload();
   }
 
-  /** Load the newest page, or the one at `cursor`. Quiet: the link already says if the server is gone. */
+  /** Load the first page, or the one at `cursor`. Silent if the server is down: the link shows that. */
   async load(cursor = null) {
     if (cursor && this.loading === cursor) return [];
     this.loading = cursor;
-    const number = cursor ? this.asked : ++this.asked;
+    const number = cursor ? this.requests : ++this.requests;
     const since = cursor ? this.since : this.since = new Map();
     let page;
     try {
-      page = await api.listSessions({ limit: cursor ? MORE : FIRST, ...(cursor ? { cursor } : {}), ...this.wanted });
+      page = await api.listSessions({ limit: cursor ? MORE : FIRST, ...(cursor ? { cursor } : {}), ...this.filter });
     } catch (error) {
       if (!(error instanceof api.Refusal)) throw error;
       if (cursor) notice(error.message, { bad: true });
@@ -79,7 +80,7 @@ export class Sessions {
     } finally {
       if (this.loading === cursor) this.loading = null;
     }
-    if (number !== this.asked) return []; // something else was searched for meanwhile
+    if (number !== this.requests) return []; // the filter has changed
     const items = page?.items ?? [];
     if (!cursor) {
       this.sessions.clear();
@@ -95,28 +96,28 @@ export class Sessions {
     return items;
   }
 
-  /** After a reconnection: the server may be another one, with other sessions. */
+  /** Load again after a reconnection. */
   reload() {
     return this.load();
   }
 
-  /** @param {Session} session */
-  take(session) {
-    if (!isWanted(session, this.wanted)) return this.drop(session.id);
-    // An answer that the link has overtaken: what is sealed stays sealed.
+  /** Add or replace a session. @param {Session} session */
+  update(session) {
+    if (!isIncluded(session, this.filter)) return this.drop(session.id);
+    // Outdated response: a sealed session stays sealed.
     if (this.sessions.get(session.id)?.state === "sealed" && session.state !== "sealed") return null;
     this.since?.set(session.id, session);
     this.sessions.set(session.id, session);
     return this.draw();
   }
 
-  /** How far an unsealed session has come: in its place, so that its buttons stay as they are. */
-  count(id, counted) {
+  /** Update the progress of an unsealed session in place, so that its buttons keep the focus. */
+  updateProgress(id, progress) {
     const session = this.sessions.get(id);
     if (!session) return;
-    const now = { ...session, ...counted };
+    const now = { ...session, ...progress };
     const shown = this.rows.get(id);
-    if (plainState(now)[1] !== plainState(session)[1] || !shown) return this.take(now);
+    if (stateText(now)[1] !== stateText(session)[1] || !shown) return this.update(now);
     this.sessions.set(id, now);
     shown.key = this.keyOf(now);
     for (const [cls, text] of Object.entries(counts(now))) setText(shown.row.querySelector(`.${cls}`), text);
@@ -135,13 +136,13 @@ export class Sessions {
   }
 
   draw() {
-    const sorted = [...this.sessions.values()].sort((a, b) => b.started_t_ns - a.started_t_ns).slice(0, MOST);
+    const sorted = [...this.sessions.values()].sort((a, b) => b.started_t_ns - a.started_t_ns).slice(0, SESSIONS_MAX);
     this.sessions = new Map(sorted.map((session) => [session.id, session]));
-    this.more.hidden = this.cursor === null || sorted.length >= MOST;
+    this.more.hidden = this.cursor === null || sorted.length >= SESSIONS_MAX;
     if (!sorted.length) {
       this.rows.clear();
-      this.box.setAttribute("role", "group"); // a table has rows
-      this.box.replaceChildren(el("p", { cls: "none", text: none(this.wanted) }));
+      this.box.setAttribute("role", "group"); // a table needs rows
+      this.box.replaceChildren(el("p", { cls: "none", text: emptyText(this.filter) }));
       this.chosen.draw();
       return;
     }
@@ -149,9 +150,9 @@ export class Sessions {
     const rows = new Map();
     const lines = [this.head];
     const takeRows = new Map();
-    for (const group of grouped(sorted)) {
+    for (const group of groupByTake(sorted)) {
       if (group.length > 1) lines.push(this.takeRow(group, takeRows));
-      const nodes = group.map(({ node }) => node).join(" "); // its menu names them
+      const nodes = group.map(({ node }) => node).join(" "); // shown in the menu
       for (const session of group) {
         const key = this.keyOf(session);
         const old = this.rows.get(session.id);
@@ -170,7 +171,7 @@ export class Sessions {
     if (inside?.[0] && !focused.isConnected) rows.get(inside[0])?.row.querySelector(`[data-part="${inside[1]}"]`)?.focus();
   }
 
-  /** The row above the sessions of a take, the one that is there if it shows the same. */
+  /** Return the row of a take; the old one if unchanged. */
   takeRow(group, takeRows) {
     const { take } = group[0];
     const key = JSON.stringify(group.map(({ id, name, node }) => [id, name, node]));
@@ -180,22 +181,22 @@ export class Sessions {
     return shown.row;
   }
 
-  /** Only what is new or gone is touched: a thousand rows are not laid out again for one. */
-  place(wanted) {
-    const kept = new Set(wanted);
-    for (const old of [...this.box.children]) if (!kept.has(old)) old.remove();
-    wanted.forEach((row, i) => { if (this.box.children[i] !== row) this.box.insertBefore(row, this.box.children[i] ?? null); });
+  /** Insert and remove changed rows only: no layout of a thousand rows for one. */
+  place(lines) {
+    const shown = new Set(lines);
+    for (const old of [...this.box.children]) if (!shown.has(old)) old.remove();
+    lines.forEach((row, i) => { if (this.box.children[i] !== row) this.box.insertBefore(row, this.box.children[i] ?? null); });
   }
 
-  /** What can be done with a session in its present state. @param {Session} session */
+  /** Make the menu of a session. @param {Session} session */
   menu(session) {
     return menuButton(`Actions: ${session.name || session.id}`, () => {
       const now = this.sessions.get(session.id) ?? session;
-      return [...links(now, this.others(now)), ...(mayPress() ? this.buttons(now) : [])];
+      return [...links(now, this.others(now)), ...(isOperator() ? this.buttons(now) : [])];
     });
   }
 
-  /** The other sessions of its take that are listed. @param {Session} session */
+  /** Return the other listed sessions of its take. @param {Session} session */
   others({ id, take }) {
     return take ? [...this.sessions.values()].filter((other) => other.take === take && other.id !== id) : [];
   }
@@ -209,7 +210,7 @@ export class Sessions {
       made.push(button);
     };
     add("edit", "Edit …", (now) => this.edit(now));
-    if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal as it is …" : "Seal without them …", (now) => this.seal(now));
+    if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal now …" : "Abandon missing frames …", (now) => this.abandon(now));
     if (session.state === "sealed" || session.state === "pending") add("delete", "Delete", (now) => this.delete(now));
     return made;
   }
@@ -221,17 +222,17 @@ export class Sessions {
   }
 
   /** @param {Session} session */
-  async seal(session) {
+  async abandon(session) {
     const many = frames(session.pending_frames);
-    const [question, loss] = session.waits_for === "end"
-      ? ["as it is", "What the node may have taken after the last frame that came is given up, and"]
-      : ["without them", `${many[0].toUpperCase()}${many.slice(1)} will be missing for good, and`];
-    const sure = await ask(`Seal “${session.name}” ${question}?`,
-      `${loss} the session is marked lossy. Do this only if the node never comes back: while you wait, it completes by itself as soon as the node does.`,
+    const [title, loss] = session.waits_for === "end"
+      ? [`Seal “${session.name}” now?`, "Frames after the last received one are abandoned"]
+      : [`Abandon missing frames of “${session.name}”?`, `${many[0].toUpperCase()}${many.slice(1)} will be lost for good`];
+    const sure = await ask(title,
+      `${loss}, and the session is lossy. Do this only if the node never reconnects: otherwise the session completes once they arrive.`,
       "Seal as lossy");
     if (!sure) return;
     this.onSession(await api.sealSession(session.id));
-    notice(`Sealed “${session.name}” ${question}.`);
+    notice(`Sealed “${session.name}”.`);
   }
 
   /** @param {Session} session */
@@ -244,20 +245,20 @@ export class Sessions {
   }
 }
 
-/** Downloads, and comparisons with the others of its take. @param {Session} session @param {Session[]} others */
+/** Return links to downloads and to comparisons within the take. @param {Session} session @param {Session[]} others */
 function links(session, others) {
   const link = (part, text, attributes) => el("a", { text, "data-part": part, ...attributes });
   const formats = [["parquet", "Parquet"], ["arrow", "Arrow"], ["csv", "CSV"]]
-    .filter(([format]) => format !== "parquet" || session.state === "sealed"); // it exists only once sealed
+    .filter(([format]) => format !== "parquet" || session.state === "sealed"); // only once sealed
   return [
     ...formats.map(([format, text]) => link(format, `Download ${text}`, { href: api.dataAddress(session, format), download: "" })),
-    ...others.filter(({ state }) => state === "sealed" && session.state === "sealed").slice(0, COMPARED_MOST)
+    ...others.filter(({ state }) => state === "sealed" && session.state === "sealed").slice(0, COMPARED_MAX)
       .map((other) => link("compare", `Compare with ${other.node}`, { href: `/sessions/${encodeURIComponent(session.id)}?with=${encodeURIComponent(other.id)}` })),
   ];
 }
 
-/** Sessions that are newest first, those of a take together and in the order of their nodes. @param {Session[]} sessions */
-function grouped(sessions) {
+/** Group sessions by take, newest first, sorted by node within a take. @param {Session[]} sessions */
+function groupByTake(sessions) {
   const groups = new Map();
   for (const session of sessions) {
     const key = session.take ?? session.id;
@@ -268,20 +269,21 @@ function grouped(sessions) {
   return [...groups.values()].map((group) => group.sort(byNode));
 }
 
-const MISSING = { true: "complete", lossy: "lacking frames", false: "incomplete" };
+const COMPLETENESS = { true: "complete ", lossy: "lossy ", false: "incomplete " };
 
-/** @param {{q?: string, complete?: string}} wanted */
-function none({ q, complete }) {
-  if (q) return `No session${complete ? ` that is ${MISSING[complete]}` : ""} mentions “${q}”.`;
-  return complete ? `No session is ${MISSING[complete]}.` : "No sessions yet. Press Record on the live page to start one.";
+/** Return the text of an empty list. @param {{q?: string, complete?: string}} filter */
+function emptyText({ q, complete }) {
+  const kind = COMPLETENESS[complete] ?? "";
+  if (q) return `No ${kind}session matches “${q}”.`;
+  return kind ? `No ${kind}sessions.` : "No sessions yet. Press Record on the live page.";
 }
 
-/** As the server chooses. @param {Session} session @param {{q?: string, complete?: string}} wanted */
-function isWanted(session, { q, complete }) {
-  return (!complete || String(session.complete) === complete) && (!q || mentions(session, q.toLowerCase()));
+/** Return true if the server would list a session. @param {Session} session @param {{q?: string, complete?: string}} filter */
+function isIncluded(session, { q, complete }) {
+  return (!complete || String(session.complete) === complete) && (!q || matches(session, q.toLowerCase()));
 }
 
-function mentions(session, q) {
-  const said = [session.id, session.name, session.subject, session.notes, session.node, session.scene, ...(session.tags ?? [])];
-  return said.some((text) => text?.toLowerCase().includes(q));
+function matches(session, q) {
+  const texts = [session.id, session.name, session.subject, session.notes, session.node, session.scene, ...(session.tags ?? [])];
+  return texts.some((text) => text?.toLowerCase().includes(q));
 }

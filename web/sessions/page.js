@@ -1,4 +1,4 @@
-// The page of recorded sessions: the list and the trash, kept up to date by the link.
+// Page of sessions: list and trash, updated over the websocket.
 
 import { helpWithKeys } from "../common/help.js";
 import { Link } from "../common/link.js";
@@ -8,27 +8,27 @@ import { byId, setText } from "../common/text.js";
 import { Sessions } from "./list.js";
 import { Trash } from "./trash.js";
 
-const RATE_HZ = 1; // this page draws no frames
+const RATE_HZ = 1; // no frames on this page
 
-const takeSession = (session) => sessions.take(session);
+const updateSession = (session) => sessions.update(session);
 
-function forgetSession(id) {
+function removeSession(id) {
   sessions.drop(id);
-  trash.changed();
+  trash.reload();
 }
 
-const trash = new Trash(takeSession);
-const sessions = new Sessions({ onSession: takeSession, onDeleted: forgetSession });
+const trash = new Trash(updateSession);
+const sessions = new Sessions({ onSession: updateSession, onDeleted: removeSession });
 
 const handlers = {
   hello() {
     sessions.reload();
-    trash.changed();
+    trash.reload();
     look(); // the login may have ended with the server
   },
-  session: ({ session }) => takeSession(session),
-  counted: ({ sessions: counts }) => Object.entries(counts).forEach(([id, counted]) => sessions.count(id, counted)),
-  deleted: ({ session_id: id }) => forgetSession(id),
+  session: ({ session }) => updateSession(session),
+  counted: ({ sessions: counts }) => Object.entries(counts).forEach(([id, progress]) => sessions.updateProgress(id, progress)),
+  deleted: ({ session_id: id }) => removeSession(id),
 };
 
 const link = new Link({
@@ -36,7 +36,7 @@ const link = new Link({
   onMessage(message) {
     if (Object.hasOwn(handlers, message.type)) handlers[message.type](message);
   },
-  onChange: () => setText(byId("link-down"), link.open || !link.failures ? "" : "Link to the server is down; trying again."),
+  onChange: () => setText(byId("link-down"), link.open || !link.failures ? "" : "Server link down; reconnecting."),
 });
 
 inSunlight();

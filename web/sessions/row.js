@@ -1,21 +1,21 @@
-// A session, or a take, as a row of the list.
+// Rows of the list: sessions and takes.
 
 import { frames } from "../common/losses.js";
 import { bytes, duration, el, localTime } from "../common/text.js";
-import { plainState } from "./state.js";
+import { stateText } from "./state.js";
 
 const HEADS = ["Name", "Node", "Started", "Duration", "Frames", "Markers", "Size", "State", "Actions"];
 
-/** @param {HTMLInputElement} all selects every session that is shown */
+/** Make the head of the table. @param {HTMLInputElement} all selects all sessions */
 export function head(all) {
   const row = el("div", { cls: "head", role: "row" }, el("span", { cls: "c-pick", role: "columnheader" }, all));
   for (const text of HEADS) row.append(el("span", { role: "columnheader", text }));
   return row;
 }
 
-/** @param {Session} session @param {HTMLInputElement} pick selects it @param {HTMLElement} menu */
+/** Make the row of a session. @param {Session} session @param {HTMLInputElement} pick selects it @param {HTMLElement} menu */
 export function makeRow(session, pick, menu) {
-  const [short, long, weight] = plainState(session);
+  const [short, long, weight] = stateText(session);
   const name = el("a", {
     cls: "session-name", text: session.name || session.id, "data-part": "open", href: `/sessions/${encodeURIComponent(session.id)}`,
   });
@@ -24,22 +24,22 @@ export function makeRow(session, pick, menu) {
   if (session.absolute_scale === "assumed") state.append(" ", el("span", { cls: "why", text: "Scale assumed." }));
   const cell = (cls, label, text) => el("div", { cls, role: "cell", "data-label": label, text });
   const now = counts(session);
-  const taken = cell("c-frames", "Frames", null);
-  taken.append(el("span", { cls: "taken", text: now.taken }), el("span", { cls: "missed", text: now.missed }));
+  const framesCell = cell("c-frames", "Frames", null);
+  framesCell.append(el("span", { cls: "taken", text: now.taken }), el("span", { cls: "missed", text: now.missed }));
   return el("div", { cls: "session", role: "row", "data-session-id": session.id, "data-state": session.state, "data-complete": String(session.complete) },
     el("div", { cls: "c-pick", role: "cell" }, pick),
     el("div", { cls: "c-name", role: "cell" }, name, ...about(session)),
     cell("c-node", "Node", session.node),
     cell("c-start", "Started", localTime(new Date(session.started_t_ns / 1e6)).slice(0, 16)),
     cell("c-duration", "Duration", now["c-duration"]),
-    taken,
-    cell("c-marks", "Markers", Number.isFinite(session.marks) ? String(session.marks) : "–"),
+    framesCell,
+    cell("c-markers", session.marks === 1 ? "Marker" : "Markers", Number.isFinite(session.marks) ? String(session.marks) : "–"),
     cell("c-size", "Size", bytes(session.bytes)),
     state,
     el("div", { cls: "c-do", role: "cell" }, menu));
 }
 
-/** Subject and tags in a line, a tag leads to all sessions that have it; under them the notes. @param {Session} session */
+/** Return subject, tags as links that filter the list, and notes. @param {Session} session */
 function about({ subject, tags, notes }) {
   const parts = [
     ...(subject ? [el("span", { cls: "subject", text: subject })] : []),
@@ -50,7 +50,7 @@ function about({ subject, tags, notes }) {
   return lines;
 }
 
-/** The row above the sessions of a take. @param {Session[]} sessions @param {HTMLInputElement} pick selects them all */
+/** Make the row above the sessions of a take. @param {Session[]} sessions @param {HTMLInputElement} pick selects them all */
 export function makeTakeRow(sessions, pick) {
   const names = [...new Set(sessions.map(({ name }) => name))];
   const started = localTime(new Date(Math.min(...sessions.map(({ started_t_ns: t_ns }) => t_ns)) / 1e6)).slice(0, 16);
@@ -61,12 +61,12 @@ export function makeTakeRow(sessions, pick) {
       el("span", { cls: "why", text: ` ${started}, ${sessions.length} nodes: ${sessions.map(({ node }) => node).join(", ")}` })));
 }
 
-/** What changes while a session grows, by the class of its element. @param {Session} session */
+/** Return the texts that change during a recording, by class. @param {Session} session */
 export function counts(session) {
   const lost = Object.values(session.lost ?? {}).reduce((sum, count) => sum + count, 0);
   return {
     "c-duration": duration(session.duration_s),
     taken: Number.isFinite(session.frames) ? session.frames.toLocaleString("en-GB") : "–",
-    missed: lost ? `${lost.toLocaleString("en-GB")} missing` : session.pending_frames ? `${frames(session.pending_frames).split(" ")[0]} to come` : "",
+    missed: lost ? `${lost.toLocaleString("en-GB")} missing` : session.pending_frames ? `${frames(session.pending_frames).split(" ")[0]} pending` : "",
   };
 }

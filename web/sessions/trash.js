@@ -1,12 +1,13 @@
-// The trash: what was deleted, to be restored or deleted for good. Loaded when it is opened.
+// Trash: deleted sessions, to restore or to delete permanently. Loaded when opened.
 
 import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, bytes, el, localTime, setText } from "../common/text.js";
 
+/** List of deleted sessions. */
 export class Trash {
-  /** `onRestored(session)` takes a session that is back. */
+  /** `onRestored(session)` receives a restored session. */
   constructor(onRestored) {
     this.onRestored = onRestored;
     this.card = byId("trash-card", HTMLDetailsElement);
@@ -14,8 +15,8 @@ export class Trash {
     byId("trash-empty").addEventListener("click", () => this.empty());
   }
 
-  /** Something was moved there, or back; it costs nothing while it is closed. */
-  changed() {
+  /** Load again after a change, while it is open. */
+  reload() {
     if (this.card.open) this.load();
   }
 
@@ -25,17 +26,17 @@ export class Trash {
       this.items = items;
       byId("trash").replaceChildren(...items.map((session) => this.row(session)));
       byId("trash-empty").hidden = !items.length;
-      setText(byId("trash-legend"), items.length ? "deleted sessions, which can be restored" : "empty");
+      setText(byId("trash-legend"), items.length ? "deleted sessions, can be restored" : "empty");
     });
   }
 
   /** @param {Session} session */
   row(session) {
-    const back = el("button", { type: "button", cls: "small", text: "Restore", "aria-label": `Restore ${session.name}` });
-    back.addEventListener("click", () => this.restore(session));
-    const about = [localTime(new Date(session.started_t_ns / 1e6)), `${session.frames.toLocaleString("en-GB")} frames`];
-    if (session.state === "pending") about.push("still pending: its frames are kept");
-    return el("li", { "data-session-id": session.id }, back, el("strong", { text: session.name }), el("span", { text: about.join(", ") }));
+    const button = el("button", { type: "button", cls: "small", text: "Restore", "aria-label": `Restore ${session.name}` });
+    button.addEventListener("click", () => this.restore(session));
+    const facts = [localTime(new Date(session.started_t_ns / 1e6)), `${session.frames.toLocaleString("en-GB")} frames`];
+    if (session.state === "pending") facts.push("pending");
+    return el("li", { "data-session-id": session.id }, button, el("strong", { text: session.name }), el("span", { text: facts.join(", ") }));
   }
 
   /** @param {Session} session */
@@ -51,10 +52,10 @@ export class Trash {
   async empty() {
     const count = this.items?.length ?? 0;
     const what = count === 1 ? "1 session" : `${count} sessions`;
-    if (!await ask("Empty the trash?", `${what} will be deleted for good. Nothing brings them back.`, `Delete ${what}`)) return;
+    if (!await ask("Empty the trash?", `${what} will be deleted permanently.`, `Delete ${what}`)) return;
     await quietly(async () => {
       const emptied = await api.emptyTrash();
-      notice(`Deleted ${emptied.sessions} session${emptied.sessions === 1 ? "" : "s"}, ${bytes(emptied.bytes)} are free.`);
+      notice(`Deleted ${emptied.sessions} session${emptied.sessions === 1 ? "" : "s"}, ${bytes(emptied.bytes)} freed.`);
       await this.load();
     });
   }

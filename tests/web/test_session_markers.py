@@ -1,4 +1,4 @@
-"""Marks and what people say of a session, changed on its page; also by two people at once."""
+"""Markers and what people say of a session, changed on its page; also by two people at once."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 
 @pytest.fixture
 def session(scripted: Scripted) -> Recording:
-    return marked(scripted)
+    return with_marker(scripted)
 
 
-def marked(scripted: Scripted) -> Recording:
-    """A sealed session with a mark in its middle."""
+def with_marker(scripted: Scripted) -> Recording:
+    """A sealed session with a marker in its middle."""
     session = scripted.recorded("walk")
     t_ns = session.column("t_ns")
     clock = session.clock()["streams"][0]["stretches"][0]
@@ -39,7 +39,7 @@ def marked(scripted: Scripted) -> Recording:
     return session
 
 
-def marks(session: Recording) -> list[dict[str, Any]]:
+def markers(session: Recording) -> list[dict[str, Any]]:
     items: list[dict[str, Any]] = session.running.http.get(f"{session.url}/events").json()["items"]
     return items
 
@@ -47,7 +47,7 @@ def marks(session: Recording) -> list[dict[str, Any]]:
 def opened(session: Recording, open_page: OpenPage, ticket: str = "") -> Page:
     page = open_page(f"{session.running.url}/sessions/{session.id}#{ticket}")
     expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
-    expect(page.locator("#marks-list li")).to_have_count(len(marks(session)))
+    expect(page.locator("#markers-list li")).to_have_count(len(markers(session)))
     return page
 
 
@@ -58,7 +58,7 @@ def left_px(page: Page) -> float:
 
 
 def drag_in_plots(page: Page, from_px: float, to_px: float) -> None:
-    """Drag at the height of marks' flags."""
+    """Drag at the height of markers' flags."""
     page.locator("#plots").evaluate("(plots) => plots.scrollIntoView()")
     box = page.locator("#plots").bounding_box()
     assert box is not None
@@ -68,41 +68,41 @@ def drag_in_plots(page: Page, from_px: float, to_px: float) -> None:
     page.mouse.up()
 
 
-def test_a_mark_is_renamed_moved_to_the_cursor_dragged_and_removed(
+def test_a_marker_is_renamed_moved_to_the_cursor_dragged_and_removed(
     session: Recording, open_page: OpenPage
 ) -> None:
     page = opened(session, open_page)
-    before = marks(session)[0]
-    page.click("#marks-list [aria-label='Change the mark a stone']")
+    before = markers(session)[0]
+    page.click("#markers-list [aria-label='Edit marker a stone']")
     assert complaints(page) == []
-    page.fill("#mark-label", "a boulder")
-    page.press("#mark-label", "Enter")
-    expect(page.locator("#marks-list")).to_contain_text("a boulder")
-    renamed = marks(session)[0]
+    page.fill("#marker-label", "a boulder")
+    page.press("#marker-label", "Enter")
+    expect(page.locator("#markers-list")).to_contain_text("a boulder")
+    renamed = markers(session)[0]
     assert (renamed["label"], renamed["t_ns"]) == ("a boulder", before["t_ns"])
 
     page.keyboard.press("ArrowRight")  # the second frame
     expect(page.locator("#readout")).not_to_have_attribute("data-time-s", "")
-    page.click("#marks-list [aria-label='Change the mark a boulder']")
-    page.click("#mark-to-cursor")
-    page.click("#mark-dialog [value=ok]")
-    wait_until(lambda: marks(session)[0]["t_ns"] != before["t_ns"], "the mark to move")
+    page.click("#markers-list [aria-label='Edit marker a boulder']")
+    page.click("#marker-to-cursor")
+    page.click("#marker-dialog [value=ok]")
+    wait_until(lambda: markers(session)[0]["t_ns"] != before["t_ns"], "the marker to move")
     t_ns = session.column("t_ns")
     offset_ns = session.clock()["streams"][0]["stretches"][0]["offset_ns"]
-    assert marks(session)[0]["t_ns"] - offset_ns == pytest.approx(int(t_ns[1]), abs=2e5)
+    assert markers(session)[0]["t_ns"] - offset_ns == pytest.approx(int(t_ns[1]), abs=2e5)
 
-    moved = marks(session)[0]["t_ns"]
+    moved = markers(session)[0]["t_ns"]
     drag_in_plots(page, left_px(page) + 12, 200)
-    wait_until(lambda: marks(session)[0]["t_ns"] > moved, "the flag to be where it was let go")
-    dragged_s = (marks(session)[0]["t_ns"] - offset_ns - int(t_ns[0])) * 1e-9
-    shown = page.locator("#marks-list li").get_attribute("data-time-s")
+    wait_until(lambda: markers(session)[0]["t_ns"] > moved, "the flag to be where it was let go")
+    dragged_s = (markers(session)[0]["t_ns"] - offset_ns - int(t_ns[0])) * 1e-9
+    shown = page.locator("#markers-list li").get_attribute("data-time-s")
     assert float(shown or "nan") == pytest.approx(dragged_s, abs=1e-4)
     assert page.locator("#plots").get_attribute("data-whole") == "true"
 
-    page.click("#marks-list [aria-label='Change the mark a boulder']")
-    page.click("#mark-dialog [value=remove]")
-    expect(page.locator("#marks-list li")).to_have_count(0)
-    assert marks(session) == []
+    page.click("#markers-list [aria-label='Edit marker a boulder']")
+    page.click("#marker-dialog [value=remove]")
+    expect(page.locator("#markers-list li")).to_have_count(0)
+    assert markers(session) == []
 
 
 def test_what_people_say_is_changed_and_the_second_of_two_is_told(
@@ -123,34 +123,34 @@ def test_what_people_say_is_changed_and_the_second_of_two_is_told(
     expect(other.locator("#about")).to_contain_text("slipped twice")
     assert session.now()["notes"] == "slipped twice"
 
-    mark = marks(session)[0]
-    one.click("#marks-list [aria-label='Change the mark a stone']")
-    url = f"{session.url}/events/{mark['id']}"
+    marker = markers(session)[0]
+    one.click("#markers-list [aria-label='Edit marker a stone']")
+    url = f"{session.url}/events/{marker['id']}"
     assert session.running.http.patch(url, json={"label": "water"}).status_code == 200
-    one.fill("#mark-label", "sand")
-    one.press("#mark-label", "Enter")
+    one.fill("#marker-label", "sand")
+    one.press("#marker-label", "Enter")
     expect(one.locator("#notices")).to_contain_text("changed by another client")
-    expect(one.locator("#marks-list")).to_contain_text("water")
-    assert marks(session)[0]["label"] == "water"
+    expect(one.locator("#markers-list")).to_contain_text("water")
+    assert markers(session)[0]["label"] == "water"
 
 
-def test_a_viewer_drags_no_mark_and_is_offered_to_change_none(
+def test_a_viewer_drags_no_marker_and_is_offered_to_change_none(
     script: Callable[..., Scripted], open_page: OpenPage
 ) -> None:
     server = script(token=TOKEN)
-    session = marked(server)
+    session = with_marker(server)
     ticket = server.running.http.post("/tickets", json={"may": "look"}).json()["ticket"]
     page = opened(session, open_page, f"ticket={ticket}")
-    expect(page.locator("#login")).to_have_text("viewer: looks only")
-    expect(page.get_by_label("Change the mark a stone")).to_be_hidden()
+    expect(page.locator("#login")).to_have_text("viewer (read-only)")
+    expect(page.get_by_label("Edit marker a stone")).to_be_hidden()
     expect(page.locator("#edit")).to_be_hidden()
-    before_s = page.locator("#marks-list li").get_attribute("data-time-s")
+    before_s = page.locator("#markers-list li").get_attribute("data-time-s")
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.method))
     middle = (left_px(page) + page.locator("#plots").evaluate("(plots) => plots.clientWidth")) / 2
     drag_in_plots(page, middle + 12, middle + 160)
     expect(page.locator("#plots")).to_have_attribute("data-whole", "false")  # a stretch is chosen
-    expect(page.locator("#marks-list li")).to_have_attribute("data-time-s", before_s or "")
+    expect(page.locator("#markers-list li")).to_have_attribute("data-time-s", before_s or "")
     assert set(asked) <= {"GET"}
 
 
@@ -159,7 +159,7 @@ def test_it_says_what_became_of_every_frame(session: Recording, open_page: OpenP
     page.click("#ledger-card summary")
     said = page.locator("#ledger")
     now = session.now()
-    expect(said).to_contain_text(f"{now['frames']:,} frames are in it.")
-    expect(said).to_contain_text("none is lost")
+    expect(said).to_contain_text(f"{now['frames']:,} frames recorded.")
+    expect(said).to_contain_text("complete from first to last")
     expect(said).to_contain_text(now["sha256"])
     assert complaints(page) == []
