@@ -85,7 +85,7 @@ try:
                 print("no node" if "nobody" in str(error) else error)
         asyncio.run(dial(ingest_url(url))).close()
     ticket = subprocess.run(
-        [*words, "ticket", "--data", os.environ["DATA"]], capture_output=True, text=True
+        [*words, "invite", "--data", os.environ["DATA"]], capture_output=True, text=True
     )
     print(ticket.stdout.partition("#")[0])
 finally:

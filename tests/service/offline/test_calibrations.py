@@ -145,13 +145,13 @@ def test_a_cached_calibration_that_does_not_prove_itself_is_set_aside_and_made_a
 
     first = found()
     assert found() == first
-    assert pressed == ["bench-A01"]
+    assert pressed == ["emulated-rig-A01"]
     (kept,) = (tmp_path / "cache").iterdir()
     assert callable(damaged)
     damaged(kept)
     said.clear()
     assert found() == first
-    assert pressed == ["bench-A01"] * 2
+    assert pressed == ["emulated-rig-A01"] * 2
     assert "is left out" in said[0]
     assert f"set aside as {kept.name}.damaged-1" in said[0]
     assert {path.name for path in kept.parent.iterdir()} == {kept.name, f"{kept.name}.damaged-1"}
@@ -168,7 +168,7 @@ def test_each_family_of_parts_and_each_repeatability_has_a_bench_of_its_own(
         find_calibration(
             "emulated-rig", ["A01"], cache=tmp_path, family="broad", repeatability=0.01
         )
-    assert pressed == ["bench-A01"] * 3
+    assert pressed == ["emulated-rig-A01"] * 3
 
 
 def test_a_cache_that_cannot_be_written_is_said_and_no_reason_to_fail(
@@ -179,5 +179,5 @@ def test_a_cache_that_cannot_be_written_is_said_and_no_reason_to_fail(
     cache = tmp_path / "file" / "cache"
     for _ in range(2):
         find_calibration("emulated-rig", ["A01"], cache=cache, progress=said.append)
-    assert pressed == ["bench-A01"] * 2
+    assert pressed == ["emulated-rig-A01"] * 2
     assert any("is not cached" in line for line in said)

@@ -73,7 +73,7 @@ def test_a_slice_counts_from_each_sessions_own_beginning(feet: list[Path], tmp_p
             "csv holds one session only.*c3d, opensim, mcap, mat, xdf",
         ),
         (ExportOptions("c3d"), 2, "the nodes' own clocks are no common axis"),
-        (replace(TOGETHER, marks=True), 2, "nothing is known of marks"),
+        (replace(TOGETHER, marks=True), 2, "its markers are unknown"),
         (replace(TOGETHER, part=Slice(50.0)), 2, "starts at 50 s"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

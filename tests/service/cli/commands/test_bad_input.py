@@ -267,7 +267,7 @@ def test_a_reference_with_brackets_is_printed_as_it_is(
 ) -> None:
     (tmp_path / "bench.parquet").write_bytes(bench)
     reference = "load cell [/dev/ttyUSB0]"
-    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--reference", reference)
+    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--sensor", reference)
     assert outcome.code == 0, outcome.err
     assert reference in outcome.out
 

@@ -115,7 +115,7 @@ def test_what_the_reference_has_not_is_a_missed_limit_too(
     force = ("--map", "time_s=Time,grf_n=Fz", "--units", "grf=N", "--sign", "-")
     asked = (*force, "--limits", "cop_p95_m=1", "--out", "o")
     run("compare", session, "--reference", plate, *asked).fails(
-        3, "cop_p95_m is not known here, and was limited to 1: the reference states no centre"
+        3, "cop_p95_m is not known here, and was limited to 1: the reference has no centre"
     )
 
 

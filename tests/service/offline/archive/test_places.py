@@ -65,7 +65,7 @@ def test_sessions_are_found_and_staged_in_any_filesystem(archive: Path) -> None:
         changed = bytearray(read_bytes(file))
         changed[1000] ^= 1
         memory.pipe(f"/lab/sessions/{IDS[2]}/frames.parquet", bytes(changed))
-        with pytest.raises(FileFormatError, match="not the one"), staged(place):
+        with pytest.raises(FileFormatError, match="does not have the hash"), staged(place):
             pass
         with pytest.raises(FileFormatError, match="no such file"):
             identity(place_of("memory://lab/sessions/nothing"))

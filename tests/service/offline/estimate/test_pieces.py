@@ -156,7 +156,7 @@ def test_what_another_array_has_kept_is_refused(raw: Path, tmp_path: Path) -> No
     make_piece(raw, tmp_path, asked, piece_frames=1, remark=ignored)
     with np.load(tmp_path / "0000.npz") as kept:
         columns = dict(kept)
-    columns["run/tiles"] = columns["run/tiles"][:1]
+    columns["run/tile_states"] = columns["run/tile_states"][:1]
     np.savez(tmp_path / "0000.npz", **columns)
     said = json.loads((tmp_path / "0000.json").read_text())
     said = {name: said[name] for name in ("number", "groups", "frames", "sha256")}

@@ -229,7 +229,7 @@ def test_sessions_without_a_common_axis_are_not_put_together(
     left, right = two_feet()
     never = ClockTable({}, [StreamFacts(ARRAY.boot_id)], [ARRAY.boot_id])
     second = replace(right, clock=never, source={"session": "s2"})
-    with pytest.raises(UsageError, match=r"session s2 of right-2: of .* time is not known"):
+    with pytest.raises(UsageError, match=r"session s2 of right-2: .* time is not known"):
         written(to, [left, second], options)
 
 

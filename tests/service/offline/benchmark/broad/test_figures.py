@@ -89,7 +89,7 @@ def test_what_is_good_meets_every_goal_and_what_is_not_misses_its_own() -> None:
 
 def test_a_tile_that_its_bench_refuses_is_counted_among_all_that_were_pressed() -> None:
     refused = result().model_copy(update={"judged": {}, "tiles": (), "tiles_refused": 1})
-    (goal,) = [g for g in error_goals([refused, result()]) if "refuses" in g.figure]
+    (goal,) = [g for g in error_goals([refused, result()]) if "refused" in g.figure]
     assert goal.value == pytest.approx(100 / 8)
     assert not goal.met
 
