@@ -52,7 +52,7 @@ def test_a_phone_that_opens_a_ticket_may_record_and_a_second_one_may_not(
         expect(second.locator("#login")).to_have_text("not logged in")
         expect(second.locator(_LIVE)).to_have_count(1)
         second.evaluate("document.getElementById('stop').click()")
-        expect(second.locator("#token-why")).to_contain_text("good once")
+        expect(second.locator("#token-why")).to_contain_text("valid once")
         second.fill("#token-field", "wrong")
         second.press("#token-field", "Enter")
         expect(second.locator("#token-why")).to_contain_text("not this server's token")
