@@ -31,7 +31,7 @@ TOKEN = os.environ.setdefault("FOOTTILE_TOKEN", secrets.token_urlsafe(18))
 
 @contextmanager
 def demo(*options: str, is_tared: bool = True) -> Iterator[str]:
-    """A demo, once its foot is tared, or connected: the address of its server."""
+    """Run a demo; yield the address of its server once its foot is tared, or connected."""
     with tempfile.TemporaryDirectory() as data:
         running = subprocess.Popen(
             [*COMMAND, "demo", "--port=0", f"--data={data}", *options],
@@ -53,12 +53,12 @@ def demo(*options: str, is_tared: bool = True) -> Iterator[str]:
 
 
 def api_of(url: str) -> httpx.Client:
-    """A client of the demo's API, with its token."""
+    """Return a client of the demo's API, with its token."""
     return httpx.Client(base_url=f"{url}api/v1", headers={"Authorization": f"Bearer {TOKEN}"})
 
 
 def live(browser: Browser) -> None:
-    """The live page, on a laptop and on a phone."""
+    """Shoot the live page, on a laptop and on a phone."""
     with demo(*sys.argv[1:]) as url:
         for name, (width, height, scale) in SIZES.items():
             page = browser.new_page(
@@ -72,7 +72,7 @@ def live(browser: Browser) -> None:
 
 
 def session(browser: Browser) -> None:
-    """The page of a session of a walking foot: two of its stances."""
+    """Shoot the page of a session of a walking foot: two of its stances."""
     with demo("--scene", "poppy") as url, api_of(url) as http:
         body = {
             "node": http.get("/nodes").json()["items"][0]["node"],
@@ -155,7 +155,7 @@ CALIBRATE_STAGES = {
 
 
 def calibrate(browser: Browser) -> None:
-    """The guided calibration: a weight that is held, and the result."""
+    """Shoot the guided calibration: a weight that is held, and the result."""
     with tempfile.TemporaryDirectory() as folder:
         scene, load = Path(folder) / "one.toml", Path(folder) / "weights.csv"
         scene.write_text(ONE_TILE)

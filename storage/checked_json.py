@@ -45,7 +45,7 @@ def write_checked(path: Path, text: bytes, *, mode: int = 0o666) -> None:
         mode: permissions before the umask.
 
     Raises:
-        StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
+        StorageError: the disk is full or not writable; raises as `whole_file`.
     """
     write_whole(path, with_check(text), mode=mode)
 

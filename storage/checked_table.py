@@ -1,6 +1,6 @@
 """Small Parquet tables with a hash of their bytes, such as markers and clocks of a session.
 
-The hash is in the footer (`storage.parquet_hash`), and every page has a checksum. Older versions
+The hash is in the footer (`storage.file_hash`), and every page has a checksum. Older versions
 wrote neither: such a table is read and reported as unproven, and gets both at the next write.
 """
 
@@ -49,7 +49,7 @@ def write_table(
         group_rows: most rows of a row group; None: nearly all rows in one.
 
     Raises:
-        StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
+        StorageError: the disk is full or not writable; raises as `whole_file`.
     """
     metadata = {**(table.schema.metadata or {}), FORMAT_KEY: FORMAT}
     table = table.replace_schema_metadata(metadata)

@@ -44,7 +44,7 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
         mode: permissions before the umask.
 
     Raises:
-        StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
+        StorageError: the disk is full or not writable; raises as `whole_file`.
     """
     with whole_file(path, mode=mode) as file:
         file.write(content)
@@ -79,7 +79,7 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
 
 
 def open_own(path: Path) -> io.BufferedReader:
-    """Open a regular file of any length for reading; raises as `read_small_file`."""
+    """Open a regular file of any length for reading; raises as `read_whole`."""
     with read_errors(path):
         # A link may lead anywhere, and a pipe would be waited for.
         if not stat.S_ISREG(path.lstat().st_mode):
@@ -89,7 +89,7 @@ def open_own(path: Path) -> io.BufferedReader:
 
 @contextmanager
 def read_errors(path: Path) -> Iterator[None]:
-    """Context manager: turn an OSError into `read_small_file`'s errors."""
+    """Context manager: turn an OSError into `read_whole`'s errors."""
     try:
         yield
     except FileNotFoundError:

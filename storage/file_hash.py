@@ -93,7 +93,7 @@ def check_hash(hashes: tuple[str, str] | None, said: Mapping[bytes, bytes], *, w
     format with a hash, and passes.
 
     Args:
-        hashes: stated and actual, as of `read_stated_and_actual_hash`.
+        hashes: stated and actual, as of `file_hashes`.
         said: the metadata of its schema.
         where: for errors.
 
@@ -151,7 +151,7 @@ def check_footer(hashes: tuple[str, str], *, where: str) -> None:
     """Refuse a footer whose bytes have changed since it was written.
 
     Args:
-        hashes: as of `footer_stated_and_actual_hash`.
+        hashes: as of `footer_hashes`.
         where: for errors.
 
     Raises:

@@ -237,7 +237,7 @@ class Losses:
         return union(self.by_reason.values())
 
     def add(self, numbers: Intervals, reason: str) -> None:
-        """Add lost numbers; those that have a reason already keep it."""
+        """Add lost numbers; a number keeps its first reason."""
         if new := numbers - self.all:
             self.by_reason[reason] = new | self.by_reason.get(reason, Intervals())
 

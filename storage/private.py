@@ -24,10 +24,10 @@ _NO_MODES = {
 
 
 def keep_private(folder: Path) -> None:
-    """Set umask and folder permissions so that only this user can read what it writes.
+    """Set umask and folder permissions so that only this user can read its files.
 
     A folder is closed to others if it is created here, is empty, or holds only files of ours. One
-    that its owner has opened to its group, and to nobody else, stays so, and the group can read new
+    that its owner has opened to its group only stays so, and the group can read new
     files.
 
     Args:

@@ -228,7 +228,7 @@ def to_record_batch(batch: FrameBatch, schema: pa.Schema) -> pa.RecordBatch:
 
 
 def from_record_batch(record: pa.RecordBatch) -> FrameBatch:
-    """Return frames as numpy views of a record batch; inverse of `frames_to_record_batch`.
+    """Return frames as numpy views of a record batch; inverse of `to_record_batch`.
 
     Raises:
         FileFormatError: the record batch does not hold frames.

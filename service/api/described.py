@@ -24,7 +24,7 @@ _TOKEN = {
 
 
 def swagger_folder() -> Path:
-    """Return the folder with `SWAGGER_FILES`.
+    """Return the folder with `DOCS_FILES`.
 
     Raises:
         FootTileError: the installation lacks it.

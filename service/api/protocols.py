@@ -37,7 +37,7 @@ from service.link import INGEST_PATH, SUBPROTOCOL, Close
 log = logging.getLogger("foottile.doors")
 
 OUTLET = "foottile.outlet"
-"""Extension in a websocket's scope with its connection, a `SubscriberSocket`."""
+"""Extension in a websocket's scope with its connection, a `Outlet`."""
 SAID_ON_LIVE_BYTES_MAX = 4096
 """Size limit of a message by clients other than nodes."""
 _UNREAD_BYTES_MAX = 1 << 20

@@ -21,7 +21,7 @@ from service.user_folders import user_folder
 
 
 class Settings(Bounds):
-    """Settings of a server; limits of connections are in `service.api.connection_limits`."""
+    """Settings of a server; limits of connections are in `service.api.doors`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

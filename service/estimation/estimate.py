@@ -1,6 +1,6 @@
 """Estimator: frames to estimates, with one code path for ten rows live and ten million offline.
 
-`process_frames` returns the estimates that are due, `finish` the remaining ones. Estimates come a
+`step` returns the estimates that are due, `finish` the remaining ones. Estimates come a
 look-ahead later than their frames, in order, exactly one per frame. Any batches of a recording give
 the same bits: one compiled function works frame by frame and tile by tile, and its state is in
 records.
@@ -112,7 +112,7 @@ class Estimator:
         return _estimates(output, self._unmeasured)
 
     def kept(self) -> Columns:
-        """Return a copy of its state for `from_state`; records as their bytes."""
+        """Return a copy of its state for `going_on`; records as their bytes."""
         self._make_room(0)  # drops rows that nothing reaches back to
         return {name: as_bytes(column).copy() for name, column in self._memory().items()}
 
@@ -122,7 +122,7 @@ class Estimator:
 
         Args:
             plan: plan of the estimator that the state comes from.
-            kept: answer of `state_dict`, of the same version.
+            kept: answer of `kept`, of the same version.
 
         Raises:
             ValueError: the state is of another plan; compiled code would read beyond its memory.

@@ -108,7 +108,7 @@ class Stance:
 
 
 def stances_of(seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) -> list[Stance]:
-    """Compute the stances of a complete recording; arguments as of `StanceDetector.add_frames`."""
+    """Compute the stances of a complete recording; arguments as of `Stances.feed`."""
     gathered = Stances()
     return [*gathered.feed(seq, t_ns, columns), *gathered.finish()]
 

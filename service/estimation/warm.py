@@ -1,7 +1,7 @@
 """Compilation of the models before the first frames are estimated.
 
 On a new machine it takes some ten seconds, in which a compiling server would not answer. So another
-process compiles, and until then frames have no estimates (`is_compiling`). Later it takes half a
+process compiles, and until then frames have no estimates (`is_warming`). Later it takes half a
 second, because the machine code is cached.
 """
 

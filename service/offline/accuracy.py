@@ -30,7 +30,7 @@ COMPARED = (
     "true_cop_x_m",
     "true_cop_y_m",
 )
-"""Columns that `compute_accuracy` needs."""
+"""Columns that `accuracy_of` needs."""
 
 GRF_FROM_N = 0.5
 COP_FROM_N = 3.0
@@ -120,7 +120,7 @@ def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0)
     """Compute the errors of estimates against the truth.
 
     Args:
-        columns: `ACCURACY_COLUMNS`, one value per frame, at least one.
+        columns: `COMPARED`, one value per frame, at least one.
         lag_ms: look-ahead of the estimates, the delay from frame to publication.
     """
     true_n, error_n = columns["true_grf_n"], columns["grf_n"] - columns["true_grf_n"]
@@ -186,7 +186,7 @@ def phases_of(t_ns: npt.NDArray[np.int64], true_n: Floats) -> npt.NDArray[np.int
     """Return every frame's index into `PHASES`, by the true force alone.
 
     Flight: the true force is exactly zero. Each interval between two flights is classified by its
-    own peak and duration; see `STEEP_PEAKS_PER_DURATION`.
+    own peak and duration; see `STEEP`.
     """
     phases = np.full(len(true_n), PHASES.index("flight"))
     t_s = (t_ns - t_ns[0]) * 1e-9

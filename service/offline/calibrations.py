@@ -2,7 +2,7 @@
 
 The emulated rig indents each tile alone, as a user would, and fits the recording. The result is
 deterministic by serial, parts seed and version, and is stored under these in the user's cache. The
-program contains those for the tiles of built-in scenes, in `SHIPPED_FOLDER`, so that a first start
+program contains those for the tiles of built-in scenes, in `SHIPPED`, so that a first start
 need not wait for the rig.
 """
 

@@ -63,10 +63,10 @@ class Comparison:
         alignment: alignment of both.
         clock_lag: lag by the clock tables, if both are sessions of one server.
         pairs: our frames with the reference.
-        tile_force_n: (n, tiles), tile forces of these frames; NaN for a tile without dome.
+        force_n: (n, tiles), tile forces of these frames; NaN for a tile without dome.
         serials: serials of the tiles.
         errors: errors by trial and over trials.
-        trial_definition: definition of a trial, in words.
+        trials_are: definition of a trial, in words.
         notes: remarks on both recordings.
         advice: suggestions for a more informative comparison.
         options: options of the comparison.

@@ -49,8 +49,8 @@ class Compared:
 
     Attributes:
         content: content of `compare.json`.
-        report_text: content of `compare.md`.
-        missed_limits: descriptions of missed limits.
+        text: content of `compare.md`.
+        missed: descriptions of missed limits.
     """
 
     content: Mapping[str, Any]

@@ -53,11 +53,11 @@ class Diagnosis:
     Attributes:
         tiles: findings for all tiles of the scene and all others found.
         scl_hz: measured bus clock; None without a working tile.
-        configured_scl_hz: configured bus clock.
-        transaction_overhead_s: overhead of a transaction beyond its bits.
+        asked_scl_hz: configured bus clock.
+        transaction_s: overhead of a transaction beyond its bits.
         rates_hz: frames per second by schedule; None if it would open too many channels.
-        fastest_schedule: fastest schedule; None without tiles.
-        is_rate_reached: True if all tiles work and the requested rate is reached.
+        schedule: fastest schedule; None without tiles.
+        holds: True if all tiles work and the requested rate is reached.
         verdict: summary in a few sentences, with advice.
     """
 

@@ -35,7 +35,7 @@ class Pull:
 
     Attributes:
         duration_s: total duration.
-        greatest_n: greatest magnitude.
+        most_n: greatest magnitude.
     """
 
     duration_s: float = 0.0
@@ -58,7 +58,7 @@ class FindingsOf:
     """Accumulator of a summary over consecutive frames with estimates.
 
     Args:
-        judging: True if the columns contain the truth, and perhaps `PLATE_COLUMN`.
+        judging: True if the columns contain the truth, and perhaps `PLATE`.
     """
 
     def __init__(self, *, judging: bool) -> None:

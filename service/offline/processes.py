@@ -51,7 +51,7 @@ def spread(
 
     Args:
         work: a module-level function, which returns expected failures as results.
-        tasks: arguments of `work`; a task that returns `Unfinished` is submitted again.
+        tasks: arguments of `work`; a task that returns `GoesOn` is submitted again.
         jobs: number of processes; 1: run in this process.
         begin: a module-level function, called first in every process.
     """

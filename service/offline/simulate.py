@@ -158,12 +158,12 @@ class Simulation:
 def simulate(
     options: SimulateOptions, out: Path, estimate: Callable[[], EstimateOptions] | None
 ) -> Simulated:
-    """Run a session and seal it at `out_path`; without `make_estimate_options`, raw frames only.
+    """Run a session and seal it at `out`; without `estimate`, raw frames only.
 
-    `make_estimate_options` is called after the scene has started: a calibration may be slow.
+    `estimate` is called after the scene has started: a calibration may be slow.
 
     Raises:
-        FootTileError: scene, load or calibration is invalid; `out_path` is unchanged.
+        FootTileError: scene, load or calibration is invalid; `out` is unchanged.
     """
     notes: dict[str, object] = {
         "scene": options.scene.model_dump(mode="json"),

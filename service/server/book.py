@@ -112,7 +112,7 @@ class Trash:
         return self._sessions.take(session_id)
 
     def doom(self) -> list[Path]:
-        """Remove all sessions for good; return their folders, to be deleted by `delete_files`.
+        """Remove all sessions for good; return their folders, to be deleted by `destroy`.
 
         Raises:
             StorageError: a folder cannot be moved; its session and those after it are still in the
@@ -236,7 +236,7 @@ class SessionBook:
         return found[::-1]
 
     def keep(self, session: Session) -> Session:
-        """Save a new or changed session to the disk, and notify `on_change`.
+        """Save a new or changed session to the disk, and notify `changed`.
 
         Raises:
             StorageError: it cannot be saved; the session in memory is unchanged.
@@ -255,7 +255,7 @@ class SessionBook:
 
         Args:
             session_id: id of the session.
-            only_if: expected `session_revision`; None: any.
+            only_if: expected `said_of`; None: any.
             changes: new values by name.
 
         Raises:
@@ -292,7 +292,7 @@ class SessionBook:
     def change_mark(
         self, session_id: str, event_id: str, *, only_if: str | None = None, **changes: object
     ) -> Event:
-        """Rename or move a marker; arguments as for `edit_description`.
+        """Rename or move a marker; arguments as for `change`.
 
         Raises:
             UnknownError: no such session or marker.
@@ -306,7 +306,7 @@ class SessionBook:
         return changed
 
     def remove_mark(self, session_id: str, event_id: str, *, only_if: str | None = None) -> None:
-        """Remove a marker; arguments and errors as for `edit_marker`."""
+        """Remove a marker; arguments and errors as for `change_mark`."""
         self._marked(session_id, event_id, only_if)
         events = self.get(session_id).events
         self._keep_marks(session_id, tuple(event for event in events if event.id != event_id))

@@ -82,7 +82,7 @@ class Fits:
 
     @property
     def is_busy(self) -> bool:
-        """Whether one is under way."""
+        """True while a job is running."""
         return self._running is not None
 
     def all(self) -> list[Fit]:

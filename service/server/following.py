@@ -2,7 +2,7 @@
 
 A session is a list of intervals of streams. A node that restarts adds a part, and so does every
 stream that it recorded offline and sends later. Where a part ends is decided in
-`service.sessions.part_end`.
+`service.sessions.ends`.
 
 The present ledger and inputs of a session follow from its parts.
 """

@@ -26,7 +26,7 @@ class Claim:
     Attributes:
         node: name of the node.
         challenge: challenge sent to the machine.
-        proof: answer of the machine.
+        answer: answer of the machine.
         address: peer address of the machine.
     """
 
@@ -96,7 +96,7 @@ class NodeIdentities:
         """Make the challenge for a machine that connects as this node.
 
         Raises:
-            StorageError: as `read_secret`.
+            StorageError: as `secret_of`.
         """
         is_known = self.secret_of(node) is not None
         return Challenge(
@@ -108,7 +108,7 @@ class NodeIdentities:
 
         Raises:
             HangUp: the name belongs to another machine.
-            StorageError: as `read_secret`.
+            StorageError: as `secret_of`.
         """
         node, answer = claim.node, claim.answer
         secret = self.secret_of(node)

@@ -1,7 +1,7 @@
 """Recording commands: start, stop, abandon, delete and restore sessions, and report them.
 
 Starting and stopping only note numbers and times; the frames are in the journals anyway.
-`service.server.sealer` does the rest.
+`service.server.settling` does the rest.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Recorder:
         """Start a session with the next frame, or `pre_roll_s` earlier if still stored.
 
         Several sessions may be recorded on one node at a time. The caller looks up an earlier
-        sending of the same request: `SessionStore.find_by_idempotency_key`.
+        sending of the same request: `SessionBook.begun_by`.
 
         Raises:
             UnknownError: no node has this name.
@@ -159,7 +159,7 @@ class Recorder:
 
         Args:
             session_id: id of the session.
-            only_if: expected `session_revision`; None: any.
+            only_if: expected `said_of`; None: any.
 
         Raises:
             UnknownError: no session has this id.
@@ -292,7 +292,7 @@ class Recorder:
         )
 
     def wanted(self, node_name: str) -> Wanted:
-        """Return `needed_frames` as the message to the node."""
+        """Return `needed` as the message to the node."""
         streams = tuple(
             StreamNumbers(boot_id=boot_id, numbers=with_open_ends(numbers))
             for boot_id, numbers in sorted(self.needed(node_name).items())

@@ -179,7 +179,7 @@ class ServerStream:
         The result is cached: callers repeat the query while frames are missing. The journal's index
         is read again only when frames between the two have come.
 
-        Args, result and errors as for the function `find_seqs_around`; with `wait_for_missing` the
+        Args, result and errors as for the function `around_in`; with `waiting` the
         cached result is kept until all frames between have come or are lost.
         """
         if self.journal is None:
@@ -201,7 +201,7 @@ class ServerStream:
         return found
 
     def missing(self, newest: int) -> Intervals:
-        """Return the frames that are not stored, from the first known one to `newest_seq`."""
+        """Return the frames that are not stored, from the first known one to `newest`."""
         if self._first_seq is None or newest < self._first_seq:
             return Intervals()
         return self.held.missing(self._first_seq, newest) - self._forgotten

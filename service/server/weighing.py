@@ -1,8 +1,8 @@
 """Steps of a calibration with known weights, which follow from the tile's pressure.
 
-Nobody has a hand free for a key: a weight that was put on shows in the pressure, and so does one
-that was taken off. `Weighing` waits until the pressure is steady, marks the beginning of a step,
-watches it for some seconds, and goes on. A step in which something moves is withdrawn and repeated.
+Hands stay free: the pressure shows when a weight is put on or taken off. `Weighing`
+waits until the pressure is steady, marks the beginning of a step, watches it for some seconds, and
+goes on. A step in which something moves is withdrawn and repeated.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class Weighing:
                 return f"All weights are done: unload {tile}"
 
     def push(self, t_ns: npt.NDArray[np.int64], kpa: Floats) -> list[Action]:
-        """Take readings of the tile, and return what has to be marked, in order.
+        """Take readings of the tile, and return the actions for the markers, in order.
 
         Args:
             t_ns: (n,), instants, rising from call to call.
@@ -166,7 +166,7 @@ class Weighing:
         """Go back to the weight that is held, or else to the last one, and rest before it.
 
         Returns:
-            What has to be withdrawn.
+            Actions that withdraw markers.
         """
         reason = "repeated by hand"
         actions: list[Action] = []

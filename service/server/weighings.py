@@ -32,9 +32,9 @@ from storage.sessions.folder import FRAMES_NAME, Session
 log = logging.getLogger("foottile.weighings")
 
 IDLE_S = 600.0
-"""A weighing in which no step was completed for so long ends by itself."""
+"""Longest time without a completed step before a weighing ends."""
 AWAY_S = 30.0
-"""So long it waits for a node whose link has broken."""
+"""Longest silence of a node before its weighing ends."""
 _SEAL_S = 300.0
 _LOOK_S = 0.2
 _WEIGHT_S = 30.0  # least time that a weight takes a person
@@ -67,7 +67,7 @@ class NodeWeighing:
 
     plan: WeighingPlan
     session_id: str
-    """Of its recording; also its own name."""
+    """Session of its recording; also its own id."""
     boot_id: str
     passes: list[Weighing]
     """One per tile."""
@@ -95,14 +95,14 @@ class NodeWeighing:
 
 
 class Weighings:
-    """The guided calibrations of a server; all of it is used from the server's loop.
+    """Guided calibrations of a server; used from the server's event loop only.
 
     Args:
-        sessions: where recordings are kept.
-        recorder: starts and stops them.
-        settling: seals them.
-        fits: fit them.
-        calibrations: what was fitted.
+        sessions: store of sessions.
+        recorder: starts and stops recordings.
+        settling: seals recordings.
+        fits: jobs that fit them.
+        calibrations: fitted calibrations.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Weighings:
         self._of: dict[str, NodeWeighing] = {}
 
     def find(self, node: str) -> NodeWeighing | None:
-        """The weighing of a node, or the one that has ended there last."""
+        """Return the weighing of a node, running or last ended; None: there is none."""
         return self._of.get(node)
 
     def get(self, node: str, session_id: str | None = None) -> NodeWeighing:
@@ -129,7 +129,7 @@ class Weighings:
 
         Args:
             node: its name.
-            session_id: only if it is this one; None: whichever it is.
+            session_id: expected session of the weighing; None: any.
 
         Raises:
             UnknownError: there is none.
@@ -278,7 +278,7 @@ class Weighings:
             weighing.task = asyncio.get_running_loop().create_task(self._finish(weighing))
 
     def _mark(self, weighing: NodeWeighing, node: ServerNode, actions: Sequence[Action]) -> None:
-        """Have the steps in the session's markers."""
+        """Add and remove markers of the session."""
         for action in actions:
             match action:
                 case Begin(label, t_ns):
@@ -346,7 +346,7 @@ class Weighings:
 
     @contextmanager
     def _failing(self, weighing: NodeWeighing) -> Iterator[None]:
-        """Context manager: an error ends the weighing, and nothing else."""
+        """Context manager: an error ends the weighing only."""
         try:
             yield
         except Exception as error:

@@ -30,7 +30,7 @@ class Around(Protocol):
     def __call__(
         self, t_ns: int, *, at_least: int, waiting: bool = False
     ) -> tuple[int, int] | None:
-        """Return the same as `find_seqs_around`, possibly from a cache with `wait_for_missing`."""
+        """Return the same as `around_in`, possibly from a cache with `waiting`."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class SessionStream(StreamState):
     Attributes:
         info: description of its array; None: unknown.
         journal: its frames; None: there are none.
-        find_seqs_around: lookup of the frames next to a time.
+        around: lookup of the frames next to a time.
         offset_ns: offset from its times to the clock that gives the stop's time; None: unknown, or
             no session is stopped by that clock.
             None: not known, or no session ends by that clock.
@@ -67,7 +67,7 @@ def around_in(
     Args:
         journal: journal of the stream.
         t_ns: the time, node's UTC.
-        at_least: earlier numbers do not count; the last is `min_seq` - 1 if there is none.
+        at_least: earlier numbers do not count; the last is `at_least` - 1 if there is none.
         waiting: ignored, since nothing is cached here.
 
     Returns:
@@ -140,7 +140,7 @@ def broken_off(session: Session, streams: Streams, now_t_ns: int | None = None) 
     Args:
         session: the session.
         streams: facts by stream id, for all of its parts.
-        now_t_ns: as for `close_at_stream_end`.
+        now_t_ns: as for `at_end`.
 
     Raises:
         DamagedFramesError: the frames at the stop are damaged.

@@ -33,7 +33,7 @@ class FramesSoFar:
         part: time interval.
 
     Attributes:
-        notes: file metadata of the estimates; known after `make_content`.
+        notes: file metadata of the estimates; known after `content`.
     """
 
     def __init__(self, so_far: SoFar, sources: Sources, part: Slice) -> None:

@@ -36,11 +36,11 @@ class Milestone:
     Attributes:
         part: part of the next frame.
         seq: least number of the next frame.
-        fed_frames: frames fed before.
-        estimated_frames: frames estimated before; others wait for their look-ahead.
+        taken: frames fed before.
+        left: frames estimated before; others wait for their look-ahead.
         newest_ns: greatest `t_ns` of the fed frames.
-        last_estimated: part and `t_ns` of the last estimated frame; None: there is none.
-        state: saved state of the estimator; None: initial state.
+        last: part and `t_ns` of the last estimated frame; None: there is none.
+        kept: saved state of the estimator; None: initial state.
         begin_ns: least `t_ns` of the frames estimated from here to the next checkpoint.
         end_ns: greatest `t_ns` of these frames.
     """

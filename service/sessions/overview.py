@@ -98,10 +98,10 @@ class Seen:
     Attributes:
         bins: bins as in `storage.sessions.pyramid`, in the order of the file, times on the time
             axis.
-        frames_per_bin: number of frames per bin; 1: these are the frames themselves.
+        frames_in_bin: number of frames per bin; 1: these are the frames themselves.
         begin_ns: `t_ns` of the session's first frame.
         end_ns: last time on the axis.
-        time_axis: time axis of the session.
+        axis: time axis of the session.
     """
 
     bins: Bins

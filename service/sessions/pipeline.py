@@ -70,7 +70,7 @@ class EstimateRun:
 
     @classmethod
     def going_on(cls, plan: EstimationPlan, kept: Columns) -> Self:
-        """Create a run from the state of another one, as `Estimator.from_state`."""
+        """Create a run from the state of another one, as `Estimator.going_on`."""
         new = cls(plan)
         new._estimator = Estimator.going_on(plan, _under("run/", kept))
         if waiting := _under("held/", kept):
@@ -80,7 +80,7 @@ class EstimateRun:
     def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
         """Add the next frames; yield those whose estimates are due, in order.
 
-        One batch per `ROWS_PER_STEP` frames, since each batch has a fixed cost.
+        One batch per `CHUNK` frames, since each batch has a fixed cost.
         """
         for begin in range(0, len(frames), CHUNK):
             end = min(begin + CHUNK, len(frames))
@@ -134,7 +134,7 @@ class EstimateStream:
 
         Args:
             pieces: next frames.
-            ends: True: no more frames will come; else `state_dict` has the frames that wait for
+            ends: True: no more frames will come; else `kept` has the frames that wait for
                 their look-ahead.
 
         Raises:
@@ -168,7 +168,7 @@ class EstimateStream:
         self._run = EstimateRun.going_on(self.plan_of(self.tare), kept)
 
     def find_tare(self, pieces: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
-        """Find the tare that `estimate_batches` would use; read no more than needed.
+        """Find the tare that `run` would use; read no more than needed.
 
         Raises:
             TareError: there is none.

@@ -61,10 +61,10 @@ class Recovery:
 
     Attributes:
         sessions: formerly unsealed sessions.
-        removed_temporaries: half-written files of dead processes.
-        cut_bytes: bytes that were cut off, by journal; they are set aside, not deleted.
-        rewritten_markers: sessions whose `events.parquet` was written again.
-        rebuilt_sessions: sessions whose `session.json` was rebuilt from the files beside it.
+        removed: half-written files of dead processes.
+        cut: bytes that were cut off, by journal; they are set aside, not deleted.
+        mended: sessions whose `events.parquet` was written again.
+        restored: sessions whose `session.json` was rebuilt from the files beside it.
         problems: further failures.
     """
 

@@ -29,7 +29,7 @@ class OpenedStream:
         journal: its frames.
         notes: its `stream.json`; None if there is none.
         damaged: frames that were stored and cannot be read any more.
-        is_node_folder: True: the stream is in its own node's folder.
+        is_local: True: the stream is in its own node's folder.
     """
 
     journal: Journal

@@ -38,7 +38,7 @@ class SoFar:
 
     Args:
         sources: inputs of the session.
-        folder: folder on the disk for states of estimators (`service.sessions.checkpoints`).
+        folder: folder on the disk for states of estimators (`service.sessions.milestones`).
     """
 
     def __init__(self, sources: Sources, folder: Path) -> None:
@@ -77,7 +77,7 @@ class SoFar:
         return list(checkpoints[: max(1, count)])
 
     def take(self, sources: Sources) -> None:
-        """Estimate the frames that have come; `can_use` is true of `inputs`, the present ones.
+        """Estimate the frames that have come; `is_of` is true of `inputs`, the present ones.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.

@@ -23,10 +23,10 @@ class SessionOverlay:
     Attributes:
         overlay: curves, mean and spread.
         numbers: numbers of the stances with single curves, in the order of its rows.
-        whole_count: number of stances that could be overlaid.
-        overlaid_count: number of stances in mean and spread: all, or `STANCES_MAX`.
-        partial_count: number of stances left out as incomplete.
-        too_short_count: number of stances left out as single frames without duration.
+        whole: number of stances that could be overlaid.
+        overlaid: number of stances in mean and spread: all, or `STANCES_MAX`.
+        not_whole: number of stances left out as incomplete.
+        too_short: number of stances left out as single frames without duration.
     """
 
     overlay: Overlay
@@ -48,7 +48,7 @@ def overlay_of_session(
 
     Args:
         session: frames of the session, open for slices.
-        stances: table of `service.sessions.stances.load_stances`.
+        stances: table of `service.sessions.stances.stances_in`.
         points: number of percentages of the duration, from 0 to 100.
         curves: limit of single curves, evenly spread over the session.
 

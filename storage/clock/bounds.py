@@ -5,7 +5,7 @@ bound however asymmetric the two ways were. So rows are intersected, never avera
 asymmetric ways would have a small sigma around a wrong value. Two instants are connected by how
 fast one clock can gain on the other:
 
-- never more than `CRYSTAL_RATE_LIMIT`, two uncompensated crystals of 50 ppm each, and
+- never more than `CRYSTAL`, two uncompensated crystals of 50 ppm each, and
 - within `RATE_TOLERANCE` of its mean over the stretch, the frequency tolerance of RFC 5905 (PHI).
 
 From every row the offset can thus only lie in a cone that opens with time; the intersection of all

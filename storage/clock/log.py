@@ -1,7 +1,7 @@
 """Log of one stream's clock measurements: `clock.jsonl` in its journal folder.
 
 One JSON object a line, each with its own CRC-32. Lines are only appended; a torn end, as after a
-power cut, is cut off before the next append. A line that differs from what was written is skipped:
+power cut, is cut off before the next append. A damaged line is skipped:
 every row only narrows the bounds of the offset, so without it they are wider, and still right.
 """
 

@@ -79,7 +79,7 @@ class ClockTable:
             part: uint16[n]; None: all are of the first part.
 
         Returns:
-            `t_server_ns` and `t_server_uncertainty_ns`, int64[n]; `UNKNOWN_T_NS` in both where the
+            `t_server_ns` and `t_server_uncertainty_ns`, int64[n]; `NO_INSTANT` in both where the
                 stream's offset was not measured.
         """
         t_server_ns = np.full(len(t_ns), NO_INSTANT, dtype=np.int64)
@@ -108,7 +108,7 @@ class ClockTable:
             part: number of the part.
 
         Returns:
-            As of `ClockOffsets.bound_ranges`; None: this part's clock was never measured.
+            As of `ClockMap.reach`; None: this part's clock was never measured.
         """
         clock = self._maps.get(self._parts[part]) if part < len(self._parts) else None
         if clock is None:

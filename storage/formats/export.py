@@ -188,7 +188,7 @@ class Export:
         """Read the flat columns of the slice's frames in chunks of some thousand rows.
 
         Args:
-            columns: as for `select_columns`.
+            columns: as for `chosen`.
 
         Yields:
             At least one chunk; it has no rows if the slice has no frames, else all chunks have
@@ -253,11 +253,11 @@ class Export:
         """Read all frames of the slice at once, for a format that cannot be written in chunks.
 
         Args:
-            columns: as for `select_columns`, including `t_ns`.
+            columns: as for `chosen`, including `t_ns`.
             frames_max: limit of the format.
 
         Raises:
-            UsageError: as for `read_chunks`, or there are too many frames; the error names a slice
+            UsageError: as for `pieces`, or there are too many frames; the error names a slice
                 that fits.
         """
         pieces: list[dict[str, Array]] = []

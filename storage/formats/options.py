@@ -11,7 +11,7 @@ class FormatOptions(BaseModel):
     """Options of export formats. None: the format's default.
 
     REST and the command line offer these fields unchanged. A format refuses an option that it does
-    not support (`storage.formats.writers.format.ExportFormat.options`).
+    not support (`storage.formats.written.format.Format.options`).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -52,7 +52,7 @@ class Instants:
         """Return a message if time would run back between `frames` and stored ones; else empty.
 
         Args:
-            frames: frames of one message; those that are stored already are ignored.
+            frames: frames of one message; stored frames are ignored.
             held: numbers in the journal.
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
@@ -66,7 +66,7 @@ class Instants:
                 (begin_ns, end_ns, a),
                 *([] if after_ns is None else [(after_ns, after_ns, after)]),
             ]
-            # The rule of `frame_rules.find_time_reversals`, without arrays for two or three spans.
+            # The rule of `frame_rules.runs_back`, without arrays for two or three spans.
             for (_, before_end_ns, _), (next_begin_ns, _, seq) in pairwise(spans):
                 if next_begin_ns < before_end_ns:
                     return f"time runs back before frame {seq}"
@@ -127,7 +127,7 @@ def last_seq_until(
     at_least: int,
     read: Callable[[int, int], Iterable[FrameBatch]],
 ) -> int | None:
-    """Return the last number at `t_ns` or before, as `Journal.find_last_seq_until`.
+    """Return the last number at `t_ns` or before, as `Journal.last_seq_until`.
 
     Args:
         segments: segments of the journal.

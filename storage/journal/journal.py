@@ -54,7 +54,7 @@ class Journal:
         folder: the stream's own folder; created if absent.
         info: description of the stream's array.
         writes_later: `append` never waits for the disk. Appended batches wait in memory until they
-            are synced or read; those that the disk then refuses count as stored until `invalidate`.
+            are synced or read; batches that the disk then refuses count as stored until `disown`.
     """
 
     def __init__(self, folder: Path, info: ArrayInfo, *, writes_later: bool = False) -> None:
@@ -166,7 +166,7 @@ class Journal:
         """Append a message that this machine has encoded, without decoding it.
 
         Raises:
-            StorageError: as for `append_new_frames`.
+            StorageError: as for `append`.
         """
         if self.held.missing(message.seq_first, message.seq_last) == message.numbers:
             self._write(message)
@@ -182,7 +182,7 @@ class Journal:
         self._open.sync()
 
     def disown(self, doubtful: Intervals) -> None:
-        """Remove batches within `doubtful_numbers`, unsynced or damaged, from the stored ones.
+        """Remove batches within `doubtful`, unsynced or damaged, from the stored ones.
 
         In a closed segment they are removed from the index on disk, so that a later copy is the
         valid one after a restart.

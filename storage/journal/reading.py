@@ -110,9 +110,9 @@ class BatchReader:
         """Yield the frames in pieces; those before an unreadable batch come before its error.
 
         Raises:
-            DamagedFramesError: as for `read_messages`.
+            DamagedFramesError: as for `messages`.
             FileFormatError: a batch is undamaged but holds no frames of this stream.
-            StorageError: as for `read_messages`.
+            StorageError: as for `messages`.
         """
         for piece in batches.pieces():
             try:

@@ -50,7 +50,7 @@ class Segment:
 
     Attributes:
         path: the file; its index has the same name with another suffix.
-        held: numbers of frames, without those that were invalidated or are in another segment as
+        held: numbers of frames, without numbers that were invalidated or are in another segment as
             well.
         t_ns_first: instant of its oldest frame, in the node's UTC.
         t_ns_last: instant of its newest frame.
@@ -82,7 +82,7 @@ class Segment:
             self.size_bytes += int(records["length"].sum()) + records.nbytes
 
     def note(self, message: EncodedBatch) -> None:
-        """Add the numbers, times and size of one written batch; faster than `register_records`."""
+        """Add the numbers, times and size of one written batch; faster than `take_in`."""
         self.held.add(message.seq_first, message.seq_last)
         fresh = not self.size_bytes
         begin, end = message.t_ns_first, message.t_ns_last
@@ -106,7 +106,7 @@ class Segment:
         return found[np.argsort(found["seq_first"], kind="stable")]
 
     def disown(self, doubtful: Intervals) -> None:
-        """Remove batches within these numbers, also those that are not in the index.
+        """Remove batches within these numbers, also batches that are not in the index.
 
         The file under its name may be a copy that was made before they were written.
         """
@@ -139,7 +139,7 @@ def set_aside_no_files(folder: Path) -> list[str]:
     """Set aside segments and indexes that are no regular files or not readable.
 
     Returns:
-        Messages of what was found and where it is now.
+        Messages: each fault, and the new name of the file.
     """
     problems = []
     for path in sorted((*folder.glob("*" + SUFFIX), *folder.glob("*" + INDEX_SUFFIX))):

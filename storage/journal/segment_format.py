@@ -76,7 +76,7 @@ def is_whole(record: Any) -> bool:
 
 
 def are_whole(index: Records) -> npt.NDArray[np.bool_]:
-    """Return a mask of the records that `is_record_valid` accepts."""
+    """Return a mask of the records that `is_whole` accepts."""
     content = memoryview(np.ascontiguousarray(index).tobytes())
     begins = range(0, len(content), RECORD.itemsize)
     checks = [zlib.crc32(content[at : at + _CHECKED]) for at in begins]

@@ -21,7 +21,7 @@ _BATCH_S = 0.033
 
 
 def unsynced_tail_max(rate_hz: float, waited_s: float = 0.0) -> int:
-    """Compute how many frames a power cut loses at most: those that waited, and one batch.
+    """Compute how many frames a power cut loses at most: waiting frames and one batch.
 
     Args:
         rate_hz: frame rate of the stream.
@@ -67,7 +67,7 @@ class StreamNotes(BaseModel):
 
     @classmethod
     def load(cls, folder: Path) -> StreamNotes | None:
-        """Read `stream.json`; None if there is none. Raises as `load_with_proof`."""
+        """Read `stream.json`; None if there is none. Raises as `load_checked`."""
         notes, _ = cls.load_checked(folder)
         return notes
 

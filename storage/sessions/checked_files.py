@@ -31,10 +31,10 @@ class CheckedFiles:
 
         Args:
             path: the file.
-            only_slices: as for `SealedFileReader`.
+            only_slices: as for `SessionReader`.
 
         Raises:
-            FileFormatError: as for `SealedFileReader`.
+            FileFormatError: as for `SessionReader`.
         """
         stamps = stamps_of(path)
         with self._lock:

@@ -33,7 +33,7 @@ _F32 = pa.float32()
 _GROUP_ROWS = 1 << 16
 """Rows of a row group: two minutes."""
 ROWS_MAX = 2_500_000
-"""Most rows of a series: a longer one would not be read at once (`MAX_READ_BYTES`)."""
+"""Most rows of a series: a longer one would not be read at once (`BYTES_MAX`)."""
 
 SERIES = (
     Column("t_ns", pa.int64(), "ns", "of our frame, on the session's time axis"),
@@ -133,7 +133,7 @@ def write_series(path: Path, table: pa.Table) -> None:
 
     Args:
         path: the file.
-        table: of `SERIES_SCHEMA`.
+        table: of `SCHEMA`.
 
     Raises:
         StorageError: the disk is full or not writable.

@@ -1,7 +1,7 @@
 """Hash of a sealed file's content, which the file carries in its footer.
 
 The *content hash* covers the values, whatever the row groups and encodings: every column's numbers,
-the array's description and the notes. The *file hash* (`storage.parquet_hash`) covers the bytes.
+the array's description and the notes. The *file hash* (`storage.file_hash`) covers the bytes.
 Both are in the footer, and docs/formats.md has the few lines that compute them.
 """
 

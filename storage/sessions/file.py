@@ -6,7 +6,7 @@ byte-stream-split: DuckDB before 2.0 and pyarrow before 16 do not read that. A r
 minute, in sessions of more than an hour up to five: each row group costs a reader of the footer
 some time. The file appears completely or not at all: it is written under a temporary name, synced,
 and renamed. Its footer has hashes of its content, of its bytes and of itself
-(`storage.sessions.content_hash`, `storage.parquet_hash`).
+(`storage.sessions.content_hash`, `storage.file_hash`).
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class SessionWriter:
 
         Args:
             frames: n frames.
-            extra: columns of `storage.schema.COLUMNS_BY_NAME` by name, n rows each.
+            extra: columns of `storage.schema.KNOWN` by name, n rows each.
         """
         columns = {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
         begin = 0
@@ -116,7 +116,7 @@ class SessionWriter:
 
         Raises:
             FileFormatError: no frame was appended.
-            StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
+            StorageError: the disk is full or not writable; raises as `whole_file`.
         """
         self._end_piece()
         self._write_group()

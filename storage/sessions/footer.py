@@ -1,7 +1,7 @@
 """Footer of a sealed session: array, notes, content, and column positions.
 
 Reading it takes time with the number of row groups and columns, and it never changes. So a server
-caches it (`storage.sessions.verified_file_cache`).
+caches it (`storage.sessions.checked_files`).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Footer:
         Args:
             path: the file.
             is_checked: skip the hashes: the file was verified already, or shall not be.
-            only_slices: as for `verify_unless_done`.
+            only_slices: as for `prove`.
             file: the open file, if it is not on this machine: then the footer must have its own
                 hash.
 

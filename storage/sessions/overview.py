@@ -132,7 +132,7 @@ def write_overview(path: Path, levels: Sequence[Bins], *, tiles: int, frames_sha
 
     Args:
         path: the file.
-        levels: as for `encode_overview`.
+        levels: as for `overview_content`.
         tiles: likewise.
         frames_sha256: likewise.
 

@@ -96,7 +96,7 @@ def bins_of_frames(frames: Mapping[str, Array], before: int | None = None) -> Bi
     """Make a bin for each frame.
 
     Args:
-        frames: `required_frame_columns`, (n,) or (n, tiles); `part` if there are several.
+        frames: `frame_columns`, (n,) or (n, tiles); `part` if there are several.
         before: number of the frame before the first one, if it is of the same part.
     """
     seq, n = frames["seq"], len(frames["seq"])
@@ -211,7 +211,7 @@ class Pyramid:
         """Part and number of the last frame."""
 
     def feed(self, frames: Mapping[str, Array]) -> None:
-        """Add the next frames: `required_frame_columns`, and `part` if there are several."""
+        """Add the next frames: `frame_columns`, and `part` if there are several."""
         if not len(frames["seq"]):
             return
         part = int(frames["part"][0]) if "part" in frames else 0
@@ -254,7 +254,7 @@ def _drained(pieces: list[Bins]) -> Bins:
 
 
 def levels_over(finest: Bins) -> list[Bins]:
-    """Return a level and its coarser ones, until one has at most `MAX_COARSEST_BINS` bins."""
+    """Return a level and its coarser ones, until one has at most `TOP` bins."""
     levels = [finest]
     while len(levels[-1]["part"]) > TOP:
         levels.append(merged(levels[-1], FACTOR))

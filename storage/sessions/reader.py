@@ -38,7 +38,7 @@ class SessionReader:
     Attributes:
         path: the file.
         footer: its footer; `info`, `notes`, `format`, `content`, `content_sha256`, `column_names`
-            and `frame_count` are those of `storage.sessions.footer.SealedFileFooter`.
+            and `frame_count` are those of `storage.sessions.footer.Footer`.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class SessionReader:
         self.close()
 
     def has(self, *names: str) -> bool:
-        """Return whether the file has these quantities (of `storage.schema.COLUMNS_BY_NAME`)."""
+        """Return whether the file has these quantities (of `storage.schema.KNOWN`)."""
         tiles = len(self.info.tiles)
         return all(self.column_names.issuperset(KNOWN[name].flat_names(tiles)) for name in names)
 
@@ -130,7 +130,7 @@ class SessionReader:
         groups: Sequence[int] | None = None,
         values_max: int | None = None,
     ) -> Iterator[dict[str, Array]]:
-        """Yield some quantities (of `COLUMNS_BY_NAME`), some thousand rows at a time.
+        """Yield some quantities (of `KNOWN`), some thousand rows at a time.
 
         Args:
             wanted: names of the quantities.
@@ -138,7 +138,7 @@ class SessionReader:
             values_max: most numbers of a piece; None: the default.
 
         Raises:
-            FileFormatError: as for `read_batches`.
+            FileFormatError: as for `batches`.
         """
         tiles = len(self.info.tiles)
         names = [flat for name in wanted for flat in KNOWN[name].flat_names(tiles)]
@@ -153,7 +153,7 @@ class SessionReader:
         """Time axis of the session.
 
         Raises:
-            FileFormatError: as for `read_batches`.
+            FileFormatError: as for `batches`.
         """
         if self.footer.axis is None:
             self.footer.axis = self._time_axis()
@@ -163,7 +163,7 @@ class SessionReader:
         """Return `t_ns` of the first and of the last frame, both on the session's time axis.
 
         Raises:
-            FileFormatError: as for `read_batches`.
+            FileFormatError: as for `batches`.
         """
         if self.footer.span_ns is not None:
             return self.footer.span_ns
@@ -200,7 +200,7 @@ class SessionReader:
             At least one piece, which may have no rows.
 
         Raises:
-            FileFormatError: as for `read_batches`.
+            FileFormatError: as for `batches`.
         """
         logical = flat_of(len(self.info.tiles))
         is_empty = True
@@ -218,7 +218,7 @@ class SessionReader:
     def groups_within(self, begin_t_ns: int | None, end_t_ns: int | None) -> list[int]:
         """Return the row groups that may have frames of a time range.
 
-        Bounds as for `read_flat_columns`.
+        Bounds as for `flat`.
         """
         if begin_t_ns is None and end_t_ns is None:
             return list(range(len(self.footer.group_rows)))
@@ -232,7 +232,7 @@ class SessionReader:
         """Read all frames at once.
 
         Raises:
-            FileFormatError: as for `read_batches`.
+            FileFormatError: as for `batches`.
         """
         return FrameBatch.concatenate([frames for frames, _ in self.batches()])
 

@@ -39,7 +39,7 @@ class BinsSoFar:
         """Add the next frames.
 
         Args:
-            frames: `storage.sessions.pyramid.required_frame_columns`, and `part`.
+            frames: `storage.sessions.pyramid.frame_columns`, and `part`.
             there: number of leading frames that were added before.
 
         Returns:

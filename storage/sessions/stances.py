@@ -62,7 +62,7 @@ def stances_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
     """Convert stances to a table; NaN and None become null.
 
     Args:
-        rows: values by the names of `STORED_STANCE_COLUMNS`.
+        rows: values by the names of `STANCES`.
     """
     content = list(rows)
     arrays = [
@@ -78,7 +78,7 @@ def write_stances(path: Path, table: pa.Table, *, frames_sha256: str) -> None:
 
     Args:
         path: the file.
-        table: of `make_stance_table`.
+        table: of `stances_table`.
         frames_sha256: file hash of the stances' frames.
 
     Raises:
@@ -93,7 +93,7 @@ class StoredStances:
     """Content of `stances.parquet`.
 
     Attributes:
-        table: table with the columns of `STORED_STANCE_COLUMNS`.
+        table: table with the columns of `STANCES`.
         frames_sha256: file hash of the frames it was made from.
     """
 

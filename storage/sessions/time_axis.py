@@ -10,7 +10,7 @@ The time between two successive parts is taken
 - else by the server's clock, where both parts were compared with it;
 - else not at all: the second part begins one frame after the first one ended.
 
-Without a comparison a step back, or one of more than `MAX_GAP_NS`, cannot be true of a recording.
+Without a comparison a step back, or one of more than `GAP_MAX_NS`, cannot be true of a recording.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class TimeAxis:
 
     @classmethod
     def from_dicts(cls, stated: object, *, where: str) -> TimeAxis:
-        """Return the axis from a file's notes, as `to_json_list` made them.
+        """Return the axis from a file's notes, as `as_dicts` made them.
 
         Raises:
             FileFormatError: it is none.

@@ -1,6 +1,6 @@
 """Verification of other files in a data folder, beside sessions and journals.
 
-Every JSON file of ours has its own hash (`storage.checksummed_json`), `server_id` a CRC-32. A name
+Every JSON file of ours has its own hash (`storage.checked_json`), `server_id` a CRC-32. A name
 with `.damaged-N` was set aside and is not verified.
 """
 

@@ -90,7 +90,7 @@ class RepeatabilityView(View):
 
     @classmethod
     def of(cls, found: Repeatability) -> RepeatabilityView:
-        """As it is now."""
+        """Return the view of a step's repeatability."""
         return cls(**vars(found))
 
 
@@ -130,7 +130,7 @@ class TileResultView(View):
 
     @classmethod
     def of(cls, tile: TileCalibration) -> TileResultView:
-        """From its calibration."""
+        """Return the result of a tile from its calibration."""
         facts = tile.weights
         steps = () if facts is None else sorted(facts.steps, key=lambda step: step.force_n)
         return cls(
@@ -167,7 +167,7 @@ class WeighingResultView(View):
 
     @classmethod
     def of(cls, calibration: Calibration, node: ServerNode) -> WeighingResultView:
-        """From the calibration, for the tiles of a node."""
+        """Return the result of a calibration for the tiles of a node."""
         misfit = None
         bearing = [tile.serial for tile in node.info.tiles if not tile.reference]
         if lacking := [serial for serial in bearing if calibration.find(serial) is None]:
@@ -217,7 +217,7 @@ class WeighingView(View):
 
     @classmethod
     def of(cls, weighing: NodeWeighing, node: ServerNode) -> WeighingView:
-        """As it is now."""
+        """Return the present state of a weighing."""
         now, plan, found = weighing.now, weighing.plan, weighing.calibration
         rest_kpa = now.rest_kpa if isfinite(now.rest_kpa) else None
         recent_kpa = [round(kpa, 3) for kpa in now.recent_kpa]
@@ -268,7 +268,7 @@ class NodeWeighingView(View):
     responses=problems(_404="No such node."),
 )
 async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
-    """Ask again and again while it is under way: it has all that a person is shown."""
+    """Return the state of the guided calibration; poll it while one is under way."""
     the_node = server.nodes.get(node)
     found = server.weighings.find(node)
     return NodeWeighingView(
@@ -293,8 +293,8 @@ async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
 async def start(node: str, body: StartWeighing, server: ServerState) -> WeighingView:
     """Record, follow the pressure of each tile, mark each weight, and fit: one per node at a time.
 
-    It goes on without the one who started it, and ends by itself when the node leaves or no step is
-    completed for ten minutes.
+    It continues when the client that started it disconnects, and ends by itself when the node
+    disconnects or no step is completed for ten minutes.
     """
     the_node = server.nodes.get(node)
     return WeighingView.of(server.weighings.start(the_node, body.plan()), the_node)
@@ -321,5 +321,5 @@ async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> We
     responses={**_NONE, **_OTHER},
 )
 async def end(node: str, server: ServerState, if_match: ThisOne = None) -> None:
-    """Nothing is fitted if it is under way. Its recording stays, and so does its calibration."""
+    """Cancel a running calibration without a fit, or close an ended one; its recording stays."""
     await server.weighings.end(node, tag_of(if_match))

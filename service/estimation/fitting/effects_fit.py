@@ -43,7 +43,7 @@ def fit_effects(
     Args:
         recordings: of the tile in the rig, all of one chip.
         tile: its static curve, from the same recordings.
-        delay: of the reference; `late_s` of the answer contains it (see `separate_delays`).
+        delay: of the reference; `late_s` of the answer contains it (see `resolved`).
     """
     points, baseline_kpa = loadings(recordings)
     noise_kpa = float(np.mean([unloaded(each).noise_kpa for each in pressed_in(recordings)]))

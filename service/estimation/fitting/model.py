@@ -48,7 +48,7 @@ class DomeModel:
         flow_n: force on it during a slow stroke.
         flow_power: exponent of its flow over that force.
         late_s: delay of the tile's samples behind their instants. Forces passed to
-            `compute_pressures` have to be those at the delayed instants, from `interpolate_force`.
+            `pressed` have to be those at the delayed instants, from `load`.
     """
 
     curve: Floats
@@ -66,7 +66,7 @@ class DomeModel:
     late_s: float = 0.0
 
     def pressed(self, t_s: Floats, force_n: Floats) -> Floats:
-        """Compute pressures with these parameters; see the function `compute_pressures`."""
+        """Compute pressures with these parameters; see the function `pressed`."""
         return pressed(
             t_s,
             force_n,

@@ -42,7 +42,7 @@ class Fit:
         model: fitted parameters.
         gains: (loadings,), gain of each loading.
         scatter: standard deviation of the gains.
-        modelled: (m, 3), answer of `compute_pressures`.
+        modelled: (m, 3), answer of `pressed`.
         sigma: standard uncertainties by the name of the unknown: "late_s", "gamma", "ln_tau",
             "part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power", if fitted; and of
             sums over neighbouring terms, which are correlated: "part_sum", "loop_n".
@@ -188,7 +188,7 @@ class OutputErrorProblem:
         model: DomeModel,
         at: dict[str, slice],
     ) -> dict[str, float]:
-        """Return `Fit.correction_uncertainty`."""
+        """Return `Fit.unsure`."""
         x = (modelled[:, 1] - model.baseline_kpa) / model.scale_kpa
         corrected = {
             "gas": (("gamma", "ln_tau"), modelled[:, 0] - modelled[:, 1]),

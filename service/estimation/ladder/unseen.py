@@ -29,7 +29,7 @@ reach a little farther."""
 
 
 class SaturationParams(KernelRecord):
-    """Parameters of a tile, as in `SaturationBounds`."""
+    """Parameters of a tile, as in `Unseen`."""
 
     range_high_kpa: float
     range_end_n: float

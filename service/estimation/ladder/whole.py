@@ -19,7 +19,7 @@ HULL_SIGMAS = 3.0  # noise about the edge of the tiles is no reason to mask
 GRF, GRF_SIGMA, AT_LEAST, X, Y, SIGMA_X, SIGMA_Y, INDEX_X, INDEX_Y, GROUND_X, GROUND_Y, ANGLE, Z = (
     range(13)
 )
-"""Columns of `compute_grf_cop`; the last is needed for the ground frame only."""
+"""Columns of `stand`; the last is needed for the ground frame only."""
 COLUMNS = 13
 ALONG = ((X, SIGMA_X, GROUND_X), (Y, SIGMA_Y, GROUND_Y))
 """Columns of the centre of pressure along x, and along y."""

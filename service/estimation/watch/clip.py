@@ -33,8 +33,8 @@ ELSEWHERE = 0.3
 """Probability density, per unit of the noise, of such a mean in a healthy tile, which is no top of
 that edge if it is far away. In recorded walking it is 0.2 to 0.3."""
 EDGE = 2.5
-"""In units of the noise: what counts as at the edge, half of that as its middle; as much below it
-again is the slope that leads to it."""
+"""Half width of the edge, in units of the noise; half of it is the edge's middle. The slope that
+leads to the edge has the same width."""
 STEEP = 3.0
 """How many more readings there are in the middle of an edge than on the slope, which is as wide; at
 the top of half a sine there are twice as many."""
@@ -44,21 +44,21 @@ that ends below it ..."""
 NEAR = 12.0
 """... by so little, in units of the noise: loads end there for themselves."""
 LOADS = 16
-"""Loads that are remembered; the next one takes the place of the oldest."""
+"""Capacity of the ring of loads that have counted."""
 APART = 0.008
 """Loads differ if one of their two measures does by this part, ..."""
 APART_SIGMAS = 4.0
 """... and by so many of its standard deviations."""
 BELOW = 3.0
-"""In units of the noise: so far below the edge the pressure that is integrated ends, since the rest
-is noise behind a clip."""
+"""In units of the noise, below the edge: upper limit of the integrated pressure. Above it there is
+only noise behind a clip."""
 FADING = 0.98
-"""What is left of the evidence after a loading whose load has counted before."""
+"""Factor on the evidence after a loading whose load has counted before."""
 HOLE = 0.03
 """A loading with a longer hole than this part of its stay at the edge, and than one reading, does
 not count: without its missing frames a load would differ from itself."""
 READINGS_MIN = 20
-"""Of a loading, at the edge."""
+"""Least number of readings of a loading at the edge."""
 OVER = 4.0
 """In units of the noise: what lies farther above the edge is no reading behind a clip ..."""
 OVER_SHARE = 0.05
@@ -99,7 +99,7 @@ STATE = record_type(
         ("end_kpa", np.float64),  # of what can be told; infinite while there is no clip
     ]
 )
-"""What is remembered of each tile."""
+"""State of the detector, one record per tile."""
 
 
 def at_rest(tiles: int) -> Records:
@@ -158,7 +158,7 @@ def end_of_range(
 
 @compiled
 def _begin(tile: Record, kpa: float) -> None:
-    """Forget the loading before."""
+    """Reset the measures of a loading."""
     tile.smooth_kpa = tile.peak_kpa = kpa
     tile.readings = tile.at = tile.middle = tile.slope = tile.over = 0
     tile.hole_ns = tile.stay_ns = 0
@@ -201,7 +201,10 @@ def _count(tile: Record, kpa: float, passed_ns: int, noise_kpa: float) -> None:
 
 @compiled
 def _end_of_loading(tile: Record, baseline_kpa: float, noise: float, lasts: float) -> None:
-    """Judge a loading; `lasts`: standard deviation of means, relative to that of white noise."""
+    """Update edge and evidence from an ended loading.
+
+    `lasts` is the standard deviation of means, relative to that of white noise.
+    """
     if tile.peak_kpa < tile.edge_kpa - 2.0 * EDGE * noise:
         if tile.peak_kpa > tile.edge_kpa - NEAR * noise:
             tile.evidence = max(0.0, tile.evidence - ROUND)

@@ -30,7 +30,7 @@ class Watch:
         end_kpa: absolute pressure above which a healthy chip may stand still.
         unloaded_kpa: distance from the baseline within which a tile counts as unloaded.
         most: limits of equal counts in a row.
-        even: asymmetry for `baseline_loss.update_baseline_error`.
+        even: asymmetry for `baseline_loss.lost`.
         kpa_per_count: shift of the baseline for a raw temperature count; None if a model
             corrects it.
     """

@@ -49,7 +49,7 @@ def spread_over_cluster(
     Args:
         work: a module-level function, which returns expected failures as results.
         tasks: arguments of `work`, consumed only as threads become free. A task that returns
-            `Unfinished` is submitted again, to any worker.
+            `GoesOn` is submitted again, to any worker.
         address: the scheduler's, such as tcp://host:8786.
 
     Raises:

@@ -38,7 +38,7 @@ def find_sessions(places: Sequence[str], mirror: Path | None = None) -> Archive:
     """Find all sealed sessions at some locations.
 
     Args:
-        places: paths, globs or URIs; see `service.offline.archive.locations`.
+        places: paths, globs or URIs; see `service.offline.archive.places`.
         mirror: empty folder for metadata copied from object stores; required for
             remote sessions.
 

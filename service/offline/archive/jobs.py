@@ -34,10 +34,10 @@ class Job:
     """Task applied to one session.
 
     Attributes:
-        location: location of the session.
+        place: location of the session.
         task: the operation.
-        results_location: results folder, as a path or URI; None: results are discarded.
-        client_version: the client's version; a worker of another version refuses the job.
+        out: results folder, as a path or URI; None: results are discarded.
+        software: the client's version; a worker of another version refuses the job.
     """
 
     place: Place

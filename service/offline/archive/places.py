@@ -40,9 +40,9 @@ class Place:
     """Location of one session.
 
     Attributes:
-        uri: its folder or file, as a path or URI.
-        session_id: session id; for a single file, its name without suffix.
-        is_single_file: True for a single file without a session folder.
+        where: its folder or file, as a path or URI.
+        name: session id; for a single file, its name without suffix.
+        is_file: True for a single file without a session folder.
     """
 
     where: str

@@ -40,7 +40,7 @@ class Note:
         command: command that made it.
         software: version that made it.
         place: location of the session.
-        input_sha256: hash of the session, see `hash_session`.
+        input_sha256: hash of the session, see `identity`.
         options: options of the command.
         files: hash and length of every file, by name.
         facts: the task's report.

@@ -58,9 +58,9 @@ class Archived:
     """Sealed session of an archive.
 
     Attributes:
-        location: its location.
+        place: its location.
         folder: local folder of the session, or of the files copied from a store.
-        metadata: content of its `session.json`.
+        said: content of its `session.json`.
     """
 
     place: Place
@@ -104,7 +104,7 @@ class Archive:
 
     Attributes:
         sessions: sealed sessions without known damage.
-        left_out_reasons: reasons for missing sessions, by location.
+        left_out: reasons for missing sessions, by location.
     """
 
     sessions: list[Archived] = field(default_factory=list)

@@ -47,7 +47,7 @@ def identity(place: Place) -> str:
 
 
 def identity_of_file(where: str) -> str:
-    """Hash any file; for a session's frames, return `hash_session` of the session.
+    """Hash any file; for a session's frames, return `identity` of the session.
 
     Raises:
         FileFormatError: it is not there.
@@ -101,8 +101,8 @@ def staged_file(where: str) -> Iterator[Path]:
     """Provide any file locally; with a session's frames, the files beside them.
 
     Raises:
-        FileFormatError: as for `open_local_session`.
-        StorageError: as for `open_local_session`.
+        FileFormatError: as for `staged`.
+        StorageError: as for `staged`.
     """
     place = place_of(where)
     if not is_remote(where):

@@ -103,7 +103,7 @@ class EstimateTask(EstimateRequest):
     PIECES: ClassVar[tuple[str, ...]] = ("json", "npz")
 
     def options(self) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         named = self.calibration
         return {
             **{name: value for name, value in vars(self).items() if name != "piece_frames"},
@@ -113,7 +113,7 @@ class EstimateTask(EstimateRequest):
         }
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         from service.offline.estimate.session import estimate_session
 
         frames, remarks = frames_of(source), list[str]()
@@ -122,13 +122,13 @@ class EstimateTask(EstimateRequest):
         return self._finished(source, work, made, remarks)
 
     def is_long(self, source: Path) -> bool:
-        """See `ChunkedTask`."""
+        """See `LongTask`."""
         from service.offline.estimate.pieces import has_pieces
 
         return has_pieces(frames_of(source), self, self.piece_frames)
 
     def make_piece(self, source: Path, folder: Path) -> bool:
-        """See `ChunkedTask`."""
+        """See `LongTask`."""
         from service.offline.estimate.pieces import make_piece
 
         return make_piece(
@@ -136,7 +136,7 @@ class EstimateTask(EstimateRequest):
         )
 
     def join(self, source: Path, folder: Path, work: Path) -> dict[str, Any]:
-        """See `ChunkedTask`."""
+        """See `LongTask`."""
         from service.offline.estimate.pieces import join_pieces
 
         remarks, out = list[str](), work / FRAMES_NAME
@@ -164,12 +164,12 @@ class ExportTask:
     command: ClassVar[str] = "export"
 
     def options(self) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         asked = self.export.options.model_dump(exclude_none=True)
         return {**vars(self.export), "part": vars(self.export.part), "options": asked}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         name = f"{Path(FRAMES_NAME).stem}.{format_named(self.export.to).ending}"
         done = export_session(frames_of(source), work / name, self.export)
         left_out = {mark.event.label: mark.left_out for mark in done.left_out}
@@ -183,11 +183,11 @@ class VerifyTask:
     command: ClassVar[str] = "verify"
 
     def options(self) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         return {}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         report = verify(source)
         text = json.dumps(report.as_dict(), indent=1).encode()
         (work / "verify.json").write_bytes(text)
@@ -211,7 +211,7 @@ class CompareTask:
         return {"reference_sha256": said, "limits": self.limits, **options}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         from service.offline.comparison_files import write_comparison
 
         title = f"{source.name} against {self.reference.rpartition('/')[2]}"
@@ -232,11 +232,11 @@ class RefusedTask:
     command: str
 
     def options(self) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         raise UsageError(self.reason)
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `SessionTask`."""
+        """See `Task`."""
         raise UsageError(self.reason)
 
 

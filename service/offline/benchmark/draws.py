@@ -109,7 +109,7 @@ def plan_of(recording: Recording, models: tuple[str, ...], lag_ms: float) -> Est
 
 
 def ns_per_frame(plan: EstimationPlan, stream: Endless, frames: int, batch: int) -> float:
-    """Measure the CPU time per frame in ns, over `frames` frames, `batch_frames` per step."""
+    """Measure the CPU time per frame in ns, over `frames` frames, `batch` per step."""
     estimator = Estimator(plan)
     spent_ns = 0
     for begin in range(0, frames, batch):
@@ -214,7 +214,7 @@ def recorded(
 
     Args:
         scene: scene to run.
-        seconds: duration, as for `record_draw`.
+        seconds: duration, as for `record`.
         draw: seed of tiles and noise.
         calibration: calibration of the tiles.
         foot: emulated foot; the draw replaces its seeds.

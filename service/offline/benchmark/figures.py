@@ -129,7 +129,7 @@ class Measured:
         figures: fields of `Accuracy` over draws; magnitudes of signed ones.
         coverage: pooled over all frames of all draws: GRF in all frames and in each of `PHASES`,
             "cop_x" and "after_saturation".
-        beyond_whole: excess of `BUDGET_FIGURES` over those of the full model set in the same
+        beyond_whole: excess of `BUDGETED` over those of the full model set in the same
             draw, over draws.
     """
 

@@ -23,10 +23,10 @@ class Rung:
         label: short name for tables and plots.
         models: the models, in the order of `MODELS`.
         is_built_up: True for the first set and each set with one model more than the set before.
-        added_model: model that it adds to the set before; None for the first and ablated sets.
-        missing_model: the one model of the full set that is missing in it; None otherwise.
-        extra_model: model that it adds to the full set.
-        is_full_set: True for the scene's full set.
+        adds: model that it adds to the set before; None for the first and ablated sets.
+        lacks: the one model of the full set that is missing in it; None otherwise.
+        spare: model that it adds to the full set.
+        is_default: True for the scene's full set.
     """
 
     label: str
@@ -47,7 +47,7 @@ def rungs(
 
     First the built-up ones, ending with the scene's full set, then the full set without each of its
     models, then the full set with each further model. Unknown models are left out; see
-    `list_missing_models`.
+    `absent`.
 
     Args:
         models_of_scene: models of the scene, with `static`.

@@ -73,15 +73,15 @@ class Alignment:
     """Clock and scale of a reference relative to ours: our time `t` is its `reference_s(t)`.
 
     Attributes:
-        lag_s: reference time minus our time of the same event, at `mid_t_s`.
+        lag_s: reference time minus our time of the same event, at `at_s`.
         drift_ppm: rate of change of the lag, microseconds per second.
         offset_n: reference reading at zero force of ours, by the fit.
         scale: our force per reference force, N/N.
-        mid_t_s: our time at the middle of the overlap.
+        at_s: our time at the middle of the overlap.
         covariance: (2, 2), of lag and drift, in s and 1; without our foot's repeating error, which
             the sigma of our force contains already.
         residual_n: root mean square of the residuals under the last window.
-        block_count: number of time blocks behind the uncertainties.
+        blocks: number of time blocks behind the uncertainties.
         ambiguity: a rival lag; None if no other lag fits nearly as well.
     """
 

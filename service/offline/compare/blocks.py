@@ -9,7 +9,7 @@ Methodology 28, 2002, p. 169); the jackknife over-corrects where few blocks have
 information, as with three stances.
 
 Errors of the rubber model that repeat in every stance do not differ between blocks. They show as
-differences between phases of the load: `compute_phase_covariance` leaves out one of rise and fall,
+differences between phases of the load: `over_phases` leaves out one of rise and fall,
 each low and high, over all stances, and measures how far the estimate moves.
 """
 
@@ -44,7 +44,7 @@ class Estimate:
         value: estimate.
         sigma: standard error.
         dof: its degrees of freedom, not an integer, as blocks have unequal information.
-        repeating_sigma: standard uncertainty from our foot's error that repeats in every stance.
+        own: standard uncertainty from our foot's error that repeats in every stance.
     """
 
     value: float
@@ -80,8 +80,8 @@ class Spread:
     Attributes:
         covariance: (p, p).
         dof: (p,), degrees of freedom.
-        block_count: number of time blocks.
-        repeating_covariance: (p, p), covariance of our foot's error that repeats in every stance.
+        blocks: number of time blocks.
+        own: (p, p), covariance of our foot's error that repeats in every stance.
     """
 
     covariance: Floats
@@ -181,7 +181,7 @@ def over_phases(jacobian: Floats, score: Floats, curvature: Floats, force_n: Flo
 
     Args:
         jacobian: (n, p), derivatives of the residuals by the parameters; the first one is a time.
-        score: as for `compute_fit_uncertainty`.
+        score: as for `spread_of`.
         curvature: likewise.
         force_n: (n,), load.
     """
@@ -239,7 +239,7 @@ def _pulls(normals: Floats, slopes: Floats) -> Floats:
 
 
 def mean_of(values: Floats, samples: Ints) -> Estimate:
-    """Compute the mean of values correlated in time; `samples` as for `assign_blocks`."""
+    """Compute the mean of values correlated in time; `samples` as for `block_of`."""
     mean = float(values.mean())
     ones = np.ones((len(values), 1))
     spread = spread_of(ones, values - mean, ones[:, 0], samples)

@@ -13,7 +13,7 @@ class ClockLag:
 
     Attributes:
         lag_s: as in `Alignment`, at the same time.
-        error_bound_s: bound of its error; not a standard uncertainty.
+        within_s: bound of its error; not a standard uncertainty.
     """
 
     lag_s: float

@@ -46,7 +46,7 @@ class Peaks:
     Attributes:
         best: highest maximum.
         rival: highest maximum outside the best one's hill; None if there is none.
-        inverted_correlation: highest correlation with the reference's sign inverted.
+        opposite: highest correlation with the reference's sign inverted.
         step_s: resolution of the lags.
     """
 

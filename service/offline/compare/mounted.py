@@ -46,11 +46,11 @@ class Mount:
     Attributes:
         gains: gain of each tile; all equal if one common gain was fitted.
         shear: shear coefficient; None if it was not fitted.
-        residual_lag_s: residual lag.
-        mae_before_n: mean absolute GRF error under load before the fit, reference zero removed.
-        mae_after_n: cross-validated mean absolute GRF error with gains and shear.
-        frame_count: number of loaded frames.
-        block_count: number of time blocks behind the uncertainties.
+        late_s: residual lag.
+        before_n: mean absolute GRF error under load before the fit, reference zero removed.
+        after_n: cross-validated mean absolute GRF error with gains and shear.
+        frames: number of loaded frames.
+        blocks: number of time blocks behind the uncertainties.
     """
 
     gains: tuple[Parameter, ...]
@@ -85,7 +85,7 @@ class _Load:
         return np.asarray(self.reference_n - self.model_n(x))
 
     def jacobian(self, x: Floats) -> Floats:
-        """Compute the derivatives of `compute_residual_n`, (n, p)."""
+        """Compute the derivatives of `off_n`, (n, p)."""
         upright = 1.0 + (x[-1] if self.with_shear else 0.0) * self.tilted
         columns = [self.rate, np.ones(len(self.rate))]
         for g in range(self.gains):

@@ -57,17 +57,17 @@ class Pairs:
     """Our n frames at which the reference is known.
 
     Attributes:
-        columns: our columns, `COMPARED_COLUMNS`.
+        columns: our columns, `COMPARED`.
         t_s: (n,), since the first frame of the session.
-        reference_n: (n,), reference force, minus its zero if `is_zero_removed`.
+        reference_n: (n,), reference force, minus its zero if `removed`.
         reference_cop_m: (n, 2), reference COP.
-        reference_contact: (n,), True where the reference is loaded.
-        contact_threshold_n: contact threshold of the reference above its zero.
-        lag_sigma_n: (n,), force uncertainty due to the lag: rate of change times lag sigma.
-        is_counted: (n,), frames that count: all; with a reference slower than ours, the nearest to
+        contact: (n,), True where the reference is loaded.
+        contact_n: contact threshold of the reference above its zero.
+        lag_n: (n,), force uncertainty due to the lag: rate of change times lag sigma.
+        judged: (n,), frames that count: all; with a reference slower than ours, the nearest to
             each of its samples, so that no sample counts twice.
-        reference_zero_n: reference reading in flight; None without a long enough flight.
-        is_zero_removed: True if the zero is subtracted from `reference_n`.
+        zero_n: reference reading in flight; None without a long enough flight.
+        removed: True if the zero is subtracted from `reference_n`.
     """
 
     columns: Columns
@@ -108,7 +108,7 @@ def pair(
     """Interpolate the reference at the times of our frames.
 
     Args:
-        columns: `COMPARED_COLUMNS` of a session, one value per frame.
+        columns: `COMPARED` of a session, one value per frame.
         reference: measurements of the reference.
         alignment: alignment of both.
         remove_offset: subtract the reference's mean reading in flight.

@@ -60,9 +60,9 @@ class Even:
     Attributes:
         begin_s: time of step 0.
         step_s: time between two steps.
-        step_index: (n,), rising; step number of each sample. It jumps over long gaps.
+        step: (n,), rising; step number of each sample. It jumps over long gaps.
         force_n: (n,); linear across unknown parts.
-        is_known: (n,), False within gaps.
+        known: (n,), False within gaps.
     """
 
     begin_s: float

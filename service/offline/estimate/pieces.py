@@ -78,7 +78,7 @@ def make_piece(
 
     Args:
         source: the session.
-        folder: folder with the earlier chunks, at least their `NEEDED_SUFFIXES`; the new
+        folder: folder with the earlier chunks, at least their `NAMES`; the new
             chunk is written to it.
         request: options of the estimate.
         piece_frames: approximate number of frames; row groups are not split.

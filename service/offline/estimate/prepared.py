@@ -26,7 +26,7 @@ class Prepared:
     Attributes:
         info: its array, with the requested tile positions.
         options: options of the estimate.
-        kept_columns: columns of the session, beside the frames, that are copied unchanged.
+        kept: columns of the session, beside the frames, that are copied unchanged.
     """
 
     info: ArrayInfo

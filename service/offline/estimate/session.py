@@ -35,11 +35,11 @@ class Estimated:
     """Result of a re-estimation.
 
     Attributes:
-        frame_count: number of frames.
+        frames: number of frames.
         plan: initial constants of the estimate.
         begin_t_ns: UTC of the first frame of the session.
         findings: stances, and errors against the truth; empty if not requested.
-        omitted_effects_n: omitted models with a considerable effect, with that effect in N; empty
+        asked: omitted models with a considerable effect, with that effect in N; empty
             if not requested.
     """
 

@@ -32,11 +32,11 @@ class Stretch:
     """Range of frames to read and to output; by default all.
 
     Attributes:
-        run_from_ns: time from which models run, on the time axis; None: from the first frame.
-        output_begin_ns: begin of the output; None: the session's first frame.
-        output_end_ns: end of the output, exclusive; None: to the end.
-        read_until_ns: end of the frames needed for the look-ahead, exclusive.
-        row_groups: row groups to read; None: all.
+        from_ns: time from which models run, on the time axis; None: from the first frame.
+        begin_ns: begin of the output; None: the session's first frame.
+        end_ns: end of the output, exclusive; None: to the end.
+        until_ns: end of the frames needed for the look-ahead, exclusive.
+        groups: row groups to read; None: all.
         axis: the session's time axis.
     """
 

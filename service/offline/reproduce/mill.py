@@ -48,12 +48,12 @@ class DomeFound:
 
     Attributes:
         dome: the dome.
-        indented_tile: its recording and fit.
-        expected_range: its range by the paper or, scaled, by `foottile domes`.
+        pressed: its recording and fit.
+        expected: its range by the paper or, scaled, by `foottile domes`.
         end_kpa: end of the chip's range, above the tile's baseline.
         full_scale_n: force at that end, and half width of its 95 % interval.
-        is_full_scale_reached: True if the recording reached that end; else extrapolated.
-        repeatability: standard deviation of the normalised output between loadings.
+        reached: True if the recording reached that end; else extrapolated.
+        spread: standard deviation of the normalised output between loadings.
     """
 
     dome: Dome

@@ -34,9 +34,9 @@ class Reproduction:
 
     Attributes:
         software: version.
-        run_at: time of the run, UTC.
+        made: time of the run, UTC.
         seed: seed of all random draws.
-        is_shortened: True for a shortened run.
+        quick: True for a shortened run.
         domes: results of the indented domes of Table I.
         calibration: calibration of the foot's tiles.
         experiments: experiments with at least one evaluated trial.

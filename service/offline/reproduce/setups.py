@@ -25,9 +25,9 @@ class Setup:
         name: its name, and that of its scene file.
         scene: name of the built-in scene.
         instrument: reference instrument.
-        trial_seconds: duration of a trial after the lead-in.
+        seconds: duration of a trial after the lead-in.
         title: title in reports.
-        domes_cover_sole: True if the domes bear the sole's entire load; else the scene's share.
+        whole_sole: True if the domes bear the sole's entire load; else the scene's share.
     """
 
     name: str

@@ -19,7 +19,7 @@ class TrialPlan:
         setup: its setup.
         number: number, from 1.
         seed: seed of noise, ground and the plate's properties.
-        reference_path: path of the plate's file.
+        reference: path of the plate's file.
         is_repeated: True for the repetition of a failed trial.
     """
 

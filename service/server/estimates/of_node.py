@@ -71,7 +71,7 @@ class NodeEstimates:
 
     @property
     def calibration_source(self) -> Literal["node", "server"]:
-        """Origin of `chosen_calibration`."""
+        """Origin of `calibration`."""
         chosen = self.assignment.present is not None or self.assignment.problem is not None
         return "server" if chosen else "node"
 
@@ -135,7 +135,7 @@ class NodeEstimates:
             return [(frames, {})]
 
     def look_for_tare(self, journal: Journal | None, may_come: Callable[[], Intervals]) -> None:
-        """Tare if there is reason to, as `TareController.update`.
+        """Tare if there is reason to, as `TareKeeper.update`.
 
         Raises:
             StorageError: the tare cannot be stored; it is not in force then, and retried.

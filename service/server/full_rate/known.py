@@ -71,29 +71,29 @@ class KnownStream:
 
     @property
     def held(self) -> Intervals:
-        """See `StreamView.stored`."""
+        """See `Known.stored`."""
         return Intervals() if self._stream is None else self._stream.held
 
     @property
     def lost(self) -> Losses:
-        """See `StreamView.lost`."""
+        """See `Known.lost`."""
         return Losses() if self._stream is None else self._stream.lost
 
     @property
     def is_over(self) -> bool:
-        """See `StreamView.has_ended`."""
+        """See `Known.has_ended`."""
         return self._boot_id != self._node.boot_id
 
     @property
     def end(self) -> int:
-        """See `StreamView.end_seq`."""
+        """See `Known.end`."""
         announced = None if self._stream is None else self._stream.notes.next_seq
         ends = [last + 1 for last in (self.held.last, self.lost.all.last) if last is not None]
         return max([announced or 0, *ends])
 
     @property
     def following(self) -> str | None:
-        """See `StreamView.next_stream`."""
+        """See `Known.following`."""
         node, order = self._node, self._node.order
         if self._boot_id in order:
             return (*order, None)[order.index(self._boot_id) + 1]
@@ -107,7 +107,7 @@ class KnownStream:
         return node.boot_id
 
     def to_come(self) -> Intervals:
-        """Return the frames as in `StreamView.compute_obtainable`."""
+        """Return the frames as in `Known.to_come`."""
         stream = self._stream
         if stream is None:
             return Intervals([(0, NO_END)])

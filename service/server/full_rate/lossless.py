@@ -24,10 +24,10 @@ class Again:
     """Request to estimate frames again from the journal, which has the next one.
 
     Attributes:
-        position: first frame.
-        last_seq: greatest stored number.
-        is_final: True: no more frames of this stream will come.
-        until_seq: first number in the buffer; None: the buffer has none.
+        at: first frame.
+        last: greatest stored number.
+        ends: True: no more frames of this stream will come.
+        until: first number in the buffer; None: the buffer has none.
     """
 
     at: Position

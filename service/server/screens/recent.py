@@ -55,7 +55,7 @@ class Recent:
             self._join(self._as_told.popleft())
 
     def rows(self, seconds: float, before_seq: int | None = None) -> npt.NDArray[np.void]:
-        """Return the newest seconds, with the fields of `ForceSpan`, oldest first.
+        """Return the newest seconds, with the fields of `Span`, oldest first.
 
         Args:
             seconds: counted back from the newest frame.

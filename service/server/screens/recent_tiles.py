@@ -71,7 +71,7 @@ class RecentTiles:
             before_seq: only spans that begin before this number.
 
         Returns:
-            Numbers (n,) with the fields of `ForceSpan`, minimum and maximum (n, tiles).
+            Numbers (n,) with the fields of `Span`, minimum and maximum (n, tiles).
         """
         indices = np.arange(max(0, self._count - _MOST), self._count) % _MOST
         rows = self._rows[indices]

@@ -3,7 +3,7 @@
 A line of names precedes the numbers. Blank lines, comments, a title or Excel's `sep=` may precede
 it; a line of units may follow it. Commas, semicolons, tabs or blanks separate cells. Numbers have a
 decimal point or a decimal comma. The text is UTF-8, UTF-16, or else Windows-1252. If detection
-fails, the user states the layout (`TextOptions`). Columns without names are numbered: `column1`,
+fails, the user states the layout (`StatedText`). Columns without names are numbered: `column1`,
 `column2` and so on.
 """
 

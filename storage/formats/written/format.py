@@ -11,7 +11,7 @@ from devices.errors import Extra, UsageError, needs_extra
 from storage.formats.export import Export
 
 TABLE_OPTIONS = ("names", "times")
-"""Options of every format that writes `Export.read_tables`."""
+"""Options of every format that writes `Export.tables`."""
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ def reactions_of(
         frames_max: limit of each session's frames, and of samples.
 
     Raises:
-        UsageError: as for `Export.read_all` and `make_sample_axis`; a session has no frame, or no
+        UsageError: as for `Export.read_all` and `axis_of`; a session has no frame, or no
             frame with a force.
     """
     read = [_frames(export, further, frames_max) for export in exports]

@@ -1,7 +1,7 @@
 """Centre of pressure of tiles in one row, for programs that need a point of application.
 
-A row measures no centre of pressure along the axis that it has a place on: that column is NaN.
-Where the force acts along it is written as the place of the row.
+A row of tiles does not measure the COP across the row: that column is NaN. The file states the
+place of the row instead.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ COP = ("cop_x_m", "cop_y_m")
 NEEDED = ("grf_n", *COP, "estimate_status")
 """Columns of a force with its point of application."""
 _COP_MASKED = 16
-"""Of `estimate_status`: the frame has no centre of pressure."""
+"""Bit of `estimate_status`: no centre of pressure."""
 
 
 def with_row_place(columns: Mapping[str, Array], info: ArrayInfo) -> dict[str, Array]:

@@ -92,7 +92,7 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     result ends at the first missing one.
 
     Raises:
-        DamagedFileError: its content is not what was written.
+        DamagedFileError: its content has changed.
         StorageError: it cannot be read now.
     """
     path = folder / IN_FLIGHT_FILE
@@ -139,7 +139,7 @@ def read_in_flight_from(folder: Path, seq: int) -> FrameBatch | None:
     """Read the frames that a killed process left from number `seq` on; None if there are none.
 
     Raises:
-        DamagedFileError: its content is not what was written.
+        DamagedFileError: its content has changed.
         StorageError: it cannot be read now.
     """
     left = read_in_flight(folder)

@@ -36,7 +36,7 @@ WAITING_BYTES = 32 << 20
 SYNC_S = 0.2
 """Interval between two syncs, each after a write of all waiting batches.
 
-Less than half of `MAX_UNSYNCED_S`: a frame that just misses one sync is on the disk with the next.
+Less than half of `PROMISE_S`: a frame that just misses one sync is on the disk with the next.
 """
 _TIDY_S = 2.0
 """Interval between two deletions of expired frames, which are minutes old."""

@@ -185,7 +185,7 @@ class NodeStream:
     def lose(self, numbers: Intervals, reason: str, wanted: Wanted) -> None:
         """Record the loss of frames.
 
-        Frames that a server has are not lost, except those that the node's own session needs.
+        Frames that a server has are not lost, except frames that the node's own session needs.
         """
         needed_here = wanted.local(self.boot_id)
         with self._lock:
@@ -283,7 +283,7 @@ class NodeStream:
                 self.journal = journal
 
     def sync(self) -> None:
-        """Sync written batches; those that the disk refuses go back to the memory queue."""
+        """Sync written batches; batches that the disk refuses go back to the memory queue."""
         journal = self.journal
         if journal is None or not self._unsynced:
             return

@@ -106,7 +106,7 @@ class Wanted:
         return self.local(boot_id) | union(server.numbers(boot_id) for server in servers)
 
     def unmet(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
-        """Return the needed numbers without those that their own server has acknowledged.
+        """Return the needed numbers that their own server has not acknowledged.
 
         Numbers of the node's own session stay included even if a server has them as well.
         """

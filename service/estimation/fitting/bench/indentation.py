@@ -139,7 +139,7 @@ def strokes(*recordings: Indentation) -> Strokes:
     another one has.
 
     Raises:
-        CalibrationError: as for `measure_unloaded`, or no file has a slow stroke.
+        CalibrationError: as for `unloaded`, or no file has a slow stroke.
     """
     blocks: list[_Block] = []
     count = 0

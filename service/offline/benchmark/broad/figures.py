@@ -47,7 +47,7 @@ class Row:
         mode: live or offline.
         errors: quantiles of `grf_mae_n`, `peak_error_n`, `cop_p95_m` and the magnitude of
             `flight_mean_n`.
-        coverage: pooled over all frames, by the keys of `COVERAGE_TITLES`.
+        coverage: pooled over all frames, by the keys of `COVERED`.
         coverage_of_arrays: quantiles of the arrays' coverage.
         sigma_over_rms: quantiles of stated over actual error, in all frames and in each phase.
         sums: counts of flags over all arrays.

@@ -33,8 +33,8 @@ def judged(
     """Compute errors, coverage and flag counts.
 
     Args:
-        columns: `EVALUATED_COLUMNS` of every frame of the recording.
-        below_end: returns `find_unsaturated_tiles`, (n, tiles); called only if needed,
+        columns: `JUDGED` of every frame of the recording.
+        below_end: returns `surely_below_end`, (n, tiles); called only if needed,
             because it takes as long as the recording.
         lag_ms: look-ahead of the estimates.
     """
@@ -81,7 +81,7 @@ def judged(
 
 
 def _alarms(status: npt.NDArray[np.uint16]) -> int:
-    """Count the onsets of `FAULTY_TILE_FLAGS`."""
+    """Count the onsets of `WRONG_TILE`."""
     return sum(
         int((np.diff((status & bit) != 0, prepend=False) & ((status & bit) != 0)).sum())
         for bit in WRONG_TILE

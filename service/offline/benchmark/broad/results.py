@@ -114,7 +114,7 @@ class ArrayResult(Facts):
     cpu_scenes_s: float
     tiles: tuple[Tile, ...]
     judged: dict[str, Judged]
-    """Results by scene, condition and mode; see `make_case_key`."""
+    """Results by scene, condition and mode; see `key_of`."""
     tiles_refused: int
     """Number of tiles refused by the calibration; the array then has no other results."""
     refusals: tuple[Refusal, ...]

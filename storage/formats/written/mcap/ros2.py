@@ -54,7 +54,7 @@ def name_of(text: str) -> str:
 
 
 class Ros2Messages:
-    """Encoder of a session's ROS 2 messages; arguments as for `FoxgloveEncoder`."""
+    """Encoder of a session's ROS 2 messages; arguments as for `FoxgloveMessages`."""
 
     def __init__(self, channels: Channels, export: Export, prefix: str) -> None:
         self._types = get_typestore(Stores.ROS2_HUMBLE)

@@ -81,7 +81,7 @@ def frames_of(export: Export, columns: list[str]) -> Iterator[Frames]:
     """Read a session's frames in chunks, with these columns.
 
     Raises:
-        UsageError: as for `Export.read_chunks`; the server's time of a frame is unknown.
+        UsageError: as for `Export.pieces`; the server's time of a frame is unknown.
     """
     asked = [*columns, "t_ns", *(["part"] if "part" in export.content.names else [])]
     asked += [column.name for column in SERVER_TIME] if export.clock is not None else []
