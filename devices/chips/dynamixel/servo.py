@@ -9,6 +9,7 @@ only if its answer was complete by then.
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from types import TracebackType
 from typing import Self
@@ -23,7 +24,7 @@ _RECENT = 16
 """Recent readings, for long frames: 64 tiles take 16 ms, a fast servo 1 ms."""
 
 
-class _PacedServo:
+class _PacedServo(ABC):
     """Base class of servos that are read at fixed intervals."""
 
     def __init__(self, servo: Dynamixel, clock: Clock, *, rate_hz: float) -> None:
@@ -64,9 +65,9 @@ class _PacedServo:
         self._failure, self._newest_is_turn_known = "", reading.is_turn_known
         return reading
 
+    @abstractmethod
     def _forget(self) -> None:
         """Discard readings from before the servo went away."""
-        raise NotImplementedError
 
     @property
     def stale_after_ns(self) -> int:
