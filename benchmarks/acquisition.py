@@ -5,7 +5,7 @@
 In virtual time: arrays of 1 to 64 tiles at 400 and 100 kHz, every part at 1.6 ms and drawn parts,
 the whole driver with self-test, audits and second looks, over emulated chips. The bound is the time
 that the transfers of a frame take on the wire with the true conversion times (hardware.md 4; the
-formulas are `devices.array.budget`, tested against its tables). In real time: CPU of a frame
+formulas are `devices.array.timing_budget`, tested against its tables). In real time: CPU of a frame
 against as many bare ioctls.
 """
 
@@ -25,13 +25,13 @@ from typing import Any, get_args
 
 from smbus2 import SMBus, i2c_msg
 
-from devices.array.budget import frame_s
-from devices.array.startup import make_ready
+from devices.array.startup import prepare_array
+from devices.array.timing_budget import compute_frame_s
 from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World
-from devices.scene.file import Scene, build_scene, load_scene
-from devices.scene.hardware import ScheduleName
+from devices.scene.hardware_sections import ScheduleName
+from devices.scene.scene_file import Scene, load_scene, validate_scene
 
 COUNTS = (1, 2, 4, 8, 16, 32, 64)
 SECONDS, FRAMES_MIN = 4.0, 60
@@ -72,7 +72,7 @@ def scene_of(tiles: int, scl_hz: float, conversion_ms: float | None) -> Scene:
         }
         for i in range(tiles)
     ]
-    return build_scene(content, where="benchmark")
+    return validate_scene(content, where="benchmark")
 
 
 def measure(
@@ -81,7 +81,7 @@ def measure(
     scene = scene_of(tiles, scl_hz, conversion_ms)
     clock = VirtualClock()
     world = World(scene, clock)
-    ready = make_ready(open_bus("emulated", world.i2c_adapter), scene, clock, schedule=schedule)
+    ready = prepare_array(open_bus("emulated", world.i2c_adapter), scene, clock, schedule=schedule)
     # Of parts as drawn, the bound is that of the times as the self-test measured them.
     true = ready.timing
     if conversion_ms is not None:
@@ -89,14 +89,14 @@ def measure(
     begin_ns, frames, stale = clock.now_ns(), 0, 0
     skews_ns, ages_ns = [], []
     while frames < FRAMES_MIN or clock.now_ns() - begin_ns < SECONDS * 1e9:
-        scan = ready.array.scan()
+        scan = ready.array.scan_frame()
         frames += 1
-        stale += sum(1 for status in scan.status if status)
+        stale += sum(1 for status in scan.tile_flags if status)
         skews_ns.append(max(scan.convert_stop_ns) - min(scan.convert_stop_ns))
         ages_ns.append(clock.now_ns() - min(scan.convert_stop_ns))
     return Measured(
         rate_hz=1e9 * frames / (clock.now_ns() - begin_ns),
-        bound_hz=1.0 / frame_s(schedule, true),
+        bound_hz=1.0 / compute_frame_s(schedule, true),
         skew_ms=statistics.median(skews_ns) * 1e-6,
         age_ms=statistics.median(ages_ns) * 1e-6,
         stale=stale,
@@ -162,12 +162,12 @@ def overhead(tiles: int, schedule: ScheduleName) -> tuple[int, float, float]:
     scene = scene.model_copy(update={"array": scene.array.model_copy(update={"wait_ms": 1.6})})
     adapter = FreeAdapter(bytes.fromhex("3ECEB3F9C51733C8"))
     clock = VirtualClock()
-    ready = make_ready(I2cBus(adapter, "free"), scene, clock, schedule=schedule)
+    ready = prepare_array(I2cBus(adapter, "free"), scene, clock, schedule=schedule)
     for _ in range(20):
-        ready.array.scan()
+        ready.array.scan_frame()
     before = adapter.calls
     for _ in range(100):
-        ready.array.scan()
+        ready.array.scan_frame()
     calls = round((adapter.calls - before) / 100)
     write = i2c_msg.write(0x60, [0x12, 0x00])
     point, read = i2c_msg.write(0x60, [0x00]), i2c_msg.read(0x60, 4)
@@ -177,7 +177,7 @@ def overhead(tiles: int, schedule: ScheduleName) -> tuple[int, float, float]:
         for request in requests:
             adapter.i2c_rdwr(*request)
 
-    ours_us = cost_us(ready.array.scan, 400) - cost_us(free, 400)
+    ours_us = cost_us(ready.array.scan_frame, 400) - cost_us(free, 400)
     kernel = SMBus()
     kernel.fd = os.open(os.devnull, os.O_RDWR)
 

@@ -24,10 +24,10 @@ from acquisition import FreeAdapter, scene_of
 from smbus2 import i2c_msg
 
 from devices.acquisition import Acquisition
-from devices.array.startup import Ready, make_ready
+from devices.array.startup import ReadyArray, prepare_array
 from devices.buses.i2c import I2cBus
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
-from devices.realtime import sharpen_timers
+from devices.realtime import set_timer_slack
 
 RATE_HZ = 250.0
 CLIENTS = 50
@@ -47,24 +47,26 @@ class SleepingAdapter(FreeAdapter):
         SystemClock().sleep_until_ns(end_ns)
 
 
-def opened(clock: Clock) -> Ready:
+def opened(clock: Clock) -> ReadyArray:
     """Four tiles on that adapter."""
     scene = scene_of(4, SCL_HZ, 1.6)
     array = scene.array.model_copy(update={"wait_ms": 1.6, "schedule": "simultaneous"})
     adapter = SleepingAdapter(bytes.fromhex("3ECEB3F9C51733C8"))
-    return make_ready(I2cBus(adapter, "sleeping"), scene.model_copy(update={"array": array}), clock)
+    return prepare_array(
+        I2cBus(adapter, "sleeping"), scene.model_copy(update={"array": array}), clock
+    )
 
 
 def take(seconds: float, *, spins: bool) -> Taken:
     """Instants of the frames, and the share of a core that they took."""
-    sharpen_timers()
+    set_timer_slack()
     clock = SpinningClock() if spins else SystemClock()
     ready = opened(clock)
-    anchor = UtcAnchor.now(clock_set=True)
+    anchor = UtcAnchor.measure(clock_set=True)
     acquisition = Acquisition(ready.array, ready.tiles, clock, anchor, rate_hz=RATE_HZ)
     begin_s, end_ns = time.thread_time(), clock.now_ns() + round(seconds * 1e9)
     t_ns: list[int] = []
-    for batch in acquisition.run(lambda: clock.now_ns() >= end_ns):
+    for batch in acquisition.acquire_batches(lambda: clock.now_ns() >= end_ns):
         t_ns += batch.t_mono_ns.tolist()
     return t_ns, (time.thread_time() - begin_s) / seconds
 

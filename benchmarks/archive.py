@@ -30,17 +30,17 @@ from query import sealed
 from recording_data import emulated, lengthened, of_scene
 from side_by_side import in_turns, note, spread, table
 
-from service.estimation.warm import warm_up
-from service.offline.archive.cluster import spread_over_cluster
-from service.offline.archive.jobs import Job, begin_worker, run_job
-from service.offline.archive.places import sessions_in
-from service.offline.archive.plan import Spread, outcomes
-from service.offline.archive.tasks import EstimateTask, Task, VerifyTask
-from service.offline.estimate.request import PIECE_FRAMES
+from service.estimation.compilation import compile_models
+from service.offline.archive.dask_cluster import map_on_cluster
+from service.offline.archive.job_runner import JobMapper, run_jobs
+from service.offline.archive.jobs import Job, limit_arrow_threads, run_job
+from service.offline.archive.locations import find_session_locations
+from service.offline.archive.tasks import EstimateTask, SessionTask, VerifyTask
+from service.offline.estimate.request import CHUNK_FRAMES
 from service.offline.estimate.session import estimate_session
-from service.offline.processes import GoesOn
-from service.offline.processes import spread as over_processes
-from storage.sessions.folder import FRAMES_NAME, SessionFolder
+from service.offline.process_pool import Unfinished
+from service.offline.process_pool import map_in_processes as over_processes
+from storage.sessions.folder import FRAMES_NAME, SessionsFolder
 from tests.service.offline.archive.clusters import Cluster
 
 ID = "20260101T000000Z-{:06x}"
@@ -61,15 +61,15 @@ def copies(first: Path, count: int) -> None:
 
 def made(data: Path, sessions: int, seconds: float) -> Path:
     """A folder with so many sessions of this length."""
-    folder = SessionFolder(data / "sessions")
+    folder = SessionsFolder(data / "sessions")
     recording = emulated(4, seconds) if seconds > 10.0 else of_scene("mud", seconds)
     first = sealed(recording, folder, ID.format(0), data.with_name("journals"))
-    copies(folder.path(first.id), sessions)
+    copies(folder.get_path(first.id), sessions)
     return data / "sessions"
 
 
-def jobs(sessions: Path, task: Task, out: str | None) -> Iterator[Job]:
-    return (Job(place, task, out) for place in sessions_in([str(sessions)]))
+def jobs(sessions: Path, task: SessionTask, out: str | None) -> Iterator[Job]:
+    return (Job(place, task, out) for place in find_session_locations([str(sessions)]))
 
 
 Rates = tuple[float, float, float]
@@ -83,12 +83,12 @@ def cpu_s() -> float:
     return float(sum(t.user + t.system for t in times) + own.cpu_times().children_user)
 
 
-def rates(sessions: Path, over: Spread, workers: int, label: str) -> Rates:
+def rates(sessions: Path, over: JobMapper, workers: int, label: str) -> Rates:
     """Of a plan; all run once every worker has given its first outcome."""
     with tempfile.TemporaryDirectory() as out:
         begin = time.perf_counter()
         at: list[float] = []
-        for outcome in outcomes(jobs(sessions, ESTIMATE, out), over):
+        for outcome in run_jobs(jobs(sessions, ESTIMATE, out), over):
             assert outcome.state == "made", outcome.reason
             at.append(time.perf_counter())
             if len(at) == workers:
@@ -100,7 +100,7 @@ def rates(sessions: Path, over: Spread, workers: int, label: str) -> Rates:
 
 
 def side_by_side(
-    sessions: Path, ways: Mapping[str, tuple[Spread, int]], turns: int
+    sessions: Path, ways: Mapping[str, tuple[JobMapper, int]], turns: int
 ) -> list[tuple[str, ...]]:
     """A row for each way, and of the second how much more it does than the first."""
     found: dict[str, list[Rates]] = {name: [] for name in ways}
@@ -132,8 +132,12 @@ HEAD = (
 
 def processes(a: argparse.Namespace, work: Path) -> list[str]:
     sessions = made(work / "data", a.sessions, a.seconds)
-    ways: dict[str, tuple[Spread, int]] = {
-        f"{n} processes": (partial(over_processes, jobs=n, begin=begin_worker), n) for n in (1, 2)
+    ways: dict[str, tuple[JobMapper, int]] = {
+        f"{n} processes": (
+            partial(over_processes, process_count=n, initializer=limit_arrow_threads),
+            n,
+        )
+        for n in (1, 2)
     }
     return table(HEAD, side_by_side(sessions, ways, a.turns))
 
@@ -144,9 +148,9 @@ def cluster(a: argparse.Namespace, work: Path) -> list[str]:
     for folder in folders:
         folder.mkdir()
     with Cluster(folders[0], 1) as one, Cluster(folders[1], 2) as two:
-        ways: dict[str, tuple[Spread, int]] = {
-            "1 Dask worker": (partial(spread_over_cluster, address=one.address), 1),
-            "2 Dask workers": (partial(spread_over_cluster, address=two.address), 2),
+        ways: dict[str, tuple[JobMapper, int]] = {
+            "1 Dask worker": (partial(map_on_cluster, scheduler_address=one.address), 1),
+            "2 Dask workers": (partial(map_on_cluster, scheduler_address=two.address), 2),
         }
         for name, (over, workers) in ways.items():  # what is compiled is loaded
             rates(sessions, over, workers, f"{name}, first")
@@ -155,20 +159,20 @@ def cluster(a: argparse.Namespace, work: Path) -> list[str]:
 
 def overhead(a: argparse.Namespace, work: Path) -> list[str]:
     sessions = made(work / "data", a.short, 2.0)
-    places = list(sessions_in([str(sessions)]))
+    places = list(find_session_locations([str(sessions)]))
 
     def bare(folder: Path) -> None:
         for place in places:
-            out = folder / place.name
+            out = folder / place.session_id
             out.mkdir()
-            file = Path(place.frames)
+            file = Path(place.frames_uri)
             estimate_session(
-                file, out / FRAMES_NAME, ESTIMATE, remark=lambda _: None, is_judged=False
+                file, out / FRAMES_NAME, ESTIMATE, on_remark=lambda _: None, with_findings=False
             )
 
     def as_jobs(folder: Path) -> None:
         for place in places:
-            assert not isinstance(made := run_job(Job(place, ESTIMATE, str(folder))), GoesOn)
+            assert not isinstance(made := run_job(Job(place, ESTIMATE, str(folder))), Unfinished)
             assert made.state == "made"
 
     def in_folder(way: Callable[[Path], None]) -> None:
@@ -209,8 +213,8 @@ def memory(a: argparse.Namespace, work: Path) -> list[str]:
 
 def client(sessions: Path) -> None:
     """Body of the process whose memory is measured: two workers, and no results kept."""
-    over = partial(over_processes, jobs=2, begin=begin_worker)
-    for outcome in outcomes(jobs(sessions, VerifyTask(), None), over):
+    over = partial(over_processes, process_count=2, initializer=limit_arrow_threads)
+    for outcome in run_jobs(jobs(sessions, VerifyTask(), None), over):
         assert outcome.state == "made", outcome.reason
     tell_greatest()
 
@@ -226,12 +230,17 @@ def long(a: argparse.Namespace, work: Path) -> list[str]:
     rows = []
     for minutes in a.minutes:
         data = work / f"{minutes:g}"
-        folder, session_id = SessionFolder(data / "sessions"), ID.format(0)
+        folder, session_id = SessionsFolder(data / "sessions"), ID.format(0)
         once = lengthened(emulated(4, 20.0), 60.0 * minutes)
         sealed(once, folder, session_id, data / "journals")
-        for way, piece_frames in (("one", sys.maxsize), ("of a million frames", PIECE_FRAMES)):
+        for way, piece_frames in (("one", sys.maxsize), ("of a million frames", CHUNK_FRAMES)):
             note(f"{minutes:g} minutes, pieces: {way}")
-            command = ("--estimate", folder.path(session_id), "--piece-frames", str(piece_frames))
+            command = (
+                "--estimate",
+                folder.get_path(session_id),
+                "--piece-frames",
+                str(piece_frames),
+            )
             told = subprocess.run(
                 [sys.executable, __file__, *command], check=True, capture_output=True, text=True
             )
@@ -241,12 +250,12 @@ def long(a: argparse.Namespace, work: Path) -> list[str]:
 
 def estimate(session: Path, piece_frames: int) -> None:
     """Body of the process whose memory is measured, once what is compiled is loaded."""
-    warm_up()
-    begin_worker()
+    compile_models()
+    limit_arrow_threads()
     begin, before = time.perf_counter(), cpu_s()
     with tempfile.TemporaryDirectory() as out:
         (job,) = jobs(session, replace(ESTIMATE, piece_frames=piece_frames), out)
-        while isinstance(outcome := run_job(job), GoesOn):
+        while isinstance(outcome := run_job(job), Unfinished):
             pass
     assert outcome.state == "made", outcome.reason
     spent, took = cpu_s() - before, time.perf_counter() - begin

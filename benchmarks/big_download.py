@@ -18,8 +18,8 @@ from pathlib import Path
 import httpx
 from many_sessions import sealed
 
-from storage.checked_json import write_checked
-from storage.file_hash import sha256_of
+from storage.checksummed_json import write_checksummed_json
+from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME
 
 PATIENCE_S = 30.0
@@ -34,8 +34,10 @@ def big_session(data: Path, megabytes: float) -> str:
     with path.open("wb") as file:
         for _ in range(max(1, round(megabytes * 1e6 / _CHUNK_BYTES))):
             file.write(os.urandom(_CHUNK_BYTES))
-    session = session.model_copy(update={"bytes": path.stat().st_size, "sha256": sha256_of(path)})
-    write_checked(path.parent / "session.json", session.model_dump_json().encode())
+    session = session.model_copy(
+        update={"bytes": path.stat().st_size, "sha256": compute_sha256(path)}
+    )
+    write_checksummed_json(path.parent / "session.json", session.model_dump_json().encode())
     return f"/sessions/{session.id}/data?format=parquet"
 
 

@@ -26,11 +26,11 @@ from scipy.signal import lfilter
 
 from devices.arrays import Floats
 from devices.errors import ComparisonError
-from devices.scene.file import load_scene
-from service.offline.benchmark.draws import estimates_of, recorded
-from service.offline.calibrations import find_calibration
-from service.offline.compare.align import Alignment, align
-from service.offline.compare.signals import Signal
+from devices.scene.scene_file import load_scene
+from service.offline.benchmark.draws import compute_estimates, record_with_calibration
+from service.offline.calibration_lookup import find_calibration
+from service.offline.compare.alignment import Alignment, align_signals
+from service.offline.compare.signals import ForceSignal
 from storage.formats.load_trace import read_load_trace
 
 MARK = "<!-- tables -->"
@@ -58,7 +58,7 @@ LOADS = (
 
 @dataclass(frozen=True)
 class Injected:
-    """What a reference is to ours, the lag at `at_s`; `ours = scale (reference - offset_n)`."""
+    """What a reference is to ours, the lag at `mid_t_s`; `ours = scale (reference - offset_n)`."""
 
     lag_s: float
     drift_ppm: float
@@ -68,7 +68,7 @@ class Injected:
 
     def of(self, found: Alignment) -> tuple[float, ...]:
         """Of each parameter, what should have been found."""
-        lag_s = self.lag_s + 1e-6 * self.drift_ppm * (found.at_s - self.at_s)
+        lag_s = self.lag_s + 1e-6 * self.drift_ppm * (found.mid_t_s - self.at_s)
         return lag_s, self.drift_ppm, self.offset_n, self.scale
 
 
@@ -79,15 +79,17 @@ def remembering(rng: np.random.Generator, n: int, hz: float, memory_s: float) ->
     return np.asarray(lfilter([1.0], [1.0, -kept], fresh))
 
 
-def noisy(rng: np.random.Generator, t_s: Floats, force_n: Floats) -> Signal:
+def noisy(rng: np.random.Generator, t_s: Floats, force_n: Floats) -> ForceSignal:
     """Ours: 0.1 N white, 0.1 N over 50 ms, and 2 % of the force over 0.3 s."""
     n = len(t_s)
     noise_n = 0.1 * rng.normal(size=n) + 0.1 * remembering(rng, n, OURS_HZ, 0.05)
     noise_n += 0.02 * force_n * remembering(rng, n, OURS_HZ, 0.3)
-    return Signal(t_s, force_n + noise_n)
+    return ForceSignal(t_s, force_n + noise_n)
 
 
-def referred(rng: np.random.Generator, t_s: Floats, force_n: Floats) -> tuple[Signal, Injected]:
+def referred(
+    rng: np.random.Generator, t_s: Floats, force_n: Floats
+) -> tuple[ForceSignal, Injected]:
     """A reference that has seen most of a force.
 
     500 or 1000 Hz; 0.3 N white, 0.2 N over 10 ms, and where the force changes most (2 %) ringing
@@ -110,10 +112,10 @@ def referred(rng: np.random.Generator, t_s: Floats, force_n: Floats) -> tuple[Si
     read_n += 0.2 * remembering(rng, len(at_s), hz, 0.01)
     read_n += 0.5 * (rate > np.percentile(rate, 98)) * rng.standard_t(2, size=len(at_s))
     clock_s = at_s + true.lag_s + 1e-6 * true.drift_ppm * (at_s - true.at_s)
-    return Signal(clock_s, read_n), true
+    return ForceSignal(clock_s, read_n), true
 
 
-Draws = Iterator[tuple[Signal, Signal, Injected]]
+Draws = Iterator[tuple[ForceSignal, ForceSignal, Injected]]
 
 
 def drawn_alone(load: Load, data: Path, draws: int) -> Draws:
@@ -141,11 +143,11 @@ def drawn_on_feet(name: str, data: Path, draws: int) -> Draws:
     for draw in range(draws):
         calibration = find_calibration(scene.calibration, serials, parts_seed=draw)
         foot = replace(case.foot(data), parts_seed=draw)
-        recording, _ = recorded(scene, case.seconds, draw, calibration, foot)
-        columns = estimates_of(recording, tuple(scene.models), 100.0, wanted)
+        recording, _ = record_with_calibration(scene, case.seconds, draw, calibration, foot)
+        columns = compute_estimates(recording, tuple(scene.models), 100.0, wanted)
         known = np.isfinite(columns["grf_n"])
         t_s = ((columns["t_ns"] - columns["t_ns"][0]) * 1e-9)[known]
-        ours = Signal(t_s, columns["grf_n"][known], columns["grf_sigma_n"][known])
+        ours = ForceSignal(t_s, columns["grf_n"][known], columns["grf_sigma_n"][known])
         rng = np.random.default_rng(draw)
         yield ours, *referred(rng, t_s, columns["true_grf_n"][known])
 
@@ -159,7 +161,7 @@ def row(name: str, draws: Draws) -> str:
     refused: Counter[str] = Counter()
     for ours, reference, true in draws:
         try:
-            found = align(ours, reference)
+            found = align_signals(ours, reference)
         except ComparisonError as error:
             refused[error.what.partition(":")[0]] += 1
             continue

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from devices.emulation.dome import Domes
-from devices.emulation.families import dome_of
+from devices.emulation.dome_physics import Domes
+from devices.emulation.part_families import draw_family_dome
 from devices.emulation.surroundings import Surroundings
 from devices.errors import CalibrationError
-from devices.scene.emulated import Family
-from service.estimation.fitting.bench.indentation import Indentation
-from service.estimation.fitting.weights_fit import fit_weights
+from devices.scene.emulation_sections import PartFamily
+from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2
+from service.estimation.fitting.rig.indentation import Indentation
+from service.estimation.fitting.weights_fit import fit_dead_weights
 from service.estimation.models.static import StaticCurves
-from service.estimation.weights import STANDARD_GRAVITY_M_S2
-from service.offline.calibrations import bench_scene
+from service.offline.calibration_lookup import make_rig_scene
 
 FIVE_G = (200.0, 500.0, 1000.0, 1500.0, 2000.0)
 REST_S, HOLD_S, HANDS_S = 4.0, 6.0, 1.0
@@ -62,13 +62,13 @@ class _Weights:
 
 
 def measure(
-    weights_g: Sequence[float], *, domes: int, tests: int, family: Family, seed: int
+    weights_g: Sequence[float], *, domes: int, tests: int, family: PartFamily, seed: int
 ) -> Outcome:
     """Calibrate emulated domes with these weights, and test each with loads that are drawn."""
     rng = np.random.default_rng(seed)
-    scene = bench_scene("T01", family, 0.03).emulation
+    scene = make_rig_scene("T01", family, 0.03).emulation
     serials = [f"W{seed}-{i}" for i in range(domes)]
-    parts = [dome_of(family, serial, seed) for serial in serials]
+    parts = [draw_family_dome(family, serial, seed) for serial in serials]
     known_n = 1e-3 * STANDARD_GRAVITY_M_S2 * np.array(weights_g)
     scale = 1.0 + rng.uniform(-0.005, 0.005, domes)  # what each scale is off by
     test_n = rng.uniform(0.1, 0.95, (tests, domes)) * known_n.max()
@@ -77,7 +77,9 @@ def measure(
         parts, serials, _Weights(forces_n), scene, Surroundings(scene), label=f"weights/{seed}"
     )
     t_s = np.arange(len(forces_n) * STEP_S * RATE_HZ) / RATE_HZ
-    kpa = np.array([[emulated.pressure_kpa(i, t) for i in range(domes)] for t in t_s.tolist()])
+    kpa = np.array(
+        [[emulated.compute_pressure_kpa(i, t) for i in range(domes)] for t in t_s.tolist()]
+    )
     kpa += NOISE_KPA * rng.standard_normal(kpa.shape)
     step, since = np.divmod(t_s, STEP_S)
     in_rest = since < REST_S
@@ -97,11 +99,11 @@ def measure(
             kpa=kpa[calibrating, i],
             reference_n=np.full(calibrating.sum(), np.nan),
             phase=phase[calibrating],
-            under_spindle=(in_rest | in_hold)[calibrating],
-            tadc=np.full(calibrating.sum(), np.nan),
+            is_under_indenter=(in_rest | in_hold)[calibrating],
+            temperature_raw=np.full(calibrating.sum(), np.nan),
         )
         try:
-            tile = fit_weights([recording])
+            tile = fit_dead_weights([recording])
         except CalibrationError:
             refused += 1
             continue
@@ -112,7 +114,7 @@ def measure(
             gauge = kpa[now & (since >= at_s) & (since < at_s + 0.5), i].mean() - tare_kpa
             if gauge > tile.range_kpa[1]:
                 continue  # an estimate says that it is a lower bound
-            found = StaticCurves([tile]).force(np.array([[gauge]]))
+            found = StaticCurves([tile]).compute_forces(np.array([[gauge]]))
             true_n = test_n[test, i]
             half_n = 1.96 * float(found.fit_sigma_n[0, 0])
             error_n = float(found.force_n[0, 0]) - true_n
@@ -130,7 +132,7 @@ def main() -> None:
     asked = parser.parse_args()
     print("| weights | family | tests | within 95 % | half width, median | error, RMS | refused |")
     print("|---|---|---|---|---|---|---|")
-    families: tuple[Family, ...] = ("default", "broad")
+    families: tuple[PartFamily, ...] = ("default", "broad")
     for weights_g, name in (
         (FIVE_G, "five, once"),
         (FIVE_G * 2, "five, twice"),

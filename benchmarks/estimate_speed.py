@@ -21,9 +21,9 @@ import numpy as np
 from static_kernel import StaticKernel
 
 from devices.frames import FrameBatch
-from service.estimation.calibration import paper_eq2_shape
+from service.estimation.calibration import make_paper_eq2_preset
 from service.estimation.estimate import Estimator
-from service.estimation.ladder.plan import EstimationPlan, make_plan
+from service.estimation.pipeline.plan import EstimationPlan, make_plan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -52,7 +52,7 @@ def plan_of(models: tuple[str, ...], count: int = 4) -> EstimationPlan:
     tare = make_tare(
         count, baseline_kpa=100.0, baseline_sigma_kpa=0.165 / 20, noise_kpa=0.165, t_ns=0
     )
-    return make_plan(info, paper_eq2_shape(), tare, models=models, lag_ms=10.0)
+    return make_plan(info, make_paper_eq2_preset(), tare, models=models, lag_ms=10.0)
 
 
 def frames_of(n: int, count: int = 4) -> FrameBatch:
@@ -66,8 +66,8 @@ def frames_of(n: int, count: int = 4) -> FrameBatch:
         count,
         period_ns=2_532_500,
         utc_offset_ns=0,
-        padc=np.round(380 - load + rng.normal(0.0, 0.7, shape)).astype(np.int64),
-        tadc=rng.integers(500, 510, shape),
+        pressure_raw=np.round(380 - load + rng.normal(0.0, 0.7, shape)).astype(np.int64),
+        temperature_raw=rng.integers(500, 510, shape),
     )
     for column in vars(frames).values():
         column.setflags(write=False)  # as those of a message are
@@ -78,15 +78,15 @@ def estimate(plan: EstimationPlan, frames: FrameBatch, batch: int) -> None:
     """All frames in batches."""
     estimator = Estimator(plan)
     for begin in range(0, len(frames), batch):
-        estimator.step(frames.rows(begin, min(begin + batch, len(frames))))
+        estimator.process_frames(frames.slice_rows(begin, min(begin + batch, len(frames))))
     estimator.finish()
 
 
 def bare(frames: FrameBatch, batch: int) -> None:
     """Counts to GRF in plain numpy."""
     for begin in range(0, len(frames), batch):
-        p = frames.padc[begin : begin + batch].astype(np.float64)
-        t = frames.tadc[begin : begin + batch].astype(np.float64)
+        p = frames.pressure_raw[begin : begin + batch].astype(np.float64)
+        t = frames.temperature_raw[begin : begin + batch].astype(np.float64)
         kpa = (2009.75 + (-2.3758 + 0.00079 * t) * p - 0.92047 * t) * (65 / 1023) + 50 - 100.0
         u = kpa / 15.0
         (41.45 * u * (0.5702 + u * (0.02354 + u * 0.13))).sum(axis=1)
@@ -95,14 +95,14 @@ def bare(frames: FrameBatch, batch: int) -> None:
 def by_hand(kernel: StaticKernel, frames: FrameBatch, batch: int) -> None:
     """All frames in batches through the hand-written kernel."""
     for begin in range(0, len(frames), batch):
-        kernel(frames.rows(begin, min(begin + batch, len(frames))))
+        kernel(frames.slice_rows(begin, min(begin + batch, len(frames))))
 
 
 def check_same(plan: EstimationPlan, frames: FrameBatch) -> None:
     """The kernel does the same job, or a comparison of times means nothing."""
     theirs = StaticKernel(plan, len(frames))(frames)
     estimator = Estimator(plan)
-    first, last = estimator.step(frames), estimator.finish()
+    first, last = estimator.process_frames(frames), estimator.finish()
     assert last is not None
     for name, values in theirs.items():
         # What warmth and late instants may have done to a force is in our sigma only, and masks
@@ -151,7 +151,7 @@ def main() -> None:
         *((64, 10, 10_000), (64, CHUNK, 50_000)),
     ):
         plan, frames = plan_of(("static",), tiles), frames_of(n, tiles)
-        check_same(plan, frames.rows(0, 1000))
+        check_same(plan, frames.slice_rows(0, 1000))
         kernel = StaticKernel(plan, batch)
         a, b = interleaved(
             [

@@ -26,12 +26,12 @@ import recording_formats as formats
 import recording_sealing as sealing
 from side_by_side import note, table
 
-from service.estimation.calibration import Calibration, paper_eq2_shape
-from service.offline.calibrations import find_calibration
+from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.offline.calibration_lookup import find_calibration
 from storage.journal.journal import Journal
-from storage.schema import FRAMES
+from storage.schema import MEASURED_COLUMNS
 
-RAW = frozenset(column.name for column in FRAMES) | {"part"}
+RAW = frozenset(column.name for column in MEASURED_COLUMNS) | {"part"}
 
 
 def main() -> None:
@@ -55,7 +55,7 @@ def measured(recording: data.Recording, folder: Path, *, with_ladder: bool) -> l
     note(f"sealing {recording.title}")
     formats.write_journal(folder / "journal", recording)
     ways: dict[str, tuple[Calibration, tuple[str, ...]]] = {
-        "`static`": (paper_eq2_shape(), sealing.STATIC)
+        "`static`": (make_paper_eq2_preset(), sealing.STATIC)
     }
     if with_ladder:
         ways["whole ladder"] = (

@@ -23,7 +23,7 @@ from pathlib import Path
 from side_by_side import table
 from slices import write
 
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.registry import FORMATS
 
 _RUN = """
 import pathlib, sys

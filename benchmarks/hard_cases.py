@@ -38,18 +38,18 @@ from devices.frames import (
     NO_SERVO_COUNTS,
     ArrayInfo,
     FrameBatch,
-    FrameStatus,
-    zero_columns,
+    FrameFlag,
+    allocate_columns,
 )
-from devices.scene.file import Scene, load_scene
+from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
-from service.estimation.estimates import Estimates, EstimateStatus
-from service.estimation.ladder.plan import EstimationPlan, make_plan
-from service.estimation.tare.unloaded import take_tare
-from service.offline.calibrations import find_calibration
-from service.offline.simulate import SimulateOptions, Simulation
-from service.rig.emulated import EmulatedFoot
+from service.estimation.estimates import EstimateFlag, Estimates
+from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.tare.unloaded_windows import compute_recording_tare
+from service.offline.calibration_lookup import find_calibration
+from service.offline.simulation import EmulatedRun, SimulationOptions
+from service.rig.emulated_foot import EmulatedFoot
 from storage.formats.load_trace import read_load_trace
 
 LAG_MS = 10.0
@@ -64,7 +64,7 @@ LADDERS = {
 }
 WARM = ("unwrap", "temperature", *LADDERS["whole"][1:])
 MUD = ("unwrap", "temperature", "ambient", *LADDERS["whole"][1:])
-JUDGED = EstimateStatus.STUCK | EstimateStatus.CLIPPED | EstimateStatus.BASELINE_LOST
+JUDGED = EstimateFlag.STUCK | EstimateFlag.CLIPPED | EstimateFlag.BASELINE_LOST
 BEGIN_S = 5.3
 """When most faults begin, in the middle of a step."""
 
@@ -84,9 +84,11 @@ def record(scene: Scene, foot: EmulatedFoot, seconds: float | None) -> Recorded:
     serials = [tile.serial for tile in scene.tile]
     calibration = find_calibration(scene.calibration, serials, parts_seed=foot.parts_seed)
     with ExitStack() as stack:
-        options = SimulateOptions(scene, seconds, otherwise_s=20.0, truth=True, foot=foot)
-        simulation = Simulation(options, stack)
-        pieces = list(simulation.pieces())
+        options = SimulationOptions(
+            scene, seconds, default_seconds=20.0, with_truth=True, foot=foot
+        )
+        simulation = EmulatedRun(options, stack)
+        pieces = list(simulation.run_frames())
     return Recorded(
         simulation.info,
         FrameBatch.concatenate([frames for frames, _ in pieces]),
@@ -99,7 +101,9 @@ def estimated(plan: EstimationPlan, frames: FrameBatch) -> Estimates:
     """All estimates of a recording."""
     estimator, pieces = Estimator(plan), []
     for begin in range(0, len(frames), CHUNK):
-        pieces.append(estimator.step(frames.rows(begin, min(begin + CHUNK, len(frames)))))
+        pieces.append(
+            estimator.process_frames(frames.slice_rows(begin, min(begin + CHUNK, len(frames))))
+        )
     last = estimator.finish()
     return Estimates.concatenate(pieces if last is None else [*pieces, last])
 
@@ -107,9 +111,11 @@ def estimated(plan: EstimationPlan, frames: FrameBatch) -> Estimates:
 def plan_of(recorded: Recorded, models: Sequence[str], *, blind: bool = False) -> EstimationPlan:
     """A live estimate's constants, tared from the lead."""
     info, calibration = recorded.info, recorded.calibration
-    tare = take_tare(recorded.frames, Compensation(info.tiles), calibration, info.serials)
+    tare = compute_recording_tare(
+        recorded.frames, Compensation(info.tiles), calibration, info.serials
+    )
     plan = make_plan(info, calibration, tare, models=models, lag_ms=LAG_MS)
-    return replace(plan, watch=None) if blind else plan  # ANY: fields of EstimationPlan
+    return replace(plan, fault_limits=None) if blind else plan  # ANY: fields of EstimationPlan
 
 
 def walk(seconds: float) -> LoadTrace:
@@ -186,10 +192,10 @@ def row(case: Case, ladder: str, recorded: Recorded, models: Sequence[str]) -> s
     t_s = (recorded.frames.t_ns - recorded.frames.t_ns[0]) * 1e-9
     wrong = [_wrong(e, recorded.true_grf_n) for e in (before, after)]
     off_n = np.abs(before.grf_n - recorded.true_grf_n)[t_s >= case.begin_s]
-    flagged = (after.estimate_status & JUDGED) != 0
+    flagged = (after.estimate_flags & JUDGED) != 0
     first_s = "-" if not flagged.any() else f"{t_s[flagged][0] - case.begin_s:.2f}"
-    bits = np.bitwise_or.reduce(after.estimate_status & ~np.uint16(_ORDINARY))
-    names = ", ".join(f"`{bit.name.lower()}`" for bit in EstimateStatus if bit & bits and bit.name)
+    bits = np.bitwise_or.reduce(after.estimate_flags & ~np.uint16(_ORDINARY))
+    names = ", ".join(f"`{bit.name.lower()}`" for bit in EstimateFlag if bit & bits and bit.name)
     seen = np.isfinite(after.grf_sigma_n) & (t_s >= case.begin_s)
     within = np.abs(after.grf_n - recorded.true_grf_n) <= 1.96 * after.grf_sigma_n
     covered = f"{100 * within[seen].mean():.0f} %" if seen.any() else "-"
@@ -201,12 +207,12 @@ def row(case: Case, ladder: str, recorded: Recorded, models: Sequence[str]) -> s
     )
 
 
-_ORDINARY = EstimateStatus.COP_MASKED | EstimateStatus.OUTLIER_REPLACED | EstimateStatus.GAP
-_SAYING = JUDGED | EstimateStatus.SATURATED | EstimateStatus.TARE_OLD | EstimateStatus.TILE_MISSING
+_ORDINARY = EstimateFlag.COP_MASKED | EstimateFlag.OUTLIER_REPLACED | EstimateFlag.GAP
+_SAYING = JUDGED | EstimateFlag.SATURATED | EstimateFlag.TARE_OLD | EstimateFlag.TILE_MISSING
 
 
 def _said(e: Estimates) -> Bools:
-    return np.asarray((e.estimate_status & _SAYING) != 0)
+    return np.asarray((e.estimate_flags & _SAYING) != 0)
 
 
 def _wrong(e: Estimates, true_n: Floats) -> Bools:
@@ -239,7 +245,7 @@ def healthy_feet(
         if load is not None:
             scale, cop = (0.05, 1.0) if name == "insole" else (0.03, 0.2)
             trace, transform = read_load_trace(data / load), CopTransform(scale=cop)
-            foot = replace(foot, load=trace, load_scale=scale, cop=transform)
+            foot = replace(foot, load=trace, load_scale=scale, cop_transform=transform)
         yield load or name, scene, foot
 
 
@@ -247,15 +253,15 @@ def converted(
     scene: Scene, foot: EmulatedFoot, info: ArrayInfo, hours: float
 ) -> Iterator[FrameBatch]:
     """Frames of what the chips convert, over and over again, without a bus, which takes longer."""
-    world = foot.world(scene, VirtualClock(), foot.pressed_on(scene), looped=True)
-    world.begin()
+    world = foot.make_world(scene, VirtualClock(), foot.compute_tile_load(scene), is_repeated=True)
+    world.begin_scene_time()
     chips = world._front_ends  # noqa: SLF001  # a driver has the bus only; here is none
     step_ns = round(1e9 / info.nominal_rate_hz)
     late_ns = step_ns // len(chips) * np.arange(len(chips))
     end = round(hours * 3600 * info.nominal_rate_hz)
     for begin in range(0, end, CHUNK):
         n = min(CHUNK, end - begin)
-        columns = zero_columns(n, len(chips))
+        columns = allocate_columns(n, len(chips))
         t_ns = step_ns * np.arange(begin, begin + n, dtype=np.int64)
         columns["seq"][:] = np.arange(begin, begin + n)
         columns["t_mono_ns"][:] = world.epoch_ns + t_ns
@@ -263,10 +269,12 @@ def converted(
         columns["sample_offset_us"][:] = late_ns // 1000
         columns["servo_counts"][:], columns["servo_age_us"][:] = NO_SERVO_COUNTS, NO_SERVO_AGE
         columns["reference_force_n"][:] = np.nan
-        columns["frame_status"][:] = np.where(t_ns < foot.lead_s * 1e9, FrameStatus.LEAD, 0)
+        columns["frame_flags"][:] = np.where(t_ns < foot.lead_s * 1e9, FrameFlag.LEAD, 0)
         for i, at_ns in enumerate(columns["t_mono_ns"].tolist()):
             for j, chip in enumerate(chips):
-                columns["padc"][i, j], columns["tadc"][i, j] = chip(at_ns + int(late_ns[j]))
+                columns["pressure_raw"][i, j], columns["temperature_raw"][i, j] = chip(
+                    at_ns + int(late_ns[j])
+                )
         yield FrameBatch(**columns)
 
 
@@ -274,7 +282,7 @@ def without(batch: FrameBatch, share: float, rng: np.random.Generator) -> FrameB
     """Return a batch but for this share of its frames; its lead is whole."""
     begins = rng.random(len(batch)) < share / AT_A_TIME
     lost = np.convolve(begins, np.ones(AT_A_TIME))[: len(batch)] > 0
-    return batch.select(~lost | (batch.frame_status & FrameStatus.LEAD != 0))
+    return batch.select_rows(~lost | (batch.frame_flags & FrameFlag.LEAD != 0))
 
 
 def healthy(
@@ -296,10 +304,10 @@ def healthy(
 
 @dataclass
 class Alarms:
-    """Hours of healthy frames, onsets of each flag of `JUDGED`, highest evidence for a clip."""
+    """Hours of healthy frames, onsets of each `EstimateFlag`, highest evidence for a clip."""
 
     hours: float = 0.0
-    onsets: Counter[EstimateStatus] = field(default_factory=Counter)
+    onsets: Counter[EstimateFlag] = field(default_factory=Counter)
     evidence: float = 0.0
 
     def __add__(self, other: Alarms) -> Alarms:
@@ -330,7 +338,7 @@ def count_alarms(
             alarms.hours += len(batch) / recorded.info.nominal_rate_hz / 3600.0
             taken = without(batch, share, rng)
             for estimator in of_share:
-                status = estimator.step(taken).estimate_status
+                status = estimator.process_frames(taken).estimate_flags
                 for bit in JUDGED:
                     there = ((status & bit) != 0).astype(int)
                     alarms.onsets[bit] += int((np.diff(there, prepend=0) == 1).sum())
@@ -350,7 +358,7 @@ def alarm_lines(found: dict[tuple[str, float], Alarms]) -> Iterator[str]:
     every = ("all", math.nan), sum(found.values(), Alarms())
     for (name, share), alarms in [*found.items(), every]:
         counts = [alarms.onsets[bit] for bit in JUDGED]
-        bound = most_per_hour(alarms.onsets[EstimateStatus.CLIPPED], alarms.hours)
+        bound = most_per_hour(alarms.onsets[EstimateFlag.CLIPPED], alarms.hours)
         lost = "-" if math.isnan(share) else f"{100 * share:g} %"
         yield (
             f"| {name} | {lost} | {alarms.hours:.2f} | {' | '.join(map(str, counts))} "

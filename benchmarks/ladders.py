@@ -17,26 +17,30 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from devices.emulation.ground.load_trace import CopTransform
-from devices.scene.file import Scene, load_scene
+from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import PRESETS
-from service.estimation.ladder.chosen import MODELS
+from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.offline.benchmark.draws import (
-    BATCH,
+    BATCH_FRAMES,
     LAGS_MS,
-    Drawn,
-    Recording,
-    estimated,
-    recorded,
-    time_rungs,
+    DrawRecording,
+    DrawResult,
+    compute_recording_accuracy,
+    record_with_calibration,
+    time_model_sets,
 )
-from service.offline.benchmark.figures import Measured, measured_of, pareto
-from service.offline.benchmark.rungs import Rung, rungs
-from service.offline.calibrations import find_calibration
-from service.rig.emulated import EmulatedFoot
+from service.offline.benchmark.figures import (
+    ModelSetFigures,
+    find_pareto_front,
+    summarize_model_sets,
+)
+from service.offline.benchmark.model_sets import ComparedModelSet, list_model_sets
+from service.offline.calibration_lookup import find_calibration
+from service.rig.emulated_foot import EmulatedFoot
 from storage.formats.load_trace import read_load_trace
 
 MARK = "<!-- tables -->"
-FRAMES = {"live": 1000, "offline": 8 * BATCH["offline"]}
+FRAMES = {"live": 1000, "offline": 8 * BATCH_FRAMES["offline"]}
 REPETITIONS = 5
 OF_A_PRESET = ("unwrap", "static", "skew", "denoise")
 """A preset knows of a curve only."""
@@ -67,7 +71,9 @@ class Case:
         if self.load is None:
             return EmulatedFoot()
         cop = CopTransform(scale=self.cop_scale)
-        return EmulatedFoot(read_load_trace(data / self.load), load_scale=self.load_scale, cop=cop)
+        return EmulatedFoot(
+            read_load_trace(data / self.load), load_scale=self.load_scale, cop_transform=cop
+        )
 
 
 CASES = (
@@ -81,45 +87,47 @@ CASES = (
 )
 
 
-def ladders_of(scene: Scene) -> tuple[Rung, ...]:
+def ladders_of(scene: Scene) -> tuple[ComparedModelSet, ...]:
     """All that are compared: what it names, up to every model that is offered, and less each."""
     offered: tuple[str, ...] = OF_A_PRESET
     if scene.calibration not in PRESETS:
         has_bare_tile = any(tile.reference for tile in scene.tile)
-        offered = tuple(name for name in MODELS if name != "ambient" or has_bare_tile)
-    ladders = rungs(offered)
-    named = tuple(name for name in MODELS if name in scene.models)
+        offered = tuple(name for name in MODEL_NAMES if name != "ambient" or has_bare_tile)
+    ladders = list_model_sets(offered)
+    named = tuple(name for name in MODEL_NAMES if name in scene.models)
     if any(rung.models == named for rung in ladders):
         return ladders
-    return (Rung("the scene's", named, False, None, None, False), *ladders)
+    return (ComparedModelSet("the scene's", named, False, None, None, False), *ladders)
 
 
-def drawn(case: Case, data: Path, draws: int) -> Iterator[tuple[Drawn, Recording]]:
+def drawn(case: Case, data: Path, draws: int) -> Iterator[tuple[DrawResult, DrawRecording]]:
     """Every draw of tiles, calibration and noise, estimated by every ladder."""
     scene, foot = load_scene(case.scene), case.foot(data)
     serials = [tile.serial for tile in scene.tile if not tile.reference]
     for draw in range(draws):
         calibration = find_calibration(scene.calibration, serials, parts_seed=draw)
-        recording, _ = recorded(scene, case.seconds, draw, calibration, foot)
+        recording, _ = record_with_calibration(scene, case.seconds, draw, calibration, foot)
         accuracy = {
-            (mode, rung.label): estimated(recording, rung.models, lag_ms)
+            (mode, rung.label): compute_recording_accuracy(recording, rung.models, lag_ms)
             for rung in ladders_of(scene)
             for mode, lag_ms in LAGS_MS.items()
         }
-        yield Drawn(draw, len(recording.frames), accuracy, ()), recording
+        yield DrawResult(draw, len(recording.frames), accuracy, ()), recording
 
 
-def measured(case: Case, data: Path, draws: int) -> tuple[dict[tuple[str, str], Measured], str]:
+def measured(
+    case: Case, data: Path, draws: int
+) -> tuple[dict[tuple[str, str], ModelSetFigures], str]:
     """Every ladder in every mode, and what was pressed."""
     ladders = ladders_of(load_scene(case.scene))
-    judged: list[Drawn] = []
-    recordings: list[Recording] = []
+    judged: list[DrawResult] = []
+    recordings: list[DrawRecording] = []
     for draw, recording in drawn(case, data, draws):
         judged.append(draw)
         recordings[:] = [recording]
         print(f"{case.name}: {len(judged)} of {draws} draws", file=sys.stderr, flush=True)
     (recording,) = recordings
-    times_ns, failures = time_rungs(recording, ladders, FRAMES, REPETITIONS)
+    times_ns, failures = time_model_sets(recording, ladders, FRAMES, REPETITIONS)
     for failure in failures:
         print(f"{case.name}: {failure.what}: {failure.why}", file=sys.stderr)
     peak_n, info = recording.truth["true_grf_n"].max(), recording.info
@@ -127,7 +135,7 @@ def measured(case: Case, data: Path, draws: int) -> tuple[dict[tuple[str, str], 
         f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s, "
         f"{draws} draws of {len(recording.frames)} frames, up to {peak_n:.0f} N."
     )
-    return measured_of(ladders, judged, times_ns), what
+    return summarize_model_sets(ladders, judged, times_ns), what
 
 
 def tables(case: Case, data: Path, draws: int) -> Iterator[str]:
@@ -135,7 +143,7 @@ def tables(case: Case, data: Path, draws: int) -> Iterator[str]:
     scene = load_scene(case.scene)
     figures, what = measured(case, data, draws)
     ladders = ladders_of(scene)
-    named = tuple(name for name in MODELS if name in scene.models)
+    named = tuple(name for name in MODEL_NAMES if name in scene.models)
     fronts = {mode: on_front(figures, ladders, mode) for mode in LAGS_MS}
     head = [
         f"{quantity}, {mode}"
@@ -167,14 +175,14 @@ def tables(case: Case, data: Path, draws: int) -> Iterator[str]:
 
 
 def on_front(
-    figures: dict[tuple[str, str], Measured], ladders: Sequence[Rung], mode: str
+    figures: dict[tuple[str, str], ModelSetFigures], ladders: Sequence[ComparedModelSet], mode: str
 ) -> set[str]:
     """Labels of the ladders that no other beats in both time and GRF error."""
     points = [
         (m.ns_per_frame.median, m.figures["grf_mae_n"].median)
         for m in (figures[mode, rung.label] for rung in ladders)
     ]
-    return {ladders[i].label for i in pareto(points)}
+    return {ladders[i].label for i in find_pareto_front(points)}
 
 
 def cell(value: float, scale: float, digits: int) -> str:

@@ -40,7 +40,7 @@ from replayed_nodes import DRAIN_S, Played, Sent, played, run_load
 from served import Server, served
 
 from service.estimation import LIVE_LAG_MS
-from service.link import SUBPROTOCOL
+from service.protocol import SUBPROTOCOL
 
 RATE_HZ = {4: 541.0, 64: 64.0}
 SCREEN_HZ = 60
@@ -82,7 +82,7 @@ class Screen:
         if looks:
             now_ns, message = time.time_ns(), json.loads(text)
             self.ages_ms.append((now_ns - message["t_ns"]) * 1e-6 - LIVE_LAG_MS)
-            self.unknown += message["grf_at_least_n"] is None
+            self.unknown += message["grf_lower_bound_n"] is None
 
 
 @dataclass(frozen=True)

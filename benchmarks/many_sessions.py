@@ -16,7 +16,7 @@ from pathlib import Path
 
 from service.api.routes.recordings.sessions import list_sessions
 from service.server.server import TICK_S, Server
-from storage.checked_json import write_checked
+from storage.checksummed_json import write_checksummed_json
 from storage.sessions.folder import Ledger, Part, PartLedger, Session
 
 ROUNDS = 7
@@ -27,7 +27,13 @@ BOOT = "0" * 32
 
 def sealed(number: int) -> Session:
     part = PartLedger(
-        boot_id=BOOT, seq_first=0, seq_last=9, recorded=10, lost={}, pending=0, unsynced_tail_max=0
+        stream_id=BOOT,
+        seq_first=0,
+        seq_last=9,
+        recorded=10,
+        lost={},
+        pending=0,
+        max_lost_tail_frames=0,
     )
     return Session(
         id=f"20261122T000000Z-{number:06x}",
@@ -36,7 +42,7 @@ def sealed(number: int) -> Session:
         state="sealed" if number else "recording",
         started_t_ns=10**18 + number,
         stopped_t_ns=10**18 + number + 10**10 if number else None,
-        parts=(Part(boot_id=BOOT, seq_first=0, seq_last=9 if number else None),),
+        parts=(Part(stream_id=BOOT, seq_first=0, seq_last=9 if number else None),),
         scene="mud",
         ledger=Ledger(complete=True, lossy=False, missed_slots=0, parts=(part,))
         if number
@@ -51,25 +57,25 @@ def fill(data: Path, n: int) -> None:
         session = sealed(number)
         folder = data / "sessions" / session.id
         folder.mkdir(parents=True)
-        write_checked(folder / "session.json", session.model_dump_json().encode())
+        write_checksummed_json(folder / "session.json", session.model_dump_json().encode())
 
 
 class Looking:
     """A screen that takes everything at once."""
 
-    is_ready = True
+    is_writable = True
 
-    def write(self, framed: bytes) -> None:
+    def write_framed(self, framed: bytes) -> None:
         """Forget it."""
 
 
 def tick(server: Server, is_slow: bool) -> None:
     """What `Server.run` does at every tick, and at every fifth, of what looks at sessions."""
-    server.settling.settle()
-    server.recorder.wanted("left")
-    server._tell_counts()  # noqa: SLF001  # the loop that calls it sleeps
+    server.sealer.poll()
+    server.recorder.retention_request("left")
+    server._notify_progress()  # noqa: SLF001  # the loop that calls it sleeps
     if is_slow:
-        server._heartbeat()  # noqa: SLF001  # likewise
+        server._send_heartbeat()  # noqa: SLF001  # likewise
 
 
 async def listed(server: Server) -> int:
@@ -87,7 +93,7 @@ async def measure(data: Path, n: int) -> tuple[float, float, float]:
     server = Server(data)
     start_s = time.process_time() - began_s
     ticks_s, lists_s = [], []
-    screen = server.hub.join(Looking(), 60.0)
+    screen = server.broadcaster.subscribe(Looking(), 60.0)
     for _ in range(ROUNDS):
         began_s = time.process_time()
         for number in range(TICKS):
@@ -96,7 +102,7 @@ async def measure(data: Path, n: int) -> tuple[float, float, float]:
         began_s = time.process_time()
         assert await listed(server) == n + 1
         lists_s.append(time.process_time() - began_s)
-    server.hub.leave(screen)
+    server.broadcaster.unsubscribe(screen)
     await server.close()
     return start_s, statistics.median(ticks_s), statistics.median(lists_s)
 

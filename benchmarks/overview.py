@@ -25,9 +25,9 @@ import pyarrow.parquet as pq
 from served import Server, served
 from slices import session_id, write
 
-from service.sessions.overview import OverviewBeside
+from service.sessions.overview import OverviewWriter
 from storage.sessions.overview import OVERVIEW_NAME
-from storage.sessions.reader import SessionReader
+from storage.sessions.reader import SealedFileReader
 
 RATE_HZ = 544.0
 POINTS = 1000
@@ -70,16 +70,16 @@ def by_pyarrow(path: Path, part: dict[str, float]) -> float:
 def gathered(path: Path) -> float:
     """CPU seconds that sealing takes for the pyramid."""
     spent_s = 0.0
-    with SessionReader(path, only_slices=True) as reader:
-        beside = OverviewBeside(len(reader.info.tiles))
-        names = ("grf_n", "grf_sigma_n", "grf_at_least_n", "cop_x_m", "cop_y_m", "angle_rad")
-        for frames, columns in reader.batches(*names, "contact", "estimate_status", "force_n"):
+    with SealedFileReader(path, only_slices=True) as reader:
+        beside = OverviewWriter(len(reader.info.tiles))
+        names = ("grf_n", "grf_sigma_n", "grf_lower_bound_n", "cop_x_m", "cop_y_m", "angle_rad")
+        for frames, columns in reader.read_batches(*names, "contact", "estimate_flags", "force_n"):
             began_s = time.process_time()
-            beside.feed(frames, columns)
+            beside.add_frames(frames, columns)
             spent_s += time.process_time() - began_s
         began_s = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
-            beside.write(Path(folder), "0" * 64)
+            beside.write_file(Path(folder), "0" * 64)
         return spent_s + time.process_time() - began_s
 
 

@@ -19,15 +19,15 @@ from dataclasses import dataclass
 from acquisition import scene_of
 
 from devices.acquisition import Acquisition
-from devices.array.budget import frame_s
-from devices.array.startup import make_ready
+from devices.array.startup import prepare_array
+from devices.array.timing_budget import compute_frame_s
 from devices.arrays import Floats
 from devices.buses.i2c import i2c_msg, open_bus
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
-from devices.emulation.hosted_clock import HostedClock, WireClock
+from devices.emulation.driver_clock import DriverClock, WireClock
 from devices.emulation.world import World
-from devices.realtime import sharpen_timers
-from devices.scene.file import Scene, load_scene
+from devices.realtime import set_timer_slack
+from devices.scene.scene_file import Scene, load_scene
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "standing, 4 tiles": lambda: load_scene("standing"),
@@ -69,7 +69,7 @@ class Shares:
     def __init__(self, world: World) -> None:
         self.wires_s = self.physics_s = 0.0
         domes = world._domes  # noqa: SLF001  # to measure it
-        rdwr, compute = world.i2c_adapter.i2c_rdwr, domes._compute  # noqa: SLF001  # likewise
+        rdwr, compute = world.i2c_adapter.i2c_rdwr, domes._compute_chunk  # noqa: SLF001  # likewise
 
         def timed_rdwr(*messages: i2c_msg) -> None:
             begin_s, physics_s = time.thread_time(), self.physics_s
@@ -113,25 +113,33 @@ def run(
 ) -> tuple[tuple[str, float, float, int], float, tuple[float, float]]:
     """Schedule, rate, limit and slots missed; CPU of a frame in us, and if looked at its shares."""
     host: Clock = SpinningClock() if wall else IdleCore()
-    clock = HostedClock(host)
+    clock = DriverClock(host)
     world = World(
-        scene, WireClock(clock, SystemClock() if wall else host), in_real_time=True, looped=True
+        scene,
+        WireClock(clock, SystemClock() if wall else host),
+        in_real_time=True,
+        is_repeated=True,
     )
     shares = Shares(world) if looks else None
-    ready = make_ready(open_bus("emulated", world.i2c_adapter), scene, clock)
-    anchor = UtcAnchor.of(0, 0, clock_set=False)
+    ready = prepare_array(open_bus("emulated", world.i2c_adapter), scene, clock)
+    anchor = UtcAnchor.from_readings(0, 0, clock_set=False)
     acquisition = Acquisition(
-        ready.array, ready.tiles, clock, anchor, expected_hz=ready.predicted_hz
+        ready.array, ready.tiles, clock, anchor, expected_rate_hz=ready.predicted_rate_hz
     )
     if shares is not None:
         shares.wires_s = shares.physics_s = 0.0
     begin_ns, begin_s, frames = clock.now_ns(), time.thread_time(), 0
-    for batch in acquisition.run(lambda: clock.now_ns() - begin_ns > seconds * 1e9):
+    for batch in acquisition.acquire_batches(lambda: clock.now_ns() - begin_ns > seconds * 1e9):
         frames += len(batch)
     cpu_us = 1e6 * (time.thread_time() - begin_s) / frames
     rate_hz = 1e9 * frames / (clock.now_ns() - begin_ns)
     schedule = ready.choice.schedule
-    rates = (schedule, rate_hz, 1.0 / frame_s(schedule, ready.timing), acquisition.missed_slots)
+    rates = (
+        schedule,
+        rate_hz,
+        1.0 / compute_frame_s(schedule, ready.timing),
+        acquisition.missed_slots,
+    )
     parts = (shares.wires_s, shares.physics_s) if shares is not None else (0.0, 0.0)
     return rates, cpu_us, (1e6 * parts[0] / frames, 1e6 * parts[1] / frames)
 
@@ -141,7 +149,7 @@ def main() -> None:
     parser.add_argument("seconds", type=float, nargs="?", default=4.0)
     parser.add_argument("--wall", action="store_true", help="on the real clock")
     a = parser.parse_args()
-    sharpen_timers()
+    set_timer_slack()
     head = (
         "scene | schedule | frames/s | limit | ratio | missed | driver us | wires us | physics us"
     )

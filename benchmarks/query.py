@@ -20,13 +20,13 @@ from recording_formats import write_journal
 from recording_sealing import STATIC, sources_of
 from side_by_side import in_turns, note, spread, table
 
-from service.estimation.calibration import paper_eq2_shape
-from service.offline.archive.finding import find_sessions
-from service.offline.archive.query import ask
-from service.sessions.sealing import seal
+from service.estimation.calibration import make_paper_eq2_preset
+from service.offline.archive.query import run_query
+from service.offline.archive.session_search import find_sessions
+from service.sessions.sealing import seal_session
 from storage.journal.journal import Journal
-from storage.sessions.folder import FRAMES_NAME, Session, SessionFolder
-from storage.sessions.ledger import StreamState, ledger_of
+from storage.sessions.folder import FRAMES_NAME, Session, SessionsFolder
+from storage.sessions.ledger import StreamState, compute_ledger
 
 LONG = f"20260101T000000Z-{0:06x}"
 
@@ -40,20 +40,20 @@ class Extent:
     turns: int = 5
 
 
-def sealed(recording: Recording, folder: SessionFolder, session_id: str, work: Path) -> Session:
+def sealed(recording: Recording, folder: SessionsFolder, session_id: str, work: Path) -> Session:
     """A recording as a server seals it."""
     journal_folder = work / session_id
     write_journal(journal_folder, recording)
     journal = Journal.open(journal_folder)
-    sources = sources_of(journal, paper_eq2_shape(), STATIC)
+    sources = sources_of(journal, make_paper_eq2_preset(), STATIC)
     named = {"id": session_id, "name": recording.title}
     sources = type(sources)(
         **{**vars(sources), "session": sources.session.model_copy(update=named)}
     )
-    held = {journal.info.boot_id: StreamState(held=journal.held)}
-    ledger = ledger_of(sources.session.parts, held, finished=True)
+    held = {journal.info.stream_id: StreamState(stored=journal.stored)}
+    ledger = compute_ledger(sources.session.parts, held, is_finished=True)
     folder.save(sources.session)
-    done = seal(sources, folder.path(session_id), ledger)
+    done = seal_session(sources, folder.get_path(session_id), ledger)
     assert done.problem is None, done.problem
     folder.save(done)
     return done
@@ -61,14 +61,14 @@ def sealed(recording: Recording, folder: SessionFolder, session_id: str, work: P
 
 def fill(data: Path, sessions: int, extent: Extent) -> None:
     """A data folder with so many sessions, the long one among them."""
-    folder = SessionFolder(data / "sessions")
+    folder = SessionsFolder(data / "sessions")
     work = data.with_name(f"{data.name}-journals")
     once = lengthened(emulated(4, min(extent.long_s, 20.0)), extent.long_s)
     sealed(once, folder, LONG, work)
     ids = [f"20260102T000000Z-{number:06x}" for number in range(sessions - 1)]
     first = sealed(of_scene("mud", extent.hops_s), folder, ids[0], work)
     for session_id in ids[1:]:
-        shutil.copytree(folder.path(first.id), folder.path(session_id))
+        shutil.copytree(folder.get_path(first.id), folder.get_path(session_id))
         folder.save(first.model_copy(update={"id": session_id}))
 
 
@@ -96,7 +96,7 @@ def bytes_read() -> int:
 def measured(data: Path, turns: int) -> list[str]:
     """A row for each question."""
     places = [str(data)]
-    start = ask(
+    start = run_query(
         find_sessions(places), f"SELECT min(t_ns) AS t FROM frames WHERE session_id = '{LONG}'"
     )
     asked = questions(int(start["t"][0].as_py()) + 10**9)
@@ -105,7 +105,7 @@ def measured(data: Path, turns: int) -> list[str]:
 
     def job(name: str) -> None:
         before = bytes_read()
-        rows[name] = len(ask(find_sessions(places), asked[name]))
+        rows[name] = len(run_query(find_sessions(places), asked[name]))
         read[name] = bytes_read() - before
 
     times = in_turns({name: functools.partial(job, name) for name in asked}, turns)

@@ -29,7 +29,7 @@ from recording_sealing import sealed
 from recording_sizes import sizes
 from recording_turns import slices, writing
 
-from service.offline.benchmark.run import machine
+from service.offline.benchmark.run import describe_machine
 
 Lines = list[str]
 
@@ -74,7 +74,7 @@ def run(names: list[str], extent: Extent) -> dict[str, Lines]:
         load = os.getloadavg()[0]
         with tempfile.TemporaryDirectory() as folder:
             lines = measure(extent, Path(folder))
-        about = f"{machine()}, pyarrow {pa.__version__}. {_made_by(load)}"
+        about = f"{describe_machine()}, pyarrow {pa.__version__}. {_made_by(load)}"
         done[name] = [f"## {title}", "", about, "", *lines]
         print("\n".join(done[name]) + "\n", flush=True)
     return done

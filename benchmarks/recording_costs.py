@@ -24,10 +24,10 @@ from devices.acquisition import FrameRow
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.node.in_flight import InFlight
-from storage.journal.node.journal import SYNC_S, NodeJournal
+from storage.journal.node.in_flight import InFlightWriter
+from storage.journal.node.journal import SYNC_INTERVAL_S, NodeJournal
 from storage.schema import wire_schema
-from storage.wire import EncodedBatch, decode, encode
+from storage.wire import EncodedBatch, decode_message, encode_frames
 
 SYNCS_PER_S = 4
 GOAL = 0.01
@@ -81,7 +81,7 @@ class Job:
 def encoded(recording: Recording) -> Batches:
     """The recording in batches of 25 ms, each with its message."""
     schema = wire_schema(recording.info)
-    return [(batch, encode(batch, schema)) for batch in batches(recording.frames)]
+    return [(batch, encode_frames(batch, schema)) for batch in batches(recording.frames)]
 
 
 def append_costs(recording: Recording, folder: Path, *, paced: bool) -> dict[str, Cost]:
@@ -95,9 +95,9 @@ def append_costs(recording: Recording, folder: Path, *, paced: bool) -> dict[str
         costs = _in_turns(
             {
                 "bare write": Job(lambda _, payload: os.write(raw, payload), lambda: os.fsync(raw)),
-                "Journal.append": Job(journal.append, journal.sync),
-                "decode (checks everything)": Job(lambda _, p: decode(p, schema), _nothing),
-                "encode": Job(lambda batch, _: encode(batch, schema), _nothing),
+                "Journal.append": Job(journal.append_new_frames, journal.sync),
+                "decode (checks everything)": Job(lambda _, p: decode_message(p, schema), _nothing),
+                "encode": Job(lambda batch, _: encode_frames(batch, schema), _nothing),
             },
             encoded(recording),
             paced=paced,
@@ -112,16 +112,18 @@ def node_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
     with ExitStack() as stack:
         raw = _raw_file(folder / "raw.arrows", stack)
         keeper = NodeJournal(folder, "bench")
-        keeper.wanted.say_local({recording.info.boot_id: Intervals([(0, 2**61)])})
+        keeper.retention_requests.set_local_numbers(
+            {recording.info.stream_id: Intervals([(0, 2**61)])}
+        )
         before = set(threading.enumerate())
-        keeper.start()
+        keeper.start_writer()
         stack.callback(keeper.close)
         (thread,) = set(threading.enumerate()) - before
         clock = time.pthread_getcpuclockid(thread.ident or 0)
-        stream = keeper.begin(recording.info)
+        stream = keeper.begin_stream(recording.info)
 
         def put(batch: FrameBatch, payload: bytes) -> None:
-            keeper.put(stream, EncodedBatch.of(batch, payload))
+            keeper.queue_batch(stream, EncodedBatch.from_frames_and_payload(batch, payload))
 
         bare, node = "bare write", "NodeJournal.put and its thread"
         of_thread: list[float] = []
@@ -140,7 +142,7 @@ def node_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
             },
             encoded(recording),
             paced=True,
-            sync_s=SYNC_S,
+            sync_s=SYNC_INTERVAL_S,
             each_second=note_thread,
         )
     # What was noted at the begin of a second is of the one before.
@@ -155,7 +157,7 @@ def in_flight_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
     """`InFlight.put` for each frame, as the loop that takes frames calls it."""
     columns = [getattr(recording.frames, name).tolist() for name in FrameRow._fields]
     rows = [FrameRow(*values) for values in zip(*columns, strict=True)]
-    keeper = InFlight(folder, recording.info)
+    keeper = InFlightWriter(folder, recording.info)
     tiles = recording.frames.tile_count
     size = 4 + sum(
         dtype.itemsize * (tiles if per_tile else 1) for dtype, per_tile in FRAME_COLUMNS.values()
@@ -173,7 +175,7 @@ def in_flight_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
                 bare[at : at + size] = row_bytes
         with costs["InFlight.put"].measured():
             for row in rows[begin : begin + rate]:
-                keeper.put(row)
+                keeper.write_frame(row)
     keeper.close()
     bare.close()
     return costs

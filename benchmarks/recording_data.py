@@ -17,7 +17,7 @@ import numpy as np
 from devices.acquisition import BATCH_NS
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
-from devices.scene.file import Scene, build_scene, load_scene
+from devices.scene.scene_file import Scene, load_scene, validate_scene
 from storage.formats.load_trace import read_load_trace
 
 FULL_RATE_HZ = 544.0
@@ -143,17 +143,17 @@ def batches(frames: FrameBatch) -> Iterator[FrameBatch]:
         end_ns = frames.t_mono_ns[begin] + BATCH_NS
         window = frames.t_mono_ns[begin : begin + _BATCH_FRAMES_MAX]
         end = begin + max(1, int(np.searchsorted(window, end_ns)))
-        yield frames.rows(begin, end)
+        yield frames.slice_rows(begin, end)
         begin = end
 
 
 def _simulated(title: str, scene: Scene, seconds: float, load: LoadTrace | None) -> Recording:
-    from service.offline.simulate import SimulateOptions, Simulation
-    from service.rig.emulated import EmulatedFoot
+    from service.offline.simulation import EmulatedRun, SimulationOptions
+    from service.rig.emulated_foot import EmulatedFoot
 
     with ExitStack() as stack:
-        simulation = Simulation(SimulateOptions(scene, seconds, foot=EmulatedFoot(load)), stack)
-        frames = FrameBatch.concatenate([frames for frames, _ in simulation.pieces()])
+        simulation = EmulatedRun(SimulationOptions(scene, seconds, foot=EmulatedFoot(load)), stack)
+        frames = FrameBatch.concatenate([frames for frames, _ in simulation.run_frames()])
     return Recording(title, simulation.info, frames)
 
 
@@ -164,7 +164,7 @@ def _on_real_clock(tiles: int, seconds: float) -> Recording:
     with ExitStack() as stack:
         rig = Rig(RigOptions(_arc(tiles), "bench"), stack)
         end_s = time.monotonic() + seconds
-        frames = FrameBatch.concatenate(list(rig.batches(lambda: time.monotonic() > end_s)))
+        frames = FrameBatch.concatenate(list(rig.acquire_batches(lambda: time.monotonic() > end_s)))
     return Recording(f"{tiles} tiles, real clock", rig.info, frames)
 
 
@@ -181,4 +181,4 @@ def _arc(tiles: int) -> Scene:
         }
         for i, angle_rad in enumerate(angles_rad)
     ]
-    return build_scene(content, where="benchmark")
+    return validate_scene(content, where="benchmark")

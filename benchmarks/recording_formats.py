@@ -18,14 +18,14 @@ import pyarrow.parquet as pq
 from recording_data import Recording, batches
 
 from devices.frames import FrameBatch
-from storage.formats.sealed import export_of
+from storage.formats.sealed_export import make_sealed_export
 from storage.formats.slice import Slice
-from storage.formats.written.arrow import ARROW
+from storage.formats.writers.arrow import ARROW
 from storage.journal.journal import Journal
-from storage.schema import FRAMES, flat_columns, wire_schema
-from storage.sessions.file import ROW_GROUP_NS, SessionWriter
-from storage.sessions.reader import SessionReader
-from storage.wire import encode
+from storage.schema import MEASURED_COLUMNS, to_flat_columns, wire_schema
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import MIN_ROW_GROUP_NS, SealedFileWriter
+from storage.wire import encode_frames
 
 Values = npt.NDArray[Any]
 Write = Callable[[Path, Recording], None]
@@ -45,20 +45,20 @@ def absent() -> list[str]:
 
 def flat_table(frames: FrameBatch) -> pa.Table:
     """The flat columns of a sealed file, what is missing as null, minute by minute."""
-    values = {column.name: getattr(frames, column.name) for column in FRAMES}
-    fields, arrays = zip(*flat_columns(FRAMES, values), strict=True)
+    values = {column.name: getattr(frames, column.name) for column in MEASURED_COLUMNS}
+    fields, arrays = zip(*to_flat_columns(MEASURED_COLUMNS, values), strict=True)
     return pa.Table.from_arrays(list(arrays), schema=pa.schema(list(fields)))
 
 
 def minute(frames: FrameBatch) -> int:
     """Frames in a minute, which is what a row group, a chunk or a record batch holds here."""
     span_ns = int(frames.t_mono_ns[-1] - frames.t_mono_ns[0])
-    return max(1, min(len(frames), round(len(frames) * ROW_GROUP_NS / max(1, span_ns))))
+    return max(1, min(len(frames), round(len(frames) * MIN_ROW_GROUP_NS / max(1, span_ns))))
 
 
 def write_parquet(path: Path, recording: Recording) -> None:
-    with SessionWriter(path, recording.info, {}) as writer:
-        writer.append(recording.frames, {})
+    with SealedFileWriter(path, recording.info, {}) as writer:
+        writer.append_frames(recording.frames, {})
 
 
 def write_parquet_default(path: Path, recording: Recording) -> None:
@@ -103,14 +103,14 @@ def write_journal(path: Path, recording: Recording) -> None:
     schema = wire_schema(recording.info)
     journal = Journal(path, recording.info)
     for batch in batches(recording.frames):
-        journal.append(batch, encode(batch, schema))
+        journal.append_new_frames(batch, encode_frames(batch, schema))
     journal.close()
 
 
 def flat_arrays(frames: FrameBatch) -> dict[str, Values]:
     """The flat columns as plain numbers: HDF5 has no nulls."""
     arrays = {}
-    for column in FRAMES:
+    for column in MEASURED_COLUMNS:
         values = getattr(frames, column.name)
         parts = values.T if column.per_tile else values[None]
         for name, part in zip(column.flat_names(len(parts)), parts, strict=True):
@@ -159,10 +159,10 @@ def read_parquet(path: Path, column: str, begin_ns: int, end_ns: int) -> Values:
 
 def read_as_service(path: Path, column: str, begin_ns: int, end_ns: int) -> Values:
     """What the server and `foottile export` do for a slice of a sealed session."""
-    with SessionReader(path, only_slices=True) as reader:
+    with SealedFileReader(path, only_slices=True) as reader:
         first_ns = _first_t_ns(path)
         part = Slice((begin_ns - first_ns) * 1e-9, (end_ns - first_ns) * 1e-9, (column,))
-        content = b"".join(ARROW.written(export_of(reader, part)))
+        content = b"".join(ARROW.encode(make_sealed_export(reader, part)))
     return pa.ipc.open_file(content).read_all().column(column).to_numpy()
 
 

@@ -22,9 +22,9 @@ from side_by_side import table
 
 from storage.journal.journal import Journal
 from storage.schema import wire_schema
-from storage.sessions.file import SessionWriter
-from storage.sessions.reader import SessionReader
-from storage.wire import encode
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
+from storage.wire import encode_frames
 
 STEPS = {
     "build": "writing it",
@@ -62,8 +62,8 @@ class Step:
 
 def hours_of(recording: Recording, folder: Path, hours: float) -> dict[str, Step]:
     """Build such a journal, open it, then read it and, beside that, seal from it."""
-    with SessionWriter(folder / "pattern.parquet", recording.info, {}) as writer:
-        writer.append(recording.frames, {})
+    with SealedFileWriter(folder / "pattern.parquet", recording.info, {}) as writer:
+        writer.append_frames(recording.frames, {})
     steps = {}
     for together in (("build",), ("open",), ("read", "seal")):
         running = {name: _started(name, folder, hours) for name in together}
@@ -94,10 +94,10 @@ def step(name: str, folder: Path, hours: float) -> Step:
         case "build":
             frames, append_us = _build(folder, hours)
         case "open":
-            frames = Journal.open(journal).held.count
+            frames = Journal.open(journal).stored.count
         case "read":
             opened = Journal.open(journal)
-            frames = sum(len(batch) for batch in opened.read(0, opened.held.last or 0))
+            frames = sum(len(batch) for batch in opened.read_frames(0, opened.stored.last or 0))
         case _:
             frames = seal(sources_of(Journal.open(journal), None), folder / "sealed.parquet")
     return Step(
@@ -112,8 +112,8 @@ def step(name: str, folder: Path, hours: float) -> Step:
 
 
 def _build(folder: Path, hours: float) -> tuple[int, tuple[float, float]]:
-    with SessionReader(folder / "pattern.parquet") as reader:
-        pattern = Recording("", reader.info, reader.frames())
+    with SealedFileReader(folder / "pattern.parquet") as reader:
+        pattern = Recording("", reader.info, reader.read_frames())
     pattern = at_rate(pattern, FULL_RATE_HZ)
     schema = wire_schema(pattern.info)
     journal = Journal(folder / "journal", pattern.info)
@@ -123,9 +123,9 @@ def _build(folder: Path, hours: float) -> tuple[int, tuple[float, float]]:
     synced = 0
     for begin in range(0, n, _CHUNK):
         for batch in batches(repeated(pattern.frames, begin, min(begin + _CHUNK, n))):
-            payload = encode(batch, schema)
+            payload = encode_frames(batch, schema)
             began_s = time.thread_time()
-            journal.append(batch, payload)
+            journal.append_new_frames(batch, payload)
             spent_us.append((time.thread_time() - began_s) * 1e6)
         if len(spent_us) > _SAMPLED:
             ends = ends or [statistics.median(spent_us[:_SAMPLED])]

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for tests.builders
 
 BATCH_FRAMES = 14
 LEAD_FRAMES = 1000
-BOOT_ID = "b" * 32
+STREAM_ID = "b" * 32
 SESSION_ID = "20200101T000000Z-000000"
 UTC_NS = 1_577_836_800_000_000_000
 
@@ -40,7 +40,7 @@ def array(tiles: int, rate_hz: float) -> Any:
 
     return make_array(
         [make_tile(i, coefficient_words=DATA_SHEET_CHIP) for i in range(tiles)],
-        boot_id=BOOT_ID,
+        stream_id=STREAM_ID,
         schedule="pipelined",
         nominal_rate_hz=rate_hz,
         utc_offset_ns=UTC_NS,
@@ -49,7 +49,7 @@ def array(tiles: int, rate_hz: float) -> Any:
 
 
 def minute(number: int, tiles: int, rate_hz: float) -> Any:
-    from devices.frames import FrameStatus
+    from devices.frames import FrameFlag
     from tests.builders.frames import make_frames
 
     rng = np.random.default_rng(number % 7)
@@ -58,44 +58,44 @@ def minute(number: int, tiles: int, rate_hz: float) -> Any:
     t_mono_ns = (seq.astype(np.float64) * 1e9 / rate_hz).astype(np.int64)
     t_mono_ns += rng.integers(0, 20_000, rows)
     steps = 20 + 20 * np.sin(np.arange(rows) * 2 * np.pi / rate_hz)
-    padc = 400 - steps[:, None] + rng.normal(0, 1.3, (rows, tiles))
+    pressure_raw = 400 - steps[:, None] + rng.normal(0, 1.3, (rows, tiles))
     lead = seq < LEAD_FRAMES
-    padc[lead] = 400 + rng.normal(0, 1.3, (int(lead.sum()), tiles))
+    pressure_raw[lead] = 400 + rng.normal(0, 1.3, (int(lead.sum()), tiles))
     return make_frames(
         seq,
         tiles,
         utc_offset_ns=UTC_NS,
         t_mono_ns=t_mono_ns,
-        padc=padc.round(),
-        tadc=rng.integers(478, 480, (rows, tiles)),
+        pressure_raw=pressure_raw.round(),
+        temperature_raw=rng.integers(478, 480, (rows, tiles)),
         sample_offset_us=210 * np.arange(tiles) + rng.integers(0, 9, (rows, tiles)),
-        frame_status=np.where(lead, FrameStatus.LEAD, 0),
+        frame_flags=np.where(lead, FrameFlag.LEAD, 0),
     )
 
 
 def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from storage.journal.journal import Journal
 
-    journal = Journal(folder / "journal" / "bench" / BOOT_ID, array(asked.tiles, asked.rate))
+    journal = Journal(folder / "journal" / "bench" / STREAM_ID, array(asked.tiles, asked.rate))
     for number in range(round(asked.hours * 60)):
         frames = minute(number, asked.tiles, asked.rate)
         for begin in range(0, len(frames), BATCH_FRAMES):
-            journal.append(frames.rows(begin, min(begin + BATCH_FRAMES, len(frames))))
+            journal.append_new_frames(frames.rows(begin, min(begin + BATCH_FRAMES, len(frames))))
         journal.sync()
     journal.close()
-    return {"frames": journal.held.count, "bytes": journal.size_bytes}
+    return {"frames": journal.stored.count, "bytes": journal.size_bytes}
 
 
 def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from service.offline.calibrations import find_calibration
-    from service.sessions.sealing import seal
-    from service.sessions.sources import Sources
-    from storage.file_hash import write_file_hash
+    from service.offline.calibration_lookup import find_calibration
+    from service.sessions.inputs import SessionInputs
+    from service.sessions.sealing import seal_session
     from storage.journal.journal import Journal
-    from storage.sessions import file as session_file
+    from storage.parquet_hash import embed_file_hashes
+    from storage.sessions import writer as session_file
     from storage.sessions.content_hash import ContentDigest
-    from storage.sessions.folder import Part, Session, SessionFolder
-    from storage.sessions.ledger import StreamState, ledger_of
+    from storage.sessions.folder import Part, Session, SessionsFolder
+    from storage.sessions.ledger import StreamState, compute_ledger
 
     hash_s = 0.0
 
@@ -103,19 +103,19 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
         def feed(self, table: Any) -> None:
             nonlocal hash_s
             begin = time.perf_counter()
-            super().feed(table)
+            super().add_table(table)
             hash_s += time.perf_counter() - begin
 
     def timed(path: Path) -> None:
         nonlocal hash_s
         begin = time.perf_counter()
-        write_file_hash(path)
+        embed_file_hashes(path)
         hash_s += time.perf_counter() - begin
 
     vars(session_file).update(ContentDigest=Timed, write_file_hash=timed)
     info = array(asked.tiles, asked.rate)
-    journal = Journal(folder / "journal" / "bench" / BOOT_ID, info)
-    last = journal.held.last
+    journal = Journal(folder / "journal" / "bench" / STREAM_ID, info)
+    last = journal.stored.last
     assert last is not None
     session = Session(
         id=SESSION_ID,
@@ -124,18 +124,20 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
         state="sealing",
         started_t_ns=UTC_NS,
         stopped_t_ns=UTC_NS + round(asked.hours * 3.6e12),
-        parts=(Part(boot_id=BOOT_ID, seq_first=0, seq_last=last),),
+        parts=(Part(stream_id=STREAM_ID, seq_first=0, seq_last=last),),
         scene="benchmark",
     )
     calibration = find_calibration(
-        "paper-eq2-shape", list(info.serials), parts_seed=0, progress=lambda _: None
+        "paper-eq2-shape", list(info.serials), parts_seed=0, on_progress=lambda _: None
     )
-    sources = Sources(session, info, {BOOT_ID: journal}, calibration, None, (), {})
-    ledger = ledger_of(session.parts, {BOOT_ID: StreamState(held=journal.held)}, finished=True)
-    sessions = SessionFolder(folder / "sessions")
+    sources = SessionInputs(session, info, {STREAM_ID: journal}, calibration, None, (), {})
+    ledger = compute_ledger(
+        session.parts, {STREAM_ID: StreamState(stored=journal.stored)}, is_finished=True
+    )
+    sessions = SessionsFolder(folder / "sessions")
     sessions.save(session)
     begin = time.perf_counter()
-    sealed = seal(sources, sessions.path(SESSION_ID), ledger)
+    sealed = seal_session(sources, sessions.get_path(SESSION_ID), ledger)
     seal_s = time.perf_counter() - begin
     sessions.save(sealed)
     return {
@@ -147,10 +149,10 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def read_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from storage.sessions.reader import SessionReader
+    from storage.sessions.reader import SealedFileReader
 
-    with SessionReader(folder / "sessions" / SESSION_ID / "frames.parquet") as reader:
-        frames = sum(len(batch) for batch, _ in reader.batches("grf_n", "force_n"))
+    with SealedFileReader(folder / "sessions" / SESSION_ID / "frames.parquet") as reader:
+        frames = sum(len(batch) for batch, _ in reader.read_batches("grf_n", "force_n"))
     return {"frames": frames}
 
 
@@ -164,24 +166,24 @@ def column(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def verify_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from storage.verify.data import verdict_of, verify
+    from storage.verify.data_folder import find_verdict, verify_path
 
-    report = verify(folder / "sessions" / SESSION_ID)
-    return {"verdict": verdict_of(report), "problems": report.problems}
+    report = verify_path(folder / "sessions" / SESSION_ID)
+    return {"verdict": find_verdict(report), "problems": report.problems}
 
 
 def verify_journal(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from storage.verify.data import verdict_of, verify
+    from storage.verify.data_folder import find_verdict, verify_path
 
-    report = verify(folder / "journal" / "bench" / BOOT_ID)
-    return {"verdict": verdict_of(report), "problems": report.problems}
+    report = verify_path(folder / "journal" / "bench" / STREAM_ID)
+    return {"verdict": find_verdict(report), "problems": report.problems}
 
 
 def imports(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     import service.sessions.sealing
-    import storage.verify.data
+    import storage.verify.data_folder
 
-    return {"modules": [service.sessions.sealing.__name__, storage.verify.data.__name__]}
+    return {"modules": [service.sessions.sealing.__name__, storage.verify.data_folder.__name__]}
 
 
 STEPS = {

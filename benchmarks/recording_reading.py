@@ -11,7 +11,7 @@ from recording_formats import write_journal
 from side_by_side import in_turns, note, spread, table
 
 from storage.journal.journal import Journal
-from storage.verify.journal import verify_stream
+from storage.verify.journal import verify_journal
 
 LEARNT_S = 60.0
 """Of an emulated recording, which is repeated."""
@@ -29,10 +29,10 @@ def jobs(folder: Path, frames: int) -> dict[str, Callable[[], object]]:
         assert count == frames
 
     def read() -> None:
-        assert sum(len(batch) for batch in opened.read(0, frames - 1)) == frames
+        assert sum(len(batch) for batch in opened.read_frames(0, frames - 1)) == frames
 
     def verify() -> None:
-        report = verify_stream(folder)
+        report = verify_journal(folder)
         assert not report.problems, report.problems
 
     return {
@@ -47,7 +47,7 @@ def read_back(extent: Extent, folder: Path) -> list[str]:
     """A journal of `sliced_s`, as a table scaled to an hour."""
     once = emulated(4, min(LEARNT_S, extent.sliced_s))
     recording = lengthened(once, extent.sliced_s, FULL_RATE_HZ)
-    stream = folder / recording.info.node / recording.info.boot_id
+    stream = folder / recording.info.node / recording.info.stream_id
     write_journal(stream, recording)
     ways = jobs(stream, len(recording.frames))
     note("reading")

@@ -11,15 +11,15 @@ from recording_data import FULL_RATE_HZ, Extent, Recording, emulated
 from recording_formats import flat_table, minute, write_journal
 from side_by_side import in_turns, note, spread, table
 
-from service.estimation.calibration import Calibration, paper_eq2_shape
-from service.offline.calibrations import find_calibration
+from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.offline.calibration_lookup import find_calibration
 from service.sessions.frames import SessionFrames
-from service.sessions.sources import Sources
-from service.sessions.stances import StancesBeside
-from storage.file_hash import sha256_of
+from service.sessions.inputs import SessionInputs
+from service.sessions.stances import StancesWriter
 from storage.journal.journal import Journal
-from storage.sessions.file import SessionWriter, parquet_options
+from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import Part, Session
+from storage.sessions.writer import SealedFileWriter, parquet_options
 
 STATIC = ("unwrap", "static")
 LADDER = ("unwrap", "temperature", "gas", "static", "skew", "denoise", "hysteresis", "rubber")
@@ -28,10 +28,10 @@ LADDER = ("unwrap", "temperature", "gas", "static", "skew", "denoise", "hysteres
 
 def sources_of(
     journal: Journal, calibration: Calibration | None, models: tuple[str, ...] = ()
-) -> Sources:
+) -> SessionInputs:
     """All that a journal holds, as a session."""
-    boot_id, last = journal.info.boot_id, journal.held.last
-    part = Part(boot_id=boot_id, seq_first=0, seq_last=last)
+    stream_id, last = journal.info.stream_id, journal.stored.last
+    part = Part(stream_id=stream_id, seq_first=0, seq_last=last)
     session = Session(
         id="20200101T000000Z-000000",
         name="benchmark",
@@ -41,10 +41,10 @@ def sources_of(
         parts=(part,),
         scene=journal.info.scene,
     )
-    return Sources(
+    return SessionInputs(
         session=session,
         info=journal.info.model_copy(update={"models": models}),
-        journals={boot_id: journal},
+        journals={stream_id: journal},
         calibration=calibration,
         problem=None if calibration is not None else "none was asked for",
         tares=(),
@@ -52,17 +52,17 @@ def sources_of(
     )
 
 
-def seal(sources: Sources, path: Path, *, with_stances: bool = True) -> int:
+def seal(sources: SessionInputs, path: Path, *, with_stances: bool = True) -> int:
     """Write the file, its hash and stances, as `service.sessions.sealing.seal` does; its frames."""
     count = 0
-    frames, stances = SessionFrames(sources), StancesBeside()
-    with SessionWriter(path, sources.info, sources.notes) as writer:
+    frames, stances = SessionFrames(sources), StancesWriter()
+    with SealedFileWriter(path, sources.info, sources.notes) as writer:
         for batch, columns in frames:
-            writer.append(batch, columns)
+            writer.append_frames(batch, columns)
             if with_stances:
-                stances.feed(batch.seq, batch.t_ns, columns)
+                stances.add_frames(batch.seq, batch.t_ns, columns)
             count += len(batch)
-    stances.write(path.parent, sha256_of(path))
+    stances.write_file(path.parent, compute_sha256(path))
     if sources.calibration is not None:
         assert frames.problem is None, frames.problem
     return count
@@ -95,9 +95,9 @@ def jobs(
         "pyarrow alone, from memory": bare,
         "raw": lambda: sealing("raw", None, ()),
         "with estimates, `static`, without stances": lambda: sealing(
-            "static", paper_eq2_shape(), STATIC, with_stances=False
+            "static", make_paper_eq2_preset(), STATIC, with_stances=False
         ),
-        "with estimates, `static`": lambda: sealing("static", paper_eq2_shape(), STATIC),
+        "with estimates, `static`": lambda: sealing("static", make_paper_eq2_preset(), STATIC),
     }
     if with_ladder:
         bench = find_calibration("emulated-rig", recording.info.serials)

@@ -12,7 +12,7 @@ import recording_formats as formats
 from recording_data import Extent
 from side_by_side import in_turns, note, spread, table
 
-_COLUMN, _SLICE_NS = "padc_2", 2_000_000_000
+_COLUMN, _SLICE_NS = "pressure_raw_2", 2_000_000_000
 
 
 def writing(extent: Extent, folder: Path) -> list[str]:
@@ -58,7 +58,7 @@ def slices(extent: Extent, folder: Path) -> list[str]:
     frames = recording.frames
     begin_ns = int(frames.t_ns[len(frames) // 2])
     inside = (frames.t_ns >= begin_ns) & (frames.t_ns < begin_ns + _SLICE_NS)
-    right = frames.padc[inside, int(_COLUMN[-1])]
+    right = frames.pressure_raw[inside, int(_COLUMN[-1])]
 
     def job(of: str, read: formats.Read) -> Callable[[], object]:
         def run() -> None:

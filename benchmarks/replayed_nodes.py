@@ -23,21 +23,21 @@ import numpy as np
 import pyarrow as pa
 from recording_data import Recording, at_rate, batches, emulated
 
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus
-from devices.scene.file import load_scene
+from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from devices.scene.scene_file import load_scene
 from service.estimation.calibration import Calibration
-from service.identity import make_secret
-from service.link import PROTOCOL, Hello, Status
+from service.node.frame_sender import NodeCallbacks
 from service.node.publisher import Publisher
-from service.node.sending import Source
-from service.offline.calibrations import find_calibration
+from service.node_identity import generate_secret
+from service.offline.calibration_lookup import find_calibration
+from service.protocol import PROTOCOL, Hello, NodeStatus
 from storage.intervals import EVICTED, Intervals
+from storage.journal.node.retention_requests import RetentionRequests
 from storage.journal.node.stream import NodeStream
-from storage.journal.node.wanted import Wanted
 from storage.journal.stream_notes import StreamNotes
-from storage.layout import layout_of
-from storage.schema import FRAMES, wire_schema
-from storage.wire import EncodedBatch, encode
+from storage.message_layout import compute_layout
+from storage.schema import MEASURED_COLUMNS, wire_schema
+from storage.wire import EncodedBatch, encode_frames
 
 SCENE = "rolling"
 LAP_S, LEAD_S = 10.0, 1.0
@@ -122,7 +122,7 @@ def played(tiles: int, rate_hz: float) -> Played:
             "models": load_scene(SCENE).models,
         }
     )
-    known = [bench.of(serial) for serial in foot.info.serials]
+    known = [bench.get_tile(serial) for serial in foot.info.serials]
     calibration = bench.model_copy(
         update={
             "tiles": tuple(
@@ -134,9 +134,9 @@ def played(tiles: int, rate_hz: float) -> Played:
     period_ns = round(1e9 / rate_hz)
     wide = replace(
         foot.frames,
-        padc=foot.frames.padc[:, places],
-        tadc=foot.frames.tadc[:, places],
-        status=foot.frames.status[:, places],
+        pressure_raw=foot.frames.pressure_raw[:, places],
+        temperature_raw=foot.frames.temperature_raw[:, places],
+        tile_flags=foot.frames.tile_flags[:, places],
         sample_offset_us=np.broadcast_to(
             np.arange(tiles, dtype=np.int32) * (period_ns // tiles // 1000),
             (len(foot.frames), tiles),
@@ -149,12 +149,12 @@ def played(tiles: int, rate_hz: float) -> Played:
         t_mono_ns=wide.t_mono_ns - began_ns,
         t_ns=wide.t_mono_ns - began_ns,
     )
-    is_lead = (wide.frame_status & FrameStatus.LEAD) != 0
+    is_lead = (wide.frame_flags & FrameFlag.LEAD) != 0
     lead_frames = int(np.flatnonzero(is_lead)[-1]) + 1
     schema = wire_schema(info)
     lead, lap = (
         tuple(_messages(rows, schema, period_ns))
-        for rows in (wide.rows(0, lead_frames), wide.rows(lead_frames, len(wide)))
+        for rows in (wide.slice_rows(0, lead_frames), wide.slice_rows(lead_frames, len(wide)))
     )
     lap_begin_ns = int(wide.t_mono_ns[lead_frames])
     return Played(info, calibration, lead, lap, lap_begin_ns, int(wide.t_mono_ns[-1]) + period_ns)
@@ -165,14 +165,16 @@ def thinned(recording: Recording, rate_hz: float) -> Recording:
     frames = recording.frames
     since_s = (frames.t_mono_ns - frames.t_mono_ns[0]) * 1e-9
     rows = np.unique(np.searchsorted(since_s, np.arange(0.0, since_s[-1], 1.0 / rate_hz)))
-    columns = {column.name: getattr(frames, column.name)[rows] for column in FRAMES}
+    columns = {column.name: getattr(frames, column.name)[rows] for column in MEASURED_COLUMNS}
     return replace(recording, frames=FrameBatch(**columns))
 
 
 def _messages(frames: FrameBatch, schema: pa.Schema, period_ns: int) -> Iterator[Message]:
     for batch in batches(frames):
         # A frame is whole when the next one begins.
-        yield Message(encode(batch, schema), len(batch), int(batch.t_mono_ns[-1]) + period_ns)
+        yield Message(
+            encode_frames(batch, schema), len(batch), int(batch.t_mono_ns[-1]) + period_ns
+        )
 
 
 class Renumbered:
@@ -180,11 +182,11 @@ class Renumbered:
 
     def __init__(self, played: Played) -> None:
         schema = wire_schema(played.info)
-        names = [column.name for column in FRAMES]
+        names = [column.name for column in MEASURED_COLUMNS]
         self._content: dict[int, tuple[bytearray, list[Any], list[Any]]] = {}
         for message in (*played.lead, *played.lap):
             content = bytearray(message.payload)
-            layout = layout_of(pa.ipc.read_message(pa.py_buffer(message.payload)), schema)
+            layout = compute_layout(pa.ipc.read_message(pa.py_buffer(message.payload)), schema)
             views = []
             for name in _NUMBERED:
                 at, _ = layout.columns[names.index(name)]
@@ -212,23 +214,23 @@ class ReplayedNode:
         info = played.info.model_copy(
             update={
                 "node": name,
-                "boot_id": uuid.uuid4().hex,
+                "stream_id": uuid.uuid4().hex,
                 "utc_offset_ns": self._utc_offset_ns,
             }
         )
         nowhere = Path("/nonexistent")
         self.stream = NodeStream(nowhere, StreamNotes(array_info=info), None)
-        self._wanted = Wanted(nowhere)
+        self._wanted = RetentionRequests(nowhere)
         self.said: list[str] = []
-        secret = make_secret()
-        source = Source(
-            present=lambda: self.stream,
-            streams=lambda: {self.stream.boot_id: self.stream},
-            hello=self._hello,
-            secret=lambda server_id: secret,
-            status=lambda backlog: Status(missed_slots=0, backlog_frames=backlog),
-            wanted=lambda server_id, wanted, known: None,
-            damaged=lambda stream, numbers: None,
+        secret = generate_secret()
+        source = NodeCallbacks(
+            get_present_stream=lambda: self.stream,
+            get_streams=lambda: {self.stream.stream_id: self.stream},
+            make_hello=self._hello,
+            get_secret=lambda server_id: secret,
+            make_status=lambda backlog: NodeStatus(missed_slots=0, backlog_frames=backlog),
+            on_retention_request=lambda server_id, wanted, known: None,
+            on_damaged_frames=lambda stream, numbers: None,
         )
         self.publisher = Publisher(
             server, source, token=os.environ.get("FOOTTILE_TOKEN"), report=self.said.append
@@ -240,7 +242,7 @@ class ReplayedNode:
         return Hello(
             protocol=PROTOCOL,
             array_info=self.stream.info,
-            held=tuple(self.stream.held),
+            stored=tuple(self.stream.available),
             next_seq=self.stream.next_seq,
             t_mono_ns=time.monotonic_ns(),
             scene=load_scene(SCENE).model_dump(mode="json"),
@@ -269,14 +271,14 @@ class ReplayedNode:
             later, later_ns = later + lap_frames, later_ns + lap_ns
 
     def _put(self, batch: EncodedBatch) -> None:
-        self.stream.put(batch)
-        self.publisher.notify()
+        self.stream.queue_batch(batch)
+        self.publisher.notify_new_frames()
         # What the server has on its disk is let go of: there is no other place for it here.
         self._kept.append(batch.numbers)
         acked = self.stream.acked
         while self._kept and not self._kept[0] - acked:
             self._kept.popleft()
-            self.stream.drop_oldest(EVICTED, self._wanted)
+            self.stream.drop_oldest_waiting(EVICTED, self._wanted)
 
 
 def run_load(played: Played, count: int, server: str, control: Connection) -> None:
@@ -287,7 +289,7 @@ def run_load(played: Played, count: int, server: str, control: Connection) -> No
 async def _load(played: Played, count: int, server: str, control: Connection) -> Sent:
     nodes = [ReplayedNode(played, f"node{i:02d}", server) for i in range(count)]
     renumbered = Renumbered(played)
-    publishing = [asyncio.create_task(node.publisher.run()) for node in nodes]
+    publishing = [asyncio.create_task(node.publisher.publish_forever()) for node in nodes]
     # Nodes do not beat together.
     batch_s = 1e-9 * (played.lap_end_ns - played.lap_begin_ns) / len(played.lap)
     taking = [

@@ -30,11 +30,11 @@ import numpy as np
 from acquisition_jitter import RATE_HZ, opened
 
 from devices.acquisition import Acquisition
-from devices.chips.dynamixel.reader import open_servo
-from devices.chips.dynamixel.servo import ServoReader
+from devices.chips.dynamixel.driver import open_servo
+from devices.chips.dynamixel.position_sources import ThreadedServoSource
 from devices.clock import SystemClock, UtcAnchor
-from devices.frames import FrameStatus
-from devices.realtime import sharpen_timers
+from devices.frames import FrameFlag
+from devices.realtime import set_timer_slack
 from tests.builders.servo import FaultyServo
 
 BAUDRATE = 1_000_000
@@ -85,7 +85,7 @@ def line(kind: str, protocol: int) -> Iterator[str]:
 
 def take(kind: str, protocol: int, seconds: float) -> tuple[list[int], int, int]:
     """Instants of the frames; how many of them had a position; readings that failed."""
-    sharpen_timers()
+    set_timer_slack()
     clock = SystemClock()
     ready = opened(clock)
     with contextlib.ExitStack() as stack:
@@ -98,19 +98,19 @@ def take(kind: str, protocol: int, seconds: float) -> tuple[list[int], int, int]
                 protocol=protocol,
             )
             stack.callback(servo.close)
-            reader = stack.enter_context(ServoReader(servo, clock, rate_hz=SERVO_HZ))
-        anchor = UtcAnchor.now(clock_set=True)
+            reader = stack.enter_context(ThreadedServoSource(servo, clock, rate_hz=SERVO_HZ))
+        anchor = UtcAnchor.measure(clock_set=True)
         acquisition = Acquisition(
             ready.array, ready.tiles, clock, anchor, rate_hz=RATE_HZ, servo=reader
         )
         end_ns = clock.now_ns() + round(seconds * 1e9)
         t_ns: list[int] = []
         positions = 0
-        for batch in acquisition.run(lambda: clock.now_ns() >= end_ns):
+        for batch in acquisition.acquire_batches(lambda: clock.now_ns() >= end_ns):
             t_ns += batch.t_mono_ns.tolist()
             if reader is not None:
-                positions += int((batch.frame_status & FrameStatus.SERVO_STALE == 0).sum())
-        return t_ns, positions, 0 if reader is None else reader.failures
+                positions += int((batch.frame_flags & FrameFlag.SERVO_STALE == 0).sum())
+        return t_ns, positions, 0 if reader is None else reader.failed_readings
 
 
 def main() -> None:

@@ -16,13 +16,13 @@ from pathlib import Path
 from devices.buses.i2c import i2c_msg
 from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart, PartFaults
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
-from devices.emulation.faults import Faults
-from devices.scene.file import load_scene
-from devices.scene.hardware import ScheduleName
-from service.offline.calibrations import find_calibration
-from service.offline.simulate import SimulateOptions, simulate
+from devices.emulation.fault_timing import SceneFaults
+from devices.scene.hardware_sections import ScheduleName
+from devices.scene.scene_file import load_scene
+from service.offline.calibration_lookup import find_calibration
+from service.offline.simulation import SimulationOptions, run_simulation
 from service.sessions.pipeline import EstimateOptions
 
 SECONDS = 30.0
@@ -33,20 +33,20 @@ def session(scene_name: str, schedule: ScheduleName | None) -> tuple[float, floa
     """Frames/s in virtual time, and virtual seconds per wall second."""
     scene = load_scene(scene_name)
     calibration = find_calibration("emulated-rig", [tile.serial for tile in scene.tile])
-    options = SimulateOptions(scene, seconds=SECONDS, schedule=schedule)
+    options = SimulationOptions(scene, seconds=SECONDS, schedule=schedule)
     estimate = EstimateOptions(calibration, scene.models, 100.0)
     results = []
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(RUNS):
-            results.append(simulate(options, Path(folder) / "s.parquet", lambda: estimate))
+            results.append(run_simulation(options, Path(folder) / "s.parquet", lambda: estimate))
     return results[0].rate_hz, statistics.median(r.seconds / r.wall_s for r in results)
 
 
 def bare_bus() -> float:
     """Virtual seconds per wall second of ten transfers a frame and nothing else."""
     clock = VirtualClock()
-    silicon = Silicon((1, 1, 1, 1), 1_600_000, lambda t_ns: (500, 500))
-    chips = [EmulatedMpl115a2(silicon, faults=PartFaults(scene=Faults(()))) for _ in range(4)]
+    silicon = EmulatedPart((1, 1, 1, 1), 1_600_000, lambda t_ns: (500, 500))
+    chips = [EmulatedMpl115a2(silicon, faults=PartFaults(scene=SceneFaults(()))) for _ in range(4)]
     mux = EmulatedTca9548a(0x70, dict(enumerate(chips)))
     adapter = EmulatedI2cAdapter([mux], clock, 400_000.0)
     selects = [i2c_msg.write(0x70, [1 << i]) for i in range(4)]

@@ -33,30 +33,30 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
-from recording_memory import BOOT_ID, UTC_NS, array, minute
+from recording_memory import STREAM_ID, UTC_NS, array, minute
 from side_by_side import in_turns, note, spread, table
 
 from service.api.app import make_app
 from service.api.logins import Logins
 from service.estimation import OFFLINE_LAG_MS
 from service.offline.estimate.request import EstimateRequest
-from service.offline.estimate.session import Estimated, estimate_session
+from service.offline.estimate.session import EstimateResult, estimate_session
 from service.server.server import Server
-from storage.file_hash import sha256_of
-from storage.formats.sealed import export_of
+from storage.formats.sealed_export import make_sealed_export
 from storage.formats.slice import Slice
-from storage.formats.written.arrow import ARROW
-from storage.schema import ESTIMATES, Array
-from storage.sessions.file import SessionWriter
+from storage.formats.writers.arrow import ARROW
+from storage.parquet_hash import compute_sha256
+from storage.schema import ESTIMATE_COLUMNS, Array
 from storage.sessions.folder import (
     FRAMES_NAME,
     Ledger,
     Part,
     PartLedger,
     Session,
-    SessionFolder,
+    SessionsFolder,
 )
-from storage.sessions.reader import SessionReader
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
 
 TILES, RATE_HZ = 4, 544.0
 COLUMN, SECONDS = "grf_n", 10.0
@@ -77,24 +77,24 @@ def write(
     data: Path, number: int, minutes: int, *, tiles: int = TILES, rate_hz: float = RATE_HZ
 ) -> Path:
     """Seal a session of so many minutes of noise, as a server has it."""
-    sessions = SessionFolder(data / "sessions")
+    sessions = SessionsFolder(data / "sessions")
     name = session_id(number)
     frames, estimates = minute(1, tiles, rate_hz), noise(round(60 * rate_hz), tiles)
-    part = Part(boot_id=BOOT_ID, seq_first=0, seq_last=minutes * len(frames) - 1)
+    part = Part(stream_id=STREAM_ID, seq_first=0, seq_last=minutes * len(frames) - 1)
     said = {"id": name, "node": "bench", "parts": [part.model_dump()]}
-    path = sessions.path(name) / FRAMES_NAME
+    path = sessions.get_path(name) / FRAMES_NAME
     path.parent.mkdir(parents=True)
-    with SessionWriter(path, array(tiles, rate_hz), {"session": said}) as writer:
+    with SealedFileWriter(path, array(tiles, rate_hz), {"session": said}) as writer:
         for at in range(minutes):
             later = {
                 "seq": np.arange(at * len(frames), (at + 1) * len(frames), dtype=np.uint64),
                 "t_mono_ns": frames.t_mono_ns + at * _MINUTE_NS,
                 "t_ns": frames.t_ns + at * _MINUTE_NS,
             }
-            writer.append(replace(frames, **later), estimates)
+            writer.append_frames(replace(frames, **later), estimates)
     count = minutes * len(frames)
     of_part = PartLedger(
-        boot_id=BOOT_ID, seq_first=0, seq_last=count - 1, recorded=count, lost={}, pending=0
+        stream_id=STREAM_ID, seq_first=0, seq_last=count - 1, recorded=count, lost={}, pending=0
     )
     sessions.save(
         Session(
@@ -110,7 +110,7 @@ def write(
             frames=count,
             duration_s=minutes * 60.0,
             bytes=path.stat().st_size,
-            sha256=sha256_of(path),
+            sha256=compute_sha256(path),
         )
     )
     return path
@@ -120,7 +120,7 @@ def noise(rows: int, tiles: int) -> dict[str, Array]:
     """Estimates that mean nothing and take about as many bytes as those that do."""
     rng = np.random.default_rng(0)
     columns: dict[str, Array] = {"part": np.zeros(rows, dtype=np.uint16)}
-    for column in ESTIMATES:
+    for column in ESTIMATE_COLUMNS:
         values = np.round(rng.normal(0.0, 8.0, (rows, tiles) if column.per_tile else rows) * 8) / 8
         is_bits = pa.types.is_integer(column.type)
         columns[column.name] = np.zeros(rows, column.type.to_pandas_dtype()) if is_bits else values
@@ -147,11 +147,11 @@ def by_pyarrow(path: Path, start_s: float, metadata: pq.FileMetaData | None) -> 
 def by_export(path: Path, start_s: float) -> Values:
     """What `foottile export` does."""
     part = Slice(start_s, start_s + SECONDS, (COLUMN,))
-    with SessionReader(path, only_slices=True) as reader:
-        return _column(b"".join(ARROW.written(export_of(reader, part))))
+    with SealedFileReader(path, only_slices=True) as reader:
+        return _column(b"".join(ARROW.encode(make_sealed_export(reader, part))))
 
 
-def by_estimate(path: Path, start_s: float) -> Estimated:
+def by_estimate(path: Path, start_s: float) -> EstimateResult:
     """What `foottile estimate` does."""
     with tempfile.TemporaryDirectory() as folder:
         request = EstimateRequest(
@@ -162,7 +162,9 @@ def by_estimate(path: Path, start_s: float) -> Estimated:
             tare_s=(0.0, 1.0),
             part=Slice(start_s, start_s + SECONDS),
         )
-        return estimate_session(path, Path(folder) / "out.parquet", request, remark=lambda _: None)
+        return estimate_session(
+            path, Path(folder) / "out.parquet", request, on_remark=lambda _: None
+        )
 
 
 def _column(content: bytes) -> Values:

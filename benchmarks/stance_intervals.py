@@ -15,8 +15,8 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from service.cli.main import main as foottile
-from service.sessions.stances import stances_in
-from storage.sessions.reader import SessionReader
+from service.sessions.stances import compute_stances
+from storage.sessions.reader import SealedFileReader
 
 SCENES = ("poppy", "rolling", "mud")
 DRAWS = 4
@@ -42,8 +42,8 @@ def judged(path: Path) -> Iterator[tuple[dict[str, Any], dict[str, float]]]:
     table = pq.read_table(path, columns=list(_NAMES))
     t_ns, grf_n, cop_m, true_n, true_m = (table[name].to_numpy() for name in _NAMES)
     t_s = (t_ns - t_ns[0]) * 1e-9
-    with SessionReader(path) as session:
-        stances = [row for row in stances_in(session).to_pylist() if row["is_whole"]]
+    with SealedFileReader(path) as session:
+        stances = [row for row in compute_stances(session).to_pylist() if row["is_whole"]]
     edges = [np.searchsorted(t_ns, [row["begin_t_ns"], row["end_t_ns"]]) for row in stances]
     if not edges:
         return

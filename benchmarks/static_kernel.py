@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MAX_KPA, PRESSURE_MIN_KPA, Coefficients
-from devices.frames import NOT_READ, FrameBatch, TileStatus
-from service.estimation.calibration import BASIS, LOOP_OPENS_N
-from service.estimation.ladder.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
-from service.estimation.ladder.whole import HULL_SIGMAS
+from devices.frames import NOT_READ, FrameBatch, TileFlag
+from service.estimation.calibration import CUBIC_TERMS, LOOP_HALF_WIDTH_FORCE_N
+from service.estimation.pipeline.grf_cop import HULL_SIGMAS
+from service.estimation.pipeline.plan import SIGNIFICANCE_SIGMAS, TARE_OLD_NS, EstimationPlan
 
 Floats = npt.NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class StaticKernel:
         )
         self.baseline_kpa = _column(plan.tare.baseline_kpa)
         self.a0 += PRESSURE_MIN_KPA
-        entries = [plan.calibration.of(tile.serial) for tile in tiles]
+        entries = [plan.calibration.get_tile(tile.serial) for tile in tiles]
         self.offset = _column([t.p_offset_kpa for t in entries])
         self.per_kpa = 1.0 / _column([t.p_scale_kpa for t in entries])
         self.high_kpa = _column([t.range_kpa[1] for t in entries])
@@ -48,17 +48,19 @@ class StaticKernel:
             _column([t.coefficients[k] * t.f_scale_n for t in entries]) for k in (1, 2, 3)
         )
         self.u0 = -self.offset * self.per_kpa
-        self.slope_at_zero = _column(plan.ladder.curves.slope_at_zero_n_per_kpa)
+        self.slope_at_zero = _column(plan.model_set.static_curves.slope_at_zero_n_per_kpa)
         self.misfit = _column([t.relative_misfit for t in entries])
         self.loop_n = _column([t.loop_misfit_n for t in entries])
         # The matrix is symmetric: six terms instead of nine.
         self.covariance = {
             (i, j): _column([t.covariance[i][j] * t.f_scale_n**2 * (2 - (i == j)) for t in entries])
-            for i in range(BASIS)
-            for j in range(i, BASIS)
+            for i in range(CUBIC_TERMS)
+            for j in range(i, CUBIC_TERMS)
         }
         self.still_kpa = _column(np.hypot(plan.tare.noise_kpa, plan.tare.baseline_sigma_kpa))
-        self.low_kpa = _column([t.range_kpa[0] for t in entries]) - SIGMAS * self.still_kpa
+        self.low_kpa = (
+            _column([t.range_kpa[0] for t in entries]) - SIGNIFICANCE_SIGMAS * self.still_kpa
+        )
         self.plan = plan
         self.f = [np.empty((n, rows)) for _ in range(9)]
         self.flag = [np.empty((n, rows), dtype=np.bool_) for _ in range(4)]
@@ -72,18 +74,18 @@ class StaticKernel:
         kpa, gauge, u, d, curve, slope, variance, force, extra = (f[:, :n] for f in self.f)
         missing, other, saturated, spare = (f[:, :n] for f in self.flag)
         # Counts to gauge pressure
-        np.copyto(kpa, frames.padc.T)
-        np.copyto(u, frames.tadc.T)
+        np.copyto(kpa, frames.pressure_raw.T)
+        np.copyto(u, frames.temperature_raw.T)
         np.multiply(u, self.c12, out=d)
         d += self.b1
         np.multiply(kpa, d, out=kpa)
         u *= self.b2
         kpa += u
         kpa += self.a0
-        np.not_equal(frames.status.T & np.uint8(TileStatus.UNUSABLE), 0, out=missing)
-        np.equal(frames.padc.T, NOT_READ, out=other)
+        np.not_equal(frames.tile_flags.T & np.uint8(TileFlag.UNUSABLE), 0, out=missing)
+        np.equal(frames.pressure_raw.T, NOT_READ, out=other)
         missing |= other
-        np.equal(frames.tadc.T, NOT_READ, out=other)
+        np.equal(frames.temperature_raw.T, NOT_READ, out=other)
         missing |= other
         np.less(kpa, PRESSURE_MIN_KPA, out=other)
         missing |= other
@@ -128,7 +130,7 @@ class StaticKernel:
         u *= u
         variance += u
         np.abs(force, out=u)
-        np.add(u, LOOP_OPENS_N, out=d)
+        np.add(u, LOOP_HALF_WIDTH_FORCE_N, out=d)
         np.divide(u, d, out=u)
         u *= self.loop_n
         u *= u
@@ -149,7 +151,7 @@ class StaticKernel:
         np.copyto(divisor, grf)
         np.copyto(divisor, np.nan, where=grf == 0.0)
         for axis, (at, at_sigma) in enumerate(((x, sx), (y, sy), (z, sz))):
-            arm = self.plan.bearing_m[:, axis, None]
+            arm = self.plan.tile_positions_m[:, axis, None]
             np.multiply(force, arm, out=u)
             np.add.reduce(u, axis=0, out=at)
             np.divide(at, divisor, out=at)
@@ -177,7 +179,7 @@ class StaticKernel:
         np.greater(frames.t_ns, self.plan.tare.t_ns + TARE_OLD_NS, out=also)
         np.bitwise_or(status, np.uint16(128), out=status, where=also)
         np.greater_equal(grf, self.plan.contact.on_n, out=good)
-        np.multiply(grf_sigma, SIGMAS, out=nothing)
+        np.multiply(grf_sigma, SIGNIFICANCE_SIGMAS, out=nothing)
         np.greater_equal(grf, nothing, out=also)
         good &= also
         for at_sigma in (sx, sy):

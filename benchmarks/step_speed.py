@@ -18,7 +18,7 @@ import numpy as np
 
 from devices.frames import FrameBatch
 from service.estimation.estimate import Estimator
-from service.estimation.ladder.plan import EstimationPlan
+from service.estimation.pipeline.plan import EstimationPlan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -62,10 +62,10 @@ def frames_of(n: int, tiles: int) -> FrameBatch:
 def cpu_s(plan: EstimationPlan, frames: FrameBatch, batch: int) -> float:
     """CPU time of all frames, in steps of so many."""
     estimator, edges = Estimator(plan), range(0, len(frames), batch)
-    batches = [frames.rows(begin, min(begin + batch, len(frames))) for begin in edges]
+    batches = [frames.slice_rows(begin, min(begin + batch, len(frames))) for begin in edges]
     began_s = time.process_time()
     for each in batches:
-        estimator.step(each)
+        estimator.process_frames(each)
     return time.process_time() - began_s
 
 

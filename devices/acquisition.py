@@ -11,8 +11,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from devices.array.array import TileArray
-from devices.array.ports import Scan
+from devices.array.tile_array import TileArray
+from devices.array.tile_io import Scan
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.clock import Clock, UtcAnchor
@@ -21,17 +21,17 @@ from devices.frames import (
     NO_SERVO_COUNTS,
     NOT_READ,
     FrameBatch,
-    FrameStatus,
+    FrameFlag,
+    TileFlag,
     TileInfo,
-    TileStatus,
-    zero_columns,
+    allocate_columns,
 )
-from devices.temperature import HeldTemperature, hold_temperature
+from devices.temperature_hold import HeldTemperature, hold_temperature
 
 BATCH_NS = 25_000_000
 """Duration of a batch. At 10 ms two fifths of a message would be header (performance.md)."""
 
-STALLED_AFTER = 3
+STALL_SLOTS = 3
 """Slots missed at once from which a loop without a set rate counts as stalled and is flagged.
 
 The loop may also be ahead of its slots by as many periods, which makes up for longer frames.
@@ -44,7 +44,7 @@ _AGE_MAX_US = 2**31 - 1  # the limit of int32
 class ServoSource(Protocol):
     """Source of the newest servo position. The tile loop never waits for it."""
 
-    def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
+    def find_latest_position(self, t_mono_ns: int) -> tuple[int, int] | None:
         """Return the newest position known at `t_mono_ns`, in counts, and its sample instant.
 
         None before the first reading.
@@ -68,17 +68,17 @@ class FrameRow(NamedTuple):
     servo_counts: int
     servo_age_us: int
     reference_force_n: float
-    frame_status: int
-    padc: Sequence[int]
-    tadc: Sequence[int]
+    frame_flags: int
+    pressure_raw: Sequence[int]
+    temperature_raw: Sequence[int]
     sample_offset_us: Sequence[int]
-    status: Sequence[int]
+    tile_flags: Sequence[int]
 
 
-class FrameKeeper(Protocol):
+class FrameSink(Protocol):
     """Sink that receives every frame at once, before its batch is complete."""
 
-    def put(self, frame: FrameRow) -> None:
+    def write_frame(self, frame: FrameRow) -> None:
         """Store one frame. It must be quick: the loop waits."""
 
 
@@ -93,11 +93,12 @@ class Acquisition:
         clock: virtual or real clock.
         anchor: UTC anchor of the stream.
         rate_hz: frame rate; 0: as fast as the schedule allows.
-        expected_hz: expected rate without a set rate, to count missed slots; 0: do not count.
+        expected_rate_hz: expected rate without a set rate, to count missed slots; 0: do not count.
         servo: source of the position stored with each frame.
-        is_new: the array was identified again in a running node; flagged in the first frame.
-        keeper: stores frames while their batch is being filled. Readings out of range are flagged
-            later, when a batch is complete (`RangeFlag`).
+        is_reidentified: the array was identified again in a running node; flagged in the first
+            frame.
+        frame_sink: stores frames while their batch is being filled. Readings out of range are
+            flagged later, when a batch is complete (`RangeDetector`).
         lead_end_ns: as the attribute.
     """
 
@@ -109,10 +110,10 @@ class Acquisition:
         anchor: UtcAnchor,
         *,
         rate_hz: float = 0.0,
-        expected_hz: float = 0.0,
+        expected_rate_hz: float = 0.0,
         servo: ServoSource | None = None,
-        is_new: bool = False,
-        keeper: FrameKeeper | None = None,
+        is_reidentified: bool = False,
+        frame_sink: FrameSink | None = None,
         lead_end_ns: int | None = None,
     ) -> None:
         self.missed_slots = 0
@@ -124,18 +125,18 @@ class Acquisition:
         self._clock = clock
         self._anchor = anchor
         self._period_ns = round(1e9 / rate_hz) if rate_hz else 0
-        self._expected_ns = round(1e9 / expected_hz) if expected_hz else 0
+        self._expected_period_ns = round(1e9 / expected_rate_hz) if expected_rate_hz else 0
         self._servo = servo
-        self._is_new = is_new
-        self._keeper = keeper
+        self._is_reidentified = is_reidentified
+        self._frame_sink = frame_sink
         self.lead_end_ns = lead_end_ns
         """End of the lead of an emulated load: earlier frames are flagged; None: no lead."""
-        self._range = RangeFlag(tiles)
+        self._range_detector = RangeDetector(tiles)
         self._next_seq = 0
         self._last_t_mono_ns = 0
-        array.begin()
+        array.begin_stream()
 
-    def run(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
+    def acquire_batches(self, should_stop: Callable[[], bool]) -> Iterator[FrameBatch]:
         """Acquire frames until `stop()`, evaluated before every frame, returns True.
 
         Yields:
@@ -145,36 +146,40 @@ class Acquisition:
             BusMisuseError: as for `TileArray.scan`; other faults are flags.
         """
         slot_ns = self._clock.now_ns()
-        while not stop():
-            columns = zero_columns(_BATCH_FRAMES_MAX, len(self._array.tiles))
+        while not should_stop():
+            columns = allocate_columns(_BATCH_FRAMES_MAX, len(self._array.tiles))
             row = 0
             batch_end_ns = self._clock.now_ns() + BATCH_NS
-            while row < _BATCH_FRAMES_MAX and self._clock.now_ns() < batch_end_ns and not stop():
-                frame_status = 0
+            while (
+                row < _BATCH_FRAMES_MAX
+                and self._clock.now_ns() < batch_end_ns
+                and not should_stop()
+            ):
+                frame_flags = 0
                 if self._period_ns:
                     late = max(0, self._clock.now_ns() - slot_ns) // self._period_ns
                     if late:
                         self.missed_slots += late
                         slot_ns += late * self._period_ns
-                        frame_status |= FrameStatus.OVERRUN
+                        frame_flags |= FrameFlag.OVERRUN
                     self._clock.sleep_until_ns(slot_ns)
                     slot_ns += self._period_ns
-                elif self._expected_ns:
+                elif self._expected_period_ns:
                     now_ns = self._clock.now_ns()
-                    late = max(0, now_ns - slot_ns) // self._expected_ns
+                    late = max(0, now_ns - slot_ns) // self._expected_period_ns
                     self.missed_slots += late
-                    if late >= STALLED_AFTER:
-                        frame_status |= FrameStatus.OVERRUN
+                    if late >= STALL_SLOTS:
+                        frame_flags |= FrameFlag.OVERRUN
                     # A loop that is a little late in each frame misses slots, too.
-                    slot_ns += (late + 1) * self._expected_ns
-                    slot_ns = min(slot_ns, now_ns + STALLED_AFTER * self._expected_ns)
-                self._fill(columns, row, self._array.scan(), frame_status)
+                    slot_ns += (late + 1) * self._expected_period_ns
+                    slot_ns = min(slot_ns, now_ns + STALL_SLOTS * self._expected_period_ns)
+                self._store_frame(columns, row, self._array.scan_frame(), frame_flags)
                 row += 1
             if row:
-                yield self._batch(columns, row)
+                yield self._make_batch(columns, row)
 
-    def _fill(
-        self, columns: dict[str, np.ndarray], row: int, scan: Scan, frame_status: int
+    def _store_frame(
+        self, columns: dict[str, np.ndarray], row: int, scan: Scan, frame_flags: int
     ) -> None:
         samples_ns = [
             stop_ns + delay_ns
@@ -182,27 +187,29 @@ class Acquisition:
                 scan.convert_stop_ns, self._array.sample_delay_ns, strict=True
             )
         ]
-        first = next((i for i, padc in enumerate(scan.padc) if padc != NOT_READ), 0)
+        first = next(
+            (i for i, pressure_raw in enumerate(scan.pressure_raw) if pressure_raw != NOT_READ), 0
+        )
         # Monotonic: the sample of a tile that was skipped in this frame is older.
         t_mono_ns = max(samples_ns[first], self._last_t_mono_ns + 1)
         self._last_t_mono_ns = t_mono_ns
-        if self._is_new:
-            frame_status |= FrameStatus.NEW_ARRAY_INFO
-            self._is_new = False
+        if self._is_reidentified:
+            frame_flags |= FrameFlag.NEW_ARRAY_INFO
+            self._is_reidentified = False
         if scan.bus_fault:
-            frame_status |= FrameStatus.BUS_FAULT
+            frame_flags |= FrameFlag.BUS_FAULT
         if self.lead_end_ns is not None and t_mono_ns < self.lead_end_ns:
-            frame_status |= FrameStatus.LEAD
+            frame_flags |= FrameFlag.LEAD
         servo_counts, servo_age_us = NO_SERVO_COUNTS, NO_SERVO_AGE
         if self._servo is not None:
-            reading = self._servo.latest(t_mono_ns)
+            reading = self._servo.find_latest_position(t_mono_ns)
             if reading is not None:
                 servo_counts, age_ns = reading[0], t_mono_ns - reading[1]
                 servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
                 if not self._servo.is_turn_known:
-                    frame_status |= FrameStatus.SERVO_TURN_UNKNOWN
+                    frame_flags |= FrameFlag.SERVO_TURN_UNKNOWN
             if reading is None or age_ns > self._servo.stale_after_ns:
-                frame_status |= FrameStatus.SERVO_STALE
+                frame_flags |= FrameFlag.SERVO_STALE
         # Positional for speed: this runs for every frame.
         frame = FrameRow(
             self._next_seq,
@@ -211,25 +218,25 @@ class Acquisition:
             servo_counts,
             servo_age_us,
             scan.reference_n,
-            frame_status,
-            scan.padc,
-            scan.tadc,
+            frame_flags,
+            scan.pressure_raw,
+            scan.temperature_raw,
             [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
-            scan.status,
+            scan.tile_flags,
         )
         for name, value in zip(FrameRow._fields, frame, strict=True):
             columns[name][row] = value
-        if self._keeper is not None:
-            self._keeper.put(frame)
+        if self._frame_sink is not None:
+            self._frame_sink.write_frame(frame)
         self._next_seq += 1
 
-    def _batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:
+    def _make_batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:
         batch = FrameBatch(**{name: column[:rows] for name, column in columns.items()})
-        self._range.flag(batch)
+        self._range_detector.flag_out_of_range(batch)
         return batch
 
 
-class RangeFlag:
+class RangeDetector:
     """Detector of readings outside the chips' pressure range, for batches in order.
 
     Raw counts stay as read. Beyond its range a part's count falls through zero and wraps to near
@@ -240,9 +247,9 @@ class RangeFlag:
         self._compensation = Compensation(tiles)
         self._temperature: HeldTemperature | None = None
 
-    def flag(self, batch: FrameBatch) -> None:
+    def flag_out_of_range(self, batch: FrameBatch) -> None:
         """Set the flag `OVER_RANGE` in the batch, in place."""
         held, self._temperature = hold_temperature(batch, self._temperature)
-        kpa = self._compensation.readable_kpa(held)
-        outside = (kpa > PRESSURE_MAX_KPA) | (kpa < PRESSURE_MIN_KPA) | (batch.padc <= 1)
-        batch.status[outside & ~np.isnan(kpa)] |= np.uint8(TileStatus.OVER_RANGE)
+        kpa = self._compensation.compute_usable_kpa(held)
+        outside = (kpa > PRESSURE_MAX_KPA) | (kpa < PRESSURE_MIN_KPA) | (batch.pressure_raw <= 1)
+        batch.tile_flags[outside & ~np.isnan(kpa)] |= np.uint8(TileFlag.OVER_RANGE)

@@ -17,23 +17,23 @@ Bools = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Arrays:
+class ArrayRecord:
     """Base class of records whose fields are all arrays with the same first axis."""
 
-    def rows(self, start: int, stop: int) -> Self:
+    def slice_rows(self, start: int, stop: int) -> Self:
         """Return rows `start` to `stop` as views."""
         # `vars`, because `fields` takes longer than the views; this runs for every message.
         return type(self)(**{name: column[start:stop] for name, column in vars(self).items()})
 
-    def select(self, which: Bools | Ints) -> Self:
+    def select_rows(self, mask_or_rows: Bools | Ints) -> Self:
         """Return a copy of the rows selected by a mask or by row numbers."""
-        return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+        return type(self)(**{f.name: getattr(self, f.name)[mask_or_rows] for f in fields(self)})
 
     def copy(self) -> Self:
         """Return a deep copy, with writable arrays."""
         return type(self)(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
-    def is_same(self, other: Self) -> bool:
+    def has_equal_values(self, other: Self) -> bool:
         """Return whether all values are equal; NaN equals NaN."""
         return all(
             np.array_equal(getattr(self, f.name), getattr(other, f.name), equal_nan=True)

@@ -82,13 +82,13 @@ class UtcAnchor:
     clock_set: bool
 
     @classmethod
-    def now(cls, *, clock_set: bool) -> UtcAnchor:
+    def measure(cls, *, clock_set: bool) -> UtcAnchor:
         """Read both clocks of this machine as nearly at one instant as possible."""
         before_ns = time.monotonic_ns()
         t_ns = time.time_ns()
-        return cls.of((before_ns + time.monotonic_ns()) // 2, t_ns, clock_set=clock_set)
+        return cls.from_readings((before_ns + time.monotonic_ns()) // 2, t_ns, clock_set=clock_set)
 
     @classmethod
-    def of(cls, t_mono_ns: int, t_ns: int, *, clock_set: bool) -> UtcAnchor:
+    def from_readings(cls, t_mono_ns: int, t_ns: int, *, clock_set: bool) -> UtcAnchor:
         """Build an anchor from one simultaneous reading of both clocks."""
         return cls(offset_ns=t_ns - t_mono_ns, clock_set=clock_set)

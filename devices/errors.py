@@ -38,7 +38,7 @@ Every error has four facts: `what` happened, `where`, the `expected` state, and 
 errors are also a built-in type, so that callers can catch that. In a running stream a fault is a
 flag and a NaN (see `devices.frames`); these errors stop a command, never a stream.
 
-`needs_extra` guards the import of optional packages.
+`require_extra` guards the import of optional packages.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Literal, TypedDict, Unpack
 
-from devices.words import printable
+from devices.text import escape_control_chars
 
 Extra = Literal["server", "client", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
 
@@ -55,14 +55,14 @@ OUR_PACKAGES = ("devices", "storage", "service", "foottile")
 
 
 @contextmanager
-def needs_extra(extra: Extra, what: str, *, remedy: str = "") -> Iterator[None]:
+def require_extra(extra: Extra, feature: str, *, remedy: str = "") -> Iterator[None]:
     """Turn a failed import of an optional package into an error that names its extra.
 
     Use as a `with` block around the imports, or as the decorator of a function.
 
     Args:
         extra: extra of `pyproject.toml` that installs the packages.
-        what: feature that needs the packages; the error's text begins with it.
+        feature: feature that needs the packages; the error's text begins with it.
         remedy: remedy, instead of the command that installs the extra.
 
     Raises:
@@ -75,12 +75,12 @@ def needs_extra(extra: Extra, what: str, *, remedy: str = "") -> Iterator[None]:
         if package in OUR_PACKAGES:  # our own bug, not a missing package
             raise
         raise MissingExtraError(
-            f"{what} needs {package}, which is not installed",
+            f"{feature} needs {package}, which is not installed",
             remedy=remedy or f"Install it: pip install 'foottile[{extra}]'",
         ) from error
 
 
-class _Facts(TypedDict, total=False):
+class _ErrorFacts(TypedDict, total=False):
     where: str
     expected: str
     remedy: str
@@ -108,13 +108,13 @@ class FootTileError(Exception):
             text += f"; expected {self.expected}"
         if self.remedy:
             text += f"{'' if text.endswith(('.', '?', '!')) else '.'} {self.remedy}"
-        return printable(text)
+        return escape_control_chars(text)
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only arguments must survive pickling between processes.
-        return (_rebuild, (type(self), self.facts()))
+        return (_rebuild, (type(self), self.to_dict()))
 
-    def facts(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """Return the facts of this error by name."""
         return {name: getattr(self, name) for name in self.fact_names}
 
@@ -128,7 +128,9 @@ class _SystemError(FootTileError, OSError):
 
     fact_names = (*FootTileError.fact_names, "errno")
 
-    def __init__(self, what: str, *, errno: int | None = None, **facts: Unpack[_Facts]) -> None:
+    def __init__(
+        self, what: str, *, errno: int | None = None, **facts: Unpack[_ErrorFacts]
+    ) -> None:
         super().__init__(what, **facts)
         self.errno = errno
 
@@ -235,7 +237,7 @@ class DamagedFramesError(FileFormatError):
     fact_names = (*FootTileError.fact_names, "seq_first", "seq_last")
 
     def __init__(
-        self, what: str, *, seq_first: int = 0, seq_last: int = 0, **facts: Unpack[_Facts]
+        self, what: str, *, seq_first: int = 0, seq_last: int = 0, **facts: Unpack[_ErrorFacts]
     ) -> None:
         super().__init__(what, **facts)
         self.seq_first = seq_first

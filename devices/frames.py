@@ -15,16 +15,16 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from devices.arrays import Arrays, Times
-from devices.facts import (
+from devices.arrays import ArrayRecord, Times
+from devices.types import (
     MODELS_MAX,
     RATE_HZ_MIN,
     TILES_MAX,
-    Facts,
-    Label,
+    Identifier,
     Metres,
     OffsetNs,
-    Word,
+    StrictModel,
+    UInt16,
 )
 
 NOT_READ = 65535
@@ -34,7 +34,7 @@ SAME_PLACE_M = 1e-6
 """Tiles that differ by no more along an axis stand in one row."""
 
 
-class TileStatus(IntFlag):
+class TileFlag(IntFlag):
     """Flags of a tile in a frame; bits of `FrameBatch.status`."""
 
     NO_ANSWER = 1
@@ -54,8 +54,8 @@ class TileStatus(IntFlag):
     """Mask of the flags without a usable pressure."""
 
 
-class FrameStatus(IntFlag):
-    """Flags of a frame; bits of `FrameBatch.frame_status`."""
+class FrameFlag(IntFlag):
+    """Flags of a frame; bits of `FrameBatch.frame_flags`."""
 
     OVERRUN = 1
     """The frame began after its slot had passed; slots before it were missed."""
@@ -72,38 +72,38 @@ class FrameStatus(IntFlag):
 
 
 @dataclass(frozen=True)
-class FrameBatch(Arrays):
+class FrameBatch(ArrayRecord):
     """Batch of n frames of an array, in time order.
 
     Attributes:
         seq: uint64[n], number of the frame in its stream, from 0.
         t_mono_ns: int64[n], CLOCK_MONOTONIC at the sample instant of the frame's first tile.
         t_ns: int64[n], the same instant in UTC ns since 1970 (`t_mono_ns` + the stream's anchor).
-        padc: uint16[n, tiles], raw 10-bit pressure counts; `NOT_READ` where not read.
-        tadc: uint16[n, tiles], raw 10-bit temperature counts; `NOT_READ` where not read.
+        pressure_raw: uint16[n, tiles], raw 10-bit pressure counts; `NOT_READ` where not read.
+        temperature_raw: uint16[n, tiles], raw 10-bit temperature counts; `NOT_READ` where not read.
         sample_offset_us: int32[n, tiles], each tile's sample instant minus `t_ns`.
         servo_counts: int32[n], newest position, continued over whole turns (see
-            `devices.chips.dynamixel.turns`); `NO_SERVO_COUNTS` without servo.
+            `devices.chips.dynamixel.turn_unwrapping`); `NO_SERVO_COUNTS` without servo.
         servo_age_us: int32[n], its age at `t_ns`; `NO_SERVO_AGE` without servo.
-        status: uint8[n, tiles], `TileStatus` bits.
-        frame_status: uint8[n], `FrameStatus` bits.
+        tile_flags: uint8[n, tiles], `TileFlag` bits.
+        frame_flags: uint8[n], `FrameFlag` bits.
         reference_force_n: float32[n], the calibration rig's force; NaN without.
     """
 
     seq: npt.NDArray[np.uint64]
     t_mono_ns: Times
     t_ns: Times
-    padc: npt.NDArray[np.uint16]
-    tadc: npt.NDArray[np.uint16]
+    pressure_raw: npt.NDArray[np.uint16]
+    temperature_raw: npt.NDArray[np.uint16]
     sample_offset_us: npt.NDArray[np.int32]
     servo_counts: npt.NDArray[np.int32]
     servo_age_us: npt.NDArray[np.int32]
-    status: npt.NDArray[np.uint8]
-    frame_status: npt.NDArray[np.uint8]
+    tile_flags: npt.NDArray[np.uint8]
+    frame_flags: npt.NDArray[np.uint8]
     reference_force_n: npt.NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        by_tile = self.padc.shape
+        by_tile = self.pressure_raw.shape
         by_frame = by_tile[:1]
         for name, (dtype, per_tile) in FRAME_COLUMNS.items():
             column = getattr(self, name)
@@ -119,29 +119,29 @@ class FrameBatch(Arrays):
     @property
     def tile_count(self) -> int:
         """Number of tiles of the array."""
-        return int(self.padc.shape[1])
+        return int(self.pressure_raw.shape[1])
 
 
 FRAME_COLUMNS: dict[str, tuple[np.dtype[Any], bool]] = {
     "seq": (np.dtype(np.uint64), False),
     "t_mono_ns": (np.dtype(np.int64), False),
     "t_ns": (np.dtype(np.int64), False),
-    "padc": (np.dtype(np.uint16), True),
-    "tadc": (np.dtype(np.uint16), True),
+    "pressure_raw": (np.dtype(np.uint16), True),
+    "temperature_raw": (np.dtype(np.uint16), True),
     "sample_offset_us": (np.dtype(np.int32), True),
     "servo_counts": (np.dtype(np.int32), False),
     "servo_age_us": (np.dtype(np.int32), False),
-    "status": (np.dtype(np.uint8), True),
-    "frame_status": (np.dtype(np.uint8), False),
+    "tile_flags": (np.dtype(np.uint8), True),
+    "frame_flags": (np.dtype(np.uint8), False),
     "reference_force_n": (np.dtype(np.float32), False),
 }
 """Data type of every column, and whether it has one value per tile."""
 
 
-def zero_columns(n: int, tiles: int) -> dict[str, np.ndarray]:
+def allocate_columns(frame_count: int, tile_count: int) -> dict[str, np.ndarray]:
     """Allocate zeroed columns for n frames."""
     return {
-        name: np.zeros((n, tiles) if per_tile else n, dtype)
+        name: np.zeros((frame_count, tile_count) if per_tile else frame_count, dtype)
         for name, (dtype, per_tile) in FRAME_COLUMNS.items()
     }
 
@@ -149,13 +149,13 @@ def zero_columns(n: int, tiles: int) -> dict[str, np.ndarray]:
 _Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class TileInfo(Facts):
+class TileInfo(StrictModel):
     """Tile as identified on the bus at start-up."""
 
-    serial: Label
+    serial: Identifier
     mux: Annotated[int, Field(ge=0, le=0x7F)]
     channel: Annotated[int, Field(ge=0, le=7)]
-    coefficient_words: tuple[Word, Word, Word, Word]
+    coefficient_words: tuple[UInt16, UInt16, UInt16, UInt16]
     """Registers a0, b1, b2, c12 as unsigned 16-bit words (data sheet table 4)."""
     x_m: Metres
     y_m: Metres
@@ -166,10 +166,10 @@ class TileInfo(Facts):
     taken to be a quarter into it."""
 
 
-class ServoInfo(Facts):
+class ServoInfo(StrictModel):
     """Servo of a stream, and the conversion of its position to the segment's angle."""
 
-    model: Label
+    model: Identifier
     counts_per_turn: Annotated[int, Field(gt=0, lt=2**31)]
     zero_counts: Annotated[int, Field(ge=-(2**31), lt=2**31)]
     sign: Literal[-1, 1]
@@ -178,21 +178,21 @@ class ServoInfo(Facts):
     """Forward travel of the ankle per radian (radius of a rolling foot); None: not known."""
 
 
-class ArrayInfo(Facts):
+class ArrayInfo(StrictModel):
     """Description of an array, sent as JSON with its frames."""
 
-    node: Label
-    boot_id: Label
+    node: Identifier
+    stream_id: Identifier
     tiles: Annotated[tuple[TileInfo, ...], Field(max_length=TILES_MAX)]
     servo: ServoInfo | None
-    schedule: Label
+    schedule: Identifier
     nominal_rate_hz: Annotated[float, Field(ge=RATE_HZ_MIN, le=1e5)]
     utc_offset_ns: OffsetNs
     """`t_ns` minus `t_mono_ns` of every frame of this stream."""
     clock_set: bool
-    software: Label
-    scene: Label
-    models: Annotated[tuple[Label, ...], Field(max_length=MODELS_MAX)]
+    software: Identifier
+    scene: Identifier
+    models: Annotated[tuple[Identifier, ...], Field(max_length=MODELS_MAX)]
 
     @model_validator(mode="after")
     def _tiles_differ(self) -> Self:

@@ -18,12 +18,12 @@ _TIMEX_BYTES = 512  # struct timex is 208 bytes on 64-bit kernels
 _FIFO_PRIORITY = 50  # above ordinary work, level with threaded interrupts
 
 
-def sharpen_timers(slack_ns: int = 1_000) -> bool:
+def set_timer_slack(slack_ns: int = 1_000) -> bool:
     """Set the timer slack of this thread (default 50 us); return whether the kernel accepts it."""
     return bool(_libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) == 0)
 
 
-def run_before_others() -> bool:
+def use_realtime_priority() -> bool:
     """Run this thread with SCHED_FIFO; return whether it is permitted (root, or rtprio limit)."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
@@ -32,7 +32,7 @@ def run_before_others() -> bool:
     return True
 
 
-def spare_what_is_loaded() -> None:
+def freeze_garbage_collector() -> None:
     """Exclude all present objects (mostly modules) from garbage collection.
 
     A full collection stops all threads while it visits every object: 55 ms for the hundred thousand
@@ -42,12 +42,12 @@ def spare_what_is_loaded() -> None:
     gc.freeze()
 
 
-def end_with_parent() -> None:
+def terminate_with_parent() -> None:
     """Make the kernel terminate this process when its parent dies."""
     _libc().prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
-def clock_is_set() -> bool:
+def is_clock_set() -> bool:
     """Return whether the kernel reports the wall clock as set (by NTP or a laptop).
 
     A Raspberry Pi has no battery clock: until it is set, its UTC is a guess.

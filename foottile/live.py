@@ -21,7 +21,7 @@ class Live(LiveState, Closing):
     """Made by `Server.live`. It connects when the first batch is asked for; `close` ends it.
 
     Each batch has consecutive frames of one stream, with `seq`, `t_ns`, the columns asked for, and
-    `recomputed`. The array is described in `batch.schema.metadata[b"foottile.array_info"]`.
+    `is_recomputed`. The array is described in `batch.schema.metadata[b"foottile.array_info"]`.
     """
 
     def __init__(self, *asked: Any, **how: Any) -> None:

@@ -42,7 +42,7 @@ class Asked:
         node: the node; None: the only one.
         columns: names; none: all.
         policy: what is left out, if anything.
-        boot_id: stream to begin in; None: the present one.
+        stream_id: stream to begin in; None: the present one.
         from_seq: frame to begin with; None: the next that comes.
     """
 
@@ -50,7 +50,7 @@ class Asked:
     node: str | None
     columns: tuple[str, ...]
     policy: Policy
-    boot_id: str | None = None
+    stream_id: str | None = None
     from_seq: int | None = None
 
     @classmethod
@@ -68,22 +68,21 @@ class Loss:
     """Frames that are left out of a live stream, ends included.
 
     Attributes:
-        boot_id: the stream.
+        stream_id: the stream.
         from_seq: the first of them.
         to_seq: the last of them; None: not known.
         reason: why; as docs/api.md says.
     """
 
-    boot_id: str
+    stream_id: str
     from_seq: int
     to_seq: int | None
     reason: str
 
     def __str__(self) -> str:
         until = "on" if self.to_seq is None else f"to {self.to_seq}"
-        return (
-            f"frames from {self.from_seq} {until} of stream {self.boot_id} are lost: {self.reason}"
-        )
+        frames = f"frames from {self.from_seq} {until} of stream {self.stream_id}"
+        return f"{frames} are lost: {self.reason}"
 
 
 class LiveProtocol:
@@ -99,7 +98,7 @@ class LiveProtocol:
         """What was left out, as far as it was said; the newest thousand."""
         self._asked = asked
         self._on_loss = on_loss
-        self._boot_id, self._next_seq = asked.boot_id, asked.from_seq
+        self._stream_id, self._next_seq = asked.stream_id, asked.from_seq
         self._schema: pa.Schema | None = None
         self._failures = 0
         self._has_begun = False
@@ -107,16 +106,16 @@ class LiveProtocol:
     @property
     def position(self) -> tuple[str, int] | None:
         """Stream and number of the frame that is wanted next; None before the first."""
-        if self._boot_id is None or self._next_seq is None:
+        if self._stream_id is None or self._next_seq is None:
             return None
-        return self._boot_id, self._next_seq
+        return self._stream_id, self._next_seq
 
     def address(self) -> str:
         """Where to connect to, to begin or to go on."""
         asked = self._asked
         query = {"format": "arrow", "policy": asked.policy}
         given = {"node": asked.node, "columns": ",".join(asked.columns) or None}
-        given |= {"boot_id": self._boot_id}
+        given |= {"stream_id": self._stream_id}
         given |= {"from_seq": None if self._next_seq is None else str(self._next_seq)}
         query |= {name: value for name, value in given.items() if value is not None}
         self._schema = None
@@ -152,10 +151,10 @@ class LiveProtocol:
         if code == _UNREADABLE:
             raise DamagedError(f"{self._asked.url}: {reason}")
         if code == _NO_STREAM:
-            if not self._has_begun or self._boot_id is None:
+            if not self._has_begun or self._stream_id is None:
                 raise UsageError(f"{self._asked.url}: {reason}")
-            loss = Loss(self._boot_id, self._next_seq or 0, None, "no_stream")
-            self._boot_id, self._next_seq = None, 0  # all that there is of the present one
+            loss = Loss(self._stream_id, self._next_seq or 0, None, "no_stream")
+            self._stream_id, self._next_seq = None, 0  # all that there is of the present one
             self._lose(loss)
 
     def refused(self, status: int, headers: Mapping[str, str], body: bytes) -> FootTileError | None:
@@ -202,14 +201,14 @@ class LiveProtocol:
         if not isinstance(kind, str):
             raise TypeError("a message without a type")
         if kind == "stream":
-            if said["boot_id"] != self._boot_id or self._next_seq is None:
-                self._boot_id, self._next_seq = said["boot_id"], int(said["from_seq"])
+            if said["stream_id"] != self._stream_id or self._next_seq is None:
+                self._stream_id, self._next_seq = said["stream_id"], int(said["from_seq"])
             self._schema = None
         elif kind in ("lost", "dropped"):
             self._check_next(int(said["from_seq"]))
-            self._boot_id, self._next_seq = said["boot_id"], int(said["to_seq"]) + 1
+            self._stream_id, self._next_seq = said["stream_id"], int(said["to_seq"]) + 1
             reason = str(said["reason"])
-            self._lose(Loss(said["boot_id"], int(said["from_seq"]), int(said["to_seq"]), reason))
+            self._lose(Loss(said["stream_id"], int(said["from_seq"]), int(said["to_seq"]), reason))
 
     def _news(self, batch: pa.RecordBatch) -> pa.RecordBatch | None:
         seq = batch.column("seq")

@@ -34,7 +34,7 @@ class LiveState:
 
     @property
     def position(self) -> tuple[str, int] | None:
-        """`boot_id` and `from_seq` of the frame that is wanted next; None before the first."""
+        """`stream_id` and `first_seq` of the frame that is wanted next; None before the first."""
         return self._protocol.position
 
     @property

@@ -177,7 +177,7 @@ class Server(Closing):
         columns: Sequence[str] = (),
         *,
         policy: Policy = "lossless",
-        boot_id: str | None = None,
+        stream_id: str | None = None,
         from_seq: int | None = None,
         on_loss: Callable[[Loss], None] | None = None,
         give_up_s: float | None = None,
@@ -189,14 +189,14 @@ class Server(Closing):
             columns: of all tiles (`force_n`) or one (`force_n_0`); none: all.
             policy: `lossless`: every frame once, over broken links and restarts of the server;
                 `drop_oldest`: what you are 2 s late for is left out; `latest`: the newest only.
-            boot_id: with `from_seq`, the stream to begin in, as in `Live.position`.
+            stream_id: with `first_seq`, the stream to begin in, as in `Live.position`.
             from_seq: the frame to begin with.
             on_loss: told of frames that are left out; None: for `lossless` a `FramesLostWarning`,
                 and all are in `Live.losses`.
             give_up_s: raise `NoAnswerError` if the server does not answer for so long; None: never,
                 once it has answered.
         """
-        asked = Asked.of(self.http.url, node, columns, policy, boot_id, from_seq)
+        asked = Asked.of(self.http.url, node, columns, policy, stream_id, from_seq)
         return Live(asked, self.http, on_loss=on_loss, give_up_s=give_up_s)
 
 

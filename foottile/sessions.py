@@ -152,7 +152,7 @@ class Session:
             FootTileError: no answer, or it is gone.
         """
         return [
-            Mark.of(each) for each in self._http.get(f"{self._path}/events", has="items")["items"]
+            Mark.of(each) for each in self._http.get(f"{self._path}/markers", has="items")["items"]
         ]
 
     def mark(self, label: str, *, t_ns: int | None = None) -> Mark:
@@ -162,7 +162,7 @@ class Session:
             FootTileError: no answer, or it is refused.
         """
         body = {"label": label, "t_ns": t_ns, "id": uuid.uuid4().hex[:12]}
-        return Mark.of(self._http.send("POST", f"{self._path}/events", body, again=True))
+        return Mark.of(self._http.send("POST", f"{self._path}/markers", body, again=True))
 
     def describe(
         self,
@@ -180,7 +180,7 @@ class Session:
         """
         body = {"name": name, "subject": subject, "notes": notes}
         changes: dict[str, object] = {**body, "tags": None if tags is None else list(tags)}
-        headers = {"If-Match": f'"{self.facts["said"]}"'}
+        headers = {"If-Match": f'"{self.facts["revision"]}"'}
         self.facts = self._http.send("PATCH", self._path, changes, headers=headers)
         return self
 
@@ -239,5 +239,5 @@ def _why_not(facts: Mapping[str, Any]) -> str:
         return str(facts["problem"])
     return {
         "recording": "it is still being recorded, and waits for its stop",
-        "pending": f"it is stopped, and waits for its node's {facts['waits_for'] or 'frames'}",
+        "pending": f"it is stopped, and waits for its node's {facts['pending_reason'] or 'frames'}",
     }.get(facts["state"], "the server is writing it; wait again")

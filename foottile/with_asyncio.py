@@ -107,7 +107,7 @@ class AsyncSession:
         return await asyncio.to_thread(self.now.mark, label, t_ns=t_ns)
 
     async def describe(self, **changes: Any) -> Self:
-        """As `Session.describe`."""
+        """As `Session.make_array_info`."""
         await asyncio.to_thread(self.now.describe, **changes)
         return self
 
@@ -175,13 +175,13 @@ class AsyncServer(AsyncClosing):
         columns: Sequence[str] = (),
         *,
         policy: Policy = "lossless",
-        boot_id: str | None = None,
+        stream_id: str | None = None,
         from_seq: int | None = None,
         on_loss: Callable[[Loss], None] | None = None,
         give_up_s: float | None = None,
     ) -> AsyncLive:
         """As `Server.live`: `async for batch in server.live("left")`."""
-        asked = Asked.of(self._server.url, node, columns, policy, boot_id, from_seq)
+        asked = Asked.of(self._server.url, node, columns, policy, stream_id, from_seq)
         return AsyncLive(asked, self._server.http, on_loss=on_loss, give_up_s=give_up_s)
 
 

@@ -3,10 +3,10 @@
 interface Session {
   id: string; name: string; node: string; state: string; complete: boolean | "lossy"; problem: string | null;
   started_t_ns: number; stopped_t_ns: number | null; duration_s: number; frames: number; pending_frames: number;
-  waits_for: "frames" | "end" | null; lost: Record<string, number>; tail_frames_max: number; missed_slots: number; marks: number;
+  pending_reason: "frames" | "end" | null; lost: Record<string, number>; max_lost_tail_frames: number; missed_slots: number; marks: number;
   bytes: number | null; sha256: string | null; parts: object[]; subject: string; notes: string; tags: string[];
   take: string | null; scene: string; calibration_id: string | null; absolute_scale: "measured" | "assumed" | null;
-  said: string;
+  revision: string;
 }
 
 /** Recording of several nodes: a session each, or the reason of its failure. */
@@ -56,7 +56,7 @@ interface Weighing {
 /** Machine that requests to connect under the name of a node. */
 interface Replacement { fingerprint: string; address: string }
 
-interface Marker { id: string; label: string; t_ns: number; said: string }
+interface Marker { id: string; label: string; t_ns: number; revision: string }
 
 interface Tile {
   serial: string; x_m: number; y_m: number; z_m: number; reference?: boolean; full_scale_n?: number | null;
@@ -65,8 +65,8 @@ interface Tile {
 
 /** Live message: latest frame, with min and max since the previous message. */
 interface Frame {
-  node?: string; seq: number; frame_status: number; estimate_status: number | null; contact: boolean | null;
-  grf_n: number | null; grf_sigma_n: number | null; grf_at_least_n: number | null;
+  node?: string; seq: number; frame_flags: number; estimate_flags: number | null; contact: boolean | null;
+  grf_n: number | null; grf_sigma_n: number | null; grf_lower_bound_n: number | null;
   force_n: (number | null)[]; force_sigma_n: (number | null)[]; gauge_kpa: (number | null)[]; status: (number | null)[];
   saturated: boolean[];
   /** On a session's page: seconds after its first frame. */

@@ -1,1 +1,1 @@
-"""What runs: node, server, API, desk work, commands; and the pure estimation that all ask."""
+"""Programs: node, server, API, offline work, commands; and the pure estimation all of them use."""

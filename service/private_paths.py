@@ -11,22 +11,22 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-from devices.words import printable
+from devices.text import escape_control_chars
 
 _folders: list[str] = []
 """Spellings of private folders, longest first."""
 
 
-def register_folder(folder: Path) -> None:
-    """Register a folder, to be removed by `without_folders`."""
+def register_private_folder(folder: Path) -> None:
+    """Register a folder, to be removed by `strip_private_folders`."""
     for path in (folder, folder.absolute(), folder.resolve()):
-        for text in (str(path), printable(str(path))):
+        for text in (str(path), escape_control_chars(str(path))):
             if len(text) > 1 and text not in _folders:  # "/" and "." are in every path
                 _folders.append(text)
     _folders.sort(key=len, reverse=True)
 
 
-def without_folders(text: str) -> str:
+def strip_private_folders(text: str) -> str:
     """Return a message with paths relative to the registered folders."""
     for folder in _folders:
         if folder in text:
@@ -34,5 +34,5 @@ def without_folders(text: str) -> str:
     return text
 
 
-ShownText = Annotated[str, AfterValidator(without_folders)]
+PublicText = Annotated[str, AfterValidator(strip_private_folders)]
 """Message of a server without private paths."""

@@ -14,33 +14,33 @@ from urllib.parse import quote
 
 import foottile
 from devices.errors import DamagedFileError, UsageError
-from storage.checked_json import read_checked, write_checked
-from storage.checked_table import table_of
-from storage.durable import (
+from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.durable_files import (
     LOCK_NAME,
-    make_folder,
-    set_aside,
-    storage_errors,
+    make_synced_folder,
+    make_temporary_path,
+    set_aside_damaged,
     sync_folder,
-    temporary_of,
-    write_whole,
+    translate_storage_errors,
+    write_atomically,
 )
-from storage.file_hash import sha256_of
 from storage.formats.export import ClockName
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
-from storage.formats.written.format import Format
-from storage.sessions.claims import SESSION_NAME
+from storage.formats.writers.format import ExportFormat
+from storage.hashed_table import parse_hashed_table
+from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME
-from storage.verify.exported import FORMATS as PROVEN
-from storage.verify.exported import verify_export
+from storage.sessions.metadata import SESSION_NAME
+from storage.verify.export import RECOGNISED_FORMATS as PROVEN
+from storage.verify.export import read_export
 
 if TYPE_CHECKING:
     import httpx
 
-_CHUNK = 1 << 20
-_PARQUET = b"PAR1"
-_AGAIN = "Run the same command again"
+_CHUNK_BYTES = 1 << 20
+_PARQUET_MAGIC = b"PAR1"
+_RETRY_REMEDY = "Run the same command again"
 
 
 def refuse_data_folder(folder: Path) -> None:
@@ -63,18 +63,18 @@ def refuse_data_folder(folder: Path) -> None:
             raise UsageError(what, where=str(place), remedy=remedy)
     path = folder / SESSION_NAME
     try:
-        content = json.loads(read_checked(path).text)
+        content = json.loads(read_checksummed_json(path).text)
     except FileNotFoundError:
         return
     except ValueError:  # includes DamagedFileError
-        set_aside(path)
+        set_aside_damaged(path)
         return
     if not isinstance(content, dict) or "complete" not in content:
         what = f"its {SESSION_NAME} is not one that `foottile pull` wrote"
         raise UsageError(what, where=str(folder), remedy=remedy)
 
 
-def pull(server: foottile.Server, session_id: str, out: Path) -> dict[str, Any]:
+def pull_session(server: foottile.Server, session_id: str, out_folder: Path) -> dict[str, Any]:
     """Download a sealed session into the folder `out`/`session_id`.
 
     A partial download is resumed.
@@ -91,37 +91,37 @@ def pull(server: foottile.Server, session_id: str, out: Path) -> dict[str, Any]:
         UsageError: the id is not valid, or the folder belongs to a server or node.
         StorageError: a file cannot be written.
     """
-    session = _facts(server, session_id)
+    session = _get_session_metadata(server, session_id)
     if session["sha256"] is None:
         problem = f": {session['problem']}" if session["problem"] else ""
         raise foottile.ConflictError(
             f"session {session_id} is {session['state']}{problem}; expected a sealed session. "
             "Stop it first, or wait until it is sealed"
         )
-    folder = out / session_id
+    folder = out_folder / session_id
     refuse_data_folder(folder)
-    with storage_errors(folder):
-        make_folder(folder)
+    with translate_storage_errors(folder):
+        make_synced_folder(folder)
         sync_folder(folder)
     path = folder / FRAMES_NAME
     resumed = 0
-    if not (path.is_file() and sha256_of(path) == session["sha256"]):
-        resumed = _download(server, session, path)
-    events = server.http.get(f"/sessions/{session_id}/events")
+    if not (path.is_file() and compute_sha256(path) == session["sha256"]):
+        resumed = _download_frames(server, session, path)
+    markers = server.http.get(f"/sessions/{session_id}/markers")
     ledger = server.http.get(f"/sessions/{session_id}/ledger")
-    for name, content in (("session", session), ("events", events), ("ledger", ledger)):
-        write_checked(folder / f"{name}.json", json.dumps(content, indent=1).encode())
-    for name in ("events", "clock"):
+    for name, content in (("session", session), ("markers", markers), ("ledger", ledger)):
+        write_checksummed_json(folder / f"{name}.json", json.dumps(content, indent=1).encode())
+    for name in ("markers", "clock"):
         _pull_table(server, f"/sessions/{session_id}/{name}", folder / f"{name}.parquet")
     return {**session, "path": str(path), "resumed_bytes": resumed}
 
 
-def pull_made(
+def pull_export(
     server: foottile.Server,
     session_id: str,
-    out: Path,
-    part: Slice,
-    to: Format,
+    out_folder: Path,
+    selection: Slice,
+    export_format: ExportFormat,
     options: FormatOptions = NO_OPTIONS,
     clock: ClockName = "node",
 ) -> dict[str, Any]:
@@ -139,18 +139,20 @@ def pull_made(
         UsageError: the id is not valid, or the folder belongs to a server or node.
         StorageError: the file cannot be written.
     """
-    session = _facts(server, session_id)
+    session = _get_session_metadata(server, session_id)
     url = f"/sessions/{session_id}/data"
-    path = _pull_made(server, url, session_id, out, part, to, options, clock)
+    path = _download_export(
+        server, url, session_id, out_folder, selection, export_format, options, clock
+    )
     return {**session, "path": str(path), "bytes": path.stat().st_size}
 
 
-def pull_take(
+def pull_take_export(
     server: foottile.Server,
     take_id: str,
-    out: Path,
-    part: Slice,
-    to: Format,
+    out_folder: Path,
+    selection: Slice,
+    export_format: ExportFormat,
     options: FormatOptions = NO_OPTIONS,
 ) -> dict[str, Any]:
     """Download all sessions of a take, or a slice of each, as one file in the folder `out`.
@@ -166,44 +168,52 @@ def pull_take(
     url = f"/takes/{quote(take_id, safe='')}"
     take = server.http.get(url)
     complete = "lossy" if any(s["complete"] == "lossy" for s in take["sessions"]) else True
-    path = _pull_made(server, f"{url}/data", f"take-{take['id']}", out, part, to, options)
+    path = _download_export(
+        server, f"{url}/data", f"take-{take['id']}", out_folder, selection, export_format, options
+    )
     return {**take, "complete": complete, "path": str(path), "bytes": path.stat().st_size}
 
 
-def _pull_made(
+def _download_export(
     server: foottile.Server,
     url: str,
     stem: str,
-    out: Path,
-    part: Slice,
-    to: Format,
+    out_folder: Path,
+    selection: Slice,
+    export_format: ExportFormat,
     options: FormatOptions,
     clock: ClockName | None = None,
 ) -> Path:
-    refuse_data_folder(out)
-    with storage_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-    end = "end" if part.end_s is None else f"{part.end_s:g}s"
-    path = out / f"{stem}_{part.start_s or 0.0:g}s-{end}.{to.ending}"
-    query: dict[str, object] = {"format": to.name, "start_s": part.start_s, "end_s": part.end_s}
-    query["columns"], query["clock"] = ",".join(part.columns) or None, clock
+    refuse_data_folder(out_folder)
+    with translate_storage_errors(out_folder):
+        out_folder.mkdir(parents=True, exist_ok=True)
+    end = "end" if selection.end_s is None else f"{selection.end_s:g}s"
+    path = out_folder / f"{stem}_{selection.start_s or 0.0:g}s-{end}.{export_format.ending}"
+    query: dict[str, object] = {
+        "format": export_format.name,
+        "start_s": selection.start_s,
+        "end_s": selection.end_s,
+    }
+    query["columns"], query["clock"] = ",".join(selection.columns) or None, clock
     query |= options.model_dump(mode="json")
     # A temporary name until the file is verified: an interrupted download begins anew.
-    partial = temporary_of(path)
+    partial = make_temporary_path(path)
     try:
         with (
-            _to_do_again(_AGAIN),
+            _append_retry_remedy(_RETRY_REMEDY),
             server.http.stream(url, query) as answer,
-            storage_errors(partial),
+            translate_storage_errors(partial),
             partial.open("xb") as file,
         ):
-            _write(answer, file)
+            _write_response(answer, file)
         # For other formats, only the connection detects truncation.
-        report = verify_export(partial) if to.name in PROVEN else None
-        if to.name in PROVEN and (report is None or report.problems):
+        report = read_export(partial) if export_format.name in PROVEN else None
+        if export_format.name in PROVEN and (report is None or report.problems):
             why = "it cannot be read" if report is None else report.problems[0]
-            raise foottile.DamagedError(f"{server.url}: the slice is incomplete: {why}. {_AGAIN}")
-        with storage_errors(path):
+            raise foottile.DamagedError(
+                f"{server.url}: the slice is incomplete: {why}. {_RETRY_REMEDY}"
+            )
+        with translate_storage_errors(path):
             partial.replace(path)
             sync_folder(path.parent)
     finally:
@@ -211,7 +221,7 @@ def _pull_made(
     return path
 
 
-def _facts(server: foottile.Server, session_id: str) -> Mapping[str, Any]:
+def _get_session_metadata(server: foottile.Server, session_id: str) -> Mapping[str, Any]:
     """Return the session's metadata; refuse an invalid id, which could name another folder."""
     if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
         raise UsageError(
@@ -220,7 +230,7 @@ def _facts(server: foottile.Server, session_id: str) -> Mapping[str, Any]:
     return server.session(session_id).facts
 
 
-def _download(server: foottile.Server, session: Mapping[str, Any], path: Path) -> int:
+def _download_frames(server: foottile.Server, session: Mapping[str, Any], path: Path) -> int:
     """Download the frames, resuming a partial file; return the number of resumed bytes.
 
     An interrupted download leaves its partial file.
@@ -233,37 +243,39 @@ def _download(server: foottile.Server, session: Mapping[str, Any], path: Path) -
     resumed = partial_bytes
     try:
         with (
-            _to_do_again(f"{_AGAIN}: it goes on where it stopped"),
+            _append_retry_remedy(f"{_RETRY_REMEDY}: it goes on where it stopped"),
             server.http.stream(
                 f"/sessions/{session['id']}/data", {"format": "parquet"}, headers=headers
             ) as answer,
         ):
             resumed = partial_bytes if answer.status_code == HTTPStatus.PARTIAL_CONTENT else 0
-            with storage_errors(partial), partial.open("ab" if resumed else "wb") as file:
-                _write(answer, file)
+            with translate_storage_errors(partial), partial.open("ab" if resumed else "wb") as file:
+                _write_response(answer, file)
     except foottile.FootTileError as error:
         # The partial file may be complete already, but not renamed.
         if not partial_bytes or error.status != HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
-    if sha256_of(partial) != session["sha256"]:
+    if compute_sha256(partial) != session["sha256"]:
         partial.unlink()
-        raise foottile.DamagedError(f"{path}: the file differs from the server's hash. {_AGAIN}")
-    with storage_errors(path):
+        raise foottile.DamagedError(
+            f"{path}: the file differs from the server's hash. {_RETRY_REMEDY}"
+        )
+    with translate_storage_errors(path):
         partial.replace(path)
         sync_folder(path.parent)
     return resumed
 
 
-def _write(answer: httpx.Response, file: IO[bytes]) -> None:
+def _write_response(response: httpx.Response, file: IO[bytes]) -> None:
     """Write a response to a file and sync it to disk."""
-    for chunk in answer.iter_bytes(_CHUNK):
+    for chunk in response.iter_bytes(_CHUNK_BYTES):
         file.write(chunk)
     file.flush()
     os.fsync(file.fileno())
 
 
 @contextmanager
-def _to_do_again(remedy: str) -> Iterator[None]:
+def _append_retry_remedy(remedy: str) -> Iterator[None]:
     try:
         yield
     except foottile.NoAnswerError as error:
@@ -276,12 +288,12 @@ def _pull_table(server: foottile.Server, url: str, path: Path) -> None:
             content = answer.read()
     except foottile.UnknownError:
         return  # removed, or an older server without it
-    if not content.startswith(_PARQUET):
+    if not content.startswith(_PARQUET_MAGIC):
         return  # an older server, which sends only JSON here
     try:
-        table_of(content, where=path.name)
+        parse_hashed_table(content, where=path.name)
     except DamagedFileError as error:
         raise foottile.DamagedError(
-            f"{server.url}: {error}. {_AGAIN}; if it stays so, the server's file is damaged"
+            f"{server.url}: {error}. {_RETRY_REMEDY}; if it stays so, the server's file is damaged"
         ) from error
-    write_whole(path, content)
+    write_atomically(path, content)

@@ -10,14 +10,14 @@ from __future__ import annotations
 import time
 
 
-def _boot_ns() -> int:
+def _read_boottime_ns() -> int:
     # Unlike CLOCK_MONOTONIC it continues during suspend.
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-_OFFSET_NS = time.time_ns() - _boot_ns()
+_OFFSET_NS = time.time_ns() - _read_boottime_ns()
 
 
-def utc_ns() -> int:
+def server_utc_ns() -> int:
     """Return the server's UTC in nanoseconds since 1970."""
-    return _OFFSET_NS + _boot_ns()
+    return _OFFSET_NS + _read_boottime_ns()

@@ -12,39 +12,41 @@ from typing import Literal
 
 from devices.errors import UsageError
 
-Kind = Literal["data", "state", "cache"]
+FolderKind = Literal["data", "state", "cache"]
 
 
-def user_folder(kind: Kind, given: Path | None, option: str) -> Path:
+def resolve_user_folder(kind: FolderKind, option_value: Path | None, option_name: str) -> Path:
     """Return the folder that an option names, else the user's default; it need not exist.
 
     Args:
         kind: kind of its content.
-        given: value of the option. A leading `~` is replaced by the home, as shells do not do that
-            in `--data=~/x`, in an environment file or in a unit of systemd.
-        option: name of the option, for the error.
+        option_value: value of the option. A leading `~` is replaced by the home, as shells do not
+            do that in `--data=~/x`, in an environment file or in a unit of systemd.
+        option_name: name of the option, for the error.
 
     Raises:
         UsageError: no home is known, or the folder cannot be written.
     """
-    if given is not None:
+    if option_value is not None:
         try:
-            return given.expanduser()
+            return option_value.expanduser()
         except RuntimeError as error:
             raise UsageError(
-                f"no home folder is known for {str(given)!r}", remedy="Write the whole path"
+                f"no home folder is known for {str(option_value)!r}", remedy="Write the whole path"
             ) from error
-    folder = _default(kind)
+    folder = _default_folder(kind)
     if folder is None:
         problem = f"no home folder is known for user {os.getuid()}"
-    elif kind != "state" and not _can_be_written(folder):  # a node goes on without a disk
+    elif kind != "state" and not _is_writable(folder):  # a node goes on without a disk
         problem = f"user {os.getuid()} cannot write in {str(folder)!r}"
     else:
         return folder
-    raise UsageError(problem, remedy=f"Name a folder with {option}, or in XDG_{kind.upper()}_HOME")
+    raise UsageError(
+        problem, remedy=f"Name a folder with {option_name}, or in XDG_{kind.upper()}_HOME"
+    )
 
 
-def _default(kind: Kind) -> Path | None:
+def _default_folder(kind: FolderKind) -> Path | None:
     """Return the user's default folder; None without a home."""
     import platformdirs
 
@@ -61,7 +63,7 @@ def _default(kind: Kind) -> Path | None:
     return folder if folder.is_absolute() else None
 
 
-def _can_be_written(folder: Path) -> bool:
+def _is_writable(folder: Path) -> bool:
     """Return whether the folder exists or can be created."""
     if folder.exists():
         return True

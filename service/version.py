@@ -8,11 +8,11 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
-SOFTWARE = f"foottile {version('foottile')}"
+SOFTWARE_VERSION = f"foottile {version('foottile')}"
 
 
 @cache
-def exact_software() -> str:
+def compute_exact_version() -> str:
     """Return the version with a hash of the source code, for exact reproducibility."""
     digest = hashlib.sha256()
     for name in ("devices", "storage", "service"):
@@ -20,4 +20,4 @@ def exact_software() -> str:
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
             digest.update(path.read_bytes())
-    return f"{SOFTWARE} ({digest.hexdigest()[:12]})"
+    return f"{SOFTWARE_VERSION} ({digest.hexdigest()[:12]})"

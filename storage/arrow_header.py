@@ -43,7 +43,7 @@ class BatchHeader:
     body_bytes: int
 
 
-def read_header(message: pa.ipc.Message) -> BatchHeader:
+def read_batch_header(message: pa.ipc.Message) -> BatchHeader:
     """Parse the header of a message.
 
     Raises:
@@ -52,18 +52,18 @@ def read_header(message: pa.ipc.Message) -> BatchHeader:
     content = message.metadata.to_pybytes()
     try:
         root = _Table(content, _u32(content, 0))
-        if root.number(_HEADER_TYPE, "<B") != RECORD_BATCH:
+        if root.read_number(_HEADER_TYPE, "<B") != RECORD_BATCH:
             raise HeaderError(f"it is a {message.type}, and no record batch")
-        batch = root.table(_HEADER)
-        if batch.has(_COMPRESSION):
+        batch = root.read_table(_HEADER)
+        if batch.has_field(_COMPRESSION):
             raise HeaderError("its buffers are compressed, which nothing here writes")
-        if batch.has(_VARIADIC):
+        if batch.has_field(_VARIADIC):
             raise HeaderError("it has columns of variable length")
         return BatchHeader(
-            rows=batch.number(_LENGTH, "<q"),
-            nodes=batch.pairs(_NODES),
-            buffers=batch.pairs(_BUFFERS),
-            body_bytes=root.number(_BODY_LENGTH, "<q"),
+            rows=batch.read_number(_LENGTH, "<q"),
+            nodes=batch.read_pairs(_NODES),
+            buffers=batch.read_pairs(_BUFFERS),
+            body_bytes=root.read_number(_BODY_LENGTH, "<q"),
         )
     except struct.error as error:
         raise HeaderError(f"its header is cut: {error}") from error
@@ -81,35 +81,35 @@ class _Table:
         (size,) = struct.unpack_from("<H", content, self._fields)
         self._count = (size - 4) // 2
 
-    def has(self, field: int) -> bool:
+    def has_field(self, field: int) -> bool:
         """Return whether the table has the field."""
-        return bool(self._offset(field))
+        return bool(self._field_offset(field))
 
-    def number(self, field: int, form: str) -> int:
+    def read_number(self, field: int, form: str) -> int:
         """Return a number; 0 if the field is missing."""
-        offset = self._offset(field)
+        offset = self._field_offset(field)
         return int(struct.unpack_from(form, self._content, self._at + offset)[0]) if offset else 0
 
-    def table(self, field: int) -> _Table:
+    def read_table(self, field: int) -> _Table:
         """Return a nested table."""
-        return _Table(self._content, self._pointed(field))
+        return _Table(self._content, self._target_position(field))
 
-    def pairs(self, field: int) -> tuple[tuple[int, int], ...]:
+    def read_pairs(self, field: int) -> tuple[tuple[int, int], ...]:
         """Return a list of structs of two 64-bit numbers."""
-        at = self._pointed(field)
+        at = self._target_position(field)
         count = _u32(self._content, at)
         if count > _PAIRS_MAX:
             raise HeaderError(f"it has {count} columns or buffers")
         pairs = [_PAIR.unpack_from(self._content, at + 4 + _PAIR.size * i) for i in range(count)]
         return tuple((int(a), int(b)) for a, b in pairs)
 
-    def _offset(self, field: int) -> int:
+    def _field_offset(self, field: int) -> int:
         if field >= self._count:
             return 0
         return int(struct.unpack_from("<H", self._content, self._fields + 4 + 2 * field)[0])
 
-    def _pointed(self, field: int) -> int:
-        if not (offset := self._offset(field)):
+    def _target_position(self, field: int) -> int:
+        if not (offset := self._field_offset(field)):
             raise HeaderError("its header lacks a field")
         return self._at + offset + _u32(self._content, self._at + offset)
 

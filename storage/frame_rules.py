@@ -12,29 +12,29 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Times
-from devices.facts import T_MONO_NS_END, T_NS_END
 from devices.frames import (
     NO_SERVO_AGE,
     NOT_READ,
     ArrayInfo,
     FrameBatch,
-    FrameStatus,
-    TileStatus,
+    FrameFlag,
+    TileFlag,
 )
+from devices.types import T_MONO_NS_END, T_NS_END
 
-COUNTS_MAX = 1023
+MAX_RAW_COUNTS = 1023
 """Largest raw count of a 10-bit chip."""
-_OFFSET_MAX_US = 60_000_000
+_MAX_SAMPLE_OFFSET_US = 60_000_000
 """Upper limit of `sample_offset_us`: a tile is read within its frame, in less than a minute."""
 _FORCE_MAX_N = 1e6
-_TILE_BITS = sum(TileStatus)
-_FRAME_BITS = sum(FrameStatus)
+_TILE_BITS = sum(TileFlag)
+_FRAME_BITS = sum(FrameFlag)
 
-Wrong = npt.NDArray[np.bool_]
+ViolationMask = npt.NDArray[np.bool_]
 """Mask of the rows that break a rule."""
 
 
-def broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
+def find_broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
     """Return a text that names the first broken rule and frame; empty if there is none.
 
     Args:
@@ -48,7 +48,7 @@ def broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
     return ""
 
 
-def out_of_range(t_mono_ns: Times, t_ns: Times) -> Wrong:
+def mask_impossible_times(t_mono_ns: Times, t_ns: Times) -> ViolationMask:
     """Return a mask of impossible instants, int64[n] each.
 
     Differences of all others fit 64 bits.
@@ -57,7 +57,7 @@ def out_of_range(t_mono_ns: Times, t_ns: Times) -> Wrong:
     return mono | (t_ns < 0) | (t_ns >= T_NS_END)
 
 
-def runs_back(t_ns_first: Times, t_ns_last: Times) -> npt.NDArray[np.intp]:
+def find_time_reversals(t_ns_first: Times, t_ns_last: Times) -> npt.NDArray[np.intp]:
     """Return the indices of batches that begin before the batch before them has ended.
 
     Args:
@@ -67,12 +67,12 @@ def runs_back(t_ns_first: Times, t_ns_last: Times) -> npt.NDArray[np.intp]:
     return np.flatnonzero(t_ns_first[1:] < t_ns_last[:-1]) + 1
 
 
-def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Wrong]]:
+def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, ViolationMask]]:
     t_mono_ns, t_ns = frames.t_mono_ns, frames.t_ns
     # This first: within the range no difference of instants wraps.
     yield (
         "t_ns is outside of the years 1970 to 2199, or t_mono_ns beyond 36 years",
-        out_of_range(t_mono_ns, t_ns),
+        mask_impossible_times(t_mono_ns, t_ns),
     )
     yield (
         f"t_ns is not t_mono_ns plus the {info.utc_offset_ns} ns announced with the stream",
@@ -81,19 +81,19 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Wrong]]:
     back = np.zeros(len(t_mono_ns), np.bool_)
     np.less(t_mono_ns[1:], t_mono_ns[:-1], out=back[1:])
     yield "t_mono_ns runs backwards", back
-    for name in ("padc", "tadc"):
+    for name in ("pressure_raw", "temperature_raw"):
         counts = getattr(frames, name)
-        yield f"{name} has more than 10 bits", (counts > COUNTS_MAX) & (counts != NOT_READ)
+        yield f"{name} has more than 10 bits", (counts > MAX_RAW_COUNTS) & (counts != NOT_READ)
     offset_us = frames.sample_offset_us
     yield (
         "a tile was sampled more than a minute away",
-        (offset_us > _OFFSET_MAX_US) | (offset_us < -_OFFSET_MAX_US),
+        (offset_us > _MAX_SAMPLE_OFFSET_US) | (offset_us < -_MAX_SAMPLE_OFFSET_US),
     )
     yield "servo_age_us is negative", frames.servo_age_us < NO_SERVO_AGE
-    yield "status has undefined bits", (frames.status & ~np.uint8(_TILE_BITS)) != 0
+    yield "status has undefined bits", (frames.tile_flags & ~np.uint8(_TILE_BITS)) != 0
     yield (
-        "frame_status has undefined bits",
-        (frames.frame_status & ~np.uint8(_FRAME_BITS)) != 0,
+        "frame_flags has undefined bits",
+        (frames.frame_flags & ~np.uint8(_FRAME_BITS)) != 0,
     )
     force_n = frames.reference_force_n
     yield "reference_force_n is no force", ~np.isnan(force_n) & ~(np.abs(force_n) <= _FORCE_MAX_N)

@@ -87,8 +87,8 @@ class Intervals:
             end += 1
         self._intervals[begin:end] = [(first, last)]
 
-    def add_stretches(self, first: npt.NDArray[Any], count: npt.NDArray[Any]) -> None:
-        """Add ranges of numbers, none of them empty, in any order.
+    def add_ranges(self, first: npt.NDArray[Any], count: npt.NDArray[Any]) -> None:
+        """Add non-empty ranges of numbers, in any order.
 
         Args:
             first: first number of each range, [n].
@@ -101,7 +101,7 @@ class Intervals:
         for a, b in zip(first[begins].tolist(), last[ends].tolist(), strict=True):
             self.add(a, b)
 
-    def within(self, first: int, last: int) -> Intervals:
+    def restricted_to(self, first: int, last: int) -> Intervals:
         """Return the numbers of this set from `first` to `last`."""
         found = Intervals()
         begin = bisect_left(self._intervals, first, key=itemgetter(1))
@@ -113,7 +113,7 @@ class Intervals:
             ]
         return found
 
-    def neighbours(self, first: int, last: int) -> tuple[int | None, int | None]:
+    def nearest_outside(self, first: int, last: int) -> tuple[int | None, int | None]:
         """Return the nearest numbers of this set below `first` and above `last`, or None."""
         at = bisect_left(self._intervals, first, key=itemgetter(0))
         before = min(self._intervals[at - 1][1], first - 1) if at else None
@@ -121,11 +121,11 @@ class Intervals:
         after = max(self._intervals[at][0], last + 1) if at < len(self._intervals) else None
         return before, after
 
-    def missing(self, first: int, last: int) -> Intervals:
+    def missing_in(self, first: int, last: int) -> Intervals:
         """Return the numbers from `first` to `last` that are not in this set."""
         gaps = Intervals()
         at = first
-        for a, b in self.within(first, last):
+        for a, b in self.restricted_to(first, last):
             if at < a:
                 gaps._intervals.append((at, a - 1))
             at = b + 1
@@ -133,7 +133,9 @@ class Intervals:
             gaps._intervals.append((at, last))
         return gaps
 
-    def covers(self, first: npt.NDArray[Any], count: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    def contains_ranges(
+        self, first: npt.NDArray[Any], count: npt.NDArray[Any]
+    ) -> npt.NDArray[np.bool_]:
         """Return a mask of the ranges that are in this set completely.
 
         Args:
@@ -191,12 +193,12 @@ def union(sets: Iterable[Intervals]) -> Intervals:
     return Intervals(sorted(chain.from_iterable(sets)))  # sorted, each is added at the end
 
 
-def closed(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
+def intervals_from_open_pairs(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
     """Return pairs as a set, with `NO_END` for a missing last number."""
     return Intervals((first, NO_END if last is None else last) for first, last in pairs)
 
 
-def with_open_ends(pairs: Iterable[tuple[int, int]]) -> OpenPairs:
+def to_open_pairs(pairs: Iterable[tuple[int, int]]) -> OpenPairs:
     """Return intervals as pairs, with None for a last number of `NO_END` or more."""
     return tuple((first, None if last >= NO_END else last) for first, last in pairs)
 
@@ -211,7 +213,7 @@ NODE_RESTARTED = "node_restarted"
 GIVEN_UP = "given_up"
 REFUSED = "refused"
 
-AsPairs = dict[str, tuple[tuple[int, int], ...]]
+LossPairs = dict[str, tuple[tuple[int, int], ...]]
 """Losses in JSON and messages: `{"evicted": [[0, 99], [200, 299]]}`."""
 
 
@@ -227,31 +229,31 @@ class Losses:
         return any(self.by_reason.values())
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Losses) and self.as_pairs() == other.as_pairs()
+        return isinstance(other, Losses) and self.to_pairs() == other.to_pairs()
 
     __hash__ = None  # type: ignore[assignment]  # it changes
 
     @property
-    def all(self) -> Intervals:
+    def numbers(self) -> Intervals:
         """Union of all lost numbers."""
         return union(self.by_reason.values())
 
     def add(self, numbers: Intervals, reason: str) -> None:
-        """Add lost numbers; a number keeps its first reason."""
-        if new := numbers - self.all:
+        """Add lost numbers; numbers that already have a reason keep it."""
+        if new := numbers - self.numbers:
             self.by_reason[reason] = new | self.by_reason.get(reason, Intervals())
 
-    def found(self, numbers: Intervals) -> None:
+    def remove(self, numbers: Intervals) -> None:
         """Remove numbers: they are stored after all."""
         self.by_reason = {
             reason: left for reason, lost in self.by_reason.items() if (left := lost - numbers)
         }
 
-    def within(self, numbers: Intervals) -> dict[str, Intervals]:
+    def restricted_to(self, numbers: Intervals) -> dict[str, Intervals]:
         """Return the lost ones among `numbers`, by reason."""
         found = {reason: numbers & lost for reason, lost in self.by_reason.items()}
         return {reason: lost for reason, lost in found.items() if lost}
 
-    def as_pairs(self) -> AsPairs:
+    def to_pairs(self) -> LossPairs:
         """Return the losses as pairs by reason, for JSON and messages."""
         return {reason: tuple(numbers) for reason, numbers in self.by_reason.items() if numbers}

@@ -26,14 +26,14 @@ from devices.frames import (
     ArrayInfo,
     FrameBatch,
 )
-from storage.arrow_alone import leave_pandas_out
+from storage.pyarrow_startup import block_pandas_import
 
-leave_pandas_out()  # here: every process of ours imports a schema before it makes an array
+block_pandas_import()  # here: every process of ours imports a schema before it makes an array
 
 ARRAY_INFO_KEY = b"foottile.array_info"
 ARRAY_HASH_KEY = b"foottile.array_info_sha256"
 """Key of the description's checksum in a journal's segments, whose header has no other one."""
-ROUNDED_TO = "rounded_to"
+ROUNDING_STEP_KEY = "rounded_to"
 """Key of a column's rounding step, in the notes of a file and in each field's metadata."""
 
 Array = npt.NDArray[Any]
@@ -49,48 +49,48 @@ class Column:
     unit: str
     description: str
     per_tile: bool = False
-    missing: int | None = None
+    missing_value: int | None = None
     """Stand-in for an unknown value in memory; null in files. Floats: NaN, null too."""
 
     def flat_names(self, tiles: int) -> list[str]:
         """Return the names of its columns in a flat file."""
         return [f"{self.name}_{i}" for i in range(tiles)] if self.per_tile else [self.name]
 
-    def field(
-        self, name: str, type_: pa.DataType, *, nullable: bool, step: float | None = None
+    def make_field(
+        self, name: str, type_: pa.DataType, *, nullable: bool, rounding_step: float | None = None
     ) -> pa.Field[Any]:
         """Return an Arrow field with unit, description and rounding step in its metadata."""
         metadata = {"unit": self.unit, "description": self.description}
-        if step is not None:
-            metadata[ROUNDED_TO] = repr(step)
+        if rounding_step is not None:
+            metadata[ROUNDING_STEP_KEY] = repr(rounding_step)
         return pa.field(name, type_, nullable=nullable, metadata=metadata)
 
 
-def _frame(name: str, unit: str, description: str, missing: int | None = None) -> Column:
+def _frame_column(name: str, unit: str, description: str, missing: int | None = None) -> Column:
     dtype, per_tile = FRAME_COLUMNS[name]
     return Column(name, pa.from_numpy_dtype(dtype), unit, description, per_tile, missing)
 
 
-FRAMES = (
-    _frame("seq", "1", "number of the frame in its stream"),
-    _frame("t_mono_ns", "ns", "CLOCK_MONOTONIC of the node at the sample of the first tile"),
-    _frame("t_ns", "ns", "the same instant in UTC since 1970"),
-    _frame("padc", "counts", "raw pressure counts, falling with pressure", NOT_READ),
-    _frame("tadc", "counts", "raw temperature counts of the chip", NOT_READ),
-    _frame("sample_offset_us", "us", "sample instant of the tile minus t_ns"),
-    _frame("servo_counts", "counts", "newest servo position", NO_SERVO_COUNTS),
-    _frame("servo_age_us", "us", "age of the servo position at t_ns", NO_SERVO_AGE),
-    _frame(
-        "status",
+MEASURED_COLUMNS = (
+    _frame_column("seq", "1", "number of the frame in its stream"),
+    _frame_column("t_mono_ns", "ns", "CLOCK_MONOTONIC of the node at the sample of the first tile"),
+    _frame_column("t_ns", "ns", "the same instant in UTC since 1970"),
+    _frame_column("pressure_raw", "counts", "raw pressure counts, falling with pressure", NOT_READ),
+    _frame_column("temperature_raw", "counts", "raw temperature counts of the chip", NOT_READ),
+    _frame_column("sample_offset_us", "us", "sample instant of the tile minus t_ns"),
+    _frame_column("servo_counts", "counts", "newest servo position", NO_SERVO_COUNTS),
+    _frame_column("servo_age_us", "us", "age of the servo position at t_ns", NO_SERVO_AGE),
+    _frame_column(
+        "tile_flags",
         "bits",
         "1 no_answer, 2 stale, 4 retried, 8 implausible, 16 over_range, 32 not_converted",
     ),
-    _frame(
-        "frame_status",
+    _frame_column(
+        "frame_flags",
         "bits",
         "1 overrun, 2 servo_stale, 4 bus_fault, 8 lead, 16 new_array_info, 32 servo_turn_unknown",
     ),
-    _frame("reference_force_n", "N", "force of the calibration rig's sensor"),
+    _frame_column("reference_force_n", "N", "force of the calibration rig's sensor"),
 )
 """Columns that a node measures: `devices.frames.FrameBatch`."""
 
@@ -98,13 +98,13 @@ _F32 = pa.float32()
 
 CONTACT_UNKNOWN = 255
 
-ESTIMATES = (
+ESTIMATE_COLUMNS = (
     Column("gauge_kpa", _F32, "kPa", "gas pressure above the tile's own baseline", True),
     Column("force_n", _F32, "N", "force on the tile along its axis", True),
     Column("force_sigma_n", _F32, "N", "standard uncertainty of force_n", True),
     Column("grf_n", _F32, "N", "ground reaction force: sum of the tile forces"),
     Column("grf_sigma_n", _F32, "N", "standard uncertainty of grf_n"),
-    Column("grf_at_least_n", _F32, "N", "lower bound of the GRF, also where grf_n is not known"),
+    Column("grf_lower_bound_n", _F32, "N", "lower bound of the GRF, also where grf_n is not known"),
     Column("cop_x_m", _F32, "m", "centre of pressure, foot frame, x forward"),
     Column("cop_y_m", _F32, "m", "centre of pressure, foot frame, y to the left"),
     Column("cop_sigma_x_m", _F32, "m", "standard uncertainty of cop_x_m"),
@@ -114,9 +114,9 @@ ESTIMATES = (
     Column("cop_ground_x_m", _F32, "m", "centre of pressure, ground frame (paper eq. 3)"),
     Column("cop_ground_y_m", _F32, "m", "centre of pressure, ground frame"),
     Column("angle_rad", _F32, "rad", "angle of the foot segment from the servo"),
-    Column("contact", pa.uint8(), "1", "1: the foot bears load", missing=CONTACT_UNKNOWN),
+    Column("contact", pa.uint8(), "1", "1: the foot bears load", missing_value=CONTACT_UNKNOWN),
     Column(
-        "estimate_status",
+        "estimate_flags",
         pa.uint16(),
         "bits",
         "1 saturated, 2 extrapolated, 4 outlier_replaced, 8 gap, 16 cop_masked, 32 tile_missing, "
@@ -126,7 +126,7 @@ ESTIMATES = (
 )
 """Columns that the estimator computes: `service.estimation.estimates.Estimates`."""
 
-TRUTH = (
+TRUTH_COLUMNS = (
     Column("true_force_n", pa.float64(), "N", "emulation: force on the dome along its axis", True),
     Column("true_grf_n", pa.float64(), "N", "emulation: vertical sum of the dome forces"),
     Column("true_plate_n", pa.float64(), "N", "emulation: vertical force on the whole foot"),
@@ -134,35 +134,35 @@ TRUTH = (
     Column("true_cop_y_m", pa.float64(), "m", "emulation: true centre of pressure, foot frame"),
     Column("true_angle_rad", pa.float64(), "rad", "emulation: true angle of the foot segment"),
 )
-"""Ground truth of an emulated scene: `devices.emulation.world.Truth`."""
+"""Ground truth of an emulated scene: `devices.emulation.world.GroundTruth`."""
 
-MILL = (
+INDENTER_COLUMNS = (
     Column("pressed_tile", pa.string(), "1", "serial of the tile under the spindle"),
     Column("phase", pa.string(), "1", "rest, load, unload, hold, release, tap or soak"),
 )
 """Columns that the operator of an indentation rig records beside the frames."""
 
-PARTS = (Column("part", pa.uint16(), "1", "which part of the session, one for each start"),)
+PART_COLUMNS = (Column("part", pa.uint16(), "1", "which part of the session, one for each start"),)
 """Part of a recorded session: `seq` begins at 0 again when the node restarts."""
 
-NO_INSTANT = -(2**63)
+UNKNOWN_T_NS = -(2**63)
 
-SERVER_TIME = (
-    Column("t_server_ns", pa.int64(), "ns", "t_ns in the server's UTC", missing=NO_INSTANT),
+SERVER_TIME_COLUMNS = (
+    Column("t_server_ns", pa.int64(), "ns", "t_ns in the server's UTC", missing_value=UNKNOWN_T_NS),
     Column(
         "t_server_uncertainty_ns",
         pa.int64(),
         "ns",
         "bound of t_server_ns: the truth is within plus or minus this",
-        missing=NO_INSTANT,
+        missing_value=UNKNOWN_T_NS,
     ),
 )
 """Server's time, computed by a clock table when a session is read; never in a sealed file."""
 
-MARKS = (Column("event", pa.string(), "1", "what people marked at this frame"),)
-"""Markers, placed when a session is read (`storage.formats.marks`); never in a sealed file."""
+MARKER_COLUMNS = (Column("marker", pa.string(), "1", "what people marked at this frame"),)
+"""Markers, placed when a session is read (`storage.formats.markers`); never in a sealed file."""
 
-TIMES = (
+TIME_COLUMNS = (
     Column(
         "time_s", pa.float64(), "s", "seconds after the session's first frame, on its time axis"
     ),
@@ -170,14 +170,23 @@ TIMES = (
 )
 """Times computed from `t_ns` when a session is read; never in a sealed file."""
 
-KNOWN = {
+COLUMNS_BY_NAME = {
     column.name: column
-    for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME, *MARKS, *TIMES)
+    for column in (
+        *MEASURED_COLUMNS,
+        *PART_COLUMNS,
+        *ESTIMATE_COLUMNS,
+        *TRUTH_COLUMNS,
+        *INDENTER_COLUMNS,
+        *SERVER_TIME_COLUMNS,
+        *MARKER_COLUMNS,
+        *TIME_COLUMNS,
+    )
 }
 """Every column by its name."""
 
 
-def numpy_dtype(kind: pa.DataType) -> np.dtype[Any]:
+def numpy_dtype_of(kind: pa.DataType) -> np.dtype[Any]:
     """Return the numpy type of an Arrow type of numbers.
 
     `DataType.to_pandas_dtype` returns it, too, but imports pandas in pyarrow up to 25.
@@ -193,32 +202,32 @@ def wire_schema(info: ArrayInfo) -> pa.Schema:
     tiles, text = len(info.tiles), info.model_dump_json().encode()
     return pa.schema(
         [
-            column.field(
+            column.make_field(
                 column.name,
                 pa.list_(pa.field("item", column.type, nullable=False), tiles)
                 if column.per_tile
                 else column.type,
                 nullable=False,
             )
-            for column in FRAMES
+            for column in MEASURED_COLUMNS
         ],
-        metadata={ARRAY_INFO_KEY: text, ARRAY_HASH_KEY: _digits(text)},
+        metadata={ARRAY_INFO_KEY: text, ARRAY_HASH_KEY: _sha256_hex(text)},
     )
 
 
-def older_wire_schema(info: ArrayInfo) -> pa.Schema:
+def legacy_wire_schema(info: ArrayInfo) -> pa.Schema:
     """Return the wire schema of older versions, which has no checksum of the description."""
     return wire_schema(info).with_metadata({ARRAY_INFO_KEY: info.model_dump_json().encode()})
 
 
-def _digits(text: bytes) -> bytes:
+def _sha256_hex(text: bytes) -> bytes:
     return hashlib.sha256(text).hexdigest().encode()
 
 
-def to_record_batch(batch: FrameBatch, schema: pa.Schema) -> pa.RecordBatch:
+def frames_to_record_batch(batch: FrameBatch, schema: pa.Schema) -> pa.RecordBatch:
     """Return frames as one Arrow record batch; buffers are shared, not copied."""
     arrays = []
-    for column, field in zip(FRAMES, schema, strict=True):
+    for column, field in zip(MEASURED_COLUMNS, schema, strict=True):
         values = getattr(batch, column.name)
         flat = pa.array(values.reshape(-1))
         arrays.append(
@@ -227,18 +236,18 @@ def to_record_batch(batch: FrameBatch, schema: pa.Schema) -> pa.RecordBatch:
     return pa.RecordBatch.from_arrays(arrays, schema=schema)
 
 
-def from_record_batch(record: pa.RecordBatch) -> FrameBatch:
-    """Return frames as numpy views of a record batch; inverse of `to_record_batch`.
+def frames_from_record_batch(record: pa.RecordBatch) -> FrameBatch:
+    """Return frames as numpy views of a record batch; inverse of `frames_to_record_batch`.
 
     Raises:
         FileFormatError: the record batch does not hold frames.
     """
     try:
-        return FrameBatch(**{column.name: _view(record, column) for column in FRAMES})
+        return FrameBatch(**{column.name: _view(record, column) for column in MEASURED_COLUMNS})
     except (KeyError, ValueError, TypeError, AttributeError, pa.ArrowException) as error:
         raise FileFormatError(
             f"the Arrow message holds no frames: {error}",
-            expected="the columns " + ", ".join(column.name for column in FRAMES),
+            expected="the columns " + ", ".join(column.name for column in MEASURED_COLUMNS),
         ) from error
 
 
@@ -252,7 +261,7 @@ def _view(record: pa.RecordBatch, column: Column) -> Array:
     return array.to_numpy(zero_copy_only=True)
 
 
-def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
+def read_array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
     """Return the array description in a schema's metadata.
 
     Raises:
@@ -266,7 +275,7 @@ def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
             where=where,
             expected="a file written by foottile",
         )
-    if metadata.get(ARRAY_HASH_KEY, _digits(text)) != _digits(text):
+    if metadata.get(ARRAY_HASH_KEY, _sha256_hex(text)) != _sha256_hex(text):
         raise DamagedFileError(
             "its description of the tile array was changed: its checksum is wrong",
             where=where,
@@ -282,12 +291,14 @@ def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
 # --- flat -----------------------------------------------------------------------------------------
 
 
-def flat_of(tiles: int) -> dict[str, Column]:
+def map_flat_columns(tiles: int) -> dict[str, Column]:
     """Return the quantity of every possible flat column of an array, by the column's name."""
-    return {flat: column for column in KNOWN.values() for flat in column.flat_names(tiles)}
+    return {
+        flat: column for column in COLUMNS_BY_NAME.values() for flat in column.flat_names(tiles)
+    }
 
 
-def flat_columns(
+def to_flat_columns(
     columns: Sequence[Column],
     values: Mapping[str, Array],
     notes: Mapping[str, object] | None = None,
@@ -304,43 +315,46 @@ def flat_columns(
         data = values[column.name]
         parts = data.T if column.per_tile else data[None]
         for name, part in zip(column.flat_names(len(parts)), parts, strict=True):
-            out.append(flat_column(column, name, part, notes))
+            out.append(to_flat_column(column, name, part, notes))
     return out
 
 
-def flat_column(
+def to_flat_column(
     column: Column, name: str, values: Array, notes: Mapping[str, object] | None = None
 ) -> tuple[pa.Field[Any], pa.Array[Any]]:
     """Return field and array of one flat column, n rows; missing values are null."""
-    may_miss = column.missing is not None or not np.issubdtype(values.dtype, np.integer)
-    steps = (notes or {}).get(ROUNDED_TO)
+    may_miss = column.missing_value is not None or not np.issubdtype(values.dtype, np.integer)
+    steps = (notes or {}).get(ROUNDING_STEP_KEY)
     step = steps.get(name) if isinstance(steps, dict) else None
-    field = column.field(
-        name, column.type, nullable=may_miss, step=step if isinstance(step, float) else None
+    field = column.make_field(
+        name,
+        column.type,
+        nullable=may_miss,
+        rounding_step=step if isinstance(step, float) else None,
     )
     return field, _to_arrow(np.ascontiguousarray(values), column)
 
 
 def _to_arrow(values: Array, column: Column) -> pa.Array[Any]:
     mask = None
-    if column.missing is not None:
-        mask = values == column.missing
+    if column.missing_value is not None:
+        mask = values == column.missing_value
     # from_pandas: NaN is null. Arrow refuses a cast that would lose an integer's value.
     return pa.array(values, mask=mask, from_pandas=True).cast(column.type, safe=column.type != _F32)
 
 
-def from_flat(column: Column, table: pa.Table, tiles: int) -> Array:
+def read_quantity(column: Column, table: pa.Table, tiles: int) -> Array:
     """Read a quantity from a flat table, (n,) or (n, tiles); nulls become missing values.
 
     Raises:
         KeyError: the table has no such column.
         ValueError: its type is not the column's.
     """
-    parts = [flat_values(column, name, table) for name in column.flat_names(tiles)]
+    parts = [read_flat_column(column, name, table) for name in column.flat_names(tiles)]
     return np.stack(parts, axis=1) if column.per_tile else parts[0]
 
 
-def flat_values(column: Column, name: str, table: pa.Table) -> Array:
+def read_flat_column(column: Column, name: str, table: pa.Table) -> Array:
     """Read one flat column, (n,); nulls become missing values.
 
     Raises:
@@ -350,8 +364,8 @@ def flat_values(column: Column, name: str, table: pa.Table) -> Array:
     array = table.column(name).combine_chunks()
     if array.type != column.type:
         raise ValueError(f"column {name} is {array.type}, not {column.type}")
-    if column.missing is not None:
-        array = array.fill_null(column.missing)
+    if column.missing_value is not None:
+        array = array.fill_null(column.missing_value)
     elif array.null_count and pa.types.is_integer(array.type):
         raise ValueError(f"column {name} has {array.null_count} empty values")
     return array.to_numpy(zero_copy_only=False)

@@ -17,18 +17,18 @@ import pyarrow as pa
 from devices.errors import DamagedFileError, StorageError
 
 
-class Kept(NamedTuple):
+class ScratchBlock(NamedTuple):
     """Position and sizes of a block in a scratch file."""
 
-    at: int
+    offset: int
     """Offset in bytes."""
-    stored: int
+    stored_bytes: int
     """Length in the file, compressed."""
-    size: int
+    size_bytes: int
     """Length after decompression."""
 
 
-class Scratch:
+class ScratchFile:
     """Scratch file of compressed blocks. One thread appends; any may read.
 
     Args:
@@ -40,7 +40,7 @@ class Scratch:
         self._file: IO[bytes] | None = None
         self._end = 0
 
-    def put(self, content: bytes) -> Kept:
+    def append(self, content: bytes) -> ScratchBlock:
         """Compress and append a block.
 
         Raises:
@@ -59,11 +59,11 @@ class Scratch:
             raise StorageError(
                 f"cannot be written: {error.strerror}", where=str(self._folder), errno=error.errno
             ) from error
-        block = Kept(self._end, len(stored), len(content))
+        block = ScratchBlock(self._end, len(stored), len(content))
         self._end += len(stored)
         return block
 
-    def get(self, kept: Kept) -> bytes:
+    def read(self, block: ScratchBlock) -> bytes:
         """Read and decompress a block.
 
         Raises:
@@ -73,7 +73,7 @@ class Scratch:
         if self._file is None:
             raise DamagedFileError("the scratch file holds no block", where=where)
         try:
-            stored = os.pread(self._file.fileno(), kept.stored, kept.at)
-            return pa.decompress(stored, kept.size, "zstd", asbytes=True)
+            stored = os.pread(self._file.fileno(), block.stored_bytes, block.offset)
+            return pa.decompress(stored, block.size_bytes, "zstd", asbytes=True)
         except (OSError, ValueError, pa.ArrowException) as error:
             raise DamagedFileError(f"cannot be read: {error}", where=where) from error

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from devices.errors import DamagedFileError
-from storage.checked_json import read_checked, write_checked
-from storage.durable import make_folder, storage_errors
+from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.durable_files import make_synced_folder, translate_storage_errors
 
 SECRETS_NAME = "secrets.json"
 _SECRET = re.compile(r"[0-9a-f]{64}")
@@ -29,7 +29,7 @@ def read_secrets(path: Path) -> dict[str, str]:
         StorageError: it cannot be read now.
     """
     try:
-        content = json.loads(read_checked(path).text)
+        content = json.loads(read_checksummed_json(path).text)
     except FileNotFoundError:
         return {}
     found = content.get("secrets") if isinstance(content, dict) else None
@@ -48,7 +48,7 @@ def write_secrets(path: Path, secrets: Mapping[str, str]) -> None:
     Raises:
         StorageError: the disk is full or not writable; the old file is unchanged.
     """
-    with storage_errors(path.parent):
-        make_folder(path.parent)
+    with translate_storage_errors(path.parent):
+        make_synced_folder(path.parent)
     text = json.dumps({"secrets": dict(secrets)}).encode()
-    write_checked(path, text, mode=_OWNER_ONLY)
+    write_checksummed_json(path, text, mode=_OWNER_ONLY)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import DamagedFileError
-from storage.durable import read_whole, write_whole
+from storage.durable_files import read_small_file, write_atomically
 
 SERVER_ID_NAME = "server_id"
 _FORM = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
@@ -19,7 +19,7 @@ class ServerId:
     """Content of the file."""
 
     id: str
-    is_proven: bool
+    has_checksum: bool
     """False: an older version wrote it without a CRC-32."""
 
 
@@ -31,25 +31,25 @@ def read_server_id(path: Path) -> ServerId:
         DamagedFileError: its CRC-32 is wrong.
         StorageError: it cannot be read now.
     """
-    text = read_whole(path).decode("ascii", "replace").strip()
+    text = read_small_file(path).decode("ascii", "replace").strip()
     found = _FORM.fullmatch(text)
-    if found is None or found[2] not in (None, _check_of(found[1])):
+    if found is None or found[2] not in (None, _crc32_hex(found[1])):
         raise DamagedFileError("it is not the id that was written", where=str(path))
-    return ServerId(found[1], is_proven=found[2] is not None)
+    return ServerId(found[1], has_checksum=found[2] is not None)
 
 
-def write_server_id(path: Path, made: str) -> None:
+def write_server_id(path: Path, server_id: str) -> None:
     """Write an id atomically.
 
     Args:
         path: the file; an existing one is replaced.
-        made: 32 hexadecimal digits.
+        server_id: 32 hexadecimal digits.
 
     Raises:
         StorageError: the disk is full or not writable.
     """
-    write_whole(path, f"{made} {_check_of(made)}\n".encode())
+    write_atomically(path, f"{server_id} {_crc32_hex(server_id)}\n".encode())
 
 
-def _check_of(made: str) -> str:
-    return f"{zlib.crc32(made.encode()):08x}"
+def _crc32_hex(server_id: str) -> str:
+    return f"{zlib.crc32(server_id.encode()):08x}"

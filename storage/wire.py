@@ -14,13 +14,13 @@ import numpy as np
 import pyarrow as pa
 
 from devices.errors import FileFormatError
-from devices.facts import SEQ_END
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
+from devices.types import SEQ_END
 from storage.intervals import Intervals
-from storage.layout import Layouts
-from storage.schema import to_record_batch, wire_schema
+from storage.message_layout import MessageLayoutCache
+from storage.schema import frames_to_record_batch, wire_schema
 
-_MESSAGE_FRAMES = 64
+_MAX_BATCH_FRAMES = 64
 """Largest batch of the acquisition."""
 
 
@@ -35,7 +35,7 @@ class EncodedBatch:
     payload: bytes
 
     @classmethod
-    def of(cls, frames: FrameBatch, payload: bytes) -> EncodedBatch:
+    def from_frames_and_payload(cls, frames: FrameBatch, payload: bytes) -> EncodedBatch:
         """Wrap the message `payload`, which holds these frames."""
         return cls(
             *(int(frames.seq[0]), int(frames.seq[-1])),
@@ -49,17 +49,17 @@ class EncodedBatch:
         return Intervals([(self.seq_first, self.seq_last)])
 
 
-def encode(batch: FrameBatch, schema: pa.Schema) -> bytes:
+def encode_frames(batch: FrameBatch, schema: pa.Schema) -> bytes:
     """Encode frames as one message of a stream with this schema (`storage.schema.wire_schema`)."""
-    return to_record_batch(batch, schema).serialize().to_pybytes()
+    return frames_to_record_batch(batch, schema).serialize().to_pybytes()
 
 
-def messages_of(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
+def encode_as_messages(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
     """Encode frames as messages of the size that nodes send."""
     schema = wire_schema(info)
-    for begin in range(0, len(frames), _MESSAGE_FRAMES):
-        rows = frames.rows(begin, min(begin + _MESSAGE_FRAMES, len(frames)))
-        yield EncodedBatch.of(rows, encode(rows, schema))
+    for begin in range(0, len(frames), _MAX_BATCH_FRAMES):
+        rows = frames.slice_rows(begin, min(begin + _MAX_BATCH_FRAMES, len(frames)))
+        yield EncodedBatch.from_frames_and_payload(rows, encode_frames(rows, schema))
 
 
 class Decoder:
@@ -70,9 +70,9 @@ class Decoder:
     """
 
     def __init__(self, schema: pa.Schema) -> None:
-        self._layouts = Layouts(schema)
+        self._layouts = MessageLayoutCache(schema)
         self._columns = [(name, *FRAME_COLUMNS[name]) for name in schema.names]
-        self._tiles = schema.field("padc").type.list_size
+        self._tiles = schema.field("pressure_raw").type.list_size
 
     def decode(self, payload: bytes | memoryview) -> FrameBatch:
         """Decode the frames of one message as views of its bytes, and check them completely.
@@ -81,7 +81,7 @@ class Decoder:
             FileFormatError: it is no message of this stream, is cut off, or its frames are out of
                 order.
         """
-        layout = self._layouts.of(payload)
+        layout = self._layouts.get_layout(payload)
         by_frame, by_tile = (layout.rows,), (layout.rows, self._tiles)
         batch = FrameBatch(
             **{
@@ -109,6 +109,6 @@ class Decoder:
         return batch
 
 
-def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
-    """Decode a single message; raises as `Decoder.decode`."""
+def decode_message(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
+    """Decode a single message; raises as `Decoder.decode_message`."""
     return Decoder(schema).decode(payload)

@@ -21,20 +21,32 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 
-from devices.scene.emulated import EmulationScene, FaultScene, GroundScene, MudGround, PoppyGround
-from devices.scene.file import Scene, builtin_scenes, load_scene
-from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
+from devices.scene.emulation_sections import (
+    EmulationSection,
+    FaultSection,
+    GroundSection,
+    MudGround,
+    PoppyGround,
+)
+from devices.scene.hardware_sections import (
+    ArraySection,
+    RecoverySection,
+    ReferenceSection,
+    ServoSection,
+    TileSection,
+)
+from devices.scene.scene_file import Scene, list_builtin_scenes, load_scene
 from service.api.app import make_app
 from service.api.logins import Logins
 from service.api.settings import Settings
 from service.cli.table import SUMMARIES, loaded
 from service.estimation.calibration import TileCalibration
-from service.estimation.estimates import EstimateStatus
-from service.link import Close
-from service.server.screens.picture import Summary, sum_up
-from service.server.screens.spans import span_of
+from service.estimation.estimates import EstimateFlag
+from service.protocol import LinkCloseCode
+from service.server.broadcast.force_span import summarize_force
+from service.server.broadcast.summary import PendingUpdate, summarize_frames
 from service.server.server import Server
-from storage.schema import KNOWN
+from storage.schema import COLUMNS_BY_NAME
 from tests.builders.frames import make_frames
 from tests.tokens import SHARED_TOKEN
 
@@ -45,15 +57,15 @@ FORMATS = (ROOT / "docs" / "formats.md").read_text("utf-8")
 README = (ROOT / "README.md").read_text("utf-8")
 COMMANDS = README + (ROOT / "docs" / "commands.md").read_text("utf-8")
 
-GROUNDS = get_args(get_args(GroundScene)[0])
+GROUNDS = get_args(get_args(GroundSection)[0])
 SECTIONS = {"array", "tile", "servo", "reference", "recovery", "ground", "emulation", "fault"}
 
 
 @pytest.mark.parametrize(
     "section",
     [
-        *(Scene, ArrayScene, TileScene, ServoScene, ReferenceScene, RecoveryScene),
-        *(EmulationScene, FaultScene, *GROUNDS),
+        *(Scene, ArraySection, TileSection, ServoSection, ReferenceSection, RecoverySection),
+        *(EmulationSection, FaultSection, *GROUNDS),
     ],
 )
 def test_every_scene_key_is_documented(section: type[BaseModel]) -> None:
@@ -65,18 +77,18 @@ def test_every_scene_key_is_documented(section: type[BaseModel]) -> None:
 def test_every_ground_and_builtin_scene_is_documented() -> None:
     for ground in GROUNDS:
         assert f"`{get_args(ground.model_fields['kind'].annotation)[0]}`" in SCENES
-    for scene in builtin_scenes():
+    for scene in list_builtin_scenes():
         assert f"`{scene}`" in SCENES
 
 
 @pytest.mark.parametrize(
     ("heading", "section"),
     [
-        ("[array]", ArrayScene),
-        ("[servo]", ServoScene),
-        ("[reference]", ReferenceScene),
-        ("[recovery]", RecoveryScene),
-        ("[emulation]", EmulationScene),
+        ("[array]", ArraySection),
+        ("[servo]", ServoSection),
+        ("[reference]", ReferenceSection),
+        ("[recovery]", RecoverySection),
+        ("[emulation]", EmulationSection),
     ],
 )
 def test_documented_defaults_are_the_defaults(heading: str, section: type[BaseModel]) -> None:
@@ -108,7 +120,7 @@ def test_documented_defaults_of_hops_are_the_defaults() -> None:
 
 
 def test_every_column_is_documented_with_its_unit() -> None:
-    for name, column in KNOWN.items():
+    for name, column in COLUMNS_BY_NAME.items():
         shown = f"`{name}_i`" if column.per_tile else f"`{name}`"
         row = next((line for line in FORMATS.splitlines() if line.startswith(f"| {shown} |")), None)
         assert row is not None, name
@@ -117,7 +129,7 @@ def test_every_column_is_documented_with_its_unit() -> None:
 
 
 def test_every_estimate_status_bit_is_documented() -> None:
-    for bit in EstimateStatus:
+    for bit in EstimateFlag:
         assert f"| {bit.value} | {str(bit.name).lower()} |" in FORMATS
 
 
@@ -160,7 +172,9 @@ def test_every_scene_and_file_of_documented_commands_exists() -> None:
             outputs = {after for word, after in pairwise(words) if word in ("--out", "--plot")}
             for name in set(given) - outputs:
                 read += 1
-                assert name in made or name in builtin_scenes(), f"{name} of {line!r} is nowhere"
+                assert name in made or name in list_builtin_scenes(), (
+                    f"{name} of {line!r} is nowhere"
+                )
             made |= outputs
     assert read > 8
 
@@ -198,17 +212,17 @@ def test_every_route_is_documented() -> None:
 
 
 def test_every_live_message_field_is_documented() -> None:
-    summary = Summary()
+    summary = PendingUpdate()
     frames = make_frames(1, 1)
-    summary.add("node", sum_up("0" * 32, span_of(frames, {}), frames, {}))
-    (text,) = summary.take().texts({"node": 1.0})
+    summary.add_frames("node", summarize_frames("0" * 32, summarize_force(frames, {}), frames, {}))
+    (text,) = summary.pop_update().encode_messages({"node": 1.0})
     frame = json.loads(text)
     for name in frame:
         assert f"`{name}`" in API, name
 
 
 def test_every_close_code_is_documented() -> None:
-    for code in Close:
+    for code in LinkCloseCode:
         assert str(code.value) in API, code
 
 

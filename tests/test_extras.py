@@ -17,7 +17,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from storage.sessions.folder import FRAMES_NAME, SessionFolder
+from storage.sessions.folder import FRAMES_NAME, SessionsFolder
 from tests.service.cli.outcome import static_only
 from tests.service.process import Process
 from tests.waiting import PATIENCE_S
@@ -62,13 +62,13 @@ def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_late
     words = ("--scene", tmp_path / "foot.toml", "--record", "trial", "--journal", tmp_path / "node")
     with closing(Process("node", *words, folder=tmp_path / "run", **without_server)) as node:
         node.said("tiles at")
-        folder = SessionFolder(tmp_path / "node" / "sessions")
+        folder = SessionsFolder(tmp_path / "node" / "sessions")
         node.said("schedule")
         with pytest.raises(subprocess.TimeoutExpired):  # some seconds of frames: lead and load
             node.process.wait(4.0)
         node.process.send_signal(signal.SIGINT)
         assert node.ended(60.0) == 0, node.err
-    (session_id,) = folder.ids()
+    (session_id,) = folder.list_ids()
     session = folder.load(session_id)
     assert session.problem is not None
     assert session.problem.startswith("no estimates: the estimator needs numba")
@@ -79,7 +79,7 @@ def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_late
     assert proof.returncode == 0, proof.stdout
     assert "complete" in proof.stdout
 
-    frames = folder.path(session_id) / FRAMES_NAME
+    frames = folder.get_path(session_id) / FRAMES_NAME
     estimated = foottile("estimate", frames, "--out", tmp_path / "estimated.parquet")
     assert estimated.returncode == 0, estimated.stderr
     grf_n = pq.read_table(tmp_path / "estimated.parquet")["grf_n"].to_numpy()

@@ -16,7 +16,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.registry import FORMATS
 from tests.service.process import Process
 from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S, until

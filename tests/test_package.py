@@ -252,8 +252,8 @@ HEAVY = ("fastapi", "starlette", "uvicorn", "httpx", "numba", "scipy", "matplotl
     ("imports", "absent"),
     [
         ("service.cli.main", ("numpy", "pydantic", "pyarrow", *HEAVY)),
-        ("service.cli.commands.node, service.node.run", HEAVY),
-        ("service.node.recording, service.sessions.sealing, service.link", HEAVY),
+        ("service.cli.commands.node, service.node.running_node", HEAVY),
+        ("service.node.local_recording, service.sessions.sealing, service.protocol", HEAVY),
     ],
     ids=["help", "a node", "a node that seals without a calibration"],
 )

@@ -63,7 +63,7 @@ const foot = new Foot(range);
 foot.resized = redraw;
 const trace = new Trace(() => { history.request(); pace.request(); });
 const tileTraces = new TileTraces(range, () => { redraw(); trace.recolour(); });
-const history = new History(trace.points, () => state.node?.boot_id);
+const history = new History(trace.points, () => state.node?.stream_id);
 const pause = new Pause(() => {
   if (pause.held) trace.pause(pause.held.nowMs);
   else trace.resume();
@@ -93,10 +93,10 @@ const handlers = {
   },
   node({ node }) {
     const isNew = !state.nodes.has(node.node);
-    const wasBoot = state.nodes.get(node.node)?.boot_id;
+    const wasBoot = state.nodes.get(node.node)?.stream_id;
     state.nodes.set(node.node, node);
     if (state.node?.node === node.node) {
-      if (wasBoot !== node.boot_id) clearFrames(); // new stream: the old trace does not continue
+      if (wasBoot !== node.stream_id) clearFrames(); // new stream: the old trace does not continue
       state.node = node;
       show();
     }
@@ -190,7 +190,7 @@ function storedNode() {
 function selectNode(requested = state.requested ?? storedNode()) {
   const all = [...state.nodes.values()];
   const next = state.nodes.get(requested) ?? all.find((node) => node.connected) ?? all[0] ?? null;
-  if (next?.node !== state.node?.node || next?.boot_id !== state.node?.boot_id) clearFrames();
+  if (next?.node !== state.node?.node || next?.stream_id !== state.node?.stream_id) clearFrames();
   state.node = next;
   state.requested = requested ?? next?.node ?? null;
   show();

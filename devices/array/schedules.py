@@ -1,7 +1,7 @@
 """Schedules: orders of one frame's transfers on the bus.
 
 Each schedule is a function that scans one frame of an array into a `Scan`. `TileArray` handles and
-flags faults; a schedule is only the order. `devices.array.budget` predicts the durations. At
+flags faults; a schedule is only the order. `devices.array.timing_budget` predicts the durations. At
 400 kHz with four tiles of 1.6 ms: `sequential` 132 frames a second, `simultaneous` 395,
 `pipelined` 544 (hardware.md 4, strategies a, b, c; `per_mux` is d).
 """
@@ -11,28 +11,28 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from devices.array.ports import Scan
-from devices.scene.hardware import ScheduleName
+from devices.array.tile_io import Scan
+from devices.scene.hardware_sections import ScheduleName
 
 
 class Transfers(Protocol):
     """Transfers of an array, for a schedule to order; implemented by `TileArray`."""
 
     @property
-    def indices(self) -> Sequence[int]:
+    def tile_indices(self) -> Sequence[int]:
         """Indices of all tiles."""
 
     @property
-    def by_mux(self) -> Sequence[Sequence[int]]:
+    def tiles_by_mux(self) -> Sequence[Sequence[int]]:
         """Tile indices of each multiplexer."""
 
-    def convert(self, scan: Scan, tiles: Sequence[int]) -> None:
+    def start_conversions(self, scan: Scan, tiles: Sequence[int]) -> None:
         """Start a conversion in all these tiles at once."""
 
-    def collect(self, scan: Scan, tile: int) -> None:
+    def read_conversion(self, scan: Scan, tile: int) -> None:
         """Read a tile's conversion as soon as it is finished."""
 
-    def close_ranks(self) -> None:
+    def wait_for_back_to_back_reads(self) -> None:
         """Wait until all tiles can be read and restarted back to back."""
 
 
@@ -41,16 +41,16 @@ Schedule = Callable[[Transfers, Scan], None]
 
 def sequential(array: Transfers, scan: Scan) -> None:
     """Select, convert, wait and read tile by tile: slow, and the reference for the others."""
-    for tile in array.indices:
-        array.convert(scan, [tile])
-        array.collect(scan, tile)
+    for tile in array.tile_indices:
+        array.start_conversions(scan, [tile])
+        array.read_conversion(scan, tile)
 
 
 def simultaneous(array: Transfers, scan: Scan) -> None:
     """Open all channels, send one CONVERT to all tiles, wait once, then read each: no skew."""
-    array.convert(scan, array.indices)
-    for tile in array.indices:
-        array.collect(scan, tile)
+    array.start_conversions(scan, array.tile_indices)
+    for tile in array.tile_indices:
+        array.read_conversion(scan, tile)
 
 
 def pipelined(array: Transfers, scan: Scan) -> None:
@@ -59,10 +59,10 @@ def pipelined(array: Transfers, scan: Scan) -> None:
     While one tile converts, the others are read, so that only the first tile has a wait. Tiles are
     sampled one after another; every sample has its own instant.
     """
-    array.close_ranks()
-    for tile in array.indices:
-        array.collect(scan, tile)
-        array.convert(scan, [tile])
+    array.wait_for_back_to_back_reads()
+    for tile in array.tile_indices:
+        array.read_conversion(scan, tile)
+        array.start_conversions(scan, [tile])
 
 
 def per_mux(array: Transfers, scan: Scan) -> None:
@@ -71,10 +71,10 @@ def per_mux(array: Transfers, scan: Scan) -> None:
     Before the tiles of a mux are read, the tiles of the previous mux, just read, are restarted:
     each mux converts while all the others are read.
     """
-    for index, tiles in enumerate(array.by_mux):
-        array.convert(scan, array.by_mux[index - 1])
+    for index, tiles in enumerate(array.tiles_by_mux):
+        array.start_conversions(scan, array.tiles_by_mux[index - 1])
         for tile in tiles:
-            array.collect(scan, tile)
+            array.read_conversion(scan, tile)
 
 
 SCHEDULES: Mapping[ScheduleName, Schedule] = {

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from devices.array.budget import CONVERT_BITS, read_bits
+from devices.array.timing_budget import CONVERT_BITS, count_read_bits
 from devices.buses.i2c import I2cBus, i2c_msg
 from devices.chips.mpl115a2 import (
     ADDRESS,
@@ -25,7 +25,7 @@ from devices.chips.tca9548a import ADDRESSES, CHANNELS, MuxRouter, Tca9548a
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.frames import TileInfo
-from devices.scene.hardware import TileScene
+from devices.scene.hardware_sections import TileSection
 
 _SETTLED_NS = 3_200_000  # the longest conversion and a little more
 _SHORTEST_NS = 800_000  # half the typical time: no part is that fast
@@ -49,7 +49,7 @@ _UNDISTURBED = 0.1
 _SCL_BYTES = (2, 12)  # far apart, within the part's registers
 
 
-def identify(bus: I2cBus, tiles: Sequence[TileScene]) -> tuple[TileInfo, ...]:
+def identify_tiles(bus: I2cBus, tiles: Sequence[TileSection]) -> tuple[TileInfo, ...]:
     """Identify every tile of a scene, one channel at a time, by three equal coefficient reads.
 
     One at a time, because in a broadcast the acknowledge is a wired AND, which hides a missing tile
@@ -59,16 +59,16 @@ def identify(bus: I2cBus, tiles: Sequence[TileScene]) -> tuple[TileInfo, ...]:
         TileSetupError: a tile or its mux does not answer, or its coefficients are implausible.
         BusFaultError: the bus itself fails.
     """
-    _all_closed(bus)
+    _close_muxes(bus)
     router = MuxRouter(bus, (tile.mux for tile in tiles))
     chip = Mpl115a2(bus)
-    return tuple(_identify(router, chip, tile) for tile in tiles)
+    return tuple(_identify_tile(router, chip, tile) for tile in tiles)
 
 
-def _identify(router: MuxRouter, chip: Mpl115a2, tile: TileScene) -> TileInfo:
+def _identify_tile(router: MuxRouter, chip: Mpl115a2, tile: TileSection) -> TileInfo:
     where = f"tile {tile.serial} (mux 0x{tile.mux:02x} channel {tile.channel})"
     try:
-        router.connect_only(tile.mux, tile.channel)
+        router.connect_single_channel(tile.mux, tile.channel)
         words = chip.read_coefficient_words(where=where)
     except NoAcknowledgeError as error:
         raise TileSetupError(
@@ -90,7 +90,7 @@ def _identify(router: MuxRouter, chip: Mpl115a2, tile: TileScene) -> TileInfo:
 
 
 @dataclass(frozen=True)
-class Plug:
+class FoundTile:
     """Device found at address 0x60 behind a channel of a mux.
 
     Attributes:
@@ -106,15 +106,15 @@ class Plug:
     problem: str = ""
 
 
-def find_tiles(bus: I2cBus) -> tuple[Plug, ...]:
+def find_tiles_on_all_channels(bus: I2cBus) -> tuple[FoundTile, ...]:
     """Search all mux addresses and channels for tiles, one at a time, without a scene.
 
     Raises:
         BusFaultError: the bus itself fails, or acknowledges everything and returns only zeros.
     """
-    muxes = _all_closed(bus)
+    muxes = _close_muxes(bus)
     router = MuxRouter(bus, muxes)
-    if muxes and not router.echoes():
+    if muxes and not router.check_any_mux_works():
         raise BusFaultError(
             f"{len(muxes)} multiplexers acknowledge, but none stores a mask",
             where=bus.name,
@@ -125,25 +125,25 @@ def find_tiles(bus: I2cBus) -> tuple[Plug, ...]:
     for mux in muxes:
         for channel in CHANNELS:
             try:
-                router.connect_only(mux, channel)
+                router.connect_single_channel(mux, channel)
                 words = chip.read_coefficient_words(where=f"mux 0x{mux:02x} channel {channel}")
-                plugs.append(Plug(mux, channel, words))
+                plugs.append(FoundTile(mux, channel, words))
             except NoAcknowledgeError:
                 continue
             except TileSetupError as error:
-                plugs.append(Plug(mux, channel, None, str(error)))
+                plugs.append(FoundTile(mux, channel, None, str(error)))
     return tuple(plugs)
 
 
-def _all_closed(bus: I2cBus) -> list[int]:
+def _close_muxes(bus: I2cBus) -> list[int]:
     """Close all muxes and return the addresses of those present.
 
     A tile behind an open mux would answer together with the addressed one.
     """
-    return [address for address in ADDRESSES if _answers(bus, address)]
+    return [address for address in ADDRESSES if _close_mux(bus, address)]
 
 
-def _answers(bus: I2cBus, address: int) -> bool:
+def _close_mux(bus: I2cBus, address: int) -> bool:
     try:
         Tca9548a(bus, address).write_mask(0)
     except NoAcknowledgeError:
@@ -156,10 +156,10 @@ class WireTiming:
     """Measured bus clock, and overhead of a transaction beyond its bits."""
 
     scl_hz: float
-    transaction_s: float
+    transaction_overhead_s: float
 
 
-def measure_wires(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming:
+def measure_wire_timing(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming:
     """Measure SCL from the time difference of a long and a short read: nine periods per byte.
 
     The adapter's nominal rate is unreliable: on a Raspberry Pi it follows the core's clock
@@ -168,8 +168,8 @@ def measure_wires(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming:
     Raises:
         I2cError: the tile does not answer.
     """
-    router = MuxRouter(bus, _all_closed(bus))
-    router.connect_only(tile.mux, tile.channel)
+    router = MuxRouter(bus, _close_muxes(bus))
+    router.connect_single_channel(tile.mux, tile.channel)
     point = i2c_msg.write(ADDRESS, [REGISTER_COEFFICIENTS])
     took_ns: dict[int, list[int]] = {n: [] for n in _SCL_BYTES}
     reads = {n: i2c_msg.read(ADDRESS, n) for n in _SCL_BYTES}
@@ -182,7 +182,7 @@ def measure_wires(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming:
     short_ns, long_ns = (sorted(took_ns[n])[undisturbed] for n in _SCL_BYTES)
     periods = 9 * (_SCL_BYTES[1] - _SCL_BYTES[0])
     scl_hz = 1e9 * periods / max(1.0, long_ns - short_ns)
-    overhead_s = short_ns * 1e-9 - read_bits(_SCL_BYTES[0]) / scl_hz
+    overhead_s = short_ns * 1e-9 - count_read_bits(_SCL_BYTES[0]) / scl_hz
     return WireTiming(scl_hz, max(0.0, overhead_s))
 
 
@@ -201,12 +201,12 @@ def measure_conversion_ns(
     Raises:
         I2cError: the part does not answer.
     """
-    router = MuxRouter(bus, _all_closed(bus))
-    router.connect_only(tile.mux, tile.channel)
+    router = MuxRouter(bus, _close_muxes(bus))
+    router.connect_single_channel(tile.mux, tile.channel)
     chip = Mpl115a2(bus)
 
-    wires_ns = round(1e9 * (CONVERT_BITS + read_bits(4.0)) / wires.scl_hz)
-    wires_ns += round(2e9 * wires.transaction_s)
+    wires_ns = round(1e9 * (CONVERT_BITS + count_read_bits(4.0)) / wires.scl_hz)
+    wires_ns += round(2e9 * wires.transaction_overhead_s)
 
     def convert_and_read(delay_ns: int) -> tuple[tuple[int, int], int]:
         """Return the counts, and the longest possible delay from CONVERT to their read.
@@ -214,7 +214,7 @@ def measure_conversion_ns(
         A busy machine may pause before either transaction, so all time off the wires counts.
         """
         begin_ns = clock.now_ns()
-        chip.convert()
+        chip.start_conversion()
         stop_ns = clock.now_ns()
         clock.sleep_until_ns(stop_ns + delay_ns)
         words = chip.read_counts()
@@ -243,13 +243,13 @@ def measure_conversion_ns(
                 return None
         return None if in_time >= _SAME_MAX else known_ns
 
-    delay_ns = _bisected(finished_within)
+    delay_ns = _bisect_conversion_ns(finished_within)
     if delay_ns is None:
         return None
     return min(CONVERSION_MAX_NS, round((delay_ns + _ADDRESS_BITS * 1e9 / wires.scl_hz) * _MARGIN))
 
 
-def _bisected(finished_within: Callable[[int, int], int | None]) -> int | None:
+def _bisect_conversion_ns(finished_within: Callable[[int, int], int | None]) -> int | None:
     if finished_within(CONVERSION_MAX_NS, _NEVER_NS) is None:
         return None
     unfinished_ns, finished_ns = _SHORTEST_NS, CONVERSION_MAX_NS

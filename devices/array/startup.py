@@ -5,38 +5,43 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from devices.array.array import TileArray
-from devices.array.budget import BusTiming, Choice, choose, frame_s
-from devices.array.bus_watch import Help, help_bus
-from devices.array.self_test import WireTiming, identify, measure_conversion_ns, measure_wires
-from devices.buses.i2c import I2cBus, PatientBus
+from devices.array.bus_monitor import RecoveryResult, recover_bus
+from devices.array.self_test import (
+    WireTiming,
+    identify_tiles,
+    measure_conversion_ns,
+    measure_wire_timing,
+)
+from devices.array.tile_array import TileArray
+from devices.array.timing_budget import BusTiming, ScheduleChoice, choose_schedule, compute_frame_s
+from devices.buses.i2c import I2cBus, RetryingBus
 from devices.chips.mpl115a2 import CONVERSION_MAX_NS
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError, SceneError
 from devices.frames import TileInfo
-from devices.recovery.recovery import BusRecovery
-from devices.scene.file import Scene
-from devices.scene.hardware import AnySchedule, ArrayScene
+from devices.recovery.bus_recovery import BusRecovery
+from devices.scene.hardware_sections import AnySchedule, ArraySection
+from devices.scene.scene_file import Scene
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredTiles:
     """Tiles of a scene as identified and measured on its bus.
 
     Attributes:
         tiles: identified tiles, with measured conversion times.
         timing: timing of the bus and the parts.
-        unmeasured: serials whose conversion time could not be measured; 3 ms is assumed.
+        unmeasured_serials: serials whose conversion time could not be measured; 3 ms is assumed.
     """
 
     tiles: tuple[TileInfo, ...]
     timing: BusTiming
-    unmeasured: tuple[str, ...]
+    unmeasured_serials: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Ready(Measured):
+class ReadyArray(MeasuredTiles):
     """Array that is identified, measured and ready to scan frames.
 
     Attributes:
@@ -45,23 +50,23 @@ class Ready(Measured):
     """
 
     array: TileArray
-    choice: Choice
+    choice: ScheduleChoice
 
     @property
-    def predicted_hz(self) -> float:
+    def predicted_rate_hz(self) -> float:
         """Predicted frame rate."""
-        return 1.0 / frame_s(self.choice.schedule, self.timing)
+        return 1.0 / compute_frame_s(self.choice.schedule, self.timing)
 
 
-def make_ready(
+def prepare_array(
     bus: I2cBus,
     scene: Scene,
     clock: Clock,
     *,
     schedule: AnySchedule | None = None,
     recovery: BusRecovery | None = None,
-    reference_n: Callable[[], float] | None = None,
-) -> Ready:
+    read_reference_n: Callable[[], float] | None = None,
+) -> ReadyArray:
     """Free the bus, identify and measure the tiles of a scene, and choose the schedule.
 
     Args:
@@ -70,19 +75,21 @@ def make_ready(
         clock: virtual or real clock.
         schedule: schedule, instead of the scene's.
         recovery: frees a stuck bus.
-        reference_n: as for `TileArray`.
+        read_reference_n: as for `TileArray`.
 
     Raises:
         TileSetupError, I2cError: a tile or the bus does not work.
         SceneError: the schedule does not suit the tiles.
     """
-    free_bus(bus, scene, recovery)
-    found = measured(bus, scene, clock)
-    choice = chosen(scene, found.timing, schedule, has_reference=reference_n is not None)
-    return _ready(bus, scene, clock, found, choice, recovery, reference_n)
+    ensure_bus_works(bus, scene, recovery)
+    found = identify_and_measure(bus, scene, clock)
+    choice = choose_scene_schedule(
+        scene, found.timing, schedule, has_reference=read_reference_n is not None
+    )
+    return _build_array(bus, scene, clock, found, choice, recovery, read_reference_n)
 
 
-def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
+def ensure_bus_works(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
     """Check that the bus works, and free it if need be: a slave may hang in a byte.
 
     Raises:
@@ -95,7 +102,7 @@ def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
         nonlocal fault
         try:
             # Without any mux the bus works: identification will name the missing tile.
-            if router.echoes() or router.refused is not None:
+            if router.check_any_mux_works() or router.refused_address is not None:
                 return True
             fault = BusFaultError(
                 "the multiplexers acknowledge, but none stores a mask",
@@ -107,24 +114,24 @@ def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
             fault = error
         return False
 
-    given = Help(worked=moves())
-    if not given.worked and recovery is not None:
-        given = help_bus(recovery, moves)
-    if not given.worked and fault is not None:
+    given = RecoveryResult(succeeded=moves())
+    if not given.succeeded and recovery is not None:
+        given = recover_bus(recovery, moves)
+    if not given.succeeded and fault is not None:
         if given.problem:
             fault.remedy += f". It could not be freed: {given.problem}"
         raise fault
 
 
-def renew(
+def reidentify_replaced_tiles(
     bus: I2cBus,
     scene: Scene,
     clock: Clock,
-    before: Ready,
+    ready_array: ReadyArray,
     *,
     recovery: BusRecovery | None = None,
-    reference_n: Callable[[], float] | None = None,
-) -> Ready:
+    read_reference_n: Callable[[], float] | None = None,
+) -> ReadyArray:
     """Identify and measure replaced parts, and return an array with the new ones.
 
     The other parts are not measured again, so that the interruption is short.
@@ -132,32 +139,35 @@ def renew(
     Raises:
         TileSetupError, I2cError: a new part is gone again, or is no MPL115A2.
     """
-    replaced = before.array.replaced
+    replaced = ready_array.array.replaced_serials
     new = [tile for tile in scene.tile if tile.serial in replaced]
-    found = measured(bus, scene.model_copy(update={"tile": tuple(new)}), clock)
+    found = identify_and_measure(bus, scene.model_copy(update={"tile": tuple(new)}), clock)
     waits_s = dict(zip((tile.serial for tile in new), found.timing.conversions_s, strict=True))
     by_serial = {tile.serial: tile for tile in found.tiles}
-    serials = [tile.serial for tile in before.tiles]
-    old_s = dict(zip(serials, before.timing.conversions_s, strict=True))
-    parts = Measured(
-        tiles=tuple(by_serial.get(tile.serial, tile) for tile in before.tiles),
+    serials = [tile.serial for tile in ready_array.tiles]
+    old_s = dict(zip(serials, ready_array.timing.conversions_s, strict=True))
+    parts = MeasuredTiles(
+        tiles=tuple(by_serial.get(tile.serial, tile) for tile in ready_array.tiles),
         timing=replace(
-            before.timing, conversions_s=tuple((old_s | waits_s)[serial] for serial in serials)
+            ready_array.timing, conversions_s=tuple((old_s | waits_s)[serial] for serial in serials)
         ),
-        unmeasured=(*(s for s in before.unmeasured if s not in by_serial), *found.unmeasured),
+        unmeasured_serials=(
+            *(s for s in ready_array.unmeasured_serials if s not in by_serial),
+            *found.unmeasured_serials,
+        ),
     )
-    return _ready(bus, scene, clock, parts, before.choice, recovery, reference_n)
+    return _build_array(bus, scene, clock, parts, ready_array.choice, recovery, read_reference_n)
 
 
-def _ready(
+def _build_array(
     bus: I2cBus,
     scene: Scene,
     clock: Clock,
-    found: Measured,
-    choice: Choice,
+    found: MeasuredTiles,
+    choice: ScheduleChoice,
     recovery: BusRecovery | None,
-    reference_n: Callable[[], float] | None,
-) -> Ready:
+    read_reference_n: Callable[[], float] | None,
+) -> ReadyArray:
     array = TileArray(
         bus,
         found.tiles,
@@ -167,21 +177,21 @@ def _ready(
         temperature_every=scene.array.temperature_every,
         broadcast_channels=scene.array.broadcast_channels,
         recovery=recovery,
-        reference_n=reference_n,
+        read_reference_n=read_reference_n,
     )
     # A pipelined schedule reads conversions started in the previous frame.
-    array.scan()
-    return Ready(found.tiles, found.timing, found.unmeasured, array, choice)
+    array.scan_frame()
+    return ReadyArray(found.tiles, found.timing, found.unmeasured_serials, array, choice)
 
 
-def chosen(
+def choose_scene_schedule(
     scene: Scene,
     timing: BusTiming,
     schedule: AnySchedule | None = None,
     *,
     has_reference: bool,
-    asked_hz: float = 0.0,
-) -> Choice:
+    requested_rate_hz: float = 0.0,
+) -> ScheduleChoice:
     """Choose the schedule for a scene on a bus with this timing.
 
     Args:
@@ -189,28 +199,30 @@ def chosen(
         timing: measured timing.
         schedule: schedule, instead of the scene's.
         has_reference: True if a reference force is read with the tiles.
-        asked_hz: frame rate, instead of the scene's.
+        requested_rate_hz: frame rate, instead of the scene's.
 
     Raises:
         SceneError: the schedule does not suit a reference sensor.
     """
     asked = schedule or scene.array.schedule
     if has_reference:
-        return _with_reference(asked)
+        return _choose_with_reference(asked)
     if asked == "auto":
-        return choose(
+        return choose_schedule(
             timing,
-            asked_hz=asked_hz or scene.rate_hz,
+            requested_rate_hz=requested_rate_hz or scene.rate_hz,
             channels_max=scene.array.broadcast_channels,
         )
-    return Choice(asked, "as the scene says" if schedule is None else "as asked for")
+    return ScheduleChoice(asked, "as the scene says" if schedule is None else "as asked for")
 
 
-def _with_reference(asked: AnySchedule) -> Choice:
+def _choose_with_reference(asked: AnySchedule) -> ScheduleChoice:
     if asked in ("auto", "simultaneous"):
-        return Choice("simultaneous", "the reference force is read while all tiles convert at once")
+        return ScheduleChoice(
+            "simultaneous", "the reference force is read while all tiles convert at once"
+        )
     if asked == "sequential":
-        return Choice(asked, "as the scene says")
+        return ScheduleChoice(asked, "as the scene says")
     raise SceneError(
         f"schedule {asked!r} beside a reference sensor: its tiles are sampled one after another",
         where="array.schedule",
@@ -218,18 +230,18 @@ def _with_reference(asked: AnySchedule) -> Choice:
     )
 
 
-def measured(bus: I2cBus, scene: Scene, clock: Clock) -> Measured:
+def identify_and_measure(bus: I2cBus, scene: Scene, clock: Clock) -> MeasuredTiles:
     """Identify the tiles of a scene and measure their timing.
 
     With `array.wait_ms` the conversion times are not measured. A part that cannot be measured is
     assigned the data sheet's longest time.
 
     Raises:
-        TileSetupError, I2cError: as for `make_ready`.
+        TileSetupError, I2cError: as for `prepare_array`.
     """
-    bus = PatientBus(bus)
-    tiles = list(identify(bus, scene.tile))
-    wires = measure_wires(bus, clock, tiles[0])
+    bus = RetryingBus(bus)
+    tiles = list(identify_tiles(bus, scene.tile))
+    wires = measure_wire_timing(bus, clock, tiles[0])
     unmeasured = []
     conversions_ns: list[int | None] = [None] * len(tiles)
     if scene.array.wait_ms is None:
@@ -240,12 +252,12 @@ def measured(bus: I2cBus, scene: Scene, clock: Clock) -> Measured:
                 unmeasured.append(tile.serial)
             else:
                 tiles[index] = tile.model_copy(update={"conversion_ms": conversion_ns / 1e6})
-    timing = timing_of(scene.array, wires, [tile.mux for tile in tiles], conversions_ns)
-    return Measured(tuple(tiles), timing, tuple(unmeasured))
+    timing = compute_bus_timing(scene.array, wires, [tile.mux for tile in tiles], conversions_ns)
+    return MeasuredTiles(tuple(tiles), timing, tuple(unmeasured))
 
 
-def timing_of(
-    array: ArrayScene,
+def compute_bus_timing(
+    array: ArraySection,
     wires: WireTiming,
     muxes: Sequence[int],
     conversions_ns: Sequence[int | None],
@@ -266,6 +278,6 @@ def timing_of(
         scl_hz=wires.scl_hz,
         conversions_s=tuple(wait_ns * 1e-9 for wait_ns in waits_ns),
         muxes=tuple(muxes),
-        bytes_read=2.0 + 2.0 / array.temperature_every,
-        transaction_s=wires.transaction_s,
+        bytes_per_read=2.0 + 2.0 / array.temperature_every,
+        transaction_overhead_s=wires.transaction_overhead_s,
     )

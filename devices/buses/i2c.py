@@ -17,7 +17,7 @@ from typing import Protocol
 from smbus2 import SMBus, i2c_msg
 from smbus2.smbus2 import I2C_RDWR, i2c_rdwr_ioctl_data
 
-from devices.buses.reopening import Reopener
+from devices.buses.device_reopener import DeviceReopener
 from devices.errors import (
     BusFaultError,
     BusLostError,
@@ -35,10 +35,10 @@ __all__ = ["I2cAdapter", "I2cBus", "i2c_msg", "open_bus"]
 I2C_TIMEOUT = 0x0702
 TIMEOUT_10MS = 3
 
-POISON = 0xFF
+READ_BUFFER_FILL = 0xFF
 """Content of a read buffer before the transfer, so that stale bytes cannot pass as a reading if an
-adapter leaves the buffer as it is. No working part returns it (see `is_impossible`), and no mux has
-all channels open."""
+adapter leaves the buffer as it is. No working part returns it (see `classify_impossible_counts`),
+and no mux has all channels open."""
 _READ = 0x0001  # I2C_M_RD, include/uapi/linux/i2c.h
 
 _NACK = {errno.ENXIO, errno.EREMOTEIO}
@@ -98,7 +98,7 @@ class I2cBus:
     """
 
     def __init__(
-        self, adapter: I2cAdapter, name: str, reopener: Reopener[I2cAdapter] | None = None
+        self, adapter: I2cAdapter, name: str, reopener: DeviceReopener[I2cAdapter] | None = None
     ) -> None:
         self.name = name
         self._adapter: I2cAdapter | None = adapter
@@ -111,31 +111,31 @@ class I2cBus:
         return self._adapter is not None
 
     @property
-    def problem(self) -> str:
+    def reopen_error(self) -> str:
         """Reason why the last attempt to reopen the adapter failed; empty if it is open."""
-        return "" if self._reopener is None or self.is_open else self._reopener.problem
+        return "" if self._reopener is None or self.is_open else self._reopener.last_error
 
     def transfer(self, *messages: i2c_msg) -> None:
         """Run `messages` as one transaction; read messages are filled in place.
 
         Raises:
             NoAcknowledgeError: an address or a byte was not acknowledged.
-            BusLostError: the adapter went away; `reopen` gets it back.
+            BusLostError: the adapter went away; `ensure_open` gets it back.
             BusFaultError: timeout, lost arbitration, or an unspecified I/O error.
             BusMisuseError: the adapter cannot do this sequence (a bug in the driver).
         """
         for message in messages:
             if message.flags & _READ:
-                ctypes.memset(message.buf, POISON, message.len)
+                ctypes.memset(message.buf, READ_BUFFER_FILL, message.len)
         try:
             self._i2c_rdwr(*messages)
         except OSError as error:
-            found = _classified(error, self.name, messages)
+            found = _classify_error(error, self.name, messages)
             if isinstance(found, BusLostError):
-                self.let_go()
+                self.release_adapter()
             raise found from error
 
-    def let_go(self) -> None:
+    def release_adapter(self) -> None:
         """Close an adapter that no longer works, so that its device number becomes free.
 
         Without a `reopener` do nothing.
@@ -145,12 +145,12 @@ class I2cBus:
         with contextlib.suppress(OSError):
             self._adapter.close()
         self._adapter = None
-        self._i2c_rdwr = _refuse
+        self._i2c_rdwr = _raise_no_device
 
-    def reopen(self, now_ns: int) -> bool:
+    def ensure_open(self, now_ns: int) -> bool:
         """Reopen a closed adapter, at most once a second; return whether the bus is open."""
         if self._adapter is None and self._reopener is not None:
-            self._adapter = self._reopener.poll(now_ns)
+            self._adapter = self._reopener.poll_opened_device(now_ns)
             if self._adapter is not None:
                 self._i2c_rdwr = self._adapter.i2c_rdwr
         return self._adapter is not None
@@ -163,11 +163,11 @@ class I2cBus:
             self._adapter.close()
 
 
-def _refuse(*_: i2c_msg) -> None:
+def _raise_no_device(*_: i2c_msg) -> None:
     raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
 
 
-class PatientBus(I2cBus):
+class RetryingBus(I2cBus):
     """Bus that retries transfers without an acknowledge, for start-up on a disturbed line."""
 
     TRIES = 4
@@ -175,7 +175,7 @@ class PatientBus(I2cBus):
     def __init__(self, bus: I2cBus) -> None:
         self.name = bus.name
         self._bus = bus
-        self.repeated = 0
+        self.retried_transfers = 0
         """Number of transfers that succeeded only on a retry."""
 
     def transfer(self, *messages: i2c_msg) -> None:
@@ -187,11 +187,11 @@ class PatientBus(I2cBus):
                 if attempt + 1 == self.TRIES:
                     raise
             else:
-                self.repeated += attempt > 0
+                self.retried_transfers += attempt > 0
                 return
 
 
-def _classified(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cError:
+def _classify_error(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cError:
     number = error.errno
     where = f"{bus}, address 0x{messages[-1].addr:02x}" if messages else bus
     name = errno.errorcode.get(number, str(number)) if number is not None else str(error)
@@ -258,5 +258,7 @@ def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
         emulated = None
     elif emulated is None:
         raise UsageError("bus 'emulated' needs an emulated world, and none was given")
-    reopener = Reopener(lambda: _open_adapter(name, emulated), at_once=emulated is not None)
+    reopener = DeviceReopener(
+        lambda: _open_adapter(name, emulated), is_synchronous=emulated is not None
+    )
     return I2cBus(_open_adapter(name, emulated), name, reopener)

@@ -17,11 +17,11 @@ from devices.errors import ServoLostError, ServoSetupError
 
 SYSFS = Path("/sys/bus/usb-serial/devices")
 BY_ID = Path("/dev/serial/by-id")
-LATENCY_MS = 1
+RECOMMENDED_LATENCY_MS = 1
 """Recommended latency timer."""
 
 PORT_ERRORS = (OSError, termios.error)
-NOT_SENT = serial.SerialTimeoutException
+SEND_TIMEOUT_ERROR = serial.SerialTimeoutException
 """Error of a request that was not sent in time, perhaps on a busy machine; the port still works."""
 
 
@@ -41,7 +41,7 @@ class SerialPort(Protocol):
         """Release the port."""
 
 
-def open_line(port: str, baudrate: int, timeout_s: float) -> SerialPort:
+def open_serial_line(port: str, baudrate: int, timeout_s: float) -> SerialPort:
     """Open a serial port for this program alone; a read waits `timeout_s` seconds at most.
 
     Raises:
@@ -66,7 +66,7 @@ def open_line(port: str, baudrate: int, timeout_s: float) -> SerialPort:
     return line
 
 
-def stable_path(port: str, folder: Path = BY_ID) -> str:
+def find_stable_path(port: str, folder: Path = BY_ID) -> str:
     """Return a path of the adapter at `port` that stays valid after replugging.
 
     The kernel numbers adapters in order of plugging, so /dev/ttyUSB0 may become /dev/ttyUSB1, or
@@ -81,7 +81,7 @@ def stable_path(port: str, folder: Path = BY_ID) -> str:
     return str(links[0]) if links else port
 
 
-def latency_timer_ms(port: str, sysfs: Path = SYSFS) -> int | None:
+def read_latency_timer_ms(port: str, sysfs: Path = SYSFS) -> int | None:
     """Read the latency timer of the adapter at `port`, in milliseconds; None if it has none.
 
     Only USB adapters with an FTDI chip have one. `port` may be a link, as in /dev/serial/by-id.
@@ -92,14 +92,15 @@ def latency_timer_ms(port: str, sysfs: Path = SYSFS) -> int | None:
         return None
 
 
-def latency_remark(port: str, sysfs: Path = SYSFS) -> str | None:
+def check_latency_timer(port: str, sysfs: Path = SYSFS) -> str | None:
     """Return a warning, with remedy, if the latency timer of `port` is too long; else None."""
-    timer_ms = latency_timer_ms(port, sysfs)
-    if timer_ms is None or timer_ms <= LATENCY_MS:
+    timer_ms = read_latency_timer_ms(port, sysfs)
+    if timer_ms is None or timer_ms <= RECOMMENDED_LATENCY_MS:
         return None
     return (
         f"{port}: the adapter holds every answer of the servo back for {timer_ms} ms (its latency "
-        f"timer); expected {LATENCY_MS} ms. Put this line into /etc/udev/rules.d/99-servo.rules "
+        f"timer); expected {RECOMMENDED_LATENCY_MS} ms. Put this line into "
+        "/etc/udev/rules.d/99-servo.rules "
         'and plug the adapter in again: ACTION=="add", SUBSYSTEM=="usb-serial", '
-        f'DRIVER=="ftdi_sio", ATTR{{latency_timer}}="{LATENCY_MS}"'
+        f'DRIVER=="ftdi_sio", ATTR{{latency_timer}}="{RECOMMENDED_LATENCY_MS}"'
     )

@@ -12,8 +12,8 @@ import os
 import time
 from typing import Protocol
 
-from devices.buses.reopening import Reopener
-from devices.errors import SpiSetupError, UsageError, needs_extra
+from devices.buses.device_reopener import DeviceReopener
+from devices.errors import SpiSetupError, UsageError, require_extra
 
 MAX_SPEED_HZ = 1_000_000
 """The highest clock for an MCP3208 at the Pi's 3.3 V (hardware.md 6)."""
@@ -40,7 +40,7 @@ class SpiDevice(Protocol):
 class SpiPort:
     """SPI device by its path, reopened after it went away (its driver was unbound)."""
 
-    def __init__(self, device: SpiDevice, reopener: Reopener[SpiDevice]) -> None:
+    def __init__(self, device: SpiDevice, reopener: DeviceReopener[SpiDevice]) -> None:
         self._device: SpiDevice | None = device
         self._reopener = reopener
 
@@ -51,9 +51,9 @@ class SpiPort:
             OSError: the transfer failed, or the device is away.
         """
         if self._device is None:
-            self._device = self._reopener.poll(time.monotonic_ns())
+            self._device = self._reopener.poll_opened_device(time.monotonic_ns())
         if self._device is None:
-            raise OSError(errno.ENODEV, self._reopener.problem or os.strerror(errno.ENODEV))
+            raise OSError(errno.ENODEV, self._reopener.last_error or os.strerror(errno.ENODEV))
         try:
             return self._device.xfer2(data)
         except OSError:
@@ -84,11 +84,11 @@ def open_spi(name: str, emulated: SpiDevice | None = None) -> SpiDevice:
         if emulated is None:
             raise UsageError("SPI device 'emulated' needs an emulated world, and none was given")
         return emulated
-    return SpiPort(_open_device(name), Reopener(lambda: _open_device(name)))
+    return SpiPort(_open_device(name), DeviceReopener(lambda: _open_device(name)))
 
 
 def _open_device(name: str) -> SpiDevice:
-    with needs_extra("rig", f"the SPI device {name}", remedy=_INSTALL):
+    with require_extra("rig", f"the SPI device {name}", remedy=_INSTALL):
         from spidev import SpiDev
     device = SpiDev()
     try:

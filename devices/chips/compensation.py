@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
-from devices.frames import NOT_READ, FrameBatch, TileInfo, TileStatus
+from devices.chips.mpl115a2 import Coefficients, compensate_kpa, compute_kpa_per_padc
+from devices.frames import NOT_READ, FrameBatch, TileFlag, TileInfo
 
-_ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of the quantization error, in counts
+_QUANTIZATION_SIGMA = 1.0 / np.sqrt(12.0)  # standard deviation of the quantization error, in counts
 
 
 class Compensation:
@@ -23,23 +23,25 @@ class Compensation:
             np.array([getattr(chip, name) for chip in chips]) for name in ("a0", "b1", "b2", "c12")
         )
 
-    def kpa(self, padc: npt.ArrayLike, tadc: npt.ArrayLike) -> Floats:
+    def compute_kpa(self, pressure_raw: npt.ArrayLike, temperature_raw: npt.ArrayLike) -> Floats:
         """Compute absolute pressure, (n, tiles), from raw counts of that shape."""
-        return compensate_kpa(padc, tadc, self.a0, self.b1, self.b2, self.c12)
+        return compensate_kpa(pressure_raw, temperature_raw, self.a0, self.b1, self.b2, self.c12)
 
-    def readable_kpa(self, frames: FrameBatch) -> Floats:
+    def compute_usable_kpa(self, frames: FrameBatch) -> Floats:
         """Compute absolute pressure of frames, NaN where a tile has no usable reading."""
         unreadable = (
-            ((frames.status & TileStatus.UNUSABLE) != 0)
-            | (frames.padc == NOT_READ)
-            | (frames.tadc == NOT_READ)
+            ((frames.tile_flags & TileFlag.UNUSABLE) != 0)
+            | (frames.pressure_raw == NOT_READ)
+            | (frames.temperature_raw == NOT_READ)
         )
-        return np.where(unreadable, np.nan, self.kpa(frames.padc, frames.tadc))
+        return np.where(
+            unreadable, np.nan, self.compute_kpa(frames.pressure_raw, frames.temperature_raw)
+        )
 
-    def kpa_per_count(self, tadc: npt.ArrayLike) -> Floats:
-        """Compute the pressure step of one count of `padc`; negative."""
-        return kpa_per_padc(tadc, self.b1, self.c12)
+    def compute_kpa_per_count(self, temperature_raw: npt.ArrayLike) -> Floats:
+        """Compute the pressure step of one count of `pressure_raw`; negative."""
+        return compute_kpa_per_padc(temperature_raw, self.b1, self.c12)
 
-    def rounding_kpa(self, tadc: npt.ArrayLike) -> Floats:
+    def compute_quantization_sigma_kpa(self, temperature_raw: npt.ArrayLike) -> Floats:
         """Compute the standard uncertainty due to quantization to a count."""
-        return np.asarray(np.abs(self.kpa_per_count(tadc)) * _ROUNDING)
+        return np.asarray(np.abs(self.compute_kpa_per_count(temperature_raw)) * _QUANTIZATION_SIGMA)

@@ -40,7 +40,7 @@ TADC_PER_KELVIN = -5.35
 """Counts of `tadc` per kelvin (Linux' mpl115 driver, Freescale's answer; hardware.md 1.3)."""
 _TADC_AT_25_DEGC = 472
 
-SAMPLE_PART_OF_CONVERSION = 4
+SAMPLE_DELAY_DIVISOR = 4
 """Divisor of the conversion time for the sample instant. Pressure is sampled in the first part of a
 conversion (DS table 7); a quarter is assumed, as the instant is not stated (hardware.md 1.4)."""
 
@@ -86,7 +86,7 @@ class Coefficients:
         a0, b1, b2, c12 = struct.unpack(">4H", _SIGNED_WORDS.pack(*fixed))
         return a0, b1, b2, c12
 
-    def implausibility(self) -> str:
+    def find_implausibility(self) -> str:
         """Return the reason why no working part has these coefficients; empty if plausible.
 
         All known parts have a0 > 0, b1 < 0, b2 < 0, c12 > 0 (hardware.md 8). Eight zero bytes (SDA
@@ -114,15 +114,15 @@ def compensate_kpa(
     """
     p = np.asarray(padc, dtype=np.float64)
     t = np.asarray(tadc, dtype=np.float64)
-    return np.asarray(kpa_of(p, t, a0, b1, b2, c12))
+    return np.asarray(compensate_kpa_jit(p, t, a0, b1, b2, c12))
 
 
-def kpa_of(p: Any, t: Any, a0: Any, b1: Any, b2: Any, c12: Any) -> Any:
+def compensate_kpa_jit(p: Any, t: Any, a0: Any, b1: Any, b2: Any, c12: Any) -> Any:
     """Compute `compensate_kpa` as bare arithmetic of floats or arrays, for compiled code."""
     return (a0 + (b1 + c12 * t) * p + b2 * t) * _KPA_PER_PCOMP + PRESSURE_MIN_KPA
 
 
-def padc_of_kpa(
+def compute_padc(
     pressure_kpa: npt.ArrayLike, tadc: npt.ArrayLike, coefficients: Coefficients
 ) -> Floats:
     """Compute the unrounded `padc` of a pressure: the exact inverse of `compensate_kpa`."""
@@ -132,16 +132,16 @@ def padc_of_kpa(
     return np.asarray((pcomp - c.a0 - c.b2 * t) / (c.b1 + c.c12 * t))
 
 
-def kpa_per_padc(tadc: npt.ArrayLike, b1: float | Floats, c12: float | Floats) -> Floats:
+def compute_kpa_per_padc(tadc: npt.ArrayLike, b1: float | Floats, c12: float | Floats) -> Floats:
     """Compute the pressure step of one count of `padc` in kPa.
 
     It is negative: `padc` falls as pressure rises.
     """
-    return np.asarray(kpa_per_count_of(np.asarray(tadc, dtype=np.float64), b1, c12))
+    return np.asarray(compute_kpa_per_padc_jit(np.asarray(tadc, dtype=np.float64), b1, c12))
 
 
-def kpa_per_count_of(t: Any, b1: Any, c12: Any) -> Any:
-    """Compute `kpa_per_padc` as bare arithmetic of floats or arrays, for compiled code."""
+def compute_kpa_per_padc_jit(t: Any, b1: Any, c12: Any) -> Any:
+    """Compute `compute_kpa_per_padc` as bare arithmetic of floats or arrays, for compiled code."""
     return (b1 + c12 * t) * _KPA_PER_PCOMP
 
 
@@ -161,7 +161,7 @@ class Mpl115a2:
         self._point_at_coefficients = i2c_msg.write(ADDRESS, [REGISTER_COEFFICIENTS])
         self._coefficients = i2c_msg.read(ADDRESS, 8)
 
-    def convert(self) -> None:
+    def start_conversion(self) -> None:
         """Start one conversion of pressure and temperature in every connected part."""
         self._bus.transfer(self._convert)
 
@@ -202,7 +202,7 @@ class Mpl115a2:
                 remedy="The line is disturbed: shorten the leads, check pull-ups, or use 100 kHz",
             )
         a0, b1, b2, c12 = struct.unpack(">4H", readings.pop())
-        reason = Coefficients.from_words((a0, b1, b2, c12)).implausibility()
+        reason = Coefficients.from_words((a0, b1, b2, c12)).find_implausibility()
         if reason:
             raise TileSetupError(
                 f"the coefficients are no MPL115A2's: {reason}",
@@ -212,7 +212,7 @@ class Mpl115a2:
         return a0, b1, b2, c12
 
 
-def indicative_degc(tadc: float) -> float:
+def estimate_degc(tadc: float) -> float:
     """Estimate the temperature of `tadc`, within some 5 K: the chip is not calibrated for it.
 
     25 degC at 472 counts and -5.35 counts/K (hardware.md 1.3); the data sheet states no scale.

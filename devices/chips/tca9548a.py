@@ -50,13 +50,13 @@ class MuxRouter:
         self._muxes = {address: Tca9548a(bus, address) for address in sorted(set(addresses))}
         self._masks: dict[int, int | None] = dict.fromkeys(self._muxes)
         self._refusals = dict.fromkeys(self._muxes, 0)
-        self.refused: int | None = None
+        self.refused_address: int | None = None
         """The mux that did not acknowledge in the last `connect`; None if all did."""
-        self.silent: set[int] = set()
+        self.silent_addresses: set[int] = set()
         """Muxes that did not acknowledge being closed. They are assumed to be without supply, so to
         connect no channel; callers that read a tile of another mux have to verify it."""
 
-    def connect(self, masks: Mapping[int, int]) -> None:
+    def connect_channels(self, masks_by_address: Mapping[int, int]) -> None:
         """Connect exactly the channels of `masks` (address to mask) and close all other muxes.
 
         Muxes are closed before others are opened, so that no two overlap in between.
@@ -65,28 +65,28 @@ class MuxRouter:
             I2cError: a mux did not answer. A mux that fails to close twice in a row is `silent`
                 from then on, and is skipped.
         """
-        self.refused = None
+        self.refused_address = None
         for address, mask in self._masks.items():
-            if mask != 0 and not masks.get(address):
+            if mask != 0 and not masks_by_address.get(address):
                 self._close(address)
-        for address, mask in masks.items():
+        for address, mask in masks_by_address.items():
             if self._masks[address] != mask:
                 self._write(address, mask)
 
-    def connect_only(self, address: int, channel: int) -> None:
+    def connect_single_channel(self, address: int, channel: int) -> None:
         """Connect one channel of one mux and nothing else."""
-        self.connect({address: 1 << channel})
+        self.connect_channels({address: 1 << channel})
 
-    def forget(self, address: int | None = None) -> None:
+    def invalidate_cache(self, address: int | None = None) -> None:
         """Discard the cached state of one mux, or of all: the next `connect` writes it again."""
         if address is not None:
             self._masks[address] = None
             return
         self._masks = dict.fromkeys(self._muxes)
         self._refusals = dict.fromkeys(self._muxes, 0)
-        self.silent.clear()
+        self.silent_addresses.clear()
 
-    def audit(self) -> bool:
+    def verify_masks(self) -> bool:
         """Read back the mask of every mux; return whether all match the cached state.
 
         Discards the cached state of a mux that differs (after a reset) or does not answer.
@@ -96,7 +96,7 @@ class MuxRouter:
         """
         sound = True
         for address, mask in self._masks.items():
-            if mask is None or address in self.silent:
+            if mask is None or address in self.silent_addresses:
                 continue
             try:
                 found: int | None = self._muxes[address].read_mask()
@@ -107,7 +107,7 @@ class MuxRouter:
                 sound = False
         return sound
 
-    def echoes(self) -> bool:
+    def check_any_mux_works(self) -> bool:
         """Return whether any mux returns a mask written to it, which proves that the bus works.
 
         With SDA stuck low a bus acknowledges everything and reads as zeros (hardware.md 3.2). The
@@ -116,12 +116,12 @@ class MuxRouter:
         Raises:
             BusFaultError: the bus itself failed.
         """
-        self.forget()
+        self.invalidate_cache()
         for address, mux in self._muxes.items():
-            self.refused = address
+            self.refused_address = address
             try:
                 mux.write_mask(1)
-                self.refused = None
+                self.refused_address = None
                 if mux.read_mask() == 1:
                     return True
             except NoAcknowledgeError:
@@ -135,14 +135,14 @@ class MuxRouter:
             self._refusals[address] += 1
             if self._refusals[address] < _REFUSALS_MAX:
                 raise
-            self.silent.add(address)
+            self.silent_addresses.add(address)
             self._masks[address] = 0
 
     def _write(self, address: int, mask: int) -> None:
         self._masks[address] = None  # not known until the STOP
-        self.refused = address
+        self.refused_address = address
         self._muxes[address].write_mask(mask)
-        self.refused = None
+        self.refused_address = None
         self._masks[address] = mask
         self._refusals[address] = 0
-        self.silent.discard(address)
+        self.silent_addresses.discard(address)

@@ -12,23 +12,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from devices.chips.mpl115a2 import CONVERSION_MAX_NS, PRESSURE_MAX_KPA, Coefficients, padc_of_kpa
+from devices.chips.mpl115a2 import CONVERSION_MAX_NS, PRESSURE_MAX_KPA, Coefficients, compute_padc
 
 
 @dataclass(frozen=True)
-class ChipPart:
+class ChipProperties:
     """Properties of an MPL115A2 (hardware.md 1.3, 1.4, 1.6)."""
 
     coefficients: Coefficients
     conversion_ns: int
     tadc_at_25_degc: float
-    late_ns: int = 0
+    sample_delay_ns: int = 0
     """Delay of the sample instant after a quarter of the conversion: not documented (hardware.md
     1.4)."""
 
 
 @dataclass(frozen=True)
-class DomePart:
+class DomeProperties:
     """Properties of a polyurethane dome with its bubble (hardware.md 9).
 
     Static curve: under a slow force F the bubble loses the part `stiffening * ln(1 + F / knee_n)`
@@ -65,16 +65,16 @@ class DomePart:
     kappa: float = 0.4 / 1.4
     """(gamma - 1) / gamma of the gas: air's, unless it contains vapours of the casting."""
 
-    def felt_n(self, kpa: Floats) -> Floats:
+    def compute_static_force_n(self, kpa: Floats) -> Floats:
         """Compute the slow force of a pressure: inverse static curve, at sealing temperature."""
         stretched = 1.0 + self.wall_per_kpa * (kpa - self.seal_kpa)
         lost = 1.0 - self.seal_kpa / (kpa * stretched)
         return np.asarray(self.knee_n * np.expm1(lost / self.stiffening))
 
 
-def draw_chip(serial: str, parts_seed: int) -> ChipPart:
+def draw_chip(serial: str, parts_seed: int) -> ChipProperties:
     """Draw the chip of a serial. The ranges bracket the three published sets of coefficients."""
-    rng = _rng("chip", serial, parts_seed)
+    rng = _make_part_rng("chip", serial, parts_seed)
     while True:
         drawn = Coefficients(
             a0=rng.uniform(1700, 2200),
@@ -83,28 +83,28 @@ def draw_chip(serial: str, parts_seed: int) -> ChipPart:
             c12=rng.uniform(0.00065, 0.00088),
         )
         coefficients = Coefficients.from_words(drawn.to_words())
-        if 250 <= float(padc_of_kpa(100.0, 500, coefficients)) <= 500:
+        if 250 <= float(compute_padc(100.0, 500, coefficients)) <= 500:
             break
-    return ChipPart(
+    return ChipProperties(
         coefficients=coefficients,
         conversion_ns=min(CONVERSION_MAX_NS, round(rng.uniform(1.4e6, 2.0e6))),
         tadc_at_25_degc=rng.uniform(472, 498),  # two published scales, 26 counts apart
     )
 
 
-def draw_dome(serial: str, parts_seed: int) -> DomePart:
+def draw_dome(serial: str, parts_seed: int) -> DomeProperties:
     """Draw the dome of a serial: an 11 mm Vytaflex 60 dome with casting tolerances.
 
     It reaches the chip's full scale of 115 kPa at a slow force of 25 to 35 N (paper III-A).
     """
-    rng = _rng("dome", serial, parts_seed)
+    rng = _make_part_rng("dome", serial, parts_seed)
     seal_kpa = rng.uniform(98.0, 102.5)
     knee_n = rng.uniform(8.0, 13.0)
     wall_per_kpa = rng.uniform(0.0010, 0.0015)
     full_scale_n = rng.uniform(25.0, 35.0)
     stretched = 1.0 + wall_per_kpa * (PRESSURE_MAX_KPA - seal_kpa)
     lost = 1.0 - seal_kpa / (PRESSURE_MAX_KPA * stretched)
-    return DomePart(
+    return DomeProperties(
         seal_kpa=seal_kpa,
         knee_n=knee_n,
         stiffening=float(lost / np.log1p(full_scale_n / knee_n)),
@@ -118,11 +118,11 @@ def draw_dome(serial: str, parts_seed: int) -> DomePart:
     )
 
 
-def _rng(what: str, serial: str, parts_seed: int) -> np.random.Generator:
-    return random_of(f"{what}/{parts_seed}/{serial}")
+def _make_part_rng(what: str, serial: str, parts_seed: int) -> np.random.Generator:
+    return make_rng(f"{what}/{parts_seed}/{serial}")
 
 
-def random_of(label: str) -> np.random.Generator:
+def make_rng(label: str) -> np.random.Generator:
     """Create a random generator seeded by `label` alone, the same on every machine."""
     digest = hashlib.sha256(label.encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:16], "big"))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from devices.emulation.faults import Fault
+from devices.emulation.fault_timing import FaultTiming
 
 
 class Puncture:
@@ -22,14 +22,14 @@ class Puncture:
         around_kpa: pressure of the atmosphere.
     """
 
-    def __init__(self, fault: Fault, leak_s: float, around_kpa: float) -> None:
+    def __init__(self, fault: FaultTiming, leak_s: float, around_kpa: float) -> None:
         self._fault = fault
         self._leak_s = leak_s
         self._around_kpa = around_kpa
-        self._left = 1.0  # amount of gas, relative to what was sealed in
+        self._remaining_gas = 1.0  # amount of gas, relative to what was sealed in
         self._last_s = 0.0
 
-    def leaked_kpa(self, sealed_kpa: float, t_s: float, t_ns: int) -> float:
+    def apply_leak(self, sealed_kpa: float, t_s: float, t_ns: int) -> float:
         """Compute the absolute pressure with the leak, and update the remaining gas.
 
         The load is taken as constant between two calls: a chip samples every few milliseconds.
@@ -39,13 +39,13 @@ class Puncture:
             t_s: time of the scene, never decreasing.
             t_ns: the same instant of the clock.
         """
-        if not self._fault.possible:
+        if not self._fault.is_possible:
             return sealed_kpa
         if self._fault(t_ns):
             # At constant volume the amount relaxes to its value at outer pressure, faster under
             # load.
             even = self._around_kpa / sealed_kpa
             kept = math.exp(-max(0.0, t_s - self._last_s) / (self._leak_s * even))
-            self._left = even + (self._left - even) * kept
+            self._remaining_gas = even + (self._remaining_gas - even) * kept
         self._last_s = t_s
-        return self._left * sealed_kpa
+        return self._remaining_gas * sealed_kpa

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 
 from devices.arrays import Floats
-from devices.emulation.parts import random_of
-from devices.scene.emulated import EmulationScene
+from devices.emulation.parts import make_rng
+from devices.scene.emulation_sections import EmulationSection
 
 _WEATHER_KPA = (99.0, 101.0)
 """Range on ordinary days between sea level and 200 m (hardware.md 8: 1.17 kPa per 100 m)."""
@@ -22,7 +22,7 @@ _WEATHER_KPA = (99.0, 101.0)
 class Submersion(Protocol):
     """Submersion of the tiles in a heavy medium."""
 
-    def head_kpa(self, t_s: Floats) -> Floats:
+    def compute_head_kpa(self, t_s: Floats) -> Floats:
         """Compute the head on each tile above atmospheric pressure, (len(t_s), tiles)."""
 
 
@@ -38,54 +38,58 @@ class Surroundings:
     """
 
     def __init__(
-        self, scene: EmulationScene, submersion: Submersion | None = None, label: str = ""
+        self, scene: EmulationSection, submersion: Submersion | None = None, label: str = ""
     ) -> None:
         self._scene = scene
         self._submersion = submersion
-        drawn_kpa = random_of(f"weather/{label}").uniform(*_WEATHER_KPA)
+        drawn_kpa = make_rng(f"weather/{label}").uniform(*_WEATHER_KPA)
         self.ambient_kpa = drawn_kpa if scene.ambient_kpa is None else scene.ambient_kpa
         """Pressure of the atmosphere, constant."""
 
     @property
-    def steady(self) -> bool:
+    def is_temperature_constant(self) -> bool:
         """True if the temperature never changes."""
         return self._scene.temperature_step_k == 0.0
 
-    def chip_degc(self, t_s: float, chip_lag_s: float, gas_lag_s: float) -> float:
-        """Compute a chip's temperature: one lag, or a second one behind its gas (`DomePart`)."""
+    def compute_chip_degc(self, t_s: float, chip_lag_s: float, gas_lag_s: float) -> float:
+        """Compute a chip's temperature: one lag, or one more behind its gas (`DomeProperties`)."""
         scene = self._scene
         since = max(t_s - scene.temperature_step_s, 0.0)
         if gas_lag_s < 0.0:
-            return float(self._second_degc(np.array(since), chip_lag_s, -gas_lag_s))
+            return float(self._compute_two_lag_degc(np.array(since), chip_lag_s, -gas_lag_s))
         return scene.ambient_degc - scene.temperature_step_k * math.expm1(-since / chip_lag_s)
 
-    def gas_wall_degc(self, t_s: Floats, chip_lag_s: float, gas_lag_s: float) -> Floats:
+    def compute_gas_wall_degc(self, t_s: Floats, chip_lag_s: float, gas_lag_s: float) -> Floats:
         """Compute the bubble wall's temperature: one lag, or a second one behind its chip."""
         scene = self._scene
         since = np.maximum(t_s - scene.temperature_step_s, 0.0)
         if gas_lag_s < 0.0:
             warmed_k = scene.temperature_step_k * np.expm1(-since / chip_lag_s)
             return np.asarray(scene.ambient_degc - warmed_k)
-        return self._second_degc(since, chip_lag_s, gas_lag_s)
+        return self._compute_two_lag_degc(since, chip_lag_s, gas_lag_s)
 
-    def _second_degc(self, since: Floats, a: float, b: float) -> Floats:
+    def _compute_two_lag_degc(self, since: Floats, a: float, b: float) -> Floats:
         """Compute a temperature behind the surroundings with two lags, `a` and `b`, in series."""
         arrived = 1 - (a * np.exp(-since / a) - b * np.exp(-since / b)) / (a - b)
         return np.asarray(self._scene.ambient_degc + self._scene.temperature_step_k * arrived)
 
-    def head_kpa(self, t_s: Floats) -> Floats:
+    def compute_head_kpa(self, t_s: Floats) -> Floats:
         """Compute the head around each tile, above atmospheric pressure.
 
         Returns:
             (len(t_s), tiles), or (len(t_s), 1) if it is the same for all.
         """
         own_kpa = np.where(t_s >= self._scene.head_s, self._scene.head_kpa, 0.0)[:, None]
-        return own_kpa if self._submersion is None else own_kpa + self._submersion.head_kpa(t_s)
+        return (
+            own_kpa
+            if self._submersion is None
+            else own_kpa + self._submersion.compute_head_kpa(t_s)
+        )
 
-    def bare_kpa(self, t_s: Floats) -> Floats:
+    def compute_bare_kpa(self, t_s: Floats) -> Floats:
         """Compute the pressure on tiles without a dome: atmosphere and head.
 
         Returns:
-            As `head_kpa`.
+            As `compute_head_kpa`.
         """
-        return self.ambient_kpa + self.head_kpa(t_s)
+        return self.ambient_kpa + self.compute_head_kpa(t_s)

@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING
 
-from devices.errors import BusSetupError, needs_extra
-from devices.scene.hardware import RecoveryScene
+from devices.errors import BusSetupError, require_extra
+from devices.scene.hardware_sections import RecoverySection
 
 if TYPE_CHECKING:
     from gpiod import LineRequest
@@ -39,7 +39,7 @@ class GpioLine:
 
         self._request.set_value(self._line, Value.INACTIVE if low else Value.ACTIVE)
 
-    def high(self) -> bool:
+    def is_high(self) -> bool:
         """Return the level on the pin, whatever drives it."""
         return bool(self._request.get_value(self._line))
 
@@ -52,9 +52,9 @@ class GpioLines:
         BusSetupError: the tool that restores the pins is not installed.
     """
 
-    def __init__(self, scene: RecoveryScene) -> None:
+    def __init__(self, scene: RecoverySection) -> None:
         self._scene = scene
-        with needs_extra("gpio", "recovery of the bus"):
+        with require_extra("gpio", "recovery of the bus"):
             import gpiod  # noqa: F401  # a later import must not be the first to fail
         tool = next(filter(None, map(shutil.which, _TOOLS)), None)
         if tool is None:
@@ -64,10 +64,15 @@ class GpioLines:
                 expected=f"{' or '.join(_TOOLS)}, as on Raspberry Pi OS",
                 remedy="Install raspi-utils, or remove [recovery]",
             )
-        self._give_back = [tool, "set", f"{scene.sda_line},{scene.scl_line}", scene.i2c_function]
+        self._restore_command = [
+            tool,
+            "set",
+            f"{scene.sda_line},{scene.scl_line}",
+            scene.i2c_function,
+        ]
 
     @contextmanager
-    def bus(self) -> Iterator[tuple[GpioLine, GpioLine]]:
+    def request_scl_sda(self) -> Iterator[tuple[GpioLine, GpioLine]]:
         """Request SCL and SDA from the I2C controller while the block runs, then restore them.
 
         Raises:
@@ -75,23 +80,23 @@ class GpioLines:
         """
         scl, sda = self._scene.scl_line, self._scene.sda_line
         try:
-            with self._requested(scl, sda) as request:
+            with self._request_lines(scl, sda) as request:
                 yield GpioLine(request, scl), GpioLine(request, sda)
         finally:
-            self._restore()
+            self._restore_pin_function()
 
-    def reset(self) -> AbstractContextManager[GpioLine] | None:
+    def request_reset(self) -> AbstractContextManager[GpioLine] | None:
         """Request the multiplexers' RESET; None if the scene names no line for it."""
         line = self._scene.reset_line
-        return None if line is None else self._reset(line)
+        return None if line is None else self._request_reset_line(line)
 
     @contextmanager
-    def _reset(self, line: int) -> Iterator[GpioLine]:
-        with self._requested(line) as request:
+    def _request_reset_line(self, line: int) -> Iterator[GpioLine]:
+        with self._request_lines(line) as request:
             yield GpioLine(request, line)
 
     @contextmanager
-    def _requested(self, *lines: int) -> Iterator[LineRequest]:
+    def _request_lines(self, *lines: int) -> Iterator[LineRequest]:
         import gpiod
         from gpiod.line import Direction, Drive, Value
 
@@ -113,10 +118,14 @@ class GpioLines:
                 errno=error.errno,
             ) from error
 
-    def _restore(self) -> None:
+    def _restore_pin_function(self) -> None:
         try:
             subprocess.run(  # noqa: S603  # found on the path, numbers from the scene
-                self._give_back, check=True, capture_output=True, text=True, timeout=_TOOL_TIMEOUT_S
+                self._restore_command,
+                check=True,
+                capture_output=True,
+                text=True,
+                timeout=_TOOL_TIMEOUT_S,
             )
         except (OSError, subprocess.SubprocessError) as error:
             reason = (getattr(error, "stderr", None) or str(error)).strip()
@@ -124,5 +133,5 @@ class GpioLines:
                 "SDA and SCL are still GPIO, the I2C controller is disconnected from them: "
                 + reason,
                 where=self._scene.gpiochip,
-                remedy=f"Run: sudo {' '.join(self._give_back)}; or reboot",
+                remedy=f"Run: sudo {' '.join(self._restore_command)}; or reboot",
             ) from error

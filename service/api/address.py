@@ -19,19 +19,24 @@ from urllib.parse import urlsplit
 
 from devices.errors import DamagedFileError, LinkError, UsageError
 from foottile.local_server import LocalServer, is_loopback, publish_local_server
-from storage.durable import put_aside, read_whole, storage_errors, write_whole
+from storage.durable_files import (
+    read_small_file,
+    set_aside_and_describe,
+    translate_storage_errors,
+    write_atomically,
+)
 
 log = logging.getLogger("foottile.serve")
 
-KEPT_IN = "token"
+TOKEN_NAME = "token"  # noqa: S105  # a name
 """File of the data folder with the generated token."""
 _BACKLOG = 128
-_UNREAD_MS = 60_000
+_SEND_TIMEOUT_MS = 60_000
 """Timeout of a peer that acknowledges no data: the kernel closes the connection, since no timeout
 of ours sees how much of a download has arrived."""
 
 
-def listen(host: str, port: int) -> socket.socket:
+def open_listening_socket(host: str, port: int) -> socket.socket:
     """Open a listening socket; port 0 is any free one.
 
     For a name with several addresses it is the first usable one, IPv4 first.
@@ -49,7 +54,7 @@ def listen(host: str, port: int) -> socket.socket:
     problem: OSError | None = None
     for family, kind, protocol, _, address in sorted(found, key=lambda each: each[0]):
         try:
-            return _listening(family, kind, protocol, address)
+            return _bind_socket(family, kind, protocol, address)
         except OSError as error:
             problem = problem or error
     assert problem is not None  # noqa: S101  # getaddrinfo returns an address or raises
@@ -68,14 +73,14 @@ _REMEDIES = {
 }
 
 
-def _listening(family: int, kind: int, protocol: int, address: Any) -> socket.socket:
+def _bind_socket(family: int, kind: int, protocol: int, address: Any) -> socket.socket:
     listening = socket.socket(family, kind, protocol)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if address[0] == "::":  # IPv4, too, whatever the system's default
             listening.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # accepted sockets inherit this
-            listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
+            listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _SEND_TIMEOUT_MS)
         listening.bind(address)
         listening.listen(_BACKLOG)
     except BaseException:
@@ -84,12 +89,12 @@ def _listening(family: int, kind: int, protocol: int, address: Any) -> socket.so
     return listening
 
 
-def is_everywhere(host: str) -> bool:
+def is_wildcard(host: str) -> bool:
     """Return whether a server on this address listens on all interfaces."""
     return host in ("0.0.0.0", "::", "")  # noqa: S104  # compared only
 
 
-def urls_of(listening: socket.socket, host: str, advertised: str | None = None) -> list[str]:
+def list_urls(listening: socket.socket, host: str, advertised: str | None = None) -> list[str]:
     """Return the URLs of a server, the most useful to others first.
 
     Args:
@@ -102,18 +107,20 @@ def urls_of(listening: socket.socket, host: str, advertised: str | None = None) 
     """
     bound, port = listening.getsockname()[:2]
     names = [host]
-    if is_everywhere(host):
+    if is_wildcard(host):
         from service.api.interfaces import list_addresses
 
-        found = [] if advertised else list_addresses(has_ipv6=listening.family == socket.AF_INET6)
+        found = (
+            [] if advertised else list_addresses(include_ipv6=listening.family == socket.AF_INET6)
+        )
         names = [*found, "127.0.0.1"]
     elif host == "localhost":  # another program may listen on its other address
         names = [bound]
-    first = [] if advertised is None else [advertised_url(advertised, port)]
+    first = [] if advertised is None else [parse_advertised_url(advertised, port)]
     return list(dict.fromkeys([*first, *(_url(name, port) for name in names)]))
 
 
-def advertised_url(advertised: str, port: int) -> str:
+def parse_advertised_url(advertised: str, port: int) -> str:
     """Return the URL for `--advertise`: HOST, HOST:PORT, or a whole URL.
 
     Raises:
@@ -152,7 +159,7 @@ def _is_ip(name: str) -> bool:
     return True
 
 
-def own_names() -> tuple[str, ...]:
+def list_own_names() -> tuple[str, ...]:
     """Return the names of this machine in its own network: host name, and NAME.local by mDNS.
 
     No domain is looked up: a network's DNS server could return any. A host name with a domain is
@@ -168,7 +175,7 @@ def own_names() -> tuple[str, ...]:
 _HOST_NAME = re.compile(r"(?!\d+$)[a-z0-9](?:[a-z0-9-]{0,62}[a-z0-9])?(?:\.[a-z0-9-]{1,63}){0,8}")
 
 
-def token_for(given: str | None, data: Path) -> str:
+def load_or_create_token(given: str | None, data: Path) -> str:
     """Return the server's token: the given one, else the one stored in the data folder.
 
     There is always one: through a reverse proxy, `ssh -L` or a container's port everybody comes
@@ -179,21 +186,21 @@ def token_for(given: str | None, data: Path) -> str:
     """
     if given:
         return given
-    path = data / KEPT_IN
+    path = data / TOKEN_NAME
     try:
-        return kept_token(data)
+        return read_token(data)
     except FileNotFoundError:
         pass
     except DamagedFileError as error:
-        log.warning("%s, and a new token is generated", put_aside(path, error))
-    with storage_errors(path):
+        log.warning("%s, and a new token is generated", set_aside_and_describe(path, error))
+    with translate_storage_errors(path):
         data.mkdir(parents=True, exist_ok=True)
         token = secrets.token_urlsafe(18)
-        write_whole(path, token.encode() + b"\n", mode=0o600)
+        write_atomically(path, token.encode() + b"\n", mode=0o600)
     return token
 
 
-def kept_token(data: Path) -> str:
+def read_token(data: Path) -> str:
     """Read the token stored in a data folder.
 
     Raises:
@@ -201,22 +208,22 @@ def kept_token(data: Path) -> str:
         DamagedFileError: the file holds no token.
         StorageError: it cannot be read: only its user may.
     """
-    path = data / KEPT_IN
-    token = read_whole(path).decode("ascii", "replace").strip()
+    path = data / TOKEN_NAME
+    token = read_small_file(path).decode("ascii", "replace").strip()
     if not _TOKEN.fullmatch(token):
         raise DamagedFileError("it holds no token", where=str(path))
     return token
 
 
 @contextmanager
-def published(listening: socket.socket, token: str) -> Iterator[None]:
+def publish_token(listening: socket.socket, token: str) -> Iterator[None]:
     """Context manager: let programs of this user on this machine find the token.
 
     Args:
         listening: socket of the server.
         token: token of the server.
     """
-    url = urls_of(listening, listening.getsockname()[0])[-1]
+    url = list_urls(listening, listening.getsockname()[0])[-1]
     with ExitStack() as stack:
         if is_loopback(urlsplit(url).hostname or ""):
             try:

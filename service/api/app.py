@@ -14,12 +14,11 @@ from starlette.websockets import WebSocket
 
 from devices.errors import FootTileError
 from service.api import problems
-from service.api.described import DOCS_FILES, say_who_may, swagger_folder
-from service.api.guard import Guard
+from service.api.guard import AccessGuard
 from service.api.head import HeadFromGet
 from service.api.logins import Logins
-from service.api.page import PageFiles
-from service.api.routes import access, calibrations, formats, health, index, login, nodes, weighings
+from service.api.openapi import SWAGGER_FILES, add_security_scheme, find_swagger_folder
+from service.api.routes import calibrations, common, formats, health, index, login, nodes, weighings
 from service.api.routes.downloads import data, take_data, zips
 from service.api.routes.recordings import (
     array,
@@ -32,11 +31,12 @@ from service.api.routes.recordings import (
     trash,
     verification,
 )
-from service.api.routes.sockets.ingest import ingest
-from service.api.routes.sockets.live import live
-from service.link import INGEST_PATH, LIVE_PATH
+from service.api.routes.sockets.ingest import serve_node
+from service.api.routes.sockets.live import serve_live
+from service.api.static_files import PageFiles
+from service.protocol import INGEST_PATH, LIVE_PATH
 from service.server.server import Server
-from service.version import SOFTWARE
+from service.version import SOFTWARE_VERSION
 
 API = "/api/v1"
 
@@ -78,7 +78,7 @@ def make_app(
 
     app = FastAPI(
         title="FootTile",
-        version=SOFTWARE.rsplit(" ", 1)[1],
+        version=SOFTWARE_VERSION.rsplit(" ", 1)[1],
         description=_DESCRIPTION,
         openapi_url=f"{API}/openapi.json",
         docs_url=None,  # FastAPI's page needs another host: no network in the field
@@ -88,10 +88,10 @@ def make_app(
     app.state.server = server
     app.state.logins = logins
     app.state.find_urls = find_urls
-    problems.install(app)
+    problems.install_handlers(app)
     api = APIRouter(
         prefix=API,
-        responses=access.problems(
+        responses=common.problem_responses(
             _400="Invalid HTTP/1.1, or a body that is not UTF-8.",
             _401="The token or a login is needed: for a change, and on a private server for "
             "every request.",
@@ -104,7 +104,7 @@ def make_app(
         ),
     )
     api.add_api_route(
-        "", index.index, operation_id="getIndex", summary="All routes", tags=["server"]
+        "", index.get_index, operation_id="getIndex", summary="All routes", tags=["server"]
     )
     for module in (
         health,
@@ -128,17 +128,17 @@ def make_app(
     ):
         api.include_router(module.router)
     app.include_router(api)
-    say_who_may(app)
+    add_security_scheme(app)
 
     @app.websocket(LIVE_PATH)
     async def live_socket(socket: WebSocket) -> None:
-        await live(socket, server)
+        await serve_live(socket, server)
 
     @app.websocket(INGEST_PATH)
     async def ingest_socket(socket: WebSocket) -> None:
-        await ingest(socket, server)
+        await serve_node(socket, server)
 
-    page = PageFiles(page_folder())
+    page = PageFiles(find_page_folder())
 
     @app.get("/", include_in_schema=False)
     async def live_page(request: Request) -> Response:
@@ -164,21 +164,21 @@ def make_app(
     async def docs_page(request: Request) -> Response:
         return await page.get_response("docs.html", request.scope)
 
-    swagger = PageFiles(swagger_folder())
+    swagger = PageFiles(find_swagger_folder())
 
     @app.get("/docs/{name}", include_in_schema=False)
     async def docs_file(name: str, request: Request) -> Response:
-        if name not in DOCS_FILES:
+        if name not in SWAGGER_FILES:
             raise HTTPException(HTTPStatus.NOT_FOUND)
         return await swagger.get_response(name, request.scope)
 
     app.mount("/static", page, name="static")
     app.add_middleware(HeadFromGet)
-    app.add_middleware(Guard, hosts=tuple(hosts), logins=logins)
+    app.add_middleware(AccessGuard, hosts=tuple(hosts), logins=logins)
     return app
 
 
-def page_folder() -> Path:
+def find_page_folder() -> Path:
     """Return the folder with `index.html`.
 
     Raises:

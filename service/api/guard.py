@@ -18,9 +18,9 @@ from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.logins import Logins, Right, Shown
-from service.api.problems import problem
-from service.link import LIVE_PATH
+from service.api.logins import Credentials, Logins, Role
+from service.api.problems import problem_response
+from service.protocol import LIVE_PATH
 from service.server.calibrations import CONTENT_BYTES_MAX
 
 BODY_BYTES_MAX = 64 << 10
@@ -36,30 +36,30 @@ _AS_PROGRAM = (
     "from FOOTTILE_TOKEN; the server keeps it in the file `token` of its data folder, unless it "
     "was given one, and `foottile invite --data` takes it from there"
 )
-_ASKED = (
+_CREDENTIALS_NEEDED = (
     "A change needs the server's token or a login: `foottile invite`, on "
     f"{_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
-_PRIVATE = (
+_PRIVATE_SERVER = (
     "This server is private: reading needs the server's token or a login: `foottile "
     f"ticket`, on {_HERE}, prints a link that logs a browser in. {_AS_PROGRAM}"
 )
-_WRONG = f"This is not the server's token. {_AS_PROGRAM}"
-_ENDED = (
+_WRONG_TOKEN = f"This is not the server's token. {_AS_PROGRAM}"
+_LOGIN_EXPIRED = (
     "This login has expired: the server was restarted, or 12 hours have passed. "
     f"`foottile invite` creates a new one, on {_HERE}"
 )
-_VIEWER = (
+_VIEWER_ONLY = (
     "This login is a viewer's and may not change anything. `foottile invite` creates "
     f"an operator's, on {_HERE}"
 )
-_NO_LOGIN = "A login is not enough for this: it needs the server's token"
-_OPEN = re.compile(
+_TOKEN_NEEDED = "A login is not enough for this: it needs the server's token"  # noqa: S105  # words
+_PUBLIC_PATHS = re.compile(
     rf"/|/nodes|/calibrate|/docs(?:/[^/]+)?|/sessions(?:/[^/]+)?|/static/.*|{LOGIN_PATH}|/api/v1/ready"
 )
 """Paths that a private server also serves without credentials: pages and files without data, login,
 and the readiness probe."""
-_HOST = re.compile(
+_HOST_HEADER = re.compile(
     r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)(?P<zone>%[A-Za-z0-9._~%-]{1,40})?\])"
     r"(?::[0-9]{1,5})?"
 )
@@ -77,7 +77,7 @@ _DEFAULT_HEADERS = {
 }
 
 
-class Guard:
+class AccessGuard:
     """ASGI middleware that rejects forbidden requests.
 
     Args:
@@ -96,21 +96,23 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        if (refusal := self._refusal(scope)) is not None:
+        if (refusal := self._find_refusal(scope)) is not None:
             status, detail = refusal
             extra = {"www-authenticate": "Bearer"} if status == HTTPStatus.UNAUTHORIZED else {}
-            await problem(scope["path"], status, detail, extra)(scope, receive, send)
+            await problem_response(scope["path"], status, detail, extra)(scope, receive, send)
         elif scope["type"] == "websocket":
             await self._app(scope, receive, send)
         else:
-            await self._app(scope, _Limited(receive, _most(scope)), _hardened(send))
+            await self._app(
+                scope, _LimitedBody(receive, _body_limit_bytes(scope)), _with_security_headers(send)
+            )
 
-    def _refusal(self, scope: Scope) -> tuple[HTTPStatus, str] | None:
+    def _find_refusal(self, scope: Scope) -> tuple[HTTPStatus, str] | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         # HTTP/1.0 needs no Host, and no browser speaks it: watchdogs and load balancers do.
         is_old = scope.get("http_version") == "1.0" and "host" not in headers
-        if not is_old and (len(headers.getlist("host")) != 1 or not self._is_ours(host)):
+        if not is_old and (len(headers.getlist("host")) != 1 or not self._is_own_host(host)):
             what = f"Host {host[:80]!r} is not this server; name it with --allow-host"
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"
@@ -126,33 +128,33 @@ class Guard:
                 )
                 return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > _most(scope):
-            what = f"A body of {length[:20]} bytes; at most {_most(scope)} are accepted"
+        if not length.isdigit() or int(length) > _body_limit_bytes(scope):
+            what = f"A body of {length[:20]} bytes; at most {_body_limit_bytes(scope)} are accepted"
             return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, what
         if any(ord(character) < ord(" ") for character in scope["path"]):
             return HTTPStatus.BAD_REQUEST, "The path has control characters in it"
-        needed = self._needed(scope)
+        needed = self._required_role(scope)
         if needed is None:
             return None
-        credentials = self._logins.shown_by(HTTPConnection(scope))
-        if credentials.left_s is not None and changes and "origin" not in headers:
+        credentials = self._logins.check_credentials(HTTPConnection(scope))
+        if credentials.cookie_remaining_s is not None and changes and "origin" not in headers:
             # Cookies come from browsers, which state the Origin of every change.
-            credentials = Shown(None)
-        return _lacking(needed, credentials)
+            credentials = Credentials(None)
+        return _check_role(needed, credentials)
 
-    def _needed(self, scope: Scope) -> Right | None:
-        path, looking = scope["path"], Right.LOOK if self._logins.is_private else None
+    def _required_role(self, scope: Scope) -> Role | None:
+        path, looking = scope["path"], Role.VIEWER if self._logins.is_private else None
         if scope["type"] == "websocket":
             # Every path but the live one, so that no spelling of a path bypasses the check.
-            return looking if path == LIVE_PATH else Right.OWN
+            return looking if path == LIVE_PATH else Role.OWNER
         if path == LOGIN_PATH:
             return None
         if scope["method"] in SAFE_METHODS:
-            return None if _OPEN.fullmatch(path) else looking
-        return Right.OWN if path == TICKETS_PATH else Right.PRESS
+            return None if _PUBLIC_PATHS.fullmatch(path) else looking
+        return Role.OWNER if path == TICKETS_PATH else Role.OPERATOR
 
-    def _is_ours(self, host: str) -> bool:
-        found = _HOST.fullmatch(host)
+    def _is_own_host(self, host: str) -> bool:
+        found = _HOST_HEADER.fullmatch(host)
         if found is None:
             return False
         name = (found["name"] or found["address"]).lower()
@@ -166,25 +168,25 @@ class Guard:
         return found["zone"] is None or address.is_link_local
 
 
-def _most(scope: Scope) -> int:
+def _body_limit_bytes(scope: Scope) -> int:
     """Return the limit of the body: a whole file is accepted on one path only."""
     is_file = scope["type"] == "http" and scope["path"] == CALIBRATIONS_PATH
     return CONTENT_BYTES_MAX if is_file else BODY_BYTES_MAX
 
 
-def _lacking(needed: Right, shown: Shown) -> tuple[HTTPStatus, str] | None:
+def _check_role(required: Role, credentials: Credentials) -> tuple[HTTPStatus, str] | None:
     """Return the refusal if the credentials lack the required role."""
-    if shown.right is None:
-        what = _PRIVATE if needed is Right.LOOK else _ASKED
-        if shown.has_wrong_token:
-            what = _WRONG
-        return HTTPStatus.UNAUTHORIZED, _ENDED if shown.has_ended else what
-    if shown.right < needed:
-        return HTTPStatus.FORBIDDEN, _VIEWER if needed is Right.PRESS else _NO_LOGIN
+    if credentials.role is None:
+        what = _PRIVATE_SERVER if required is Role.VIEWER else _CREDENTIALS_NEEDED
+        if credentials.has_wrong_token:
+            what = _WRONG_TOKEN
+        return HTTPStatus.UNAUTHORIZED, _LOGIN_EXPIRED if credentials.is_expired else what
+    if credentials.role < required:
+        return HTTPStatus.FORBIDDEN, _VIEWER_ONLY if required is Role.OPERATOR else _TOKEN_NEEDED
     return None
 
 
-class _Limited:
+class _LimitedBody:
     """ASGI `receive` that limits a body without a stated length."""
 
     def __init__(self, receive: Receive, most: int) -> None:
@@ -202,7 +204,7 @@ class _Limited:
         return message
 
 
-def _hardened(send: Send) -> Send:
+def _with_security_headers(send: Send) -> Send:
     async def with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":
             present = {name for name, _ in message["headers"]}

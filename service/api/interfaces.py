@@ -38,7 +38,7 @@ class InterfaceAddress:
     is_first_host: bool = False
 
     @property
-    def rank(self) -> tuple[bool, ...]:
+    def sort_key(self) -> tuple[bool, ...]:
         """Sort key: the address that a phone most probably reaches comes first.
 
         A hotspot of this machine comes before its cable to a laboratory: its address is private and
@@ -61,13 +61,13 @@ class InterfaceAddress:
         return _VIRTUAL.match(self.interface) is not None
 
 
-def list_addresses(*, has_ipv6: bool) -> list[str]:
+def list_addresses(*, include_ipv6: bool) -> list[str]:
     """Return the addresses of all interfaces that are up, the most useful one first.
 
     Args:
-        has_ipv6: include IPv6 addresses.
+        include_ipv6: include IPv6 addresses.
     """
-    families = {socket.AF_INET, socket.AF_INET6} if has_ipv6 else {socket.AF_INET}
+    families = {socket.AF_INET, socket.AF_INET6} if include_ipv6 else {socket.AF_INET}
     states = psutil.net_if_stats()
     found = [
         InterfaceAddress(
@@ -93,7 +93,7 @@ def sort_addresses(found: list[InterfaceAddress]) -> list[InterfaceAddress]:
         if not ipaddress.ip_address(each.address).is_loopback
         and (each.has_carrier or not each.is_virtual)
     ]
-    return sorted(useful, key=lambda each: each.rank)
+    return sorted(useful, key=lambda each: each.sort_key)
 
 
 def _with_zone(address: str, interface: str) -> str:

@@ -24,22 +24,22 @@ LOGINS_MAX = 256
 _SECRET_BYTES = 16
 
 
-class Right(IntEnum):
+class Role(IntEnum):
     """Role of a client; each includes those before it."""
 
-    LOOK = 1
+    VIEWER = 1
     """Watch, list, download."""
-    PRESS = 2
+    OPERATOR = 2
     """Also change something."""
-    OWN = 3
+    OWNER = 3
     """Also create tickets and be a node: has the token itself."""
 
 
 @dataclass(frozen=True)
-class Given:
+class Grant:
     """Role that was granted until a time of the boot clock."""
 
-    right: Right
+    role: Role
     ends_s: float
 
 
@@ -48,55 +48,57 @@ def _boot_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
-class Secrets:
+class SecretStore:
     """Random secrets, stored as digests with a role; each expires.
 
     Args:
-        lasts_s: lifetime of a secret.
-        most: limit of valid secrets; a further one replaces the oldest.
+        lifetime_s: lifetime of a secret.
+        max_count: limit of valid secrets; a further one replaces the oldest.
         now_s: clock that never steps.
     """
 
-    def __init__(self, *, lasts_s: float, most: int, now_s: Callable[[], float] = _boot_s) -> None:
-        self._lasts_s = lasts_s
-        self._most = most
+    def __init__(
+        self, *, lifetime_s: float, max_count: int, now_s: Callable[[], float] = _boot_s
+    ) -> None:
+        self._lifetime_s = lifetime_s
+        self._max_count = max_count
         self._now_s = now_s
-        self._given: dict[bytes, Given] = {}
+        self._grants: dict[bytes, Grant] = {}
 
-    def new(self, right: Right) -> str:
+    def create(self, role: Role) -> str:
         """Create a secret for a role."""
-        self._forget_old()
-        while len(self._given) >= self._most:
-            del self._given[next(iter(self._given))]
+        self._remove_expired()
+        while len(self._grants) >= self._max_count:
+            del self._grants[next(iter(self._grants))]
         secret = secrets.token_urlsafe(_SECRET_BYTES)
-        self._given[_digest(secret)] = Given(right, self._now_s() + self._lasts_s)
+        self._grants[_digest(secret)] = Grant(role, self._now_s() + self._lifetime_s)
         return secret
 
-    def find(self, secret: str) -> Given | None:
+    def find_grant(self, secret: str) -> Grant | None:
         """Return the grant of a secret; None: unknown, expired or used."""
-        found = self._find(secret)
-        return None if found is None else self._given[found]
+        found = self._find_digest(secret)
+        return None if found is None else self._grants[found]
 
-    def take(self, secret: str) -> Given | None:
+    def redeem(self, secret: str) -> Grant | None:
         """Return the grant of a secret and invalidate the secret."""
-        found = self._find(secret)
-        return None if found is None else self._given.pop(found)
+        found = self._find_digest(secret)
+        return None if found is None else self._grants.pop(found)
 
-    def left_s(self, given: Given) -> float:
+    def remaining_s(self, grant: Grant) -> float:
         """Return the remaining lifetime of a grant."""
-        return given.ends_s - self._now_s()
+        return grant.ends_s - self._now_s()
 
-    def _find(self, secret: str) -> bytes | None:
-        self._forget_old()
+    def _find_digest(self, secret: str) -> bytes | None:
+        self._remove_expired()
         digest, found = _digest(secret), None
-        for stored in self._given:  # compare all: constant time
+        for stored in self._grants:  # compare all: constant time
             if hmac.compare_digest(stored, digest):
                 found = stored
         return found
 
-    def _forget_old(self) -> None:
+    def _remove_expired(self) -> None:
         now_s = self._now_s()
-        self._given = {d: grant for d, grant in self._given.items() if grant.ends_s > now_s}
+        self._grants = {d: grant for d, grant in self._grants.items() if grant.ends_s > now_s}
 
 
 def _digest(secret: str) -> bytes:
@@ -104,15 +106,15 @@ def _digest(secret: str) -> bytes:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Credentials:
     """Result of checking a request's token or cookie."""
 
-    right: Right | None
+    role: Role | None
     """None: no valid credentials."""
     has_wrong_token: bool = False
-    has_ended: bool = False
+    is_expired: bool = False
     """True: it has a cookie of this server that is no longer valid."""
-    left_s: float | None = None
+    cookie_remaining_s: float | None = None
     """Remaining lifetime of its cookie; None without one."""
 
 
@@ -134,25 +136,25 @@ class Logins:
     ) -> None:
         self.token = token
         self.is_private = is_private
-        self.tickets = Secrets(lasts_s=TICKET_S, most=TICKETS_MAX, now_s=now_s)
-        self.cookies = Secrets(lasts_s=LOGIN_S, most=LOGINS_MAX, now_s=now_s)
+        self.tickets = SecretStore(lifetime_s=TICKET_S, max_count=TICKETS_MAX, now_s=now_s)
+        self.cookies = SecretStore(lifetime_s=LOGIN_S, max_count=LOGINS_MAX, now_s=now_s)
 
-    def shown_by(self, request: HTTPConnection) -> Shown:
+    def check_credentials(self, request: HTTPConnection) -> Credentials:
         """Check the credentials of a request; the token takes precedence over a cookie."""
         if "authorization" in request.headers:
-            token = bearer_token(request.headers.getlist("authorization"))
+            token = parse_bearer_token(request.headers.getlist("authorization"))
             if token is not None and hmac.compare_digest(token.encode(), self.token.encode()):
-                return Shown(Right.OWN)
-            return Shown(None, has_wrong_token=token is not None)
-        cookie = self.cookie_of(request)
+                return Credentials(Role.OWNER)
+            return Credentials(None, has_wrong_token=token is not None)
+        cookie = self.read_cookie(request)
         if cookie is None:
-            return Shown(None)
-        login = self.cookies.find(cookie)
+            return Credentials(None)
+        login = self.cookies.find_grant(cookie)
         if login is None:
-            return Shown(None, has_ended=True)
-        return Shown(login.right, left_s=self.cookies.left_s(login))
+            return Credentials(None, is_expired=True)
+        return Credentials(login.role, cookie_remaining_s=self.cookies.remaining_s(login))
 
-    def cookie_of(self, request: HTTPConnection) -> str | None:
+    def read_cookie(self, request: HTTPConnection) -> str | None:
         """Return the secret in a request's cookie, if it has one of this server's name."""
         return request.cookies.get(cookie_name(request))
 
@@ -163,7 +165,7 @@ def cookie_name(request: HTTPConnection) -> str:
     return f"foottile_{server[1] if server else 0}"
 
 
-def bearer_token(given: Sequence[str]) -> str | None:
+def parse_bearer_token(headers: Sequence[str]) -> str | None:
     """Return the token in Authorization headers; None unless they are one `Bearer TOKEN`."""
-    scheme, _, token = (given[0] if len(given) == 1 else "").partition(" ")
+    scheme, _, token = (headers[0] if len(headers) == 1 else "").partition(" ")
     return token.strip() or None if scheme.lower() == "bearer" else None

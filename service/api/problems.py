@@ -24,7 +24,7 @@ from devices.errors import (
     UnknownError,
     UsageError,
 )
-from service.private_paths import without_folders
+from service.private_paths import strip_private_folders
 
 log = logging.getLogger("foottile.api")
 
@@ -52,7 +52,7 @@ class Problem(BaseModel):
     instance: str
 
 
-def problem(
+def problem_response(
     path: str, status: int, detail: str, headers: Mapping[str, str] | None = None
 ) -> JSONResponse:
     """Return a problem as a response.
@@ -67,29 +67,29 @@ def problem(
         "type": "about:blank",
         "title": HTTPStatus(status).phrase,
         "status": status,
-        "detail": without_folders(detail),
+        "detail": strip_private_folders(detail),
         "instance": path[:200],
     }
     return JSONResponse(content, status, dict(headers or {}), MEDIA_TYPE)
 
 
-def install(app: FastAPI) -> None:
+def install_handlers(app: FastAPI) -> None:
     """Answer every error of the app with a problem."""
-    app.add_exception_handler(FootTileError, _on_ours)
+    app.add_exception_handler(FootTileError, _on_foottile_error)
     app.add_exception_handler(RequestValidationError, _on_invalid)
     app.add_exception_handler(HTTPException, _on_http)
     app.add_exception_handler(Exception, _on_bug)
 
 
-def status_of(error: FootTileError) -> HTTPStatus:
+def http_status(error: FootTileError) -> HTTPStatus:
     """Return the HTTP status of an error."""
     found = (status for kind, status in _STATUS if isinstance(error, kind))
     return next(found, HTTPStatus.INTERNAL_SERVER_ERROR)
 
 
-async def _on_ours(request: Request, error: Exception) -> JSONResponse:
+async def _on_foottile_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, FootTileError)  # noqa: S101  # by registration
-    return problem(request.url.path, status_of(error), str(error))
+    return problem_response(request.url.path, http_status(error), str(error))
 
 
 async def _on_invalid(request: Request, error: Exception) -> JSONResponse:
@@ -98,21 +98,21 @@ async def _on_invalid(request: Request, error: Exception) -> JSONResponse:
         f"{'.'.join(str(part) for part in complaint['loc'])}: {complaint['msg']}"
         for complaint in error.errors()[:5]
     )
-    return problem(request.url.path, HTTPStatus.UNPROCESSABLE_ENTITY, complaints)
+    return problem_response(request.url.path, HTTPStatus.UNPROCESSABLE_ENTITY, complaints)
 
 
 async def _on_http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)  # noqa: S101  # by registration
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-        allow = {"Allow": ", ".join(_methods_of(request))}
+        allow = {"Allow": ", ".join(_allowed_methods(request))}
         if request.method == "OPTIONS":
             return Response(status_code=HTTPStatus.NO_CONTENT, headers=allow)
         what = f"{request.method} is not allowed here; {allow['Allow']} are"
-        return problem(request.url.path, error.status_code, what, allow)
-    return problem(request.url.path, error.status_code, str(error.detail), error.headers)
+        return problem_response(request.url.path, error.status_code, what, allow)
+    return problem_response(request.url.path, error.status_code, str(error.detail), error.headers)
 
 
-def _methods_of(request: Request) -> list[str]:
+def _allowed_methods(request: Request) -> list[str]:
     """Return the methods of a path: the framework names those of its first route only."""
     routes = [route for route in request.app.routes if not isinstance(route, Mount)]
     found = {
@@ -130,4 +130,4 @@ def _methods_of(request: Request) -> list[str]:
 async def _on_bug(request: Request, error: Exception) -> JSONResponse:
     log.error("%s %s: this is a bug", request.method, request.url.path, exc_info=error)
     detail = f"Internal error ({type(error).__name__}); see the server's log"
-    return problem(request.url.path, HTTPStatus.INTERNAL_SERVER_ERROR, detail)
+    return problem_response(request.url.path, HTTPStatus.INTERNAL_SERVER_ERROR, detail)

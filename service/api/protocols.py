@@ -30,33 +30,33 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import CloseCode
 from websockets.http11 import Request
 
-from service.api.doors import Doors
-from service.api.problems import problem
-from service.link import INGEST_PATH, SUBPROTOCOL, Close
+from service.api.connection_limits import ConnectionLimiter
+from service.api.problems import problem_response
+from service.protocol import INGEST_PATH, SUBPROTOCOL, LinkCloseCode
 
 log = logging.getLogger("foottile.doors")
 
-OUTLET = "foottile.outlet"
-"""Extension in a websocket's scope with its connection, a `Outlet`."""
-SAID_ON_LIVE_BYTES_MAX = 4096
+SOCKET_EXTENSION = "foottile.outlet"
+"""Extension in a websocket's scope with its connection, a `SubscriberSocket`."""
+CLIENT_MESSAGE_BYTES_MAX = 4096
 """Size limit of a message by clients other than nodes."""
 _UNREAD_BYTES_MAX = 1 << 20
 """Limit of unsent bytes for a client that sends requests and does not read."""
-_STARVED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
-_STARVED_PAUSE_S = 0.1
+_OUT_OF_RESOURCES = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
+_OUT_OF_RESOURCES_PAUSE_S = 0.1
 _PAUSE_S = 0.01
 _RETRY_AFTER_S = 5
 _TOO_MANY = "There are too many connections; try again in some seconds"
 
 
-class DoorsConfig(uvicorn.Config):
+class LimitedConfig(uvicorn.Config):
     """Configuration of uvicorn with the connection limiter."""
 
-    doors: Doors
+    limiter: ConnectionLimiter
 
     proxies: ProxyHeadersMiddleware
 
-    def forwarded_client(self, peer: str, forwarded_for: Sequence[str]) -> str | None:
+    def find_forwarded_client(self, peer: str, forwarded_for: Sequence[str]) -> str | None:
         """Return the client's address as named by a trusted proxy; None: the peer's.
 
         uvicorn puts it into the scope of a request only after this check.
@@ -67,13 +67,13 @@ class DoorsConfig(uvicorn.Config):
         return trusted.get_trusted_client_address(", ".join(forwarded_for))[0] or None
 
 
-class Http(HttpToolsProtocol):
+class LimitedHttp(HttpToolsProtocol):
     """HTTP with limits on the size and time of headers and bodies."""
 
-    config: DoorsConfig
+    config: LimitedConfig
     _timer: asyncio.TimerHandle | None = None
     _in_head = False
-    _unseen_bytes = 0
+    _unparsed_bytes = 0
     """Bytes since the last parsed element: an endless header, also behind the body, and an endless
     name of a chunk reach no callback before they end."""
     _head_bytes = 0
@@ -84,89 +84,89 @@ class Http(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         """Add the connection as idle."""
         super().connection_made(transport)
-        self._asked: deque[RequestResponseCycle] = deque()
+        self._unanswered: deque[RequestResponseCycle] = deque()
         """Requests without an answer, in their order; uvicorn has only the newest."""
-        self.config.doors.come(transport, _address(self.client))
-        self._expect(self.config.doors.bounds.header_timeout_s)
+        self.config.limiter.add_connection(transport, _address(self.client))
+        self._start_timeout(self.config.limiter.limits.header_timeout_s)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Remove the connection."""
-        self._expect(None)
-        self.config.doors.go(self.transport)
-        self._forget_asked()
+        self._start_timeout(None)
+        self.config.limiter.remove_connection(self.transport)
+        self._drop_unanswered()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Parse bytes, up to the limit of headers."""
-        self._unseen_bytes += len(data)
+        self._unparsed_bytes += len(data)
         super().data_received(data)
         if self.transport.is_closing() or self._is_upgraded:
             return
-        if self._unseen_bytes > 2 * self.config.doors.bounds.max_header_bytes:
+        if self._unparsed_bytes > 2 * self.config.limiter.limits.max_header_bytes:
             self._is_too_long = True
             self.send_400_response("")
-        elif self._timer is None and not self._asked:  # of a request, or empty lines
-            self._expect(self.config.doors.bounds.header_timeout_s)
+        elif self._timer is None and not self._unanswered:  # of a request, or empty lines
+            self._start_timeout(self.config.limiter.limits.header_timeout_s)
 
     def on_message_begin(self) -> None:
         """Start the limits of a request."""
         super().on_message_begin()
-        self._in_head, self._unseen_bytes, self._head_bytes = True, 0, 0
+        self._in_head, self._unparsed_bytes, self._head_bytes = True, 0, 0
 
     def on_url(self, url: bytes) -> None:
         """Add to the size of the request line."""
-        self._count(len(url))
+        self._count_head_bytes(len(url))
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
         """Add a header; headers behind the body are ignored."""
-        self._count(len(name) + len(value) + 4)
+        self._count_head_bytes(len(name) + len(value) + 4)
         if self._in_head:
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
         """Reject the request if the limit is reached, else run it."""
         self._in_head = False
-        self._expect(None)
+        self._start_timeout(None)
         is_websocket = self.parser.should_upgrade() and self._should_upgrade()
         named = [v.decode("latin-1") for name, v in self.headers if name == b"x-forwarded-for"]
-        client = self.config.forwarded_client(_address(self.client), named)
-        if not is_websocket and not self.config.doors.admit(self.transport, client):
-            self.app = refuse
+        client = self.config.find_forwarded_client(_address(self.client), named)
+        if not is_websocket and not self.config.limiter.acquire(self.transport, client):
+            self.app = refuse_connection
         app = self.app
-        without_chunks = WithoutChunks(app, self.transport)
+        without_chunks = UnchunkedApp(app, self.transport)
         if self.parser.get_http_version() == "1.0":
             self.app = without_chunks
         before: RequestResponseCycle | None = self.cycle  # None before the first one
         super().on_headers_complete()
         without_chunks.cycle, self.app = self.cycle, app
         if self.cycle is not before:
-            self._asked.append(self.cycle)
-            self._expect_more()
+            self._unanswered.append(self.cycle)
+            self._start_next_timeout()
 
     def on_chunk_header(self) -> None:
         """Reset the limit at a piece of the body."""
-        self._unseen_bytes = 0
+        self._unparsed_bytes = 0
 
     def on_body(self, body: bytes) -> None:
         """Pass on a piece of the body."""
-        self._unseen_bytes = 0
+        self._unparsed_bytes = 0
         super().on_body(body)
 
     def on_message_complete(self) -> None:
         """Stop the timeout of the body."""
-        self._expect(None)
-        self._unseen_bytes = 0
+        self._start_timeout(None)
+        self._unparsed_bytes = 0
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
         """Make the connection idle, unless another request follows."""
         is_last = not self.pipeline
-        self._asked.popleft()
-        self._expect_more()
+        self._unanswered.popleft()
+        self._start_next_timeout()
         super().on_response_complete()
         if is_last:
-            self.config.doors.rest(self.transport)
+            self.config.limiter.release(self.transport)
 
     def handle_websocket_upgrade(self) -> None:
         """Hand the connection over to the websocket."""
@@ -176,57 +176,57 @@ class Http(HttpToolsProtocol):
     def send_400_response(self, msg: str) -> None:
         """Answer a malformed request with a problem, and close."""
         if self._is_too_long:
-            what = f"Headers of more than {self.config.doors.bounds.max_header_bytes} bytes"
-            self._end(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, what)
+            what = f"Headers of more than {self.config.limiter.limits.max_header_bytes} bytes"
+            self._refuse_and_close(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, what)
         else:
-            self._end(HTTPStatus.BAD_REQUEST, "This is not HTTP/1.1")
+            self._refuse_and_close(HTTPStatus.BAD_REQUEST, "This is not HTTP/1.1")
 
-    def _count(self, more: int) -> None:
+    def _count_head_bytes(self, more: int) -> None:
         self._head_bytes += more
-        if self._head_bytes > self.config.doors.bounds.max_header_bytes:
+        if self._head_bytes > self.config.limiter.limits.max_header_bytes:
             self._is_too_long = True
             raise ValueError(
                 "headers are too long"
             )  # the parser stops; `send_400_response` answers
 
-    def _expect(self, within_s: float | None) -> None:
+    def _start_timeout(self, within_s: float | None) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        late = self._too_late
+        late = self._on_timeout
         self._timer = self.loop.call_later(within_s, late) if within_s is not None else None
 
-    def _expect_more(self) -> None:
+    def _start_next_timeout(self) -> None:
         """Start the timeout of the first unanswered request; later ones may not even be read."""
-        if not self._asked:
+        if not self._unanswered:
             if self._in_head:
-                self._expect(self.config.doors.bounds.header_timeout_s)
-        elif self._asked[0].more_body:
-            self._expect(self.config.doors.bounds.body_timeout_s)
+                self._start_timeout(self.config.limiter.limits.header_timeout_s)
+        elif self._unanswered[0].more_body:
+            self._start_timeout(self.config.limiter.limits.body_timeout_s)
 
-    def _too_late(self) -> None:
+    def _on_timeout(self) -> None:
         self._timer = None
-        self._end(HTTPStatus.REQUEST_TIMEOUT, "The request did not come in time")
+        self._refuse_and_close(HTTPStatus.REQUEST_TIMEOUT, "The request did not come in time")
 
-    def _end(self, status: HTTPStatus, detail: str) -> None:
+    def _refuse_and_close(self, status: HTTPStatus, detail: str) -> None:
         if self.transport.is_closing():
             return
-        waits = not self._asked[0].response_started if self._asked else self._in_head
+        waits = not self._unanswered[0].response_started if self._unanswered else self._in_head
         if waits:
-            answer = problem("", status, detail, {"connection": "close"})
+            answer = problem_response("", status, detail, {"connection": "close"})
             head = [f"HTTP/1.1 {status.value} {status.phrase}".encode()]
             head += [name + b": " + value for name, value in answer.raw_headers]
             self.transport.write(b"\r\n".join([*head, b"", bytes(answer.body)]))
-        self._forget_asked()
+        self._drop_unanswered()
         self.transport.close()
 
-    def _forget_asked(self) -> None:
+    def _drop_unanswered(self) -> None:
         """Mark unanswered requests as disconnected, so that no answer is written."""
-        for cycle in self._asked:
+        for cycle in self._unanswered:
             cycle.disconnected = True
             cycle.message_event.set()
 
 
-class WithoutChunks:
+class UnchunkedApp:
     """Application for one request of HTTP/1.0, which has no chunks.
 
     uvicorn sends chunks nevertheless. Here a body of unknown length is sent as it is, and ends with
@@ -263,11 +263,11 @@ class WithoutChunks:
             await self._app(scope, receive, send_unframed)
         except BaseException:
             if is_unframed:
-                reset(self._transport)
+                reset_connection(self._transport)
             raise
 
 
-def reset(transport: asyncio.Transport) -> None:
+def reset_connection(transport: asyncio.Transport) -> None:
     """Close a connection so that the peer sees an error, not an end."""
     connection = transport.get_extra_info("socket")
     if connection is not None:
@@ -275,15 +275,15 @@ def reset(transport: asyncio.Transport) -> None:
     transport.abort()
 
 
-class WebSocket(WebSocketsSansIOProtocol):
+class LimitedWebSocket(WebSocketsSansIOProtocol):
     """Websocket with a place: a node's after its first message, else a subscriber's."""
 
-    config: DoorsConfig
+    config: LimitedConfig
     _is_node = False
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Remove the connection."""
-        self.config.doors.go(self.transport)
+        self.config.limiter.remove_connection(self.transport)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -295,33 +295,33 @@ class WebSocket(WebSocketsSansIOProtocol):
 
     def handle_connect(self, event: Request) -> None:
         """Reject the connection if the limit is reached, else accept it."""
-        doors = self.config.doors
+        doors = self.config.limiter
         self._is_node = event.path.partition("?")[0] == INGEST_PATH
         if not self._is_node:
-            self.conn.max_message_size = SAID_ON_LIVE_BYTES_MAX
+            self.conn.max_message_size = CLIENT_MESSAGE_BYTES_MAX
         named = event.headers.get_all("X-Forwarded-For")
-        client = self.config.forwarded_client(_address(self.client), named)
-        if doors.nodes_are_full if self._is_node else not doors.admit(self.transport, client):
-            self.app = refuse
+        client = self.config.find_forwarded_client(_address(self.client), named)
+        if doors.has_max_nodes if self._is_node else not doors.acquire(self.transport, client):
+            self.app = refuse_connection
         super().handle_connect(event)
         if not self.close_sent:
             # ASGI requires a dict; the live route reads it.
             self.scope["extensions"] = {
                 **(self.scope["extensions"] or {}),
-                OUTLET: {"outlet": self},
+                SOCKET_EXTENSION: {"outlet": self},
             }
 
     @property
-    def is_ready(self) -> bool:
+    def is_writable(self) -> bool:
         """True if all earlier writes are sent, up to the transport buffer (64 KiB)."""
         return self.writable.is_set()
 
-    def write(self, framed: bytes) -> None:
+    def write_framed(self, framed: bytes) -> None:
         """Write whole frames beside uvicorn's own `send`, which frames each message again."""
         if not (self.close_sent or self.disconnected or self.transport.is_closing()):
             self.transport.write(framed)
 
-    def hang_up(self, code: int, reason: str) -> None:
+    def close_now(self, code: int, reason: str) -> None:
         """Close with a reason without waiting for room, behind all earlier writes.
 
         Until the peer has answered, or for `close_timeout`, the connection stays open and received
@@ -340,25 +340,29 @@ class WebSocket(WebSocketsSansIOProtocol):
         """Return a message, or the end; the first message of a node acquires its place."""
         event = await super().receive()
         is_word = self._is_node and event["type"] == "websocket.receive"
-        if is_word and not self.config.doors.admit_node(self.transport):
+        if is_word and not self.config.limiter.acquire_node(self.transport):
             with suppress(ClientDisconnected, RuntimeError):  # it has disconnected, or got a reason
                 await self.send(
-                    {"type": "websocket.close", "code": Close.TRY_LATER, "reason": _TOO_MANY}
+                    {
+                        "type": "websocket.close",
+                        "code": LinkCloseCode.TRY_LATER,
+                        "reason": _TOO_MANY,
+                    }
                 )
-            return {"type": "websocket.disconnect", "code": Close.TRY_LATER}
+            return {"type": "websocket.disconnect", "code": LinkCloseCode.TRY_LATER}
         return event
 
     async def run_asgi(self) -> None:
         """Run the app; then make the connection idle, so that it can be closed."""
         await super().run_asgi()
-        self.config.doors.rest(self.transport)
+        self.config.limiter.release(self.transport)
 
 
 def _address(peer: tuple[str, int] | None) -> str:
     return peer[0] if peer else ""
 
 
-async def send(socket: StarletteWebSocket, message: str | bytes) -> None:
+async def send_message(socket: StarletteWebSocket, message: str | bytes) -> None:
     """Send a message on an open websocket, once there is room for it.
 
     Raises:
@@ -374,20 +378,24 @@ async def send(socket: StarletteWebSocket, message: str | bytes) -> None:
         raise WebSocketDisconnect(CloseCode.ABNORMAL_CLOSURE) from error
 
 
-async def refuse(scope: Scope, receive: Receive, send: Send) -> None:
+async def refuse_connection(scope: Scope, receive: Receive, send: Send) -> None:
     """Refuse a connection for lack of room, by HTTP or websocket."""
     if scope["type"] == "websocket":
         chosen = SUBPROTOCOL if SUBPROTOCOL in scope["subprotocols"] else None
         await receive()
         await send({"type": "websocket.accept", "subprotocol": chosen})
-        await send({"type": "websocket.close", "code": Close.TRY_LATER, "reason": _TOO_MANY})
+        await send(
+            {"type": "websocket.close", "code": LinkCloseCode.TRY_LATER, "reason": _TOO_MANY}
+        )
         return
     headers = {"connection": "close", "retry-after": str(_RETRY_AFTER_S)}
-    answer = problem(scope["path"], HTTPStatus.SERVICE_UNAVAILABLE, _TOO_MANY, headers)
+    answer = problem_response(scope["path"], HTTPStatus.SERVICE_UNAVAILABLE, _TOO_MANY, headers)
     await answer(scope, receive, send)
 
 
-async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors) -> None:
+async def accept_connections(
+    listening: socket.socket, make_protocol: Callable[[], Any], limiter: ConnectionLimiter
+) -> None:
     """Accept connections until cancelled, one after the other.
 
     An event loop's own server accepts all pending ones before it reports any, and, out of
@@ -395,28 +403,28 @@ async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors
 
     Args:
         listening: listening socket.
-        make: creates a protocol for each connection.
-        doors: limiter of connections.
+        make_protocol: creates a protocol for each connection.
+        limiter: limiter of connections.
     """
     loop = asyncio.get_running_loop()
     listening.setblocking(False)
     while True:
-        if doors.is_full:
-            doors.turn_out()
+        if limiter.is_full:
+            limiter.evict_idle()
             await asyncio.sleep(_PAUSE_S)
             continue
         try:
             connection, _ = await loop.sock_accept(listening)
         except OSError as error:
-            is_starved = error.errno in _STARVED  # or the client has disconnected
+            is_starved = error.errno in _OUT_OF_RESOURCES  # or the client has disconnected
             if is_starved:
-                doors.say("starved", f"no connection can be accepted now: {error}")
-                doors.turn_out()
-            await asyncio.sleep(_STARVED_PAUSE_S if is_starved else _PAUSE_S)
+                limiter.log_limited("starved", f"no connection can be accepted now: {error}")
+                limiter.evict_idle()
+            await asyncio.sleep(_OUT_OF_RESOURCES_PAUSE_S if is_starved else _PAUSE_S)
             continue
         try:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            await loop.connect_accepted_socket(make, connection)
+            await loop.connect_accepted_socket(make_protocol, connection)
         except Exception as error:
             if not isinstance(error, OSError):
                 log.exception("a connection is closed: this is a bug; others are accepted")

@@ -14,14 +14,14 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from devices.errors import UsageError
-from devices.inputs import read_text
+from devices.input_files import read_text
 from foottile.environment import read_variable
-from service.api.doors import Bounds
-from service.user_folders import user_folder
+from service.api.connection_limits import LimitSettings
+from service.user_folders import resolve_user_folder
 
 
-class Settings(Bounds):
-    """Settings of a server; limits of connections are in `service.api.doors`."""
+class Settings(LimitSettings):
+    """Settings of a server; limits of connections are in `service.api.connection_limits`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -29,7 +29,7 @@ class Settings(Bounds):
     """Address to listen on; 0.0.0.0: all addresses."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """TCP port; 0: any free one."""
-    data: Path = Field(default_factory=lambda: user_folder("data", None, "--data"))
+    data: Path = Field(default_factory=lambda: resolve_user_folder("data", None, "--data"))
     """Folder for sessions, journals and files of nodes."""
     token: Annotated[str, Field(pattern=r"^[!-~]{8,200}$")] | None = None
     """Token required for changes; generated and stored in the data folder if none is given."""
@@ -83,7 +83,9 @@ def load_settings(config: Path | None, **given: object) -> Settings:
         elif top in from_environment:
             where = variables[top]
         raise UsageError(f"setting {name!r}: {complaint['msg']}", where=where) from error
-    return settings.model_copy(update={"data": user_folder("data", settings.data, "--data")})
+    return settings.model_copy(
+        update={"data": resolve_user_folder("data", settings.data, "--data")}
+    )
 
 
 def _read_file(config: Path) -> dict[str, object]:

@@ -11,8 +11,8 @@ from rich.table import Table
 from service.cli.report import ASSUMED_SCALE
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import Effects, Parameter
-from service.estimation.estimates import INTERVAL_95
-from service.estimation.fitting.confidence import student_t_95
+from service.estimation.estimates import SIGMAS_95
+from service.estimation.fitting.confidence import compute_student_t_95
 from service.estimation.models.hysteresis import WIDTHS_N
 
 
@@ -53,7 +53,7 @@ def _weights(calibration: Calibration, tile: TileCalibration) -> Table:
             _number(step.noise_kpa, 2),
             f"{step.settle_kpa:+.2f}",
             f"{step.residual_n:+.2f}",
-            f"±{facts.half_width_n(step.gauge_kpa):.2f}",
+            f"±{facts.interpolate_half_width_n(step.gauge_kpa):.2f}",
         )
     return table
 
@@ -116,7 +116,7 @@ def _ranges(calibration: Calibration) -> Table:
             "ended by: the load, which went no further, or the chip, whose reading did not",
         ],
         *("tile", "end\nkPa", "absolute\nkPa", "left to 115\nkPa", "force\nN", "ended by"),
-        *("drift\nkPa", "tadc\ncounts", "about\ndegC"),
+        *("drift\nkPa", "temperature_raw\ncounts", "about\ndegC"),
     )
     for tile in calibration.tiles:
         facts = tile.bench
@@ -131,7 +131,7 @@ def _ranges(calibration: Calibration) -> Table:
             _number(facts.end_n, 1),
             facts.ended_by,
             _number(facts.baseline_drift_kpa, 2),
-            _number(facts.tadc_counts, 0),
+            _number(facts.temperature_raw_counts, 0),
             _number(facts.degc, 0),
         )
     return table
@@ -221,7 +221,7 @@ def _tile_json(tile: TileCalibration) -> dict[str, object]:
     kpa_per_k, lag = (warm.kpa_per_k, warm.lag_s) if warm else (None, None)
     return {
         **tile.model_dump(mode="json", include=_OF_A_TILE),
-        "student_t_95": student_t_95(tile.repeats) if tile.repeats > 1 else None,
+        "student_t_95": compute_student_t_95(tile.repeats) if tile.repeats > 1 else None,
         "effects": {
             "late_us": _parameter(effects.late_s, 1e6),
             "late_common_sigma_us": 1e6 * effects.late_common_s,
@@ -247,7 +247,7 @@ def _parameter(parameter: Parameter | None, factor: float = 1.0) -> dict[str, ob
 
 
 def _interval(parameter: Parameter, digits: int, factor: float = 1.0) -> str:
-    half = INTERVAL_95 * factor * parameter.sigma
+    half = SIGMAS_95 * factor * parameter.sigma
     return f"{factor * parameter.value:.{digits}f}±{half:.{digits}f}"
 
 

@@ -14,8 +14,8 @@ from service.cli.options import pair
 from service.cli.reference_options import named_values, sole_size, text_stated
 
 if TYPE_CHECKING:
+    from service.offline.archive.job_runner import OutcomeCounts
     from service.offline.archive.jobs import Job
-    from service.offline.archive.plan import Summary
     from service.offline.archive.tasks import CompareTask
     from service.offline.comparison import CompareOptions
 
@@ -35,14 +35,14 @@ def options_of(said: Said, *, remove_offset: bool) -> CompareOptions:
         UsageError: one of them cannot be meant.
     """
     from service.offline.comparison import CompareOptions
-    from storage.formats.reference import Stated
+    from storage.formats.reference import ReferenceOptions
 
     def text(name: str) -> str | None:
         value = said.get(name)
         return None if value is None else str(value)
 
     return CompareOptions(
-        stated=Stated(
+        stated=ReferenceOptions(
             named_values(text("map"), "--map"),
             named_values(text("units"), "--units"),
             text("sign"),
@@ -67,7 +67,7 @@ def compare_many(
     jobs: int | None,
     scheduler: str | None,
     as_json: bool,
-) -> Summary:
+) -> OutcomeCounts:
     """Compare the sessions of a manifest, each with the reference of its row.
 
     Args:
@@ -84,15 +84,15 @@ def compare_many(
     Raises:
         UsageError: as for `run_many`, or an option cannot be meant.
     """
-    from service.offline.archive.manifest import rows_in
-    from service.offline.archive.places import absolute
+    from service.offline.archive.locations import make_absolute
+    from service.offline.archive.manifest import read_rows
 
     options_of(said, remove_offset=remove_offset)  # what is wrong in all rows is wrong usage
     known = {"session", "reference", "name", *_TEXTS, *_OF_TEXT, *_NUMBERS}
-    out = absolute(out)
+    out = make_absolute(out)
 
     def rows() -> Iterator[dict[str, str]]:
-        return rows_in(manifest, known)
+        return read_rows(manifest, known)
 
     return run_plan(
         (_job(manifest, row, said, limits, remove_offset, out) for row in rows()),
@@ -114,16 +114,16 @@ def _job(
 ) -> Job:
     """Of a row; one that cannot be meant is a job that fails."""
     from service.offline.archive.jobs import Job
-    from service.offline.archive.places import place_of
-    from service.offline.archive.tasks import RefusedTask
+    from service.offline.archive.locations import parse_session_location
+    from service.offline.archive.tasks import InvalidTask
 
-    place = place_of(row["session"])
+    place = parse_session_location(row["session"])
     try:
-        name = _name(row, place.name)
+        name = _name(row, place.session_id)
         task = _task(manifest, row, said, limits, remove_offset=remove_offset)
     except UsageError as error:
-        return Job(place, RefusedTask(str(error), "compare"), out)
-    return Job(replace(place, name=name), task, out)
+        return Job(place, InvalidTask(str(error), "compare"), out)
+    return Job(replace(place, session_id=name), task, out)
 
 
 def _name(row: Mapping[str, str], default: str) -> str:
@@ -141,14 +141,14 @@ def _task(
     *,
     remove_offset: bool,
 ) -> CompareTask:
-    from service.offline.archive.manifest import resolved
+    from service.offline.archive.manifest import resolve_path
     from service.offline.archive.tasks import CompareTask
 
     if not row.get("reference"):
         raise UsageError("there is no reference in its row")
     given = {**said, **{name: value for name, value in row.items() if value}}
     options = options_of(given, remove_offset=remove_offset)
-    return CompareTask(resolved(manifest, row["reference"]), options, dict(limits))
+    return CompareTask(resolve_path(manifest, row["reference"]), options, dict(limits))
 
 
 def _number(said: Said, name: str) -> float | None:

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 
 from devices.errors import UsageError
 from storage.formats.options import FormatOptions
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.registry import FORMATS
 
 FormatOption = Annotated[str, typer.Option("--format", help=", ".join(FORMATS) + ".")]
 

@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import foottile
 from devices.errors import FootTileError, LinkError
-from service.pull import pull
+from service.pull import pull_session
 from storage.sessions.folder import FRAMES_NAME
 
 _SERVER_S = 120.0
@@ -35,7 +35,7 @@ PRE_ROLL_S = 5.0
 """A recording begins so much earlier, if the node has run that long: with the lead, the tare."""
 _AT = "FootTile is at "
 _CODE = (
-    "from devices.realtime import end_with_parent; end_with_parent(); "
+    "from devices.realtime import terminate_with_parent; terminate_with_parent(); "
     "from service.cli.main import main; main()"
 )
 
@@ -134,7 +134,7 @@ class Laboratory:
                 _wait(trial.seconds, node, trial.name)
                 sealed = session.stop().wait(_SEALED_S).facts
                 missed = server.node(trial.name)["missed_slots"]
-                pulled = pull(server, session.id, self._folder / "sessions")
+                pulled = pull_session(server, session.id, self._folder / "sessions")
         except foottile.FootTileError as error:
             raise LinkError(f"trial {trial.name}: {error}") from error
         finally:

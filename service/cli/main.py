@@ -12,11 +12,11 @@ from typing import Annotated
 import typer
 
 from devices.errors import FootTileError, UsageError
-from devices.words import is_utf8, printable
+from devices.text import escape_control_chars, is_utf8_encodable
 from foottile.errors import FootTileError as ClientError
 from service.cli.table import Commands, name_all
-from service.freed import give_back_freed
-from service.version import SOFTWARE
+from service.memory import use_system_allocator
+from service.version import SOFTWARE_VERSION
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, typer's and any shell's."""
@@ -35,7 +35,7 @@ name_all(app)
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(SOFTWARE)
+        typer.echo(SOFTWARE_VERSION)
         raise typer.Exit
 
 
@@ -63,7 +63,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             # A letter that the terminal's encoding lacks must not end a command.
             stream.reconfigure(errors="backslashreplace")
-    give_back_freed()
+    use_system_allocator()
     # So that what is half-written is cleaned up when the machine is shut down, too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     try:
@@ -73,7 +73,7 @@ def main() -> None:
         sys.stderr.write(f"foottile: {error}\n")
         sys.exit(error.exit_code)
     except ClientError as error:
-        sys.stderr.write(f"foottile: {printable(str(error))}\n")
+        sys.stderr.write(f"foottile: {escape_control_chars(str(error))}\n")
         sys.exit(2 if isinstance(error, ValueError) else 1)
     except SystemExit as end:
         if end.code == INTERRUPTED:
@@ -83,7 +83,7 @@ def main() -> None:
         _say_interrupted()
         sys.exit(INTERRUPTED)
     except OSError as error:
-        sys.stderr.write(f"foottile: {printable(str(error))}\n")
+        sys.stderr.write(f"foottile: {escape_control_chars(str(error))}\n")
         _leave_unwritten()
         sys.exit(1)
 
@@ -106,7 +106,7 @@ def _check_texts() -> None:
     with suppress(OSError):  # it is gone
         texts["the working folder"] = os.getcwd()
     for what, text in texts.items():
-        if not is_utf8(text):
+        if not is_utf8_encodable(text):
             raise UsageError(
                 f"{what} is not UTF-8: {text!r}",
                 expected="paths that JSON can state: they are in results and messages",

@@ -15,14 +15,14 @@ from typing import IO, TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
-from devices.words import printable
+from devices.text import escape_control_chars
 from service.cli.options import remark, say, stderr
 
 if TYPE_CHECKING:
+    from service.offline.archive.job_runner import JobMapper, OutcomeCounts
     from service.offline.archive.jobs import Job, Outcome
-    from service.offline.archive.places import Place
-    from service.offline.archive.plan import Spread, Summary
-    from service.offline.archive.tasks import Task
+    from service.offline.archive.locations import SessionLocation
+    from service.offline.archive.tasks import SessionTask
 
 NOT_ALL = 3
 """Exit code: finished, but not with every session."""
@@ -42,9 +42,9 @@ SchedulerOption = Annotated[
 
 def is_one(places: Sequence[str] | None, manifest: Path | None) -> bool:
     """Is a single session asked for, as a file, a folder or an id?"""
-    from service.offline.archive.places import is_remote
-    from storage.sessions.claims import SESSION_NAME
+    from service.offline.archive.locations import is_remote
     from storage.sessions.folder import FRAMES_NAME
+    from storage.sessions.metadata import SESSION_NAME
 
     if manifest is not None or len(places or ()) != 1:
         return False
@@ -56,7 +56,7 @@ def is_one(places: Sequence[str] | None, manifest: Path | None) -> bool:
 
 
 def run_many(
-    task: Task,
+    task: SessionTask,
     places: Sequence[str] | None,
     manifest: Path | None,
     *,
@@ -64,7 +64,7 @@ def run_many(
     jobs: int | None,
     scheduler: str | None,
     as_json: bool,
-) -> Summary:
+) -> OutcomeCounts:
     """Do a task with many sessions, say what became of each that failed, and count.
 
     A result that is there, made from the same in the same way, is not made again.
@@ -73,8 +73,13 @@ def run_many(
         UsageError: nothing, or twice the same, says which sessions; or a place is not there.
     """
     from service.offline.archive.jobs import Job
-    from service.offline.archive.manifest import rows_in
-    from service.offline.archive.places import absolute, no_session_in, place_of, sessions_in
+    from service.offline.archive.locations import (
+        find_session_locations,
+        make_absolute,
+        make_no_session_error,
+        parse_session_location,
+    )
+    from service.offline.archive.manifest import read_rows
 
     if (manifest is None) == (not places):
         raise UsageError(
@@ -84,15 +89,17 @@ def run_many(
     if jobs is not None and scheduler is not None:
         raise UsageError("--jobs and --scheduler are two ways to spread work", remedy="Name one")
 
-    out = None if out is None else absolute(out)
+    out = None if out is None else make_absolute(out)
 
-    def found() -> Iterator[Place]:
+    def found() -> Iterator[SessionLocation]:
         if manifest is not None:
-            return (place_of(row["session"]) for row in rows_in(manifest, {"session"}))
-        sessions = sessions_in(places or ())
+            return (
+                parse_session_location(row["session"]) for row in read_rows(manifest, {"session"})
+            )
+        sessions = find_session_locations(places or ())
         first = next(sessions, None)
         if first is None:
-            raise no_session_in(places or ())
+            raise make_no_session_error(places or ())
         return chain([first], sessions)
 
     return run_plan(
@@ -111,9 +118,9 @@ def run_plan(
     command: str,
     count: Callable[[], Iterator[Any]],
     out: str | None,
-    spread: Spread,
+    spread: JobMapper,
     as_json: bool,
-) -> Summary:
+) -> OutcomeCounts:
     """Run jobs, show how far they are, write the report, and say what came of them.
 
     Args:
@@ -124,22 +131,22 @@ def run_plan(
         spread: over processes or a cluster.
         as_json: each outcome is a line of JSON on stdout.
     """
-    from service.offline.archive.plan import Summary, outcomes
-    from service.offline.archive.results import Results
+    from service.offline.archive.job_runner import OutcomeCounts, run_jobs
+    from service.offline.archive.result_store import ResultStore
 
     jobs = iter(jobs)
     first = next(jobs, None)
     if first is None:
         raise UsageError("there is no row in the list of sessions")
-    summary = Summary()
-    results = None if out is None else Results(out)
+    summary = OutcomeCounts()
+    results = None if out is None else ResultStore(out)
     if results is not None:
-        results.begin()
+        results.prepare_folder()
     with ExitStack() as stack:
         report = stack.enter_context(_report(results, command))
         tell = stack.enter_context(_progress(command, count))
-        for outcome in outcomes(chain([first], jobs), spread):
-            summary.add(outcome)
+        for outcome in run_jobs(chain([first], jobs), spread):
+            summary.add_outcome(outcome)
             line = json.dumps({k: v for k, v in vars(outcome).items() if v not in ("", {})})
             if report is not None:
                 report.write(line + "\n")
@@ -148,21 +155,25 @@ def run_plan(
                 say(line)
             tell(outcome)
     if results is not None:
-        results.end()
+        results.remove_work_folder()
     _tell(summary, command, out, as_json=as_json)
     return summary
 
 
-def spread_over(jobs: int | None, scheduler: str | None) -> Spread:
+def spread_over(jobs: int | None, scheduler: str | None) -> JobMapper:
     """Processes of this machine, or a cluster."""
     if scheduler is not None:
-        from service.offline.archive.cluster import spread_over_cluster
+        from service.offline.archive.dask_cluster import map_on_cluster
 
-        return partial(spread_over_cluster, address=scheduler)
-    from service.offline.archive.jobs import begin_worker
-    from service.offline.processes import cores, spread
+        return partial(map_on_cluster, scheduler_address=scheduler)
+    from service.offline.archive.jobs import limit_arrow_threads
+    from service.offline.process_pool import count_available_cores, map_in_processes
 
-    return partial(spread, jobs=jobs or cores(), begin=begin_worker)
+    return partial(
+        map_in_processes,
+        process_count=jobs or count_available_cores(),
+        initializer=limit_arrow_threads,
+    )
 
 
 @contextmanager
@@ -213,12 +224,12 @@ def _progress(command: str, count: Callable[[], Iterator[Any]]) -> Iterator[Call
 
 def _failure(outcome: Outcome) -> str:
     """Place and reason; a reason may begin with a file in that place."""
-    place = printable(outcome.place)
+    place = escape_control_chars(outcome.place)
     within = outcome.reason.startswith((f"{place}/", f"{place}: "))
     return outcome.reason if within else f"{place}: {outcome.reason}"
 
 
-def _tell(summary: Summary, command: str, out: str | None, *, as_json: bool) -> None:
+def _tell(summary: OutcomeCounts, command: str, out: str | None, *, as_json: bool) -> None:
     states = summary.states
     if not as_json:
         where = f"{out}: " if out is not None else ""

@@ -24,9 +24,9 @@ from rich.markup import escape
 from rich.text import Text
 
 from devices.errors import UsageError
-from devices.scene.file import Scene, load_scene
-from devices.scene.hardware import EMULATED
-from devices.words import printable
+from devices.scene.hardware_sections import EMULATED
+from devices.scene.scene_file import Scene, load_scene
+from devices.text import escape_control_chars
 from foottile.environment import read_variable
 from service.cli.reference_options import (
     ColumnsOfReference,
@@ -40,12 +40,12 @@ from service.cli.reference_options import (
     named_values,
     text_stated,
 )
-from service.plain_json import json_text
+from service.json_output import to_json_text
 
 if TYPE_CHECKING:
-    from service.rig.emulated import EmulatedFoot
-    from service.rig.plates import PlateFiles
-    from storage.formats.reference import Stated
+    from service.rig.emulated_foot import EmulatedFoot
+    from service.rig.plate_files import PlateFiles
+    from storage.formats.reference import ReferenceOptions
 
 SEED_MAX = 2**63 - 1
 SECONDS_MAX = NUMBER_MAX = 1e9
@@ -73,7 +73,7 @@ class _Screen(Console):
     """A console that shows control characters of any text or cell of a table, and obeys none."""
 
     def render_str(self, text: str, **how: Any) -> Text:
-        return super().render_str(printable(text, keeps_lines=True), **how)
+        return super().render_str(escape_control_chars(text, keep_line_breaks=True), **how)
 
 
 class _Output(_Screen):
@@ -113,9 +113,9 @@ def pair(text: str | None, option: str) -> tuple[float, float] | None:
 
 def data_folder(given: Path | None) -> Path:
     """Return the data folder that `--data` names, or the user's."""
-    from service.user_folders import user_folder
+    from service.user_folders import resolve_user_folder
 
-    return user_folder("data", given, "--data")
+    return resolve_user_folder("data", given, "--data")
 
 
 def output_path(path: Path, *inputs: Path) -> Path:
@@ -145,7 +145,7 @@ def _resolved(path: Path) -> Path:
 
 def print_json(value: object) -> None:
     """One JSON document on stdout."""
-    sys.stdout.write(json_text(value))
+    sys.stdout.write(to_json_text(value))
 
 
 @contextmanager
@@ -159,8 +159,8 @@ def progress(message: str) -> Iterator[Callable[[str], None]]:
         return
     # The usual spinner is of Braille, which not every terminal's encoding has.
     spinner = "dots" if is_shown("⠋") else "line"
-    with stderr.status(escape(printable(message)), spinner=spinner) as status:
-        yield lambda text: status.update(escape(printable(text)))
+    with stderr.status(escape(escape_control_chars(message)), spinner=spinner) as status:
+        yield lambda text: status.update(escape(escape_control_chars(text)))
 
 
 def is_shown(text: str) -> bool:
@@ -176,17 +176,19 @@ def is_shown(text: str) -> bool:
 def say(message: str) -> None:
     """Print one line of the result on stdout; what is in it cannot make a second one."""
     indent = " " * (len(message) - len(message.lstrip(" ")))
-    say_lines(indent + printable(message))
+    say_lines(indent + escape_control_chars(message))
 
 
 def say_lines(text: str) -> None:
-    """Print a report of several lines on stdout; names in it must be `printable` already."""
+    """Print a report of several lines on stdout; names in it must be escaped already."""
     stdout.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def remark(message: str) -> None:
     """Print one line on stderr that a user should see, wherever it goes."""
-    stderr.print(printable(message), style="dim", highlight=False, markup=False, soft_wrap=True)
+    stderr.print(
+        escape_control_chars(message), style="dim", highlight=False, markup=False, soft_wrap=True
+    )
 
 
 @dataclass(frozen=True)
@@ -234,9 +236,9 @@ class FootOptions:
             LoadTraceError: the load is not readable.
         """
         from devices.emulation.ground.load_trace import CopTransform
-        from service.rig.emulated import EmulatedFoot
+        from service.rig.emulated_foot import EmulatedFoot
         from storage.formats.load_trace import read_load_trace
-        from storage.formats.reference import Stated
+        from storage.formats.reference import ReferenceOptions
 
         for option, value, least in (
             ("--load-scale", self.load_scale, 0.0),
@@ -249,7 +251,7 @@ class FootOptions:
             raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
         plates = self._plates(scene)
         stated = self._stated()
-        if self.load is None and stated != Stated():
+        if self.load is None and stated != ReferenceOptions():
             raise UsageError(
                 "what a table does not state itself is stated, and none is named",
                 remedy="Add --load FILE",
@@ -263,15 +265,15 @@ class FootOptions:
         return EmulatedFoot(
             load=read_load_trace(self.load, stated) if self.load is not None else None,
             load_scale=self.load_scale,
-            cop=CopTransform(self.cop_scale, offset_m, self.cop_axes),
+            cop_transform=CopTransform(self.cop_scale, offset_m, self.cop_axes),
             lead_s=self.lead_s,
             seed=self.seed,
             parts_seed=self.parts_seed,
             plates=plates,
         )
 
-    def _stated(self) -> Stated:
-        from storage.formats.reference import Stated
+    def _stated(self) -> ReferenceOptions:
+        from storage.formats.reference import ReferenceOptions
 
         of_text: dict[str, str | float | None] = {
             "skip_rows": self.skip_rows,
@@ -279,7 +281,7 @@ class FootOptions:
             "decimal": self.decimal,
             "encoding": self.encoding,
         }
-        return Stated(
+        return ReferenceOptions(
             named_values(self.map_, "--map"),
             named_values(self.units, "--units"),
             self.sign,
@@ -288,8 +290,8 @@ class FootOptions:
         )
 
     def _plates(self, scene: Scene) -> PlateFiles:
-        from devices.emulation.plates.underfoot import check_seen
-        from service.rig.plates import PlateFiles
+        from devices.emulation.plates.plate_load import check_plate_usable
+        from service.rig.plate_files import PlateFiles
 
         for name, path, ending in (
             ("force plate", self.force_plate, ".csv"),
@@ -305,7 +307,7 @@ class FootOptions:
                     f"{option} {str(path)!r}", expected=f"a file that ends in {ending}"
                 )
             output_path(path)
-            check_seen(name, scene)
+            check_plate_usable(name, scene)
         return PlateFiles(self.force_plate, self.pressure_plate)
 
     def as_arguments(self) -> list[str]:

@@ -10,7 +10,7 @@ import typer
 from devices.errors import UsageError
 
 if TYPE_CHECKING:
-    from storage.formats.tables.stated_text import StatedText
+    from storage.formats.readers.text_options import TextOptions
 
 SOLE_MAX_M = 1.0
 
@@ -81,19 +81,19 @@ LagRange = Annotated[
 ]
 
 
-def text_stated(said: Mapping[str, str | float | None]) -> StatedText:
+def text_stated(said: Mapping[str, str | float | None]) -> TextOptions:
     """Return how a text is laid out, by options or cells of these names.
 
     Raises:
         UsageError: one of them cannot be meant.
     """
-    from storage.formats.tables.stated_text import StatedText
+    from storage.formats.readers.text_options import TextOptions
 
     def text(name: str) -> str | None:
         value = said.get(name)
         return None if value is None else str(value)
 
-    return StatedText(
+    return TextOptions(
         _whole_number(text("skip_rows"), "--skip-rows"),
         _whole_number(text("units_row"), "--units-row"),
         text("decimal"),

@@ -10,8 +10,8 @@ from rich.table import Table
 
 from service.cli.options import remark, say, stdout
 from service.estimation.stances import Stance
-from service.offline.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
-from service.offline.findings import Findings
+from service.offline.accuracy import MIN_COP_GRF_N, MIN_GRF_N, Accuracy
+from service.offline.estimate_summary import EstimateSummary
 
 PHASES = {
     "flight": "in flight",
@@ -30,8 +30,8 @@ def accuracy_table(a: Accuracy) -> Table:
     table.add_column("quantity")
     table.add_column("value", justify="right")
     table.add_column("over")
-    grf = f"{a.grf_frames} frames above {GRF_FROM_N} N, unsaturated"
-    cop = f"{a.cop_frames} frames above {COP_FROM_N} N"
+    grf = f"{a.grf_frames} frames above {MIN_GRF_N} N, unsaturated"
+    cop = f"{a.cop_frames} frames above {MIN_COP_GRF_N} N"
     stances = f"{a.stances} stances"
     for name, value, unit, over in (
         ("GRF mean absolute", a.grf_mae_n, "N", grf),
@@ -57,7 +57,7 @@ def accuracy_table(a: Accuracy) -> Table:
     heavy = a.cop_frames + a.cop_masked_frames
     share = "" if math.isnan(a.cop_masked_share) else f" ({100 * a.cop_masked_share:.1f} %)"
     table.add_row(
-        "COP not stated", f"{a.cop_masked_frames}{share}", f"{heavy} frames above {COP_FROM_N} N"
+        "COP not stated", f"{a.cop_masked_frames}{share}", f"{heavy} frames above {MIN_COP_GRF_N} N"
     )
     table.add_row("saturated", str(a.saturated_frames), f"{a.frames} frames")
     if a.bounds.frames:
@@ -73,7 +73,7 @@ def accuracy_table(a: Accuracy) -> Table:
     return table
 
 
-def tell_findings(findings: Findings) -> None:
+def tell_findings(findings: EstimateSummary) -> None:
     """Print what the estimates of a session come to."""
     if findings.assumed_scale:
         say(ASSUMED_SCALE)
@@ -82,14 +82,14 @@ def tell_findings(findings: Findings) -> None:
     if findings.pull.duration_s > PULL_LONG_S:
         remark(
             f"The GRF is below zero for {findings.pull.duration_s:.2f} s, by up to "
-            f"{findings.pull.most_n:.1f} N: the foot was probably loaded during the tare. "
+            f"{findings.pull.greatest_n:.1f} N: the foot was probably loaded during the tare. "
             "Name an unloaded interval with --tare-s BEGIN,END."
         )
     if findings.accuracy is not None:
         stdout.print(accuracy_table(findings.accuracy))
 
 
-def findings_json(findings: Findings) -> dict[str, object]:
+def findings_json(findings: EstimateSummary) -> dict[str, object]:
     """The same for programs."""
     scale = {None: None, True: "assumed", False: "measured"}[findings.assumed_scale]
     return {

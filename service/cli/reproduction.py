@@ -16,28 +16,34 @@ from functools import partial
 from pathlib import Path
 
 from devices.errors import FootTileError
-from devices.scene.file import load_scene
+from devices.scene.scene_file import load_scene
 from service.cli.laboratory import Laboratory, Trial
 from service.estimation.calibration import Calibration
 from service.estimation.domes import DOMES, PAPER_DOME, Dome
-from service.offline.calibrations import EMULATED_RIG, bench_scene, find_calibration
-from service.offline.processes import spread
-from service.offline.reproduce.judge import Judged, judge
-from service.offline.reproduce.mill import (
-    DomeFound,
-    calibrate,
-    found_of,
-    press,
-    table_scene,
-    together,
+from service.offline.calibration_lookup import EMULATED_RIG, find_calibration, make_rig_scene
+from service.offline.process_pool import map_in_processes
+from service.offline.reproduce.indentation import (
+    DomeResult,
+    calibrate_tile,
+    evaluate_dome,
+    indent_tile,
+    make_dome_scene,
+    merge_calibrations,
 )
-from service.offline.reproduce.result import Experiment, Reproduction
-from service.offline.reproduce.setups import ROLLING, SETUPS, TRIALS, Setup, scene_text
-from service.offline.reproduce.trials import TrialPlan, plans
-from service.offline.reproduce.truth import not_borne_n
+from service.offline.reproduce.result import ExperimentResult, Reproduction
+from service.offline.reproduce.setups import (
+    ROLLING,
+    SETUPS,
+    TRIALS,
+    ExperimentSetup,
+    compose_scene_toml,
+)
+from service.offline.reproduce.trial_evaluation import TrialResult, evaluate_trial
+from service.offline.reproduce.trial_plan import TrialPlan, plan_trials
+from service.offline.reproduce.unborne_force import compute_not_borne_n
 from service.sessions.calibration_file import write_calibration
-from service.version import SOFTWARE
-from storage.durable import make_folder, write_whole
+from service.version import SOFTWARE_VERSION
+from storage.durable_files import make_synced_folder, write_atomically
 
 Tell = Callable[[str], None]
 QUICK_TRIALS = 1
@@ -62,7 +68,7 @@ class ReproduceOptions:
         return (PAPER_DOME,) if self.quick else DOMES
 
     @property
-    def setups(self) -> tuple[Setup, ...]:
+    def setups(self) -> tuple[ExperimentSetup, ...]:
         """That are recorded."""
         return (ROLLING,) if self.quick else SETUPS
 
@@ -102,15 +108,15 @@ def reproduce(options: ReproduceOptions, folder: Path, tell: Tell) -> Reproducti
     run = _Run(options, folder, tell)
     with run.timed("mill"):
         domes, calibration = _mill(run)
-    experiments: tuple[Experiment, ...] = ()
+    experiments: tuple[ExperimentResult, ...] = ()
     if calibration is not None:
         with run.timed("trials"):
             experiments = _experiments(run, calibration)
     return Reproduction(
-        software=SOFTWARE,
-        made=datetime.now(UTC).strftime("%Y-%m-%d"),
+        software=SOFTWARE_VERSION,
+        run_at=datetime.now(UTC).strftime("%Y-%m-%d"),
         seed=options.seed,
-        quick=options.quick,
+        is_shortened=options.quick,
         domes=domes,
         calibration=calibration,
         experiments=experiments,
@@ -138,21 +144,21 @@ def _notes(run: _Run) -> list[str]:
     ]
 
 
-def _mill(run: _Run) -> tuple[tuple[DomeFound, ...], Calibration | None]:
+def _mill(run: _Run) -> tuple[tuple[DomeResult, ...], Calibration | None]:
     options = run.options
-    pressed: dict[str, DomeFound] = {}
+    pressed: dict[str, DomeResult] = {}
     calibrated: dict[str, Calibration] = {}
     serials = () if options.quick else _serials()
     tasks: list[Dome | str] = [*options.domes, *serials]
     work = partial(_pressed, seed=options.seed, parts_seed=options.parts_seed)
-    results: Iterator[tuple[Dome | str, DomeFound | Calibration | Exception]]
-    results = spread(work, tasks, min(options.jobs, len(tasks)))
+    results: Iterator[tuple[Dome | str, DomeResult | Calibration | Exception]]
+    results = map_in_processes(work, tasks, min(options.jobs, len(tasks)))
     for number, (task, found) in enumerate(results, 1):
         name = task if isinstance(task, str) else task.name
         run.tell(f"mill: {number} of {len(tasks)} tiles pressed, the last one {name}")
         if isinstance(found, Exception):
             run.failed(f"mill: {name}", found)
-        elif isinstance(found, DomeFound):
+        elif isinstance(found, DomeResult):
             pressed[name] = found
         else:
             calibrated[name] = found
@@ -161,10 +167,12 @@ def _mill(run: _Run) -> tuple[tuple[DomeFound, ...], Calibration | None]:
     try:
         if options.quick:
             calibration = find_calibration(
-                EMULATED_RIG, _serials(), parts_seed=options.parts_seed, progress=run.tell
+                EMULATED_RIG, _serials(), parts_seed=options.parts_seed, on_progress=run.tell
             )
         elif set(calibrated) == set(serials):
-            calibration = together([calibrated[serial] for serial in serials], "reproduce")
+            calibration = merge_calibrations(
+                [calibrated[serial] for serial in serials], "reproduce"
+            )
     except FootTileError as error:
         run.failed("mill: the foot", error)
     return domes, calibration
@@ -176,59 +184,63 @@ def _serials() -> tuple[str, ...]:
 
 def _pressed(
     task: Dome | str, *, seed: int, parts_seed: int
-) -> DomeFound | Calibration | FootTileError:
+) -> DomeResult | Calibration | FootTileError:
     """Press a dome of Table I, or calibrate a tile of the foot."""
     try:
         if isinstance(task, str):
-            return calibrate(bench_scene(task), seed=seed, parts_seed=parts_seed)
-        return found_of(task, press(table_scene(task), seed=seed, parts_seed=parts_seed))
+            return calibrate_tile(make_rig_scene(task), seed=seed, parts_seed=parts_seed)
+        return evaluate_dome(
+            task, indent_tile(make_dome_scene(task), seed=seed, parts_seed=parts_seed)
+        )
     except FootTileError as error:
         return error
 
 
-def _experiments(run: _Run, calibration: Calibration) -> tuple[Experiment, ...]:
+def _experiments(run: _Run, calibration: Calibration) -> tuple[ExperimentResult, ...]:
     options = run.options
     _write_scenes(run, calibration)
-    planned = plans(options.setups, options.trials, options.seed, run.folder / "references")
+    planned = plan_trials(options.setups, options.trials, options.seed, run.folder / "references")
     run.tell("trials: starting the server")
     with Laboratory(run.folder) as laboratory:
         judged, spoiled = _recorded(run, laboratory, planned, options.jobs)
         if len(spoiled) <= REPEATED_MAX:
             # One at a time: a machine that was too busy for two may have room for one.
-            again = [plan.again() for plan in spoiled]
-            run.repeated |= {plan.trial: str(error) for plan, error in spoiled.items()}
+            again = [plan.make_repetition() for plan in spoiled]
+            run.repeated |= {plan.trial_name: str(error) for plan, error in spoiled.items()}
             better, spoiled = _recorded(run, laboratory, again, 1)
             judged |= better
     for plan, error in spoiled.items():
-        run.failed(plan.trial, error)
+        run.failed(plan.trial_name, error)
     grouped = (
-        Experiment(
+        ExperimentResult(
             setup,
-            tuple(judged[p.trial] for p in planned if p.setup is setup and p.trial in judged),
+            tuple(
+                judged[p.trial_name] for p in planned if p.setup is setup and p.trial_name in judged
+            ),
         )
         for setup in options.setups
     )
-    return tuple(one for one in grouped if one.judged)
+    return tuple(one for one in grouped if one.trials)
 
 
 def _write_scenes(run: _Run, calibration: Calibration) -> None:
     for name in ("scenes", "references"):
-        make_folder(run.folder / name)
+        make_synced_folder(run.folder / name)
     kept = run.folder / "calibration.json"
     write_calibration(kept, calibration)
     for setup in run.options.setups:
-        write_whole(_scene(run, setup), scene_text(setup, kept).encode())
+        write_atomically(_scene(run, setup), compose_scene_toml(setup, kept).encode())
 
 
-def _scene(run: _Run, setup: Setup) -> Path:
+def _scene(run: _Run, setup: ExperimentSetup) -> Path:
     return run.folder / "scenes" / f"{setup.name}.toml"
 
 
 def _recorded(
     run: _Run, laboratory: Laboratory, planned: Sequence[TrialPlan], jobs: int
-) -> tuple[dict[str, Judged], dict[TrialPlan, FootTileError]]:
+) -> tuple[dict[str, TrialResult], dict[TrialPlan, FootTileError]]:
     """Trials that were recorded and judged, by name, and those that were not."""
-    judged: dict[str, Judged] = {}
+    judged: dict[str, TrialResult] = {}
     spoiled: dict[TrialPlan, FootTileError] = {}
     with ThreadPoolExecutor(jobs) as pool:
         futures = {pool.submit(_trial, run, laboratory, plan): plan for plan in planned}
@@ -236,10 +248,12 @@ def _recorded(
             for number, future in enumerate(as_completed(futures), 1):
                 plan = futures[future]
                 try:
-                    judged[plan.trial] = future.result()
+                    judged[plan.trial_name] = future.result()
                 except FootTileError as error:
                     spoiled[plan] = error
-                run.tell(f"trials: {number} of {len(planned)} done, the last one {plan.name}")
+                run.tell(
+                    f"trials: {number} of {len(planned)} done, the last one {plan.session_name}"
+                )
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             laboratory.end_nodes()
@@ -247,25 +261,27 @@ def _recorded(
     return judged, spoiled
 
 
-def _trial(run: _Run, laboratory: Laboratory, plan: TrialPlan) -> Judged:
-    arguments = plan.arguments(_scene(run, plan.setup), run.options.parts_seed)
-    recorded = laboratory.record(Trial(plan.name, arguments, plan.seconds, (plan.reference,)))
-    return judge(
+def _trial(run: _Run, laboratory: Laboratory, plan: TrialPlan) -> TrialResult:
+    arguments = plan.make_node_arguments(_scene(run, plan.setup), run.options.parts_seed)
+    recorded = laboratory.record(
+        Trial(plan.session_name, arguments, plan.recording_seconds, (plan.reference_path,))
+    )
+    return evaluate_trial(
         plan.setup,
-        plan.name,
+        plan.session_name,
         recorded.path,
-        plan.reference,
+        plan.reference_path,
         lost_frames=recorded.lost_frames,
         missed_slots=recorded.missed_slots,
     )
 
 
-def _not_borne_n(run: _Run, experiments: tuple[Experiment, ...]) -> dict[str, float]:
+def _not_borne_n(run: _Run, experiments: tuple[ExperimentResult, ...]) -> dict[str, float]:
     found = {}
     for one in experiments:
         scene = load_scene(str(_scene(run, one.setup)))
         each = [
-            not_borne_n(scene, run.options.seed + number, one.setup.seconds)
+            compute_not_borne_n(scene, run.options.seed + number, one.setup.trial_seconds)
             for number in range(1, run.options.trials + 1)
         ]
         found[one.setup.name] = sum(each) / len(each)

@@ -40,17 +40,17 @@ def read_data_token(folder: Path | None) -> str | None:
     Raises:
         UsageError: no token is there.
     """
-    from service.api.address import KEPT_IN, kept_token
+    from service.api.address import TOKEN_NAME, read_token
 
     if folder is None:
         return None
     folder = data_folder(folder)
     try:
-        return kept_token(folder)
+        return read_token(folder)
     except FileNotFoundError as error:
         raise UsageError(
             f"no token in the data folder {str(folder)!r}",
-            expected=f"a file `{KEPT_IN}`, which a server makes unless FOOTTILE_TOKEN is set",
+            expected=f"a file `{TOKEN_NAME}`, which a server makes unless FOOTTILE_TOKEN is set",
             remedy="Name the folder of --data of `foottile serve`, or set FOOTTILE_TOKEN",
         ) from error
 
@@ -74,11 +74,11 @@ def remark_reach(urls: list[str], host: str) -> None:
         urls: its addresses.
         host: what it was told to listen on.
     """
-    from service.api.address import is_everywhere
+    from service.api.address import is_wildcard
     from service.api.interfaces import list_addresses
 
-    if is_everywhere(host) and not any(reaches_others(url) for url in urls):
-        if list_addresses(has_ipv6=True):
+    if is_wildcard(host) and not any(reaches_others(url) for url in urls):
+        if list_addresses(include_ipv6=True):
             remark("this machine has addresses of IPv6 only: start the server with --host ::")
         else:
             remark(

@@ -3,4 +3,4 @@
 LIVE_LAG_MS = 10.0
 """Look-ahead of estimates that are shown live, and of sessions that are not sealed yet."""
 OFFLINE_LAG_MS = 100.0
-"""Look-ahead of offline estimates: in sealed sessions, in `simulate` and in `estimate`."""
+"""Look-ahead of offline estimates: in sealed sessions, in `run_simulation` and in `estimate`."""

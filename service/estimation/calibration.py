@@ -22,22 +22,22 @@ from pydantic import (
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
-from devices.facts import Count, Label, Text, Word
-from service.estimation.effects import CalibrationPart, Effects, NotNegative, Number, Parameter
-from service.estimation.mounted import Mounted
+from devices.types import Count, Identifier, Text, UInt16
+from service.estimation.effects import CalibrationPart, Effects, NonNegative, Number, Parameter
+from service.estimation.mounting import MountCalibration
 
 ANY_SERIAL = "*"
-UNPROVEN = ", unproven"
+UNPROVEN_SUFFIX = ", unproven"
 """Suffix of the name of a calibration that was written or edited by hand."""
-EDITED = (
+EDITED_REMEDY = (
     "It was edited by hand or damaged: calibrate again; or, if the edit is meant, delete its lines "
     '"id" and "check": then it is used, and called unproven'
 )
-LOOP_OPENS_N = 1.0
-CURVE_OPENS_N = 0.2
+LOOP_HALF_WIDTH_FORCE_N = 1.0
+CURVE_MISFIT_HALF_FORCE_N = 0.2
 """Forces at which the loop, and the misfit of the cubic, reach half of their final width; both
 are 0 at zero load."""
-BASIS = 3
+CUBIC_TERMS = 3
 """Number of coefficients of a cubic without constant term."""
 _TILES_MAX = 256
 """Largest number of tiles of a calibration, which may exceed that of an array."""
@@ -54,7 +54,7 @@ class TileCalibration(CalibrationPart):
     the same at zero gauge pressure.
     """
 
-    serial: Label
+    serial: Identifier
     p_input: Literal["gauge_kpa", "normalised"]
     p_offset_kpa: _Pressure
     p_scale_kpa: _Scale
@@ -68,8 +68,8 @@ class TileCalibration(CalibrationPart):
     absolute_scale: Literal["measured", "assumed"]
     covariance: tuple[tuple[Number, ...], ...]
     """Covariance of coefficients 1 to 3, in units of `f_scale_n` squared."""
-    relative_misfit: NotNegative
-    loop_misfit_n: NotNegative
+    relative_misfit: NonNegative
+    loop_misfit_n: NonNegative
     """Scatter of a new loading's force about the curve: its variance is the sum of
     (`relative_misfit` F)^2, a gain that differs between loadings, and (`loop_misfit_n`
     `loop_share(F)`)^2, a hysteresis loop that opens with the first newton."""
@@ -84,12 +84,12 @@ class TileCalibration(CalibrationPart):
     """Absolute pressure unloaded, during the calibration."""
     noise_kpa: Number | None
     """Standard deviation of a single reading, unloaded."""
-    coefficient_words: tuple[Word, Word, Word, Word] | None = None
+    coefficient_words: tuple[UInt16, UInt16, UInt16, UInt16] | None = None
     """Registers of the chip that was calibrated: a serial can be re-labelled, a chip can not.
     None: for any chip, as a preset is."""
     effects: Effects = Effects()
     """Parameters of the dome beside its static curve."""
-    bench: BenchFacts | None = None
+    bench: RigFacts | None = None
     """Facts about the slow strokes; None for a preset, and for dead weights."""
     weights: WeightFacts | None = None
     """Dead weights that the curve was fitted to; None: slow strokes, or a preset."""
@@ -99,21 +99,23 @@ class TileCalibration(CalibrationPart):
         if not self.range_kpa[0] < self.range_kpa[1]:
             raise ValueError(f"range_kpa {self.range_kpa} is empty")
         matrix = np.array(self.covariance)
-        if matrix.shape != (BASIS, BASIS):
-            raise ValueError(f"covariance is {matrix.shape}, expected {(BASIS, BASIS)}")
+        if matrix.shape != (CUBIC_TERMS, CUBIC_TERMS):
+            raise ValueError(f"covariance is {matrix.shape}, expected {(CUBIC_TERMS, CUBIC_TERMS)}")
         if self.monotonic != is_monotonic(self.coefficients, self.range_u):
             raise ValueError(f"monotonic = {self.monotonic} is not true of the coefficients")
         rubber = self.effects.rubber
         if rubber is not None:
             shape = np.array(rubber.covariance, dtype=object).shape
-            if shape != (BASIS, BASIS):
-                raise ValueError(f"covariance of rubber is {shape}, expected {(BASIS, BASIS)}")
+            if shape != (CUBIC_TERMS, CUBIC_TERMS):
+                raise ValueError(
+                    f"covariance of rubber is {shape}, expected {(CUBIC_TERMS, CUBIC_TERMS)}"
+                )
             if not is_monotonic(rubber.coefficients, self.range_u):
                 raise ValueError("the curve beneath rubber does not rise all over its range")
         return self
 
     @model_serializer(mode="wrap")
-    def _without_weights_as_before(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _serialize_without_weights(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave absent weights out, so that ids of older calibrations stay the same."""
         content: dict[str, Any] = written(self)
         if self.weights is None:
@@ -131,19 +133,19 @@ class Calibration(CalibrationPart):
     """Calibrations of tiles by serial, with their force reference."""
 
     version: Literal[1] = 1
-    name: Label
+    name: Identifier
     reference: Text
     """Force sensor, or publication, that defines the scale."""
-    date: Label
+    date: Identifier
     """Date of the recordings, ISO 8601."""
     tiles: Annotated[tuple[TileCalibration, ...], Field(max_length=_TILES_MAX)]
-    refused: Annotated[dict[Label, Text], Field(max_length=_TILES_MAX)] = Field(default={})
+    refused: Annotated[dict[Identifier, Text], Field(max_length=_TILES_MAX)] = Field(default={})
     """Serials that were loaded too, and the reason for having no curve."""
-    mounted: Mounted | None = None
+    mounted: MountCalibration | None = None
     """Mount calibration against a force plate; None: there is none."""
 
     @model_serializer(mode="wrap")
-    def _unmounted_as_before(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _serialize_without_mount(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Omit an absent mount calibration, so that ids of older calibrations stay the same."""
         content: dict[str, Any] = written(self)
         if self.mounted is None:
@@ -155,20 +157,20 @@ class Calibration(CalibrationPart):
         """Identifier: first 16 hexadecimal digits of the SHA-256 of the content."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
-    def find(self, serial: str) -> TileCalibration | None:
+    def find_tile(self, serial: str) -> TileCalibration | None:
         """Return the entry for a serial; None without one, as for bare tiles."""
         for tile in self.tiles:
             if tile.serial in (serial, ANY_SERIAL):
                 return tile
         return None
 
-    def of(self, serial: str) -> TileCalibration:
+    def get_tile(self, serial: str) -> TileCalibration:
         """Return the entry for a serial.
 
         Raises:
             CalibrationError: there is none.
         """
-        if (found := self.find(serial)) is not None:
+        if (found := self.find_tile(serial)) is not None:
             return found
         known = ", ".join(tile.serial for tile in self.tiles)
         why = f": it was refused ({self.refused[serial]})" if serial in self.refused else ""
@@ -180,7 +182,7 @@ class Calibration(CalibrationPart):
             "calibration with --calibration",
         )
 
-    def gain(self, serial: str) -> Parameter | None:
+    def find_mount_gain(self, serial: str) -> Parameter | None:
         """Return a tile's gain as mounted, over that in the rig; None: not measured."""
         return None if self.mounted is None else self.mounted.gains.get(serial)
 
@@ -213,20 +215,20 @@ class Calibration(CalibrationPart):
                 expected="a file written by `foottile calibrate`",
             ) from error
         if stated_id is None:
-            name = calibration.name.removesuffix(UNPROVEN) + UNPROVEN
+            name = calibration.name.removesuffix(UNPROVEN_SUFFIX) + UNPROVEN_SUFFIX
             return calibration.model_copy(update={"name": name})
         if stated_id != calibration.id:
             raise CalibrationError(
                 f"its id says {stated_id}, its content is {calibration.id}",
                 where=where,
-                remedy=EDITED,
+                remedy=EDITED_REMEDY,
             )
         return calibration
 
 
-def loop_share(force_n: Floats) -> Floats:
+def compute_loop_share(force_n: Floats) -> Floats:
     """Return the width of the loop at a force over the final one: 0 at 0 N, a half at 1 N."""
-    return np.asarray(1.0 - LOOP_OPENS_N / (np.abs(force_n) + LOOP_OPENS_N))
+    return np.asarray(1.0 - LOOP_HALF_WIDTH_FORCE_N / (np.abs(force_n) + LOOP_HALF_WIDTH_FORCE_N))
 
 
 def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:
@@ -238,7 +240,7 @@ def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) ->
     return all(c1 + u * (2 * c2 + u * 3 * c3) > 0.0 for u in places)
 
 
-def paper_eq2_shape() -> Calibration:
+def make_paper_eq2_preset() -> Calibration:
     """Make the preset of the paper's eq. 2 as a shape, for any tile, with an assumed scale.
 
     F = 0.13 p^3 + 0.02354 p^2 + 0.5702 p + 0.1309 has no stated units, and no reading in SI units
@@ -247,7 +249,7 @@ def paper_eq2_shape() -> Calibration:
     """
     coefficients = (0.1309, 0.5702, 0.02354, 0.13)
     full_scale = sum(coefficients[1:])
-    none = tuple(tuple(0.0 for _ in range(BASIS)) for _ in range(BASIS))
+    none = tuple(tuple(0.0 for _ in range(CUBIC_TERMS)) for _ in range(CUBIC_TERMS))
     tile = TileCalibration(
         serial=ANY_SERIAL,
         p_input="normalised",
@@ -279,7 +281,7 @@ def paper_eq2_shape() -> Calibration:
     )
 
 
-PRESETS = {"paper-eq2-shape": paper_eq2_shape}
+PRESETS = {"paper-eq2-shape": make_paper_eq2_preset}
 
 
 class BandPoint(CalibrationPart):
@@ -287,13 +289,13 @@ class BandPoint(CalibrationPart):
 
     gauge_kpa: Number
     force_n: Number
-    mean_n: NotNegative
+    mean_n: NonNegative
     """Half width for the mean curve."""
-    new_loading_n: NotNegative
+    new_loading_n: NonNegative
     """Half width for a reading in a single new loading."""
 
 
-class BenchFacts(CalibrationPart):
+class RigFacts(CalibrationPart):
     """Facts about the slow strokes of a curve's fit."""
 
     recordings: Annotated[int, Field(ge=1, lt=2**31)]
@@ -307,7 +309,7 @@ class BenchFacts(CalibrationPart):
     ended_by: Literal["load", "chip"]
     """"load": the spindle turned back before the tile saturated; "chip": its reading wrapped or
     stood still."""
-    tadc_counts: Number | None
+    temperature_raw_counts: Number | None
     """Chip's temperature in counts, unloaded; None: not recorded."""
     degc: Number | None
     """Chip's temperature, to a few degrees."""
@@ -315,7 +317,7 @@ class BenchFacts(CalibrationPart):
     """R2 of the cubic to the mean of all repeats and both branches, as in the paper."""
     repeat_gains: Annotated[tuple[Number, ...], Field(max_length=_ROWS_MAX)]
     """Force of each repeat over the curve's."""
-    baseline_drift_kpa: NotNegative
+    baseline_drift_kpa: NonNegative
     """Largest change of the unloaded pressure between repeats of a file, from the second on."""
     band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
     """Bands at ten equal steps from zero to the end of the range."""
@@ -324,11 +326,11 @@ class BenchFacts(CalibrationPart):
 class WeightStep(CalibrationPart):
     """Dead weight on a tile, and the tile's settled reading."""
 
-    weight: Label
+    weight: Identifier
     """Text of the marker: `500 g +-0.5 %`."""
     force_n: Number
     gauge_kpa: Number
-    noise_kpa: NotNegative
+    noise_kpa: NonNegative
     """Standard deviation of a reading."""
     settle_kpa: Number
     """Last second of the step less its first."""
@@ -340,14 +342,14 @@ class WeightFacts(CalibrationPart):
     """Facts about the dead weights of a curve's fit."""
 
     steps: Annotated[tuple[WeightStep, ...], Field(max_length=_ROWS_MAX)]
-    baseline_drift_kpa: NotNegative
+    baseline_drift_kpa: NonNegative
     """Largest change of the unloaded pressure since the first rest."""
-    scale_sigma: NotNegative
+    scale_sigma: NonNegative
     """Standard uncertainty of the weights' common scale, relative."""
     band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
     """Bands at ten equal steps; `new_loading_n` is for an estimate of a settled load."""
 
-    def half_width_n(self, gauge_kpa: float) -> float:
+    def interpolate_half_width_n(self, gauge_kpa: float) -> float:
         """Return the half width of the 95 % interval of a new loading at this pressure."""
         grid = [point.gauge_kpa for point in self.band_95]
         return float(np.interp(gauge_kpa, grid, [point.new_loading_n for point in self.band_95]))

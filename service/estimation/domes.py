@@ -22,8 +22,8 @@ relaxation of 5 to 42 ms ([D])."""
 BUBBLE_RADIUS_MM = 3.0
 """PAPER Table I, for the 11 mm dome; assumed for the others."""
 
-Basis = Literal["paper", "estimate"]
-Verdict = Literal["covers", "perhaps", "saturates"]
+RangeSource = Literal["paper", "estimate"]
+LoadVerdict = Literal["covers", "perhaps", "saturates"]
 
 
 @dataclass(frozen=True)
@@ -72,27 +72,29 @@ PAPER_RANGE_N = (25.0, 35.0)
 """Load at which that dome saturates its chip (PAPER III-A)."""
 
 
-def volume_left(
-    p1_kpa: float = SEAL_KPA, p2_kpa: float = PRESSURE_MAX_KPA, exponent: float = ISOTHERMAL
+def compute_volume_ratio(
+    initial_kpa: float = SEAL_KPA, final_kpa: float = PRESSURE_MAX_KPA, exponent: float = ISOTHERMAL
 ) -> float:
     """Return V2/V1 of a bubble that goes from p1 to p2: p1 V1^k = p2 V2^k.
 
     Slowly, k = 1, this is Boyle's law (PAPER eq. 1): 0.8696 is left at 115 kPa, 13 % are gone. Fast
     loads reach full scale earlier: k = 1.4 leaves 0.9050.
     """
-    return float((p1_kpa / p2_kpa) ** (1.0 / exponent))
+    return float((initial_kpa / final_kpa) ** (1.0 / exponent))
 
 
-def fast_share(p1_kpa: float = SEAL_KPA, exponent: float = ADIABATIC) -> float:
+def compute_fast_load_ratio(seal_kpa: float = SEAL_KPA, exponent: float = ADIABATIC) -> float:
     """Return the change of volume of a fast load at full scale over that of a slow one: 0.73.
 
     With volume proportional to force this is also the ratio of the loads ([D], estimate).
     """
-    fast = 1.0 - volume_left(p1_kpa, exponent=exponent)
-    return fast / (1.0 - volume_left(p1_kpa))
+    fast = 1.0 - compute_volume_ratio(seal_kpa, exponent=exponent)
+    return fast / (1.0 - compute_volume_ratio(seal_kpa))
 
 
-def give_per_kpa(dome: Dome, bubble_radius_mm: float = BUBBLE_RADIUS_MM) -> float:
+def compute_wall_compliance_per_kpa(
+    dome: Dome, bubble_radius_mm: float = BUBBLE_RADIUS_MM
+) -> float:
     """Return the compliance of the wall: part of the bubble's volume for a kPa of difference.
 
     Thick sphere of an incompressible rubber, 9 b^3 / (4 E (b^3 - a^3)): 0.00124 for Vytaflex 60,
@@ -102,52 +104,52 @@ def give_per_kpa(dome: Dome, bubble_radius_mm: float = BUBBLE_RADIUS_MM) -> floa
     return 9.0 * b3 / (4.0 * dome.material.modulus_mpa * 1e3 * (b3 - a3))
 
 
-def external_share(dome: Dome, p1_kpa: float = SEAL_KPA) -> float:
+def compute_ambient_transmission(dome: Dome, seal_kpa: float = SEAL_KPA) -> float:
     """Return the part of a change of the surrounding pressure that reaches the bubble.
 
     11 % in Vytaflex 60 and 28 % in Vytaflex 40, both of 11 mm ([D], estimate): weather, height, and
     the depth of mud. The gas' own stiffness is its pressure.
     """
-    given = give_per_kpa(dome) * p1_kpa
+    given = compute_wall_compliance_per_kpa(dome) * seal_kpa
     return given / (1.0 + given)
 
 
 @dataclass(frozen=True)
-class DomeRange:
+class SaturationLoad:
     """Range of slow loads at which a dome saturates its chip, with its source."""
 
     dome: Dome
     low_n: float
     high_n: float
-    basis: Basis
+    source: RangeSource
 
-    def verdict(self, load_n: float) -> Verdict:
+    def judge_load(self, load_n: float) -> LoadVerdict:
         """Return whether the dome covers a slow load without saturating."""
         if load_n <= self.low_n:
             return "covers"
         return "perhaps" if load_n <= self.high_n else "saturates"
 
 
-def range_of(dome: Dome) -> DomeRange:
+def compute_saturation_load(dome: Dome) -> SaturationLoad:
     """Return the saturation load: the paper's for its dome, else scaled by modulus and area.
 
     The scaling assumes the same shape and strain at full scale. It agrees with the paper in
     direction only: stiffer and larger domes shift the curve to higher force (PAPER Fig. 5).
     """
     if dome == PAPER_DOME:
-        return DomeRange(dome, *PAPER_RANGE_N, "paper")
+        return SaturationLoad(dome, *PAPER_RANGE_N, "paper")
     scale = (dome.material.modulus_mpa * dome.area_mm2) / (
         PAPER_DOME.material.modulus_mpa * PAPER_DOME.area_mm2
     )
-    return DomeRange(dome, scale * PAPER_RANGE_N[0], scale * PAPER_RANGE_N[1], "estimate")
+    return SaturationLoad(dome, scale * PAPER_RANGE_N[0], scale * PAPER_RANGE_N[1], "estimate")
 
 
-def ranges() -> list[DomeRange]:
+def list_saturation_loads() -> list[SaturationLoad]:
     """Return the saturation loads of all domes of Table I, weakest first."""
-    return sorted((range_of(dome) for dome in DOMES), key=lambda found: found.low_n)
+    return sorted((compute_saturation_load(dome) for dome in DOMES), key=lambda found: found.low_n)
 
 
-def dome_for(load_n: float) -> DomeRange | None:
+def select_dome_for_load(load_n: float) -> SaturationLoad | None:
     """Return the weakest dome that covers a slow load; it resolves the load best.
 
     If none does for certain, the weakest that perhaps does; None if all saturate.
@@ -158,7 +160,7 @@ def dome_for(load_n: float) -> DomeRange | None:
     if not load_n > 0.0:
         raise ValueError(f"a load of {load_n} N is no load")
     for verdict in ("covers", "perhaps"):
-        for found in ranges():
-            if found.verdict(load_n) == verdict:
+        for found in list_saturation_loads():
+            if found.judge_load(load_n) == verdict:
                 return found
     return None

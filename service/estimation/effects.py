@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from devices.arrays import Floats
-from devices.facts import Facts, Text
+from devices.types import StrictModel, Text
 
 WALL_PER_KPA = 0.00124
 """Compliance of the wall, part of the bubble's volume for a kPa: elastic estimate for Vytaflex 60
@@ -26,16 +26,16 @@ sphere's many, two terms for a spectrum, three plays for a continuum."""
 EffectName = Literal["temperature", "ambient", "gas", "rubber", "hysteresis"]
 
 
-_MOST = 1e12
+_NUMBER_MAX = 1e12
 """Bound beyond every quantity here, whose sums, products and cubes do not overflow."""
-Number = Annotated[float, Field(ge=-_MOST, le=_MOST)]
-NotNegative = Annotated[float, Field(ge=0, le=_MOST)]
-PARTS_MAX = 32
-Some = Field(max_length=PARTS_MAX)
+Number = Annotated[float, Field(ge=-_NUMBER_MAX, le=_NUMBER_MAX)]
+NonNegative = Annotated[float, Field(ge=0, le=_NUMBER_MAX)]
+TERMS_MAX = 32
+TermLimit = Field(max_length=TERMS_MAX)
 """Bound of the number of terms of a model."""
 
 
-class CalibrationPart(Facts):
+class CalibrationPart(StrictModel):
     """Base of the parts of a calibration file."""
 
 
@@ -43,7 +43,7 @@ class Parameter(CalibrationPart):
     """Fitted value with its standard uncertainty."""
 
     value: Number
-    sigma: NotNegative
+    sigma: NonNegative
 
     @property
     def interval_95(self) -> tuple[float, float]:
@@ -51,12 +51,12 @@ class Parameter(CalibrationPart):
         return self.value - 1.96 * self.sigma, self.value + 1.96 * self.sigma
 
 
-def values(parameters: Iterable[Parameter]) -> Floats:
+def parameter_values(parameters: Iterable[Parameter]) -> Floats:
     """Return the values of parameters without their uncertainties, (n,)."""
     return np.array([parameter.value for parameter in parameters])
 
 
-GAMMA_MOST = 5.0 / 3.0
+GAMMA_MAX = 5.0 / 3.0
 """Largest ratio of heat capacities of any gas, that of single atoms."""
 
 
@@ -65,12 +65,12 @@ class GasEffect(CalibrationPart):
 
     gamma: Parameter
     tau_s: Parameter
-    misfit: NotNegative
+    misfit: NonNegative
     """Part of the correction that the bench shows to be wrong, root mean square."""
 
     @model_validator(mode="after")
-    def _can_be_undone(self) -> Self:
-        if not (1.0 <= self.gamma.value <= GAMMA_MOST and self.tau_s.value > 0.0):
+    def _check_invertible(self) -> Self:
+        if not (1.0 <= self.gamma.value <= GAMMA_MAX and self.tau_s.value > 0.0):
             raise ValueError("a gas has a gamma of 1 to 5/3 and a tau above 0")
         return self
 
@@ -81,30 +81,30 @@ class RubberEffect(CalibrationPart):
     Curve as in `TileCalibration`, in the same variable and units.
     """
 
-    part: Annotated[tuple[Parameter, ...], Some]
-    tau_s: Annotated[tuple[Parameter, ...], Some]
+    part: Annotated[tuple[Parameter, ...], TermLimit]
+    tau_s: Annotated[tuple[Parameter, ...], TermLimit]
     coefficients: tuple[Number, Number, Number, Number]
     covariance: tuple[tuple[Number, ...], ...]
-    scatter: NotNegative
+    scatter: NonNegative
     """Standard deviation of a new loading's gauge pressure, relative."""
-    misfit: NotNegative
+    misfit: NonNegative
     """Part of the correction that the bench shows to be wrong, root mean square."""
-    curve_misfit_n: NotNegative
+    curve_misfit_n: NonNegative
     """Root mean square misfit of the cubic where slow strokes agree with one another."""
 
     @model_validator(mode="after")
-    def _can_be_undone(self) -> Self:
+    def _check_invertible(self) -> Self:
         if len(self.part) != len(self.tau_s) or not all(tau.value > 0.0 for tau in self.tau_s):
             raise ValueError("every creeping part has a time above 0")
-        _leave_something("creeping parts", self.part)
+        _check_fractions("creeping parts", self.part)
         return self
 
 
-PART_MOST = 0.4
+FLOW_FRACTION_MAX = 0.4
 """Largest part of a change of force for which the inversion always converges."""
-POWERS = (1.5, 10.0)
+FLOW_EXPONENT_RANGE = (1.5, 10.0)
 """Range of the flow's exponent: from nearly an exponential to nearly a play."""
-STRESS_LEAST_N = 0.01
+FLOW_STRESS_MIN_N = 0.01
 """Least stress of a branch that a recording shows."""
 
 
@@ -119,13 +119,15 @@ class FlowEffect(CalibrationPart):
     """Exponent of the flow over the force on the branch."""
 
     @model_validator(mode="after")
-    def _can_be_undone(self) -> Self:
-        if not (0.0 <= self.part.value <= PART_MOST and self.stress_n.value >= STRESS_LEAST_N):
+    def _check_invertible(self) -> Self:
+        if not (
+            0.0 <= self.part.value <= FLOW_FRACTION_MAX and self.stress_n.value >= FLOW_STRESS_MIN_N
+        ):
             raise ValueError(
-                f"a branch that flows has a part of 0 to {PART_MOST:g} and bears "
-                f"{STRESS_LEAST_N:g} N or more"
+                f"a branch that flows has a part of 0 to {FLOW_FRACTION_MAX:g} and bears "
+                f"{FLOW_STRESS_MIN_N:g} N or more"
             )
-        least, most = POWERS
+        least, most = FLOW_EXPONENT_RANGE
         if not least <= self.power.value <= most:
             raise ValueError(f"a branch flows with a power of {least:g} to {most:g}")
         return self
@@ -134,16 +136,16 @@ class FlowEffect(CalibrationPart):
 class HysteresisEffect(CalibrationPart):
     """Parameters of the model `hysteresis`: weights of its plays, and a viscous branch or None."""
 
-    part: Annotated[tuple[Parameter, ...], Some]
+    part: Annotated[tuple[Parameter, ...], TermLimit]
     flow: FlowEffect | None = None
 
     @model_validator(mode="after")
-    def _can_be_undone(self) -> Self:
-        _leave_something("parts of the plays", self.part)
+    def _check_invertible(self) -> Self:
+        _check_fractions("parts of the plays", self.part)
         return self
 
     @model_serializer(mode="wrap")
-    def _without_a_branch_as_before(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _serialize_without_flow(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Omit an absent branch, so that ids of older calibrations stay the same."""
         content: dict[str, Any] = written(self)
         if self.flow is None:
@@ -162,13 +164,13 @@ class TemperatureEffect(CalibrationPart):
     """Compliance of the wall, part of the volume for a kPa, from the rise's deficit below p/T."""
 
     @model_validator(mode="after")
-    def _can_be_undone(self) -> Self:
+    def _check_invertible(self) -> Self:
         if not self.kpa_per_k.value > 0.0:
             raise ValueError("a sealed gas has a rise per kelvin above 0")
         return self
 
 
-LATE_MOST_S = 60.0
+SAMPLE_DELAY_MAX_S = 60.0
 """Largest delay of a sample, so that instants fit into 64 bits."""
 
 
@@ -182,18 +184,18 @@ class Effects(CalibrationPart):
     late_s: Parameter | None = None
     """Delay of the tile's samples behind the instants in its frames: the data sheet does not say
     where in a conversion the chip samples. None: not determined, for want of fast loads."""
-    late_common_s: NotNegative = 0.0
-    """Standard uncertainty that all tiles' `late_s` share, by the reference's own delay."""
+    late_common_s: NonNegative = 0.0
+    """Standard uncertainty that all tiles' `residual_lag_s` share, by the reference's own delay."""
     reference_late_s: Number = 0.0
-    """Assumed delay of the reference; the rig measured the sum of `late_s` and this."""
-    at_bound: Annotated[tuple[Text, ...], Some] = ()
+    """Assumed delay of the reference; the rig measured the sum of `residual_lag_s` and this."""
+    at_bound: Annotated[tuple[Text, ...], TermLimit] = ()
     """Parameters at a bound."""
     refused: dict[EffectName, Text] = Field(default={})
 
     @model_validator(mode="after")
-    def _is_read_in_its_frame(self) -> Self:
-        if self.late_s is not None and abs(self.late_s.value) > LATE_MOST_S:
-            raise ValueError(f"a tile is sampled {LATE_MOST_S:g} s from its frame at most")
+    def _check_sample_delay(self) -> Self:
+        if self.late_s is not None and abs(self.late_s.value) > SAMPLE_DELAY_MAX_S:
+            raise ValueError(f"a tile is sampled {SAMPLE_DELAY_MAX_S:g} s from its frame at most")
         return self
 
     @property
@@ -202,6 +204,6 @@ class Effects(CalibrationPart):
         return WALL_PER_KPA if self.temperature is None else self.temperature.wall_per_kpa.value
 
 
-def _leave_something(what: str, parts: tuple[Parameter, ...]) -> None:
+def _check_fractions(what: str, parts: tuple[Parameter, ...]) -> None:
     if not all(part.value >= 0.0 for part in parts) or sum(part.value for part in parts) >= 1.0:
         raise ValueError(f"{what} are 0 or more, and in sum below 1: else no force follows")

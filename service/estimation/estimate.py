@@ -1,6 +1,6 @@
 """Estimator: frames to estimates, with one code path for ten rows live and ten million offline.
 
-`step` returns the estimates that are due, `finish` the remaining ones. Estimates come a
+`process_frames` returns the estimates that are due, `finish` the remaining ones. Estimates come a
 look-ahead later than their frames, in order, exactly one per frame. Any batches of a recording give
 the same bits: one compiled function works frame by frame and tile by tile, and its state is in
 records.
@@ -15,26 +15,37 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Times
-from devices.compiled import compiled, inlined
 from devices.frames import FrameBatch
-from service.estimation.estimates import Estimates, EstimateStatus
-from service.estimation.foot import UNKNOWN
-from service.estimation.foot.contact import has_lasted
-from service.estimation.foot.geometry import to_ground_x_m
-from service.estimation.foot.kinematics import counts_at
-from service.estimation.ladder import whole
-from service.estimation.ladder.laws import Laws, make_laws
-from service.estimation.ladder.lower import feel
-from service.estimation.ladder.plan import EstimationPlan
-from service.estimation.ladder.room import ROWS_LEAST, Room, TileSample, make_room, moved
-from service.estimation.ladder.state import FootState, TileState, at_rest
-from service.estimation.ladder.taken import take
-from service.estimation.ladder.upper import BORNE, BOUND_SIGMAS, TileForce, bear
+from devices.jit import jit_cached, jit_inlined
+from service.estimation.estimates import EstimateFlag, Estimates
+from service.estimation.foot import CONTACT_UNKNOWN
+from service.estimation.foot.contact import is_debounced
+from service.estimation.foot.geometry import transform_to_ground_x_m
+from service.estimation.foot.kinematics import interpolate_servo_counts
 from service.estimation.models import denoise
+from service.estimation.pipeline import grf_cop
+from service.estimation.pipeline.counts import load_frames
+from service.estimation.pipeline.frame_buffer import (
+    ROWS_MIN,
+    FrameBuffer,
+    TileSample,
+    compact,
+    make_frame_buffer,
+)
+from service.estimation.pipeline.params import KernelParams, make_kernel_params
+from service.estimation.pipeline.plan import EstimationPlan
+from service.estimation.pipeline.sample_stage import compute_apparent_forces
+from service.estimation.pipeline.smoothing_stage import (
+    BOUND_SIGMAS,
+    TILE_FORCE,
+    TileForce,
+    compute_tile_forces,
+)
+from service.estimation.pipeline.state import FootState, TileState, initial_state
 from service.estimation.records import Columns, RecordArray, as_bytes
 
-_COP_MASKED = int(EstimateStatus.COP_MASKED)
-_AFTER_SATURATION = int(EstimateStatus.AFTER_SATURATION)
+_COP_MASKED = int(EstimateFlag.COP_MASKED)
+_AFTER_SATURATION = int(EstimateFlag.AFTER_SATURATION)
 _GAUGE, _FORCE, _SIGMA = range(3)
 
 _C_CONTIGUOUS, _ALIGNED, _WRITEABLE = 0x1, 0x100, 0x400  # numpy's own, of `flags.num`
@@ -44,18 +55,18 @@ _COLUMNS = (
     "seq",
     "t_mono_ns",
     "t_ns",
-    "padc",
-    "tadc",
+    "pressure_raw",
+    "temperature_raw",
     "sample_offset_us",
     "servo_counts",
     "servo_age_us",
-    "status",
-    "frame_status",
+    "tile_flags",
+    "frame_flags",
 )
-"""Columns of frames, in the order of the parameters of `_step`."""
-_ROWS = ("release_row", "sample_row", "end_row")
+"""Columns of frames, in the order of the parameters of `_compute_step`."""
+_ROW_FIELDS = ("release_row", "sample_row", "end_row")
 """Rows of the buffer in `FootState`."""
-Answers = tuple[
+KernelOutput = tuple[
     npt.NDArray[np.uint64],
     Times,
     Floats,
@@ -74,14 +85,14 @@ class Estimator:
 
     def __init__(self, plan: EstimationPlan) -> None:
         self.plan = plan
-        self._params = make_laws(plan)
+        self._params = make_kernel_params(plan)
         tiles = len(plan.info.tiles)
-        self._foot_state, self._tile_states = at_rest(tiles)
-        self._buffer = make_room(ROWS_LEAST, tiles)
-        axes = zip(whole.ALONG, plan.cop_measured, strict=True)
+        self._foot_state, self._tile_states = initial_state(tiles)
+        self._buffer = make_frame_buffer(ROWS_MIN, tiles)
+        axes = zip(grf_cop.COLUMNS_BY_AXIS, plan.cop_measured, strict=True)
         self._unmeasured = [row for rows, is_measured in axes if not is_measured for row in rows]
 
-    def step(self, frames: FrameBatch) -> Estimates:
+    def process_frames(self, frames: FrameBatch) -> Estimates:
         """Process the next frames, in order; return the estimates that are due.
 
         Args:
@@ -99,69 +110,69 @@ class Estimator:
         if frames.tile_count != tiles:
             raise ValueError(f"frames of {frames.tile_count} tiles, a plan of {tiles}")
         if self._foot_state["end_row"][0] + n > len(self._buffer.rows):
-            self._make_room(n)
-        columns = [_as_compiled(getattr(frames, name)) for name in _COLUMNS]
+            self._compact_buffer(n)
+        columns = [_to_compiled_layout(getattr(frames, name)) for name in _COLUMNS]
         output = _step(self._params, self._foot_state, self._tile_states, self._buffer, *columns)
-        return _estimates(output, self._unmeasured)
+        return _make_estimates(output, self._unmeasured)
 
     def finish(self) -> Estimates | None:
         """Return the estimates that still wait for their look-ahead; None if there are none."""
         if self._foot_state["release_row"][0] == self._foot_state["end_row"][0]:
             return None
         output = _finish(self._params, self._foot_state, self._tile_states, self._buffer)
-        return _estimates(output, self._unmeasured)
+        return _make_estimates(output, self._unmeasured)
 
-    def kept(self) -> Columns:
-        """Return a copy of its state for `going_on`; records as their bytes."""
-        self._make_room(0)  # drops rows that nothing reaches back to
-        return {name: as_bytes(column).copy() for name, column in self._memory().items()}
+    def state_dict(self) -> Columns:
+        """Return a copy of its state for `from_state`; records as their bytes."""
+        self._compact_buffer(0)  # drops rows that nothing reaches back to
+        return {name: as_bytes(column).copy() for name, column in self._state_columns().items()}
 
     @classmethod
-    def going_on(cls, plan: EstimationPlan, kept: Columns) -> Self:
+    def from_state(cls, plan: EstimationPlan, state: Columns) -> Self:
         """Make an estimator that continues from a state, with the bits of an uninterrupted one.
 
         Args:
             plan: plan of the estimator that the state comes from.
-            kept: answer of `kept`, of the same version.
+            state: answer of `kept`, of the same version.
 
         Raises:
             ValueError: the state is of another plan; compiled code would read beyond its memory.
         """
         new = cls(plan)
-        rows = len(kept["t_mono_ns"])
-        new._buffer = make_room(max(ROWS_LEAST, rows), len(new._tile_states))
+        rows = len(state["t_mono_ns"])
+        new._buffer = make_frame_buffer(max(ROWS_MIN, rows), len(new._tile_states))
         new._foot_state["end_row"] = rows
-        for name, column in new._memory().items():
-            memory, given = as_bytes(column), kept[name]
+        for name, column in new._state_columns().items():
+            memory, given = as_bytes(column), state[name]
             if (given.dtype, given.shape) != (memory.dtype, memory.shape):
                 raise ValueError(f"{name} is {given.dtype}{given.shape}, not {memory.shape}")
             memory[...] = given
-        due, sample, end = (int(new._foot_state[name][0]) for name in _ROWS)
+        due, sample, end = (int(new._foot_state[name][0]) for name in _ROW_FIELDS)
         if not 0 <= due <= sample <= end == rows:
             raise ValueError(f"its rows are {due}, {sample}, {end} of {rows}")
         return new
 
-    def _memory(self) -> Columns:
+    def _state_columns(self) -> Columns:
         end = int(self._foot_state["end_row"][0])
         rows = {name: column[:end] for name, column in self._buffer._asdict().items()}
         states = {"foot_state": self._foot_state, "tile_states": self._tile_states}
         return cast("Columns", {**states, **rows})
 
-    def _make_room(self, more: int) -> None:
-        due, sample, end = (int(self._foot_state[name][0]) for name in _ROWS)
+    def _compact_buffer(self, new_rows: int) -> None:
+        due, sample, end = (int(self._foot_state[name][0]) for name in _ROW_FIELDS)
         first = min(due, max(sample - 1, 0))
-        if self.plan.ladder.denoise and end:
+        if self.plan.model_set.has_denoise and end:
             t_mono_ns = self._buffer.t_mono_ns[:end]
             # The next frame may not be here yet; it will be no earlier than the last that is.
             oldest_ns = t_mono_ns[min(due, end - 1)] - denoise.PAST_NS
             within = int(np.searchsorted(t_mono_ns, oldest_ns))
-            first = min(first, max(within, due - int(denoise.REACHES[-1])))
-        self._buffer = moved(self._buffer, first, end, more)
-        for name in _ROWS:
+            first = min(first, max(within, due - int(denoise.WINDOW_REACHES[-1])))
+        self._buffer = compact(self._buffer, first, end, new_rows)
+        for name in _ROW_FIELDS:
             self._foot_state[name] -= first
 
 
-def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _to_compiled_layout(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return a column in row order, aligned and read-only: compiled for that only."""
     if column.flags.num & _LAYOUT == _COMPILED_LAYOUT:
         return column
@@ -170,8 +181,8 @@ def _as_compiled(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return column
 
 
-def _estimates(answers: Answers, unmeasured: list[int]) -> Estimates:
-    seq, t_ns, by_tile, by_frame, contact, status = answers
+def _make_estimates(output: KernelOutput, unmeasured: list[int]) -> Estimates:
+    seq, t_ns, by_tile, by_frame, contact, status = output
     # Afterwards: masking of the centre of pressure needs the row's position.
     by_frame[unmeasured] = math.nan
     return Estimates(
@@ -180,29 +191,29 @@ def _estimates(answers: Answers, unmeasured: list[int]) -> Estimates:
         gauge_kpa=by_tile[_GAUGE],
         force_n=by_tile[_FORCE],
         force_sigma_n=by_tile[_SIGMA],
-        grf_n=by_frame[whole.GRF],
-        grf_sigma_n=by_frame[whole.GRF_SIGMA],
-        grf_at_least_n=by_frame[whole.AT_LEAST],
-        cop_x_m=by_frame[whole.X],
-        cop_y_m=by_frame[whole.Y],
-        cop_sigma_x_m=by_frame[whole.SIGMA_X],
-        cop_sigma_y_m=by_frame[whole.SIGMA_Y],
-        cop_index_x=by_frame[whole.INDEX_X],
-        cop_index_y=by_frame[whole.INDEX_Y],
-        cop_ground_x_m=by_frame[whole.GROUND_X],
-        cop_ground_y_m=by_frame[whole.GROUND_Y],
-        angle_rad=by_frame[whole.ANGLE],
+        grf_n=by_frame[grf_cop.GRF],
+        grf_sigma_n=by_frame[grf_cop.GRF_SIGMA],
+        grf_lower_bound_n=by_frame[grf_cop.GRF_LOWER_BOUND],
+        cop_x_m=by_frame[grf_cop.COP_X],
+        cop_y_m=by_frame[grf_cop.COP_Y],
+        cop_sigma_x_m=by_frame[grf_cop.COP_SIGMA_X],
+        cop_sigma_y_m=by_frame[grf_cop.COP_SIGMA_Y],
+        cop_index_x=by_frame[grf_cop.COP_INDEX_X],
+        cop_index_y=by_frame[grf_cop.COP_INDEX_Y],
+        cop_ground_x_m=by_frame[grf_cop.COP_GROUND_X],
+        cop_ground_y_m=by_frame[grf_cop.COP_GROUND_Y],
+        angle_rad=by_frame[grf_cop.FOOT_ANGLE],
         contact=contact,
-        estimate_status=status,
+        estimate_flags=status,
     )
 
 
-@compiled
+@jit_cached
 def _step(
-    params: Laws,
+    params: KernelParams,
     foot_states: RecordArray[FootState],
     tile_states: RecordArray[TileState],
-    buffer: Room,
+    buffer: FrameBuffer,
     seq: npt.NDArray[np.uint64],
     t_mono_ns: Times,
     t_ns: Times,
@@ -213,53 +224,53 @@ def _step(
     servo_age_us: npt.NDArray[np.int32],
     tile_flags: npt.NDArray[np.uint8],
     frame_flags: npt.NDArray[np.uint8],
-) -> Answers:
+) -> KernelOutput:
     foot_params, foot_state = params.foot[0], foot_states[0]
-    take(
+    load_frames(
         params, foot_state, tile_states, buffer, seq, t_mono_ns, t_ns, pressure_raw,
         temperature_raw, sample_offset_us, servo_counts, servo_age_us, tile_flags, frame_flags,
     )  # fmt: skip
     # With look-ahead and averages, a frame waits for the next one, for outlier replacement.
     while foot_state.sample_row < foot_state.end_row - foot_params.waits_for_next:
-        feel(params, foot_state, tile_states, buffer, foot_state.sample_row)
+        compute_apparent_forces(params, foot_state, tile_states, buffer, foot_state.sample_row)
         foot_state.sample_row += 1
     until, due_ns = foot_state.release_row, foot_state.newest_ns - foot_params.lag_ns
     while until < foot_state.sample_row and buffer.t_mono_ns[until] <= due_ns:
         until += 1
-    return _released(params, foot_state, tile_states, buffer, until)
+    return _estimate_due_rows(params, foot_state, tile_states, buffer, until)
 
 
-@compiled
+@jit_cached
 def _finish(
-    params: Laws,
+    params: KernelParams,
     foot_states: RecordArray[FootState],
     tile_states: RecordArray[TileState],
-    buffer: Room,
-) -> Answers:
+    buffer: FrameBuffer,
+) -> KernelOutput:
     foot_state = foot_states[0]
     while foot_state.sample_row < foot_state.end_row:
-        feel(params, foot_state, tile_states, buffer, foot_state.sample_row)
+        compute_apparent_forces(params, foot_state, tile_states, buffer, foot_state.sample_row)
         foot_state.sample_row += 1
-    return _released(params, foot_state, tile_states, buffer, foot_state.end_row)
+    return _estimate_due_rows(params, foot_state, tile_states, buffer, foot_state.end_row)
 
 
-@inlined
-def _released(
-    params: Laws,
+@jit_inlined
+def _estimate_due_rows(
+    params: KernelParams,
     foot_state: FootState,
     tile_states: RecordArray[TileState],
-    buffer: Room,
+    buffer: FrameBuffer,
     until: int,
-) -> Answers:
+) -> KernelOutput:
     """Estimate the rows up to `until`, whose look-ahead is complete."""
     foot_params, count = params.foot[0], len(tile_states)
     n = until - foot_state.release_row
     seq, t_ns = np.empty(n, np.uint64), np.empty(n, np.int64)
     by_tile = np.full((3, n, count), math.nan)
-    by_frame = np.full((whole.COLUMNS, n), math.nan)
+    by_frame = np.full((grf_cop.N_COLUMNS, n), math.nan)
     contact, flags = np.empty(n, np.uint8), np.empty(n, np.uint16)
-    out, windows = np.empty(whole.COLUMNS), denoise.scratch_of_windows()
-    forces: RecordArray[TileForce] = np.zeros(count, BORNE)
+    out, windows = np.empty(grf_cop.N_COLUMNS), denoise.allocate_scratch()
+    forces: RecordArray[TileForce] = np.zeros(count, TILE_FORCE)
     # Without look-ahead the next frame is not there, and may be of the same instant.
     look_ns = foot_params.lookahead_ns if foot_params.waits_for_next == 1 else -1
     rows = (foot_state.release_row, foot_state.release_row)
@@ -272,32 +283,32 @@ def _released(
         row = buffer.rows[i]
         out[:] = math.nan
         if foot_params.has_denoise == 1:
-            rows = denoise.in_sight(buffer.t_mono_ns, i, 0, end, rows, look_ns)
-        unsettled = bear(params, tile_states, buffer, i, rows, windows, forces)
+            rows = denoise.find_window_limits(buffer.t_mono_ns, i, 0, end, rows, look_ns)
+        unsettled = compute_tile_forces(params, tile_states, buffer, i, rows, windows, forces)
         if foot_params.has_servo == 1:
-            counts = counts_at(buffer.readings, i, end, lookahead_ns)
-            out[whole.ANGLE] = (counts - foot_params.zero_counts) * foot_params.rad_per_count
-        whole.push(params, forces, out[whole.ANGLE])
-        whole.stand(params, forces, out)
+            counts = interpolate_servo_counts(buffer.readings, i, end, lookahead_ns)
+            out[grf_cop.FOOT_ANGLE] = (counts - foot_params.zero_counts) * foot_params.rad_per_count
+        grf_cop.set_vertical_fractions(params, forces, out[grf_cop.FOOT_ANGLE])
+        grf_cop.compute_grf_cop(params, forces, out)
         min_ns = foot_params.contact_min_ns
-        if has_lasted(buffer.since_ns, buffer.t_mono_ns, i, end, min_ns, lookahead_ns):
+        if is_debounced(buffer.since_ns, buffer.t_mono_ns, i, end, min_ns, lookahead_ns):
             foot_state.is_contact = row.is_loaded
         in_contact = foot_state.is_contact == 1
-        masked = whole.is_masked(params, out) or not in_contact
+        masked = grf_cop.is_cop_masked(params, out) or not in_contact
         # A lower bound can prove contact, and never its absence.
-        is_proven = in_contact and out[whole.AT_LEAST] >= foot_params.contact_bound_n
-        is_known = not math.isnan(out[whole.GRF]) or is_proven
+        is_proven = in_contact and out[grf_cop.GRF_LOWER_BOUND] >= foot_params.contact_bound_n
+        is_known = not math.isnan(out[grf_cop.GRF]) or is_proven
         if masked:
-            out[whole.X : whole.ANGLE] = math.nan
+            out[grf_cop.COP_X : grf_cop.FOOT_ANGLE] = math.nan
         else:
-            _place(params, buffer.samples[i], out)
+            _compute_cop_positions(params, buffer.samples[i], out)
         for j in range(count):
             by_tile[_GAUGE, k, j] = buffer.samples[i, j].gauge_kpa
             if params.tiles[j].is_load_bearing == 1:
-                by_tile[_FORCE, k, j], by_tile[_SIGMA, k, j] = _stated(forces[j])
+                by_tile[_FORCE, k, j], by_tile[_SIGMA, k, j] = _force_or_bound(forces[j])
         by_frame[:, k] = out
         seq[k], t_ns[k] = row.seq, row.t_ns
-        contact[k] = foot_state.is_contact if is_known else UNKNOWN
+        contact[k] = foot_state.is_contact if is_known else CONTACT_UNKNOWN
         flags[k] = (
             row.flags | (_COP_MASKED if masked else 0) | (_AFTER_SATURATION if unsettled else 0)
         )
@@ -305,21 +316,26 @@ def _released(
     return seq, t_ns, by_tile, by_frame, contact, flags
 
 
-@inlined
-def _place(params: Laws, samples: RecordArray[TileSample], out: Floats) -> None:
+@jit_inlined
+def _compute_cop_positions(
+    params: KernelParams, samples: RecordArray[TileSample], out: Floats
+) -> None:
     """Compute the grid indices of the COP, and its position on the ground."""
     foot_params = params.foot[0]
     if foot_params.has_grid == 1:
-        whole.note_index(params, samples, out)
+        grf_cop.compute_cop_index(params, samples, out)
     if foot_params.has_servo == 1 and not math.isnan(foot_params.travel_m_per_rad):
-        out[whole.GROUND_X] = to_ground_x_m(
-            out[whole.X], out[whole.Z], out[whole.ANGLE], foot_params.travel_m_per_rad
+        out[grf_cop.COP_GROUND_X] = transform_to_ground_x_m(
+            out[grf_cop.COP_X],
+            out[grf_cop.COP_Z],
+            out[grf_cop.FOOT_ANGLE],
+            foot_params.travel_m_per_rad,
         )
-        out[whole.GROUND_Y] = out[whole.Y]
+        out[grf_cop.COP_GROUND_Y] = out[grf_cop.COP_Y]
 
 
-@compiled
-def _stated(force: TileForce) -> tuple[float, float]:
+@jit_cached
+def _force_or_bound(force: TileForce) -> tuple[float, float]:
     """Return a tile's force and sigma, or a bound that the truth exceeds in 99 of 100 frames."""
     if force.is_saturated == 1:
         return force.force_n - BOUND_SIGMAS * force.sigma_n, math.nan

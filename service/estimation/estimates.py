@@ -8,14 +8,14 @@ from enum import IntFlag
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Arrays, Floats, Times
+from devices.arrays import ArrayRecord, Floats, Times
 
-INTERVAL_95 = 1.96
+SIGMAS_95 = 1.96
 """Sigmas to each side of a 95 % interval."""
 
 
-class EstimateStatus(IntFlag):
-    """Bits of `Estimates.estimate_status`, one value per frame."""
+class EstimateFlag(IntFlag):
+    """Bits of `Estimates.estimate_flags`, one value per frame."""
 
     SATURATED = 1
     """A tile is beyond its range: its force is a lower bound, and so is the GRF."""
@@ -49,8 +49,8 @@ class EstimateStatus(IntFlag):
 
 
 @dataclass(frozen=True)
-class Estimates(Arrays):
-    """Estimates of n frames; the columns of `storage.schema.ESTIMATES` in float64.
+class Estimates(ArrayRecord):
+    """Estimates of n frames; the columns of `storage.schema.ESTIMATE_COLUMNS` in float64.
 
     Arrays are (n,), those of tiles (n, tiles). Undefined is NaN, contact 255.
     """
@@ -62,7 +62,7 @@ class Estimates(Arrays):
     force_sigma_n: Floats
     grf_n: Floats
     grf_sigma_n: Floats
-    grf_at_least_n: Floats
+    grf_lower_bound_n: Floats
     cop_x_m: Floats
     cop_y_m: Floats
     cop_sigma_x_m: Floats
@@ -73,7 +73,7 @@ class Estimates(Arrays):
     cop_ground_y_m: Floats
     angle_rad: Floats
     contact: npt.NDArray[np.uint8]
-    estimate_status: npt.NDArray[np.uint16]
+    estimate_flags: npt.NDArray[np.uint16]
 
     def __len__(self) -> int:
         return len(self.seq)

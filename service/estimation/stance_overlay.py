@@ -17,14 +17,14 @@ import numpy.typing as npt
 
 from devices.arrays import Floats, Times
 
-OVERLAID = ("grf_n", "cop_x_m", "cop_y_m")
+OVERLAY_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")
 """Columns of estimates in the overlay."""
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class Spread:
+class CurveStatistics:
     """Statistics of one quantity over all stances, (points,) each.
 
     Attributes:
@@ -43,24 +43,24 @@ class Overlay:
     """Overlay of stances.
 
     Attributes:
-        spread: statistics by column.
+        statistics: statistics by column.
         rows: (k,), indices of the stances with single curves.
         curves: by column, (k, points), these curves.
     """
 
-    spread: Mapping[str, Spread]
+    statistics: Mapping[str, CurveStatistics]
     rows: npt.NDArray[np.int64]
     curves: Mapping[str, Floats]
 
 
-def evenly(count: int, most: int) -> npt.NDArray[np.int64]:
+def select_evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
     """Select at most `most` of `count` rows: the first, the last, and evenly in between."""
-    if count <= most:
+    if count <= max_count:
         return np.arange(count)
-    return np.round(np.linspace(0, count - 1, most)).astype(np.int64)
+    return np.round(np.linspace(0, count - 1, max_count)).astype(np.int64)
 
 
-def normalised(t_ns: Times, values: Floats, points: int) -> Floats:
+def resample_stance(t_ns: Times, values: Floats, points: int) -> Floats:
     """Resample one stance at `points` percentages from 0 to 100, (points, ...).
 
     Args:
@@ -80,7 +80,7 @@ def normalised(t_ns: Times, values: Floats, points: int) -> Floats:
     return np.asarray(np.where(part <= 0.0, low, between))
 
 
-class StanceOverlay:
+class StanceOverlayBuilder:
     """Accumulator of stances from consecutive frames; the result does not depend on the batches.
 
     It stores sums, and the curves of some stances: its memory does not grow with their number.
@@ -112,40 +112,43 @@ class StanceOverlay:
         self._points = points
         self._wanted = frozenset(int(row) for row in rows)
         self._kept: list[tuple[int, Floats]] = []
-        shape = (points, len(OVERLAID))
+        shape = (points, len(OVERLAY_COLUMNS))
         self._count = np.zeros(shape, np.int64)
         self._mean, self._squares = np.zeros(shape), np.zeros(shape)
 
-    def feed(self, t_ns: Times, columns: Columns) -> None:
+    def add_frames(self, t_ns: Times, columns: Columns) -> None:
         """Add the next n frames.
 
         Args:
             t_ns: (n,), instants, rising within a part.
-            columns: `OVERLAID`, (n,) each; `part`, 0 if absent.
+            columns: `OVERLAY_COLUMNS`, (n,) each; `part`, 0 if absent.
         """
         if not len(t_ns) or self._next >= len(self._windows):
             return
         part = columns["part"] if "part" in columns else np.zeros(len(t_ns), np.uint16)
-        values = np.stack([columns[name].astype(np.float64) for name in OVERLAID], axis=1)
+        values = np.stack([columns[name].astype(np.float64) for name in OVERLAY_COLUMNS], axis=1)
         edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(part)]
         for first, end in pairwise(edges):
-            self._feed_part(int(part[first]), t_ns[first:end], values[first:end])
+            self._add_part_frames(int(part[first]), t_ns[first:end], values[first:end])
 
-    def finish(self) -> Overlay:
+    def build_overlay(self) -> Overlay:
         """Return the overlay of all stances that are complete."""
         known = self._count > 0
         mean = np.where(known, self._mean, np.nan)
         several = self._count > 1
         sd = np.sqrt(np.where(several, self._squares / np.maximum(1, self._count - 1), np.nan))
         spread = {
-            name: Spread(mean[:, i], sd[:, i], self._count[:, i]) for i, name in enumerate(OVERLAID)
+            name: CurveStatistics(mean[:, i], sd[:, i], self._count[:, i])
+            for i, name in enumerate(OVERLAY_COLUMNS)
         }
         rows = np.array([row for row, _ in self._kept], np.int64)
-        empty = np.empty((0, self._points, len(OVERLAID)))
+        empty = np.empty((0, self._points, len(OVERLAY_COLUMNS)))
         curves = np.stack([curve for _, curve in self._kept]) if self._kept else empty
-        return Overlay(spread, rows, {name: curves[:, :, i] for i, name in enumerate(OVERLAID)})
+        return Overlay(
+            spread, rows, {name: curves[:, :, i] for i, name in enumerate(OVERLAY_COLUMNS)}
+        )
 
-    def _feed_part(self, part: int, t_ns: Times, values: Floats) -> None:
+    def _add_part_frames(self, part: int, t_ns: Times, values: Floats) -> None:
         while self._next < len(self._windows):
             of, begin_ns, end_ns = self._windows[self._next]
             if of != part or begin_ns > t_ns[-1]:
@@ -157,14 +160,14 @@ class StanceOverlay:
             self._open.append((t_ns[rows], values[rows]))
             if t_ns[-1] < end_ns:
                 return
-            self._close()
+            self._add_stance()
 
-    def _close(self) -> None:
+    def _add_stance(self) -> None:
         row, pieces = self._next, self._open
         self._next, self._open = row + 1, []
         t_ns = np.concatenate([piece for piece, _ in pieces])
         values = np.concatenate([piece for _, piece in pieces])
-        curve = normalised(t_ns, values, self._points)
+        curve = resample_stance(t_ns, values, self._points)
         if row in self._wanted:
             self._kept.append((row, curve))
         # Welford (1962): no cancellation for any number of stances.

@@ -1,7 +1,7 @@
 """Stances: contacts of the foot with the ground, from estimates.
 
 The only definition of a stance: a run of frames whose `contact` is 1, with the frames of unknown
-contact in between. During a gap longer than `UNSEEN_NS`, or a restart of the node, the foot may
+contact in between. During a gap longer than `LONG_GAP_NS`, or a restart of the node, the foot may
 have been lifted: the stance is cut there, and another one begins.
 """
 
@@ -16,17 +16,24 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Times
-from service.estimation.estimates import INTERVAL_95, EstimateStatus
-from service.estimation.foot import UNKNOWN, UNSEEN_NS
+from service.estimation.estimates import SIGMAS_95, EstimateFlag
+from service.estimation.foot import CONTACT_UNKNOWN, LONG_GAP_NS
 
-GATHERED = ("contact", "grf_n", "grf_sigma_n", "cop_x_m", "cop_sigma_x_m", "estimate_status")
+STANCE_INPUT_COLUMNS = (
+    "contact",
+    "grf_n",
+    "grf_sigma_n",
+    "cop_x_m",
+    "cop_sigma_x_m",
+    "estimate_flags",
+)
 """Columns of estimates that stances need; with several parts also `part`."""
 
 STANCE_COLUMNS = (
     *("number", "part", "begin_t_ns", "end_t_ns", "duration_s", "duration_sigma_s"),
     *("peak_grf_n", "peak_t_ns", "peak_sigma_n", "impulse_n_s", "impulse_sigma_n_s"),
     *("cop_x_first_m", "cop_x_last_m", "cop_x_range_m", "cop_x_range_sigma_m"),
-    *("frames", "unknown_frames", "missing_frames", "estimate_status"),
+    *("frames", "unknown_frames", "missing_frames", "estimate_flags"),
     *("begun", "ended", "is_whole"),
 )
 """Columns of a table of stances."""
@@ -66,7 +73,7 @@ class Stance:
         frames: number of frames from the first to the last.
         unknown_frames: number of these without a GRF.
         missing_frames: number of missing frames between the first and the last.
-        estimate_status: union of the flags of its frames.
+        estimate_flags: union of the flags of its frames.
         begun: the frame before exists and is without contact.
         ended: the frame after it likewise.
     """
@@ -88,7 +95,7 @@ class Stance:
     frames: int
     unknown_frames: int
     missing_frames: int
-    estimate_status: int
+    estimate_flags: int
     begun: bool
     ended: bool
 
@@ -107,13 +114,13 @@ class Stance:
         return {name: getattr(self, name) for name in STANCE_COLUMNS}
 
 
-def stances_of(seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) -> list[Stance]:
-    """Compute the stances of a complete recording; arguments as of `Stances.feed`."""
-    gathered = Stances()
-    return [*gathered.feed(seq, t_ns, columns), *gathered.finish()]
+def compute_stances(seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) -> list[Stance]:
+    """Compute the stances of a complete recording; arguments as of `StanceDetector.add_frames`."""
+    gathered = StanceDetector()
+    return [*gathered.add_frames(seq, t_ns, columns), *gathered.finish()]
 
 
-class Stances:
+class StanceDetector:
     """Detector of stances in consecutive frames; the result does not depend on the batches.
 
     It stores sums and no frames: its memory does not grow with the length of a stance.
@@ -121,55 +128,58 @@ class Stances:
 
     def __init__(self) -> None:
         self._seen: _Frame | None = None
-        self._open: _Open | None = None
-        self._unsure = _Unsure()
+        self._open: _OpenStance | None = None
+        self._unsure = _UnknownFrames()
         self._number = 0
 
-    def feed(self, seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) -> list[Stance]:
+    def add_frames(
+        self, seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns
+    ) -> list[Stance]:
         """Add the next n frames; return the stances that have ended.
 
         Args:
             seq: (n,), numbers of the frames.
             t_ns: (n,), UTC.
-            columns: `GATHERED`, (n,) each, contact being 1, 0 or `UNKNOWN`; `part`, 0 if absent.
+            columns: `STANCE_INPUT_COLUMNS`, (n,) each, contact being 1, 0 or `CONTACT_UNKNOWN`;
+                `part`, 0 if absent.
         """
         over: list[Stance] = []
-        sure = np.flatnonzero(columns["contact"] != UNKNOWN)
+        sure = np.flatnonzero(columns["contact"] != CONTACT_UNKNOWN)
         if not len(sure):
-            self._unsure.add(columns["estimate_status"])
+            self._unsure.add_flags(columns["estimate_flags"])
             return over
         known: npt.NDArray[Any] | slice = sure
         if len(sure) == len(columns["contact"]):
             known = slice(None)  # as nearly always, and nothing is copied
         part = columns["part"][known] if "part" in columns else np.zeros(len(sure), np.uint16)
         loaded = columns["contact"][known] == 1
-        frames = _Frames(seq[known], t_ns[known], part, loaded, columns["grf_n"][known])
-        for first, end in frames.runs():
-            begin, last = frames.at(first), frames.at(end - 1)
-            if first or not begin.goes_on_from(self._seen):
-                over += self._close(begin)
+        frames = _KnownFrames(seq[known], t_ns[known], part, loaded, columns["grf_n"][known])
+        for first, end in frames.iterate_runs():
+            begin, last = frames.frame(first), frames.frame(end - 1)
+            if first or not begin.continues(self._seen):
+                over += self._end_stance(begin)
             if begin.loaded:
                 since = int(sure[first])
                 if self._open is None:
                     self._number += 1
-                    before = self._seen if begin.borders(self._seen) else None
-                    self._open = _Open(self._number, begin, before)
+                    before = self._seen if begin.is_adjacent_edge(self._seen) else None
+                    self._open = _OpenStance(self._number, begin, before)
                 else:
-                    self._open.add_unsure(self._unsure)
+                    self._open.add_unknown_frames(self._unsure)
                     since = 0
-                self._open.add(slice(since, int(sure[end - 1]) + 1), t_ns, columns)
+                self._open.add_frames(slice(since, int(sure[end - 1]) + 1), t_ns, columns)
                 self._open.last = last
-            self._seen, self._unsure = last, _Unsure()
-        self._unsure.add(columns["estimate_status"][int(sure[-1]) + 1 :])
+            self._seen, self._unsure = last, _UnknownFrames()
+        self._unsure.add_flags(columns["estimate_flags"][int(sure[-1]) + 1 :])
         return over
 
     def finish(self) -> list[Stance]:
         """Return the stance that has not ended, if there is one, at the end of the frames."""
-        return self._close(None)
+        return self._end_stance(None)
 
-    def _close(self, behind: _Frame | None) -> list[Stance]:
+    def _end_stance(self, behind: _Frame | None) -> list[Stance]:
         stance, self._open = self._open, None
-        return [] if stance is None else [stance.closed(behind)]
+        return [] if stance is None else [stance.to_stance(behind)]
 
 
 @dataclass(frozen=True)
@@ -182,25 +192,25 @@ class _Frame:
     loaded: bool
     grf_n: float
 
-    def is_seen_from(self, other: _Frame | None) -> bool:
+    def is_near(self, other: _Frame | None) -> bool:
         """Return whether no gap in which the foot may have moved lies between two frames."""
         if other is None:
             return False
-        return self.part == other.part and abs(self.t_ns - other.t_ns) <= UNSEEN_NS
+        return self.part == other.part and abs(self.t_ns - other.t_ns) <= LONG_GAP_NS
 
-    def goes_on_from(self, before: _Frame | None) -> bool:
+    def continues(self, before: _Frame | None) -> bool:
         """Return whether it belongs to the same stance, or flight, as the frame before."""
-        return before is not None and self.is_seen_from(before) and self.loaded == before.loaded
+        return before is not None and self.is_near(before) and self.loaded == before.loaded
 
-    def borders(self, other: _Frame | None) -> bool:
+    def is_adjacent_edge(self, other: _Frame | None) -> bool:
         """Return whether the two frames are consecutive and differ in contact."""
-        if other is None or not self.is_seen_from(other) or self.loaded == other.loaded:
+        if other is None or not self.is_near(other) or self.loaded == other.loaded:
             return False
         return abs(self.seq - other.seq) == 1
 
 
 @dataclass(frozen=True)
-class _Frames:
+class _KnownFrames:
     """Frames of a batch with known contact, (n,) each."""
 
     seq: npt.NDArray[np.uint64]
@@ -209,33 +219,33 @@ class _Frames:
     loaded: npt.NDArray[np.bool_]
     grf_n: Floats
 
-    def at(self, i: int) -> _Frame:
+    def frame(self, i: int) -> _Frame:
         """Return frame `i`."""
         seq, t_ns, part = int(self.seq[i]), int(self.t_ns[i]), int(self.part[i])
         return _Frame(seq, t_ns, part, bool(self.loaded[i]), float(self.grf_n[i]))
 
-    def runs(self) -> Iterator[tuple[int, int]]:
+    def iterate_runs(self) -> Iterator[tuple[int, int]]:
         """Iterate over stances and flights: first row, and row after the last."""
         differs = (self.loaded[1:] != self.loaded[:-1]) | (self.part[1:] != self.part[:-1])
-        cut = np.flatnonzero(differs | (np.diff(self.t_ns) > UNSEEN_NS)) + 1
+        cut = np.flatnonzero(differs | (np.diff(self.t_ns) > LONG_GAP_NS)) + 1
         edges = [0, *cut.tolist(), len(self.loaded)]
         return pairwise(edges)
 
 
 @dataclass
-class _Unsure:
+class _UnknownFrames:
     """Frames of unknown contact since the last known one; part of a stance if it continues."""
 
     frames: int = 0
     status: int = 0
 
-    def add(self, status: npt.NDArray[np.uint16]) -> None:
+    def add_flags(self, status: npt.NDArray[np.uint16]) -> None:
         self.frames += len(status)
         self.status |= int(np.bitwise_or.reduce(status))
 
 
 @dataclass(frozen=True)
-class _Force:
+class _ForceSeries:
     """GRF of consecutive frames, (n,) each."""
 
     t_ns: Times
@@ -243,23 +253,23 @@ class _Force:
     sigma_n: Floats
 
     @classmethod
-    def none(cls) -> _Force:
+    def make_empty(cls) -> _ForceSeries:
         """Make an empty one."""
         return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
-    def followed_by(self, other: _Force) -> _Force:
+    def append(self, other: _ForceSeries) -> _ForceSeries:
         """Return these frames, then the others."""
-        return _Force(
+        return _ForceSeries(
             np.append(self.t_ns, other.t_ns),
             np.append(self.grf_n, other.grf_n),
             np.append(self.sigma_n, other.sigma_n),
         )
 
-    def cut(self, begin: int | None, end: int | None) -> _Force:
+    def slice_rows(self, begin: int | None, end: int | None) -> _ForceSeries:
         """Return rows `begin` to `end`."""
-        return _Force(self.t_ns[begin:end], self.grf_n[begin:end], self.sigma_n[begin:end])
+        return _ForceSeries(self.t_ns[begin:end], self.grf_n[begin:end], self.sigma_n[begin:end])
 
-    def crossing_sigma_s(self, edge: int, inside: int, outside: _Frame) -> float:
+    def compute_edge_sigma_s(self, edge: int, inside: int, outside: _Frame) -> float:
         """Return the uncertainty of the instant of an edge, due to that of the force.
 
         Args:
@@ -275,7 +285,7 @@ class _Force:
 
 
 @dataclass
-class _Open:
+class _OpenStance:
     """Stance that has not ended, with the sums over its frames."""
 
     number: int
@@ -290,31 +300,31 @@ class _Open:
     """Integrals of the GRF and of its sigma over time, in newton seconds."""
     peak: tuple[float, int, float] | None = None
     """GRF, instant and sigma."""
-    head: _Force = field(default_factory=_Force.none)
+    head: _ForceSeries = field(default_factory=_ForceSeries.make_empty)
     """First frames, up to one `EDGE_NS` after the first."""
-    tail: _Force = field(default_factory=_Force.none)
+    tail: _ForceSeries = field(default_factory=_ForceSeries.make_empty)
     """Last frames, from one `EDGE_NS` before the last."""
     cop_x_m: tuple[float, float] | None = None
     """First and last known COP."""
     extremes_x_m: Floats | None = None
     """(3, 2): smallest and largest of the 95 % intervals' lower ends, of COP, of the upper ends."""
 
-    def add_unsure(self, unsure: _Unsure) -> None:
+    def add_unknown_frames(self, unsure: _UnknownFrames) -> None:
         """Add the frames of unknown contact in between."""
         self.frames += unsure.frames
         self.unknown += unsure.frames
         self.status |= unsure.status
 
-    def add(self, rows: slice, t_ns: Times, columns: Columns) -> None:
+    def add_frames(self, rows: slice, t_ns: Times, columns: Columns) -> None:
         """Add the next frames; contact of the last one is known."""
-        t_ns, unsure = t_ns[rows], columns["contact"][rows] == UNKNOWN
+        t_ns, unsure = t_ns[rows], columns["contact"][rows] == CONTACT_UNKNOWN
         grf_n = columns["grf_n"][rows].astype(np.float64)  # a copy
         grf_n[unsure] = np.nan
         there = np.isfinite(grf_n)
         self.frames += len(grf_n)
         self.unknown += int(np.count_nonzero(~there))
-        self.status |= int(np.bitwise_or.reduce(columns["estimate_status"][rows]))
-        self._integrate(_Force(t_ns, grf_n, columns["grf_sigma_n"][rows].astype(np.float64)))
+        self.status |= int(np.bitwise_or.reduce(columns["estimate_flags"][rows]))
+        self._add_force(_ForceSeries(t_ns, grf_n, columns["grf_sigma_n"][rows].astype(np.float64)))
         if there.any():
             at = int(np.argmax(np.where(there, grf_n, -np.inf)))
             if self.peak is None or grf_n[at] > self.peak[0]:
@@ -322,14 +332,14 @@ class _Open:
                 self.peak = float(grf_n[at]), int(t_ns[at]), sigma_n
         stated = np.isfinite(columns["cop_x_m"][rows]) & ~unsure
         if stated.any():
-            self._follow(columns["cop_x_m"][rows][stated], columns["cop_sigma_x_m"][rows][stated])
+            self._add_cop(columns["cop_x_m"][rows][stated], columns["cop_sigma_x_m"][rows][stated])
 
-    def _follow(self, x_m: Floats, sigma_m: Floats) -> None:
+    def _add_cop(self, x_m: Floats, sigma_m: Floats) -> None:
         """Add known centres of pressure."""
         x_m, sigma_m = x_m.astype(np.float64), sigma_m.astype(np.float64)
         first = float(x_m[0]) if self.cop_x_m is None else self.cop_x_m[0]
         self.cop_x_m = first, float(x_m[-1])
-        bounds_m = x_m - INTERVAL_95 * sigma_m, x_m, x_m + INTERVAL_95 * sigma_m
+        bounds_m = x_m - SIGMAS_95 * sigma_m, x_m, x_m + SIGMAS_95 * sigma_m
         now_m = np.array([(of_m.min(), of_m.max()) for of_m in bounds_m])
         if self.extremes_x_m is not None:
             before_m = self.extremes_x_m
@@ -337,8 +347,8 @@ class _Open:
             now_m[:, 1] = np.maximum(now_m[:, 1], before_m[:, 1])
         self.extremes_x_m = now_m
 
-    def _integrate(self, force: _Force) -> None:
-        joined = self.tail.cut(-1, None).followed_by(force)
+    def _add_force(self, force: _ForceSeries) -> None:
+        joined = self.tail.slice_rows(-1, None).append(force)
         steps_s = np.diff(joined.t_ns) * 1e-9
         # One after the other, so that the sum does not depend on the batches.
         grf_n_s, sigma_n_s = (
@@ -348,10 +358,10 @@ class _Open:
         self.integrals = grf_n_s, sigma_n_s
         if not len(self.head.t_ns) or self.head.t_ns[-1] - self.first.t_ns < EDGE_NS:
             end = int(np.searchsorted(force.t_ns, self.first.t_ns + EDGE_NS)) + 1
-            self.head = self.head.followed_by(force.cut(0, end))
-        tail = self.tail.followed_by(force)
+            self.head = self.head.append(force.slice_rows(0, end))
+        tail = self.tail.append(force)
         begin = int(np.searchsorted(tail.t_ns, tail.t_ns[-1] - EDGE_NS, side="right")) - 1
-        self.tail = tail.cut(max(0, begin), None)
+        self.tail = tail.slice_rows(max(0, begin), None)
 
     def _duration_sigma_s(self, behind: _Frame | None) -> float:
         """Return the sigma of the duration by the frames' distance and the force's uncertainty.
@@ -366,7 +376,9 @@ class _Open:
         missing_s = 0.5 * sum(gaps_s)
         spread_s = np.hypot(*gaps_s) / np.sqrt(12.0)
         # An offset of the force moves both edges, outwards or inwards: they add up.
-        force_s = head.crossing_sigma_s(0, -1, self.before) + tail.crossing_sigma_s(-1, 0, behind)
+        force_s = head.compute_edge_sigma_s(0, -1, self.before) + tail.compute_edge_sigma_s(
+            -1, 0, behind
+        )
         return float(np.sqrt(missing_s**2 + spread_s**2 + force_s**2))
 
     def _gaps_s(self, behind: _Frame | None) -> tuple[float, float]:
@@ -391,17 +403,17 @@ class _Open:
         if self.extremes_x_m is None:
             return np.nan, np.nan
         low_m, x_m, high_m = self.extremes_x_m
-        sigmas_m = (high_m - low_m) / (2.0 * INTERVAL_95)
+        sigmas_m = (high_m - low_m) / (2.0 * SIGMAS_95)
         return float(x_m[1] - x_m[0]), float(np.hypot(*sigmas_m))
 
-    def closed(self, behind: _Frame | None) -> Stance:
+    def to_stance(self, behind: _Frame | None) -> Stance:
         """Make the stance; `behind` is the next frame with known contact, if there is one."""
         missing = self.last.seq - self.first.seq + 1 - self.frames
-        hidden = self.peak is None or self.status & EstimateStatus.SATURATED
+        hidden = self.peak is None or self.status & EstimateFlag.SATURATED
         peak_n, peak_t_ns, peak_sigma_n = self.peak or (np.nan, 0, np.nan)
         x_first_m, x_last_m = self.cop_x_m or (np.nan, np.nan)
         range_m, range_sigma_m = self._cop_range_m()
-        behind = behind if self.last.borders(behind) else None
+        behind = behind if self.last.is_adjacent_edge(behind) else None
         has_impulse = not (missing or self.unknown)
         return Stance(
             number=self.number,
@@ -421,7 +433,7 @@ class _Open:
             frames=self.frames,
             unknown_frames=self.unknown,
             missing_frames=missing,
-            estimate_status=self.status,
+            estimate_flags=self.status,
             begun=self.before is not None,
             ended=behind is not None,
         )

@@ -14,21 +14,21 @@ class NodeOptions:
     """Options of a node.
 
     Attributes:
-        rig: options of the rig.
-        journal: the node's folder.
-        server: address of the server; None: no server, local recording only.
-        record: name of a session to record on the node itself; None: no recording.
+        rig_options: options of the rig.
+        node_folder: the node's folder.
+        server_url: address of the server; None: no server, local recording only.
+        session_name: name of a session to record on the node itself; None: no recording.
         calibration: calibration of the tiles, for the server's estimates.
         calibration_problem: reason why there is no calibration.
         token: the server's token; None: the token of this user's server on this machine.
-        ca: file or folder of CA certificates, in addition to the system's.
+        ca_path: file or folder of CA certificates, in addition to the system's.
     """
 
-    rig: RigOptions
-    journal: Path
-    server: str | None
-    record: str | None = None
+    rig_options: RigOptions
+    node_folder: Path
+    server_url: str | None
+    session_name: str | None = None
     calibration: Calibration | None = None
     calibration_problem: str | None = None
     token: str | None = None
-    ca: Path | None = None
+    ca_path: Path | None = None

@@ -19,23 +19,28 @@ from devices.errors import LinkError
 from foottile.local_server import find_local_server
 from foottile.tls import make_context
 from foottile.websocket import AsyncConnection
-from service.identity import fingerprint_of, make_proof
-from service.link import (
+from service.node.frame_sender import EstablishedLink, NodeCallbacks
+from service.node.server_connection import ServerConnection, parse_server_message
+from service.node.tcp_connect import (
+    ReconnectBackoff,
+    connect_tcp,
+    explain_connection_error,
+    make_ingest_url,
+)
+from service.node_identity import compute_fingerprint, make_proof
+from service.protocol import (
+    LINK_TIMEOUT_S,
     MESSAGE_BYTES_MAX,
     PROTOCOL,
-    SILENCE_S,
     SUBPROTOCOL,
     Challenge,
-    Close,
     Identify,
+    LinkCloseCode,
     Proof,
-    SaidByServer,
+    ServerMessage,
     Welcome,
-    say,
+    encode_message,
 )
-from service.node.connection import Connection, parse
-from service.node.dial import BackOff, dial, ingest_url, reason_of
-from service.node.sending import Greeted, Source
 
 
 class Publisher:
@@ -45,22 +50,22 @@ class Publisher:
         server: http(s) or ws(s) address of the server.
         source: callbacks of the node.
         token: the server's token; None: the token of this user's server on this machine.
-        ca: file or folder of CA certificates, in addition to the system's.
+        ca_path: file or folder of CA certificates, in addition to the system's.
         report: called with a message for every change.
     """
 
     def __init__(
         self,
         server: str,
-        source: Source,
+        source: NodeCallbacks,
         *,
         token: str | None,
         report: Callable[[str], None],
-        ca: Path | None = None,
+        ca_path: Path | None = None,
     ) -> None:
         self._server = server
-        self._url = ingest_url(server)
-        self._context = make_context(ca) if self._url.startswith("wss:") else None
+        self._url = make_ingest_url(server)
+        self._context = make_context(ca_path) if self._url.startswith("wss:") else None
         self._source = source
         self._token = token
         self._report = report
@@ -71,48 +76,50 @@ class Publisher:
         self._is_refused = False
         """True after a refusal as another machine: then the node sends its secret, so that a person
         can accept it."""
-        self._wake = asyncio.Event()
-        self._renewed = asyncio.Event()
+        self._wake_sender = asyncio.Event()
+        self._new_stream_began = asyncio.Event()
 
-    def notify(self) -> None:
+    def notify_new_frames(self) -> None:
         """Wake the sender: there are new frames."""
-        self._wake.set()
+        self._wake_sender.set()
 
-    def renew(self) -> None:
+    def reconnect_for_new_stream(self) -> None:
         """Reconnect with a new hello: another stream has begun."""
-        self._renewed.set()
+        self._new_stream_began.set()
 
-    async def run(self) -> None:
+    async def publish_forever(self) -> None:
         """Publish until cancelled."""
-        back_off = BackOff()
+        back_off = ReconnectBackoff()
         while True:
-            self._renewed.clear()
+            self._new_stream_began.clear()
             # Before each attempt: the server may be started after its node.
             local = None if self._token else find_local_server(self._server)
             server, token = (local.url, local.token) if local else (self._server, self._token)
-            self._url = ingest_url(server)
+            self._url = make_ingest_url(server)
             try:
-                tcp = await dial(self._url)
+                tcp = await connect_tcp(self._url)
                 try:
-                    await self._speak(tcp, token, back_off)
+                    await self._serve_connection(tcp, token, back_off)
                 finally:
                     tcp.close()  # if the websocket does not own it
             except (OSError, ValueError, WebSocketException) as error:
-                reason = reason_of(error, self._url)
+                reason = explain_connection_error(error, self._url)
                 if _is_wrong_identity(error):
                     self._is_refused = True
                     reason += f" (this machine: {self._fingerprint or 'its disk keeps no secret'})"
-                self._say(f"not connected to {self._url}: {reason}; trying again")
-                back_off.failed(error)
+                self._report_change(f"not connected to {self._url}: {reason}; trying again")
+                back_off.set_delays_for(error)
             self._connected = False
-            await asyncio.sleep(back_off.next_s())
+            await asyncio.sleep(back_off.next_delay_s())
 
     @property
     def is_connected(self) -> bool:
         """True while a server has accepted the node."""
         return self._connected
 
-    async def _speak(self, tcp: sockets.socket, token: str | None, back_off: BackOff) -> None:
+    async def _serve_connection(
+        self, tcp: sockets.socket, token: str | None, back_off: ReconnectBackoff
+    ) -> None:
         async with connect(
             self._url,
             sock=tcp,
@@ -121,42 +128,44 @@ class Publisher:
             subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
             compression=None,  # costs three times the CPU, saves little (performance.md)
             max_size=MESSAGE_BYTES_MAX,
-            ping_interval=None,  # `Sending` sends its own pings
-            open_timeout=SILENCE_S,
+            ping_interval=None,  # `FrameSender` sends its own pings
+            open_timeout=LINK_TIMEOUT_S,
             close_timeout=1.0,
             additional_headers={"Authorization": f"Bearer {token}"} if token else {},
             proxy=None,
         ) as socket:
-            link = await self._greet(socket)
+            link = await self._handshake(socket)
             self._is_refused = False
-            connection = Connection(link, delivered=back_off.succeeded)
-            self._say(f"connected to {self._url}")
+            connection = ServerConnection(link, on_acknowledged=back_off.reset)
+            self._report_change(f"connected to {self._url}")
             self._connected = True
-            await connection.run(self._renewed)
+            await connection.exchange_messages(self._new_stream_began)
             await socket.close(CloseCode.GOING_AWAY, "another stream has begun")
 
-    async def _greet(self, socket: ClientConnection) -> Greeted:
+    async def _handshake(self, socket: ClientConnection) -> EstablishedLink:
         if socket.subprotocol != SUBPROTOCOL:
             raise LinkError(
                 f"the server does not speak {SUBPROTOCOL}", where=self._url, expected=SUBPROTOCOL
             )
-        node = self._source.present().info.node
-        await socket.send(say(Identify(protocol=PROTOCOL, node=node)))
-        challenge = await _answer(socket, Challenge)
+        node = self._source.get_present_stream().info.node
+        await socket.send(encode_message(Identify(protocol=PROTOCOL, node=node)))
+        challenge = await _receive_message(socket, Challenge)
         # In threads: both read or write the disk.
-        secret = await asyncio.to_thread(self._source.secret, challenge.server_id)
-        self._fingerprint = "" if secret is None else fingerprint_of(secret)
+        secret = await asyncio.to_thread(self._source.get_secret, challenge.server_id)
+        self._fingerprint = "" if secret is None else compute_fingerprint(secret)
         if secret is not None and challenge.is_known and not self._is_refused:
             proof = Proof(proof=make_proof(secret, challenge, node))
         else:
             proof = Proof(secret=secret)
-        await socket.send(say(proof))
-        hello = await asyncio.to_thread(self._source.hello)
-        await socket.send(say(hello))
-        welcome = await _answer(socket, Welcome)
-        return Greeted(socket, self._source, challenge.server_id, hello, welcome, self._wake)
+        await socket.send(encode_message(proof))
+        hello = await asyncio.to_thread(self._source.make_hello)
+        await socket.send(encode_message(hello))
+        welcome = await _receive_message(socket, Welcome)
+        return EstablishedLink(
+            socket, self._source, challenge.server_id, hello, welcome, self._wake_sender
+        )
 
-    def _say(self, message: str) -> None:
+    def _report_change(self, message: str) -> None:
         if message != self._last_report:
             self._report(message)
         self._last_report = message
@@ -165,10 +174,10 @@ class Publisher:
 _Kind = TypeVar("_Kind", Challenge, Welcome)
 
 
-async def _answer(socket: ClientConnection, kind: type[_Kind]) -> _Kind:
+async def _receive_message(socket: ClientConnection, kind: type[_Kind]) -> _Kind:
     """Receive the next message, which has to be of a kind."""
-    async with asyncio.timeout(SILENCE_S):
-        answer: SaidByServer = parse(await socket.recv())
+    async with asyncio.timeout(LINK_TIMEOUT_S):
+        answer: ServerMessage = parse_server_message(await socket.recv())
     if not isinstance(answer, kind):
         expected = kind.model_fields["type"].default
         raise LinkError(f"the server sent {answer.type!r}", expected=expected)
@@ -179,5 +188,5 @@ def _is_wrong_identity(error: Exception) -> bool:
     return (
         isinstance(error, ConnectionClosed)
         and error.rcvd is not None
-        and error.rcvd.code == Close.WRONG_IDENTITY
+        and error.rcvd.code == LinkCloseCode.WRONG_IDENTITY
     )

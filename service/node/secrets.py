@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from devices.errors import DamagedFileError, StorageError
-from service.identity import make_secret
-from storage.durable import put_aside
+from service.node_identity import generate_secret
+from storage.durable_files import set_aside_and_describe
 from storage.secret_file import SECRETS_NAME, read_secrets, write_secrets
 
 _SERVERS_MAX = 256
@@ -31,7 +31,7 @@ class ServerSecrets:
         self._report = report
         self._reported = ""
 
-    def share(self, server_id: str) -> str | None:
+    def get_or_create_secret(self, server_id: str) -> str | None:
         """Return the secret for a server; create it at first contact and store it on disk.
 
         None: it cannot be stored. A secret lost with the process would lock the node out.
@@ -40,11 +40,11 @@ class ServerSecrets:
             secrets = self._read()
             known = secrets.get(server_id)
             if known is None:
-                known = make_secret()
+                known = generate_secret()
                 kept = list(secrets.items())[1 - _SERVERS_MAX :]
                 write_secrets(self._path, dict([*kept, (server_id, known)]))
         except StorageError as error:
-            self._tell(f"no secret is shared with the server: {error}")
+            self._report_once(f"no secret is shared with the server: {error}")
             return None
         return known
 
@@ -52,13 +52,13 @@ class ServerSecrets:
         try:
             return read_secrets(self._path)
         except DamagedFileError as error:
-            self._tell(
-                f"{put_aside(self._path, error)}; servers that know this node refuse it until a "
-                "person accepts it"
+            self._report_once(
+                f"{set_aside_and_describe(self._path, error)}; servers that know this node refuse "
+                "it until a person accepts it"
             )
             return {}
 
-    def _tell(self, what: str) -> None:
+    def _report_once(self, what: str) -> None:
         if what != self._reported:
             self._report(what)
         self._reported = what

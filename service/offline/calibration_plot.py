@@ -9,10 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.fitting.bench.indentation import Indentation, pressed_in, strokes
-from service.estimation.fitting.confidence import curve_n, mean_band_n, new_loading_band_n
-from service.estimation.fitting.effects_fit import Replay, replays
-from service.offline.plots import new_figure, png_of
+from service.estimation.fitting.confidence import (
+    compute_curve_n,
+    compute_mean_band_n,
+    compute_new_loading_band_n,
+)
+from service.estimation.fitting.effects_fit import ReplaySection, extract_replays
+from service.estimation.fitting.rig.indentation import Indentation, average_strokes, select_loaded
+from service.offline.figure_output import create_figure, render_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,9 +24,9 @@ if TYPE_CHECKING:
 # Okabe and Ito: distinct for any colour vision, and by shape.
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 BRANCHES = ((True, "loading", BLUE, "o"), (False, "unloading", VERMILION, "^"))
-COLUMNS = 4
+MAX_TILES_PER_LINE = 4
 """Tiles per line of the figure."""
-FAST = {"release": "release of a held load", "tap": "tap"}
+FAST_LOADS = {"release": "release of a held load", "tap": "tap"}
 _HEIGHTS = (3.0, 1.5, 1.5, 1.5)
 _LETTERS_PER_IN = 11.0
 
@@ -40,13 +44,13 @@ def plot_calibration(
         MissingExtraError: matplotlib is not installed.
     """
     tiles = calibration.tiles
-    fast = {tile.serial: replays(recordings[tile.serial], tile) for tile in tiles}
-    kinds = [kind for kind in FAST if any(kind in found for found in fast.values())]
-    lines = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
-    columns = min(COLUMNS, len(tiles))
+    fast = {tile.serial: extract_replays(recordings[tile.serial], tile) for tile in tiles}
+    kinds = [kind for kind in FAST_LOADS if any(kind in found for found in fast.values())]
+    lines = [tiles[i : i + MAX_TILES_PER_LINE] for i in range(0, len(tiles), MAX_TILES_PER_LINE)]
+    columns = min(MAX_TILES_PER_LINE, len(tiles))
     heights = _HEIGHTS[: 2 + len(kinds)]
     width_in = max(6.4, 1.2 + 3.7 * columns)
-    figure = new_figure(width_in, 1.0 + len(lines) * 1.15 * sum(heights))
+    figure = create_figure(width_in, 1.0 + len(lines) * 1.15 * sum(heights))
     title = (
         f"Calibration {calibration.name} ({calibration.id}), {calibration.date[:10]}, "
         f"reference: {calibration.reference}"
@@ -59,9 +63,9 @@ def plot_calibration(
         )
         for column, tile in enumerate(line):
             own = axes[:, column]
-            _curve(own[0], own[1], tile, recordings[tile.serial])
+            _plot_curve(own[0], own[1], tile, recordings[tile.serial])
             for axis, kind in zip(own[2:], kinds, strict=True):
-                _fast(axis, kind, fast[tile.serial].get(kind))
+                _plot_fast_load(axis, kind, fast[tile.serial].get(kind))
         for column in range(len(line), columns):
             for axis in axes[:, column]:
                 axis.set_visible(False)
@@ -70,23 +74,23 @@ def plot_calibration(
         for axis in axes[2:, 0]:
             axis.set_ylabel("gauge pressure, kPa")
         for row in axes:
-            _same_scale(row[: len(line)])
+            _share_scale(row[: len(line)])
         axes[0, 0].legend(markerscale=2.5, fontsize=7.5, loc="upper left", framealpha=0.9)
         for axis in axes[2:, 0]:
             if axis.get_legend_handles_labels()[0]:
                 axis.legend(fontsize=7.5, loc="upper right", framealpha=0.9)
-    return png_of(figure)
+    return render_png(figure)
 
 
-def _curve(
+def _plot_curve(
     curve: Axes, residual: Axes, tile: TileCalibration, recordings: Sequence[Indentation]
 ) -> None:
-    blocks = strokes(*pressed_in(recordings))
+    blocks = average_strokes(*select_loaded(recordings))
     end_kpa = tile.range_kpa[1]
     grid_kpa = np.linspace(0.0, end_kpa, 200)
-    force_n = curve_n(tile, grid_kpa)
-    mean_n, new_n = mean_band_n(tile, grid_kpa), new_loading_band_n(tile, grid_kpa)
-    left_n = blocks.force_n - curve_n(tile, blocks.gauge_kpa)
+    force_n = compute_curve_n(tile, grid_kpa)
+    mean_n, new_n = compute_mean_band_n(tile, grid_kpa), compute_new_loading_band_n(tile, grid_kpa)
+    left_n = blocks.force_n - compute_curve_n(tile, blocks.gauge_kpa)
     for axis, centre_n in ((curve, force_n), (residual, np.zeros_like(force_n))):
         axis.fill_between(
             grid_kpa,
@@ -130,16 +134,17 @@ def _curve(
         for axis in (curve, residual):
             axis.axvline(end_kpa + facts.spare_kpa, color=GREEN, linestyle=":", label="115 kPa")
     curve.set_title(
-        f"{tile.serial}: R² {_text(tile.r2, 4)}, RMSE {_text(tile.rmse_n, 2)} N\n"
-        f"left-out repeat {_text(tile.cv_rmse_n, 2)} N, loop {_text(tile.hysteresis_n, 2)} N\n"
+        f"{tile.serial}: R² {_format_number(tile.r2, 4)}, RMSE {_format_number(tile.rmse_n, 2)} N\n"
+        f"left-out repeat {_format_number(tile.cv_rmse_n, 2)} N, "
+        f"loop {_format_number(tile.hysteresis_n, 2)} N\n"
         f"{end}",
         fontsize=8.5,
     )
 
 
-def _fast(axis: Axes, kind: str, replay: Replay | None) -> None:
+def _plot_fast_load(axis: Axes, kind: str, replay: ReplaySection | None) -> None:
     axis.grid(alpha=0.25)
-    axis.set_title(FAST[kind], fontsize=8.5)
+    axis.set_title(FAST_LOADS[kind], fontsize=8.5)
     axis.set_xlabel("time, ms")
     if replay is None:
         axis.text(0.5, 0.5, "not recorded", ha="center", va="center", transform=axis.transAxes)
@@ -165,7 +170,7 @@ def _fast(axis: Axes, kind: str, replay: Replay | None) -> None:
     axis.plot(time_ms, replay.modelled_kpa, color=VERMILION, linewidth=1.4, label="with effects")
 
 
-def _same_scale(axes: Sequence[Axes]) -> None:
+def _share_scale(axes: Sequence[Axes]) -> None:
     """Give adjacent tiles the same y scale, labelled once."""
     low = min(axis.get_ylim()[0] for axis in axes)
     high = max(axis.get_ylim()[1] for axis in axes)
@@ -174,5 +179,5 @@ def _same_scale(axes: Sequence[Axes]) -> None:
         axis.tick_params(labelleft=i == 0)
 
 
-def _text(value: float | None, digits: int) -> str:
+def _format_number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"

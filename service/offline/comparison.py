@@ -12,31 +12,37 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.errors import ComparisonError, FileFormatError, UsageError
-from service.estimation.estimates import EstimateStatus
-from service.offline.compare.align import Alignment, align
-from service.offline.compare.clocks import ClockLag, clock_notes
-from service.offline.compare.errors import Errors, errors_of
-from service.offline.compare.pairs import COMPARED, Columns, Pairs, Reference, pair
-from service.offline.compare.plausible import (
+from service.estimation.estimates import EstimateFlag
+from service.offline.compare.alignment import Alignment, align_signals
+from service.offline.compare.clock_lag import ClockLag, describe_clock_contradiction
+from service.offline.compare.error_figures import ComparisonErrors, compute_errors
+from service.offline.compare.paired_frames import (
+    COMPARED_COLUMNS,
+    Columns,
+    PairedFrames,
+    ReferenceSignals,
+    pair_frames,
+)
+from service.offline.compare.plausibility import (
+    advise_on_scale,
+    check_cop_position,
     check_force_unit,
     check_time_unit,
-    cop_notes,
-    far_notes,
-    gain_notes,
+    describe_implausible_alignment,
 )
-from service.offline.compare.signals import Signal
-from service.offline.compare.trials import Mark, trials_of
-from storage.formats.reference import ReferenceData, Stated, read_reference
-from storage.formats.sealed import marks_of
+from service.offline.compare.signals import ForceSignal
+from service.offline.compare.trials import TrialMarker, split_into_trials
+from storage.formats.readers.session import is_sealed_session
+from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
+from storage.formats.sealed_export import place_session_markers
 from storage.formats.slice import Slice
-from storage.formats.tables.session import is_session
-from storage.schema import NO_INSTANT
-from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
-from storage.sessions.reader import SessionReader
+from storage.schema import UNKNOWN_T_NS
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.sidecars import MARKERS_NAME, load_clock_table, read_markers
 
-ROW = "row"
+ROW_COLUMN = "row"
 """Column added to a session's columns: the frame's row in the file."""
-ANGLE = "angle_rad"
+ANGLE_COLUMN = "angle_rad"
 """Column of a foot with a servo, read beside the compared ones."""
 
 
@@ -44,7 +50,7 @@ ANGLE = "angle_rad"
 class CompareOptions:
     """Options of a comparison; see `foottile compare --help`."""
 
-    stated: Stated
+    stated: ReferenceOptions
     lag_range_s: tuple[float, float] | None = None
     remove_offset: bool = False
     contact_n: float | None = None
@@ -63,10 +69,10 @@ class Comparison:
         alignment: alignment of both.
         clock_lag: lag by the clock tables, if both are sessions of one server.
         pairs: our frames with the reference.
-        force_n: (n, tiles), tile forces of these frames; NaN for a tile without dome.
+        tile_force_n: (n, tiles), tile forces of these frames; NaN for a tile without dome.
         serials: serials of the tiles.
         errors: errors by trial and over trials.
-        trials_are: definition of a trial, in words.
+        trial_definition: definition of a trial, in words.
         notes: remarks on both recordings.
         advice: suggestions for a more informative comparison.
         options: options of the comparison.
@@ -76,11 +82,11 @@ class Comparison:
     reference: str
     alignment: Alignment
     clock_lag: ClockLag | None
-    pairs: Pairs
-    force_n: Floats
+    pairs: PairedFrames
+    tile_force_n: Floats
     serials: tuple[str, ...]
-    errors: Errors
-    trials_are: str
+    errors: ComparisonErrors
+    trial_definition: str
     notes: tuple[str, ...]
     advice: tuple[str, ...]
     options: CompareOptions
@@ -95,19 +101,19 @@ class Comparison:
             "alignment": {
                 "lag_s": alignment.lag_s,
                 "clock_lag_s": self.clock_lag,
-                "at_s": alignment.at_s,
+                "at_s": alignment.mid_t_s,
                 "drift_ppm": alignment.drift_ppm,
                 "scale": alignment.scale,
                 "offset_n": alignment.offset_n,
-                "offset_in_flight_n": pairs.zero_n,
-                "offset_removed": pairs.removed,
-                "blocks": alignment.blocks,
+                "offset_in_flight_n": pairs.reference_zero_n,
+                "offset_removed": pairs.is_zero_removed,
+                "blocks": alignment.block_count,
                 "ambiguity": alignment.ambiguity,
             },
-            "contact_n": pairs.contact_n,
+            "contact_n": pairs.contact_threshold_n,
             "reference_sigma_n": self.options.reference_sigma_n,
             "reference_cop_sigma_m": self.options.reference_cop_sigma_m,
-            "trials_are": self.trials_are,
+            "trials_are": self.trial_definition,
             "figures": self.errors.figures,
             "trials": self.errors.trials,
         }
@@ -121,7 +127,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         UsageError: a unit or sign of the reference is not stated.
         ComparisonError: the two cannot be compared.
     """
-    if is_session(reference_path) and not is_session(path):
+    if is_sealed_session(reference_path) and not is_sealed_session(path):
         raise FileFormatError(
             f"it is not a session, and {reference_path.name} is one",
             where=str(path),
@@ -129,23 +135,23 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
             remedy="Were they swapped?",
         )
     data = read_reference(reference_path, options.stated)
-    with SessionReader(path) as session:
-        columns, force_n = _columns(session)
-        marks, notes = _marks(session, path, columns)
-        notes += [remark] if (remark := session.axis.remark()) else []
-        tiles, identity = session.info.tiles, session.identity
+    with SealedFileReader(path) as session:
+        columns, force_n = _read_columns(session)
+        marks, notes = _read_trial_markers(session, path, columns)
+        notes += [remark] if (remark := session.time_axis.describe_shift()) else []
+        tiles, identity = session.info.tiles, session.source_reference
     known = np.isfinite(columns["grf_n"])
     if not known.any():
         raise ComparisonError("no frame of the session has a GRF", where=str(path))
     t_ns = columns["t_ns"]
-    reference = _reference(data, int(t_ns[0]), options.cop_offset_m)
-    ours = Signal(
+    reference = _make_reference_signals(data, int(t_ns[0]), options.cop_offset_m)
+    ours = ForceSignal(
         (t_ns[known] - t_ns[0]) * 1e-9, columns["grf_n"][known], columns["grf_sigma_n"][known]
     )
     check_time_unit(ours, reference.force)
-    alignment = align(ours, reference.force, lag_range_s=options.lag_range_s)
+    alignment = align_signals(ours, reference.force, lag_range_s=options.lag_range_s)
     check_force_unit(alignment)
-    pairs = pair(
+    pairs = pair_frames(
         columns,
         reference,
         alignment,
@@ -153,51 +159,59 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         contact_n=options.contact_n,
     )
     places_m = np.array([(tile.x_m, tile.y_m) for tile in tiles if not tile.reference])
-    notes += [*data.notes, *cop_notes(pairs, places_m), *far_notes(alignment)]
-    notes += [*_remarks(alignment, pairs, options)]
-    at_ns = int(t_ns[0]) + round(1e9 * alignment.at_s)
-    by_clocks = _clock_lag(path, reference_path, at_ns) if is_session(reference_path) else None
-    notes += clock_notes(alignment, by_clocks)
-    trials, what = trials_of(pairs.columns["t_ns"], pairs.columns["part"], marks)
+    notes += [
+        *data.notes,
+        *check_cop_position(pairs, places_m),
+        *describe_implausible_alignment(alignment),
+    ]
+    notes += [*_describe_limitations(alignment, pairs, options)]
+    at_ns = int(t_ns[0]) + round(1e9 * alignment.mid_t_s)
+    by_clocks = (
+        _compute_clock_lag(path, reference_path, at_ns)
+        if is_sealed_session(reference_path)
+        else None
+    )
+    notes += describe_clock_contradiction(alignment, by_clocks)
+    trials, what = split_into_trials(pairs.columns["t_ns"], pairs.columns["part"], marks)
     return Comparison(
         session={"file": str(path), **identity},
         reference=data.where,
         alignment=alignment,
         clock_lag=by_clocks,
         pairs=pairs,
-        force_n=force_n[pairs.columns[ROW]],
+        tile_force_n=force_n[pairs.columns[ROW_COLUMN]],
         serials=tuple(tile.serial for tile in tiles),
-        errors=errors_of(
+        errors=compute_errors(
             pairs,
             trials,
             reference_sigma_n=options.reference_sigma_n,
             reference_cop_sigma_m=options.reference_cop_sigma_m,
         ),
-        trials_are=what,
+        trial_definition=what,
         notes=tuple(notes),
-        advice=tuple(_advice(alignment, options)),
+        advice=tuple(_give_advice(alignment, options)),
         options=options,
     )
 
 
-def _columns(session: SessionReader) -> tuple[Columns, Floats]:
+def _read_columns(session: SealedFileReader) -> tuple[Columns, Floats]:
     """Read the compared columns, with `t_ns` on the session's time axis, and the tile forces."""
-    wanted = [*COMPARED, "force_n"]
-    if absent := [name for name in wanted if not session.has(name)]:
+    wanted = [*COMPARED_COLUMNS, "force_n"]
+    if absent := [name for name in wanted if not session.has_columns(name)]:
         raise FileFormatError(
             f"the session has no {', '.join(absent)}",
             where=str(session.path),
             remedy="Estimate it first, with `foottile estimate`",
         )
-    if has_part := session.has("part"):
+    if has_part := session.has_columns("part"):
         wanted.append("part")
-    if session.has(ANGLE):
-        wanted.append(ANGLE)
-    pieces = list(session.columns(*wanted))
+    if session.has_columns(ANGLE_COLUMN):
+        wanted.append(ANGLE_COLUMN)
+    pieces = list(session.read_columns(*wanted))
     if not pieces:
         raise FileFormatError("the session has no frames", where=str(session.path))
     columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in wanted}
-    columns["t_ns"] = session.axis.at(columns["t_ns"], columns.get("part"))
+    columns["t_ns"] = session.time_axis.shift_to_axis(columns["t_ns"], columns.get("part"))
     if (np.diff(columns["t_ns"]) <= 0).any():
         raise ComparisonError(
             "time decreases within a part of the session",
@@ -210,65 +224,78 @@ def _columns(session: SessionReader) -> tuple[Columns, Floats]:
     columns["grf_sigma_n"] = columns["grf_sigma_n"].astype(np.float64)
     if not has_part:
         columns["part"] = np.zeros(len(force_n), dtype=np.uint16)
-    columns[ROW] = np.arange(len(force_n))
+    columns[ROW_COLUMN] = np.arange(len(force_n))
     return columns, force_n
 
 
-def _marks(session: SessionReader, path: Path, columns: Columns) -> tuple[list[Mark], list[str]]:
+def _read_trial_markers(
+    session: SealedFileReader, path: Path, columns: Columns
+) -> tuple[list[TrialMarker], list[str]]:
     """Read a session's markers at their frames; also return notes on those without a frame."""
-    beside = path.with_name(EVENTS_NAME)
+    beside = path.with_name(MARKERS_NAME)
     if not beside.is_file():
         return [], []
-    placed = marks_of(session, read_events(beside).events, Slice())
+    placed = place_session_markers(session, read_markers(beside).markers, Slice())
     marks = []
-    for mark in placed.all:
+    for mark in placed.markers:
         if mark.frame is not None:
             at = (columns["part"] == mark.frame[0]) & (columns["seq"] == mark.frame[1])
-            marks.append(Mark(mark.event.label, int(columns["t_ns"][at][0])))
-    lost = [f"mark {one.event.label!r} begins no trial: {one.left_out}" for one in placed.left_out]
+            marks.append(TrialMarker(mark.marker.label, int(columns["t_ns"][at][0])))
+    lost = [
+        f"mark {one.marker.label!r} begins no trial: {one.exclusion_reason}"
+        for one in placed.excluded
+    ]
     return marks, lost
 
 
-def _clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:
+def _compute_clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:
     """Compute the lag from two sessions' clock tables; None if either has no row at `at_ns`."""
-    found = [_server_offset(one, at_ns) for one in (path, reference_path)]
+    found = [_compute_server_offset_ns(one, at_ns) for one in (path, reference_path)]
     if found[0] is None or found[1] is None:
         return None
     (own_ns, own_within_ns), (their_ns, their_within_ns) = found[0], found[1]
     return ClockLag(1e-9 * (own_ns - their_ns), 1e-9 * (own_within_ns + their_within_ns))
 
 
-def _server_offset(path: Path, at_ns: int) -> tuple[int, int] | None:
+def _compute_server_offset_ns(path: Path, at_ns: int) -> tuple[int, int] | None:
     """Return server time minus session time at the nearest frame, and its bound, in ns."""
-    with SessionReader(path) as session:
+    with SealedFileReader(path) as session:
         try:
-            clock = clock_beside(session)
+            clock = load_clock_table(session)
         except (UsageError, FileFormatError):
             return None
-        wanted = ("t_mono_ns", "t_ns", *(("part",) if session.has("part") else ()))
+        wanted = ("t_mono_ns", "t_ns", *(("part",) if session.has_columns("part") else ()))
         nearest: dict[str, npt.NDArray[Any]] | None = None
-        for piece in session.columns(*wanted):
-            piece["axis_ns"] = session.axis.at(piece["t_ns"], piece.get("part"))
+        for piece in session.read_columns(*wanted):
+            piece["axis_ns"] = session.time_axis.shift_to_axis(piece["t_ns"], piece.get("part"))
             row = int(np.argmin(np.abs(piece["axis_ns"] - at_ns)))
             one = {name: values[row : row + 1] for name, values in piece.items()}
             apart_ns = abs(int(one["axis_ns"][0]) - at_ns)
             if nearest is None or apart_ns < abs(int(nearest["axis_ns"][0]) - at_ns):
                 nearest = one
     assert nearest is not None  # noqa: S101  # both have been compared
-    server_times = clock.columns(nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part"))
+    server_times = clock.compute_server_time(
+        nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part")
+    )
     server_ns = int(server_times["t_server_ns"][0])
-    if server_ns == NO_INSTANT:
+    if server_ns == UNKNOWN_T_NS:
         return None
     return server_ns - int(nearest["axis_ns"][0]), int(server_times["t_server_uncertainty_ns"][0])
 
 
-def _reference(data: ReferenceData, begin_ns: int, cop_offset_m: tuple[float, float]) -> Reference:
+def _make_reference_signals(
+    data: ReferenceData, begin_ns: int, cop_offset_m: tuple[float, float]
+) -> ReferenceSignals:
     since_s = 0.0 if data.epoch_ns is None else (data.epoch_ns - begin_ns) * 1e-9
-    force = Signal(data.time_s + since_s, data.grf_n)
-    return Reference(force, None if data.cop_m is None else data.cop_m + np.array(cop_offset_m))
+    force = ForceSignal(data.time_s + since_s, data.grf_n)
+    return ReferenceSignals(
+        force, None if data.cop_m is None else data.cop_m + np.array(cop_offset_m)
+    )
 
 
-def _remarks(alignment: Alignment, pairs: Pairs, options: CompareOptions) -> Sequence[str]:
+def _describe_limitations(
+    alignment: Alignment, pairs: PairedFrames, options: CompareOptions
+) -> Sequence[str]:
     notes = []
     if alignment.ambiguity is not None:
         other = alignment.ambiguity
@@ -277,31 +304,31 @@ def _remarks(alignment: Alignment, pairs: Pairs, options: CompareOptions) -> Seq
             f"{other.correlation:.3f}, {other.best_correlation:.3f} at the one taken): chance "
             "does not explain the difference"
         )
-    if options.remove_offset and not pairs.removed:
+    if options.remove_offset and not pairs.is_zero_removed:
         notes.append(
             "no flight is long enough to estimate the reference's offset; it is not removed"
         )
-    elif not pairs.removed and pairs.zero_n is not None:
-        low_n, high_n = pairs.zero_n.interval_95
+    elif not pairs.is_zero_removed and pairs.reference_zero_n is not None:
+        low_n, high_n = pairs.reference_zero_n.interval_95
         if low_n > 0.0 or high_n < 0.0:
             notes.append(
-                f"the reference reads {pairs.zero_n.value:.3f} N in flight, which is in every "
-                "error: --remove-offset takes it off"
+                f"the reference reads {pairs.reference_zero_n.value:.3f} N in flight, which is in "
+                "every error: --remove-offset takes it off"
             )
-    if not pairs.judged.all():
+    if not pairs.is_counted.all():
         notes.append("the reference is slower than ours: the frame nearest to each sample counts")
-    if _any(pairs, EstimateStatus.ASSUMED_SCALE):
+    if _has_any_flag(pairs, EstimateFlag.ASSUMED_SCALE):
         notes.append("our newtons rest on an assumed scale: the calibration was not measured")
     return notes
 
 
-def _advice(alignment: Alignment, options: CompareOptions) -> list[str]:
+def _give_advice(alignment: Alignment, options: CompareOptions) -> list[str]:
     if options.reference_sigma_n is not None:
-        return gain_notes(alignment)
+        return advise_on_scale(alignment)
     hint = "coverage is not computed: --reference-sigma-n is not given"
-    return [*gain_notes(alignment), hint]
+    return [*advise_on_scale(alignment), hint]
 
 
-def _any(pairs: Pairs, bit: EstimateStatus) -> bool:
-    status: npt.NDArray[np.uint16] = pairs.columns["estimate_status"]
+def _has_any_flag(pairs: PairedFrames, bit: EstimateFlag) -> bool:
+    status: npt.NDArray[np.uint16] = pairs.columns["estimate_flags"]
     return bool((status & np.uint16(bit)).any())

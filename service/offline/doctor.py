@@ -8,22 +8,33 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from devices.array.budget import BusTiming, broadcast_width, choose, frame_s, rates_hz
-from devices.array.self_test import Plug, find_tiles, measure_conversion_ns, measure_wires
-from devices.array.startup import chosen, timing_of
-from devices.buses.i2c import I2cBus, PatientBus
+from devices.array.self_test import (
+    FoundTile,
+    find_tiles_on_all_channels,
+    measure_conversion_ns,
+    measure_wire_timing,
+)
+from devices.array.startup import choose_scene_schedule, compute_bus_timing
+from devices.array.timing_budget import (
+    BusTiming,
+    choose_schedule,
+    compute_frame_s,
+    compute_rates_hz,
+    count_broadcast_channels,
+)
+from devices.buses.i2c import I2cBus, RetryingBus
 from devices.chips.mpl115a2 import CONVERSION_TYPICAL_NS
 from devices.clock import Clock
 from devices.errors import I2cError
 from devices.frames import TileInfo
-from devices.scene.file import Scene
-from devices.scene.hardware import ArrayScene, ScheduleName, TileScene
+from devices.scene.hardware_sections import ArraySection, ScheduleName, TileSection
+from devices.scene.scene_file import Scene
 
-_AS_ASKED = 0.95
-_PI_TRAP = 0.625  # core clock 250 MHz where the kernel believes in 400 MHz (hardware.md 3.2)
-_PI_TRAP_WITHIN = 0.03
-_SPARE = 0.98
-_WORTH_SAYING = 1.05
+_MIN_CLOCK_SHARE = 0.95
+_PI_CLOCK_RATIO = 0.625  # core clock 250 MHz where the kernel believes in 400 MHz (hardware.md 3.2)
+_PI_CLOCK_TOLERANCE = 0.03
+_RATE_MARGIN = 0.98
+_MIN_NOTABLE_GAIN = 1.05
 
 
 @dataclass(frozen=True)
@@ -47,52 +58,63 @@ class TileFinding:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class BusDiagnosis:
     """Result of a bus diagnosis.
 
     Attributes:
         tiles: findings for all tiles of the scene and all others found.
         scl_hz: measured bus clock; None without a working tile.
-        asked_scl_hz: configured bus clock.
-        transaction_s: overhead of a transaction beyond its bits.
+        configured_scl_hz: configured bus clock.
+        transaction_overhead_s: overhead of a transaction beyond its bits.
         rates_hz: frames per second by schedule; None if it would open too many channels.
-        schedule: fastest schedule; None without tiles.
-        holds: True if all tiles work and the requested rate is reached.
+        fastest_schedule: fastest schedule; None without tiles.
+        is_rate_reached: True if all tiles work and the requested rate is reached.
         verdict: summary in a few sentences, with advice.
     """
 
     tiles: tuple[TileFinding, ...]
     scl_hz: float | None
-    asked_scl_hz: float
-    transaction_s: float
+    configured_scl_hz: float
+    transaction_overhead_s: float
     rates_hz: Mapping[ScheduleName, float | None]
-    schedule: ScheduleName | None
-    holds: bool
+    fastest_schedule: ScheduleName | None
+    is_rate_reached: bool
     verdict: str
 
 
-def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float = 0.0) -> Diagnosis:
+def diagnose_bus(
+    bus: I2cBus, clock: Clock, scene: Scene | None, *, requested_hz: float = 0.0
+) -> BusDiagnosis:
     """Diagnose a bus.
 
     Args:
         bus: the bus.
         clock: virtual or real clock.
         scene: expected parts; None: accept any.
-        asked_hz: requested frames per second; 0: the highest possible.
+        requested_hz: requested frames per second; 0: the highest possible.
 
     Raises:
         BusFaultError: the bus itself does not work.
         BusSetupError: the bus cannot be used.
     """
-    array = scene.array if scene is not None else ArrayScene()
-    bus = PatientBus(bus)
-    findings = _findings(find_tiles(bus), scene.tile if scene is not None else ())
-    well = [(finding, _info(finding)) for finding in findings if not finding.problem]
+    array = scene.array if scene is not None else ArraySection()
+    bus = RetryingBus(bus)
+    findings = _match_tiles(
+        find_tiles_on_all_channels(bus), scene.tile if scene is not None else ()
+    )
+    well = [(finding, _make_tile_info(finding)) for finding in findings if not finding.problem]
     if not well:
-        return Diagnosis(
-            findings, None, array.scl_hz, 0.0, {}, None, holds=False, verdict=_nobody(findings)
+        return BusDiagnosis(
+            findings,
+            None,
+            array.scl_hz,
+            0.0,
+            {},
+            None,
+            is_rate_reached=False,
+            verdict=_describe_no_tiles(findings),
         )
-    wires = measure_wires(bus, clock, well[0][1])
+    wires = measure_wire_timing(bus, clock, well[0][1])
     measured: dict[tuple[int, int], TileFinding] = {}
     conversions_ns: list[int | None] = []
     for finding, info in well:
@@ -109,36 +131,44 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         )
     findings = tuple(measured.get((f.mux, f.channel), f) for f in findings)
     asked = tuple(measured.values())
-    timing = timing_of(array, wires, [f.mux for f in asked], conversions_ns)
+    timing = compute_bus_timing(array, wires, [f.mux for f in asked], conversions_ns)
     rates: dict[ScheduleName, float | None] = {
-        name: rate if broadcast_width(name, timing.muxes) <= array.broadcast_channels else None
-        for name, rate in rates_hz(timing).items()
+        name: rate
+        if count_broadcast_channels(name, timing.muxes) <= array.broadcast_channels
+        else None
+        for name, rate in compute_rates_hz(timing).items()
     }
-    asked_hz = asked_hz or (scene.rate_hz if scene is not None else 0.0)
-    choice = choose(timing, asked_hz=asked_hz, channels_max=array.broadcast_channels)
+    requested_hz = requested_hz or (scene.rate_hz if scene is not None else 0.0)
+    choice = choose_schedule(
+        timing, requested_rate_hz=requested_hz, channels_max=array.broadcast_channels
+    )
     schedule = choice.schedule
     if scene is not None:
         has_reference = scene.reference is not None
-        schedule = chosen(scene, timing, has_reference=has_reference, asked_hz=asked_hz).schedule
-    advice = _advice(findings, timing, rates, array, asked_hz, choice.schedule, schedule)
+        schedule = choose_scene_schedule(
+            scene, timing, has_reference=has_reference, requested_rate_hz=requested_hz
+        ).schedule
+    advice = _make_advice(findings, timing, rates, array, requested_hz, choice.schedule, schedule)
     hints = (
         *advice.hints,
-        _pace_setter(asked, timing, schedule, rates[schedule]),
-        _disturbance(bus.repeated),
+        _describe_slowest_tile(asked, timing, schedule, rates[schedule]),
+        _describe_disturbance(bus.retried_transfers),
     )
-    return Diagnosis(
+    return BusDiagnosis(
         findings,
         wires.scl_hz,
         array.scl_hz,
-        wires.transaction_s,
+        wires.transaction_overhead_s,
         rates,
         choice.schedule,
-        holds=not advice.wrong,
+        is_rate_reached=not advice.wrong,
         verdict=" ".join(filter(None, (advice.summary, *advice.wrong, *hints))),
     )
 
 
-def _findings(plugs: tuple[Plug, ...], wanted: tuple[TileScene, ...]) -> tuple[TileFinding, ...]:
+def _match_tiles(
+    plugs: tuple[FoundTile, ...], wanted: tuple[TileSection, ...]
+) -> tuple[TileFinding, ...]:
     serials = {(tile.mux, tile.channel): tile.serial for tile in wanted}
     found = [
         TileFinding(
@@ -160,7 +190,7 @@ def _findings(plugs: tuple[Plug, ...], wanted: tuple[TileScene, ...]) -> tuple[T
     return tuple(sorted((*found, *absent), key=lambda f: (f.mux, f.channel)))
 
 
-def _info(finding: TileFinding) -> TileInfo:
+def _make_tile_info(finding: TileFinding) -> TileInfo:
     assert finding.coefficient_words is not None  # noqa: S101  # without a problem there are some
     return TileInfo(
         serial=finding.serial or f"0x{finding.mux:02x}.{finding.channel}",
@@ -175,7 +205,7 @@ def _info(finding: TileFinding) -> TileInfo:
     )
 
 
-def _nobody(findings: tuple[TileFinding, ...]) -> str:
+def _describe_no_tiles(findings: tuple[TileFinding, ...]) -> str:
     if any(finding.coefficient_words or "answer" not in finding.problem for finding in findings):
         return "No tile works: look at the problems above."
     return (
@@ -191,11 +221,11 @@ class _Advice:
     hints: tuple[str, ...]
 
 
-def _advice(
+def _make_advice(
     findings: tuple[TileFinding, ...],
     timing: BusTiming,
     rates: Mapping[ScheduleName, float | None],
-    array: ArrayScene,
+    array: ArraySection,
     asked_hz: float,
     best: ScheduleName,
     chosen: ScheduleName,
@@ -207,9 +237,9 @@ def _advice(
         names = ", ".join(f.serial or f"0x{f.mux:02x} channel {f.channel}" for f in ill)
         wrong.append(f"{names} {'needs' if len(ill) == 1 else 'need'} attention first.")
     part = timing.scl_hz / array.scl_hz
-    if part < _AS_ASKED:
+    if part < _MIN_CLOCK_SHARE:
         slow = f"The bus runs at {timing.scl_hz / 1e3:.0f} kHz where {array.scl_hz / 1e3:.0f} are"
-        if abs(part - _PI_TRAP) < _PI_TRAP_WITHIN:
+        if abs(part - _PI_CLOCK_RATIO) < _PI_CLOCK_TOLERANCE:
             slow += (
                 " asked for: this Raspberry Pi derives it from a core that idles at 250 MHz. Fix "
                 "the core's clock in config.txt (core_freq and core_freq_min alike, or "
@@ -226,13 +256,12 @@ def _advice(
             f"{chosen} would open more than {array.broadcast_channels} channels at once: "
             f"use {best}."
         )
-        summary = (
-            f"{tiles} on {len(timing.tiles_by_mux)} mux{'es' * (len(timing.tiles_by_mux) > 1)}."
-        )
+        mux_count = len(timing.tile_counts_by_mux)
+        summary = f"{tiles} on {mux_count} mux{'es' * (mux_count > 1)}."
         return _Advice(summary, tuple(wrong), tuple(hints))
     summary = f"{tiles}: {chosen} gives {rate:.0f} frames/s."
     if asked_hz and rate < asked_hz:
-        change = f"ask for {_SPARE * best_hz:.0f} or less"
+        change = f"ask for {_RATE_MARGIN * best_hz:.0f} or less"
         if best_hz >= asked_hz:
             change = f"use schedule {best}"
         wrong.append(f"The {asked_hz:g} frames/s asked for will not hold: {change}.")
@@ -243,7 +272,7 @@ def _advice(
     return _Advice(summary, tuple(wrong), tuple(hints))
 
 
-def _pace_setter(
+def _describe_slowest_tile(
     asked: tuple[TileFinding, ...],
     timing: BusTiming,
     schedule: ScheduleName,
@@ -258,8 +287,8 @@ def _pace_setter(
     like_others = replace(
         timing, conversions_s=tuple(min(wait_s, usual_s) for wait_s in timing.conversions_s)
     )
-    without_hz = 1.0 / frame_s(schedule, like_others)
-    if without_hz < _WORTH_SAYING * rate_hz:
+    without_hz = 1.0 / compute_frame_s(schedule, like_others)
+    if without_hz < _MIN_NOTABLE_GAIN * rate_hz:
         return ""
     name = slow.serial or f"The tile at 0x{slow.mux:02x} channel {slow.channel}"
     return (
@@ -268,7 +297,7 @@ def _pace_setter(
     )
 
 
-def _disturbance(repeated: int) -> str:
+def _describe_disturbance(repeated: int) -> str:
     """Describe disturbed wiring from the number of transfers acknowledged only on retry."""
     if not repeated:
         return ""

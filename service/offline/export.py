@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import UsageError
-from storage.durable import whole_file
+from storage.durable_files import open_for_atomic_write
 from storage.formats.export import ClockName, Export
-from storage.formats.marks import Mark
+from storage.formats.markers import PlacedMarker
 from storage.formats.options import NO_OPTIONS, FormatOptions
-from storage.formats.sealed import export_of, marks_of
+from storage.formats.sealed_export import make_sealed_export, place_session_markers
 from storage.formats.slice import Slice
-from storage.formats.written.registry import format_named, together_named
-from storage.sessions.beside import EVENTS_NAME, read_events
-from storage.sessions.reader import SessionReader
+from storage.formats.writers.registry import get_format, get_multi_session_format
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.sidecars import MARKERS_NAME, read_markers
 
 _ALL = Slice()
 
@@ -29,25 +29,25 @@ class ExportOptions:
     """Name of the format."""
     part: Slice = _ALL
     clock: ClockName = "node"
-    marks: bool | None = None
+    markers: bool | None = None
     """Export of markers; None: if there is a markers file beside the frames."""
     options: FormatOptions = NO_OPTIONS
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportResult:
     """Result of an export."""
 
     size_bytes: int
-    left_out: tuple[Mark, ...]
+    left_out_markers: tuple[PlacedMarker, ...]
     """Markers without a frame."""
-    lacks_marks: bool
+    is_markers_file_missing: bool
     """True if a markers file was expected beside the frames but is missing."""
     remarks: tuple[str, ...]
     """Remarks on the time axes for the user."""
 
 
-def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
+def export_session(source: Path, out: Path, options: ExportOptions) -> ExportResult:
     """Write a sealed session, or a slice of it, in another format.
 
     Args:
@@ -60,13 +60,13 @@ def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
         FileFormatError: a file is damaged.
         StorageError: `out` cannot be written.
     """
-    to = format_named(options.to)
-    with SessionReader(source, only_slices=not options.part.is_all) as reader:
-        export, lacks_marks = _export_of(reader, options)
-        return _written(out, to.written(export), [export], lacks_marks)
+    to = get_format(options.to)
+    with SealedFileReader(source, only_slices=not options.part.is_whole_session) as reader:
+        export, lacks_marks = _prepare_export(reader, options)
+        return _write_export(out, to.encode(export), [export], lacks_marks)
 
 
-def export_together(sources: Sequence[Path], out: Path, options: ExportOptions) -> Exported:
+def export_merged(sources: Sequence[Path], out: Path, options: ExportOptions) -> ExportResult:
     """Write several sealed sessions to one file, on the server's time axis.
 
     Args:
@@ -79,45 +79,47 @@ def export_together(sources: Sequence[Path], out: Path, options: ExportOptions) 
         FileFormatError: a file is damaged.
         StorageError: `out` cannot be written.
     """
-    to = together_named(options.to)
+    to = get_multi_session_format(options.to)
     with ExitStack() as opened:
         readers = [
-            opened.enter_context(SessionReader(source, only_slices=not options.part.is_all))
+            opened.enter_context(
+                SealedFileReader(source, only_slices=not options.part.is_whole_session)
+            )
             for source in sources
         ]
-        found = [_export_of(reader, options) for reader in readers]
+        found = [_prepare_export(reader, options) for reader in readers]
         exports = [export for export, _ in found]
         lacks_marks = any(lacks for _, lacks in found)
-        return _written(out, to.written_together(exports), exports, lacks_marks)
+        return _write_export(out, to.encode_together(exports), exports, lacks_marks)
 
 
-def _export_of(reader: SessionReader, options: ExportOptions) -> tuple[Export, bool]:
+def _prepare_export(reader: SealedFileReader, options: ExportOptions) -> tuple[Export, bool]:
     """Prepare an export; also return True if an expected markers file is missing."""
-    beside = reader.path.with_name(EVENTS_NAME)
-    stored = read_events(beside) if options.marks is not False and beside.is_file() else None
-    if options.marks and stored is None:
+    beside = reader.path.with_name(MARKERS_NAME)
+    stored = read_markers(beside) if options.markers is not False and beside.is_file() else None
+    if options.markers and stored is None:
         raise UsageError(
-            f"there is no {EVENTS_NAME} beside {reader.path.name}, so its markers are unknown",
+            f"there is no {MARKERS_NAME} beside {reader.path.name}, so its markers are unknown",
             where=str(reader.path.parent),
             expected="a session's folder as a server sealed it or `foottile pull` fetched it",
         )
-    placed = None if stored is None else marks_of(reader, stored.events, options.part)
-    export = export_of(
-        reader, options.part, clock=options.clock, marks=placed, options=options.options
+    placed = None if stored is None else place_session_markers(reader, stored.markers, options.part)
+    export = make_sealed_export(
+        reader, options.part, clock=options.clock, markers=placed, options=options.options
     )
-    return export, options.marks is None and stored is None and "session" in reader.notes
+    return export, options.markers is None and stored is None and "session" in reader.notes
 
 
-def _written(
+def _write_export(
     out: Path, chunks: Iterator[bytes], exports: Sequence[Export], lacks_marks: bool
-) -> Exported:
-    with whole_file(out) as file:
+) -> ExportResult:
+    with open_for_atomic_write(out) as file:
         for chunk in chunks:
             file.write(chunk)
-    left_out = [mark for export in exports if export.marks for mark in export.marks.left_out]
+    left_out = [mark for export in exports if export.markers for mark in export.markers.excluded]
     remarks = [
-        f"{export.called}: {remark}"
+        f"{export.display_name}: {remark}"
         for export in exports
-        if (remark := export.content.axis.remark())
+        if (remark := export.frame_source.axis.describe_shift())
     ]
-    return Exported(out.stat().st_size, tuple(left_out), lacks_marks, tuple(remarks))
+    return ExportResult(out.stat().st_size, tuple(left_out), lacks_marks, tuple(remarks))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from devices.buses.holders import holders_of
-from devices.buses.serial_line import latency_remark, latency_timer_ms, stable_path
-from devices.chips.dynamixel.probe import BAUDRATES, FoundServo, probe
+from devices.buses.device_users import find_programs_using
+from devices.buses.serial_line import check_latency_timer, find_stable_path, read_latency_timer_ms
+from devices.chips.dynamixel.servo_search import BAUDRATES, FoundServo, find_servos
 from devices.clock import Clock
 from devices.errors import ServoSetupError
-from devices.scene.hardware import ServoScene
+from devices.scene.hardware_sections import ServoSection
 
 TIMEOUTS_S = (0.05, 0.25)
 """Response timeouts; the second one is used if no servo answered, because a busy machine may read
@@ -34,24 +34,24 @@ class ServoDiagnosis:
     verdict: str
 
 
-def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoDiagnosis:
+def diagnose_servo(port: str, clock: Clock, expected: ServoSection | None) -> ServoDiagnosis:
     """Search for a servo in both protocols at the usual baud rates.
 
     Args:
         port: serial port.
         clock: a real clock.
-        wanted: the scene's servo; None: any with id 1.
+        expected: the scene's servo; None: any with id 1.
     """
-    servo_id = wanted.id if wanted is not None else 1
-    rates = dict.fromkeys((*((wanted.baudrate,) if wanted is not None else ()), *BAUDRATES))
+    servo_id = expected.id if expected is not None else 1
+    rates = dict.fromkeys((*((expected.baudrate,) if expected is not None else ()), *BAUDRATES))
     found: tuple[FoundServo, ...] = ()
     try:
         for timeout_s in TIMEOUTS_S:
             found = found or tuple(
-                probe(port, clock, servo_ids=[servo_id], baudrates=rates, timeout_s=timeout_s)
+                find_servos(port, clock, servo_ids=[servo_id], baudrates=rates, timeout_s=timeout_s)
             )
     except ServoSetupError as error:
-        holders = ", ".join(holders_of(port))
+        holders = ", ".join(find_programs_using(port))
         held = f" It is open in {holders}." if holders else ""
         return ServoDiagnosis((), None, is_well=False, verdict=f"{error}.{held}")
     found_texts = [
@@ -65,23 +65,23 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
             f"No servo answers as id {servo_id}. Check power, cable and id; an MX leaves the "
             "factory with id 1 at 57600 baud."
         )
-    elif wanted is not None and not any(_is_wanted(servo, wanted) for servo in found):
+    elif expected is not None and not any(_is_expected(servo, expected) for servo in found):
         wrong.append(
-            f"The scene says {wanted.model}, protocol {wanted.protocol}, {wanted.baudrate} baud: "
-            "change the scene's [servo], or the servo."
+            f"The scene says {expected.model}, protocol {expected.protocol}, "
+            f"{expected.baudrate} baud: change the scene's [servo], or the servo."
         )
-    if remark := latency_remark(port):
+    if remark := check_latency_timer(port):
         wrong.append(remark)
-    if (lasting := stable_path(port)) != port:
+    if (lasting := find_stable_path(port)) != port:
         found_texts.append(
             f"Name it {lasting} in the scene: {port} may be another adapter's next time."
         )
     return ServoDiagnosis(
-        found, latency_timer_ms(port), not wrong, " ".join((*found_texts, *wrong))
+        found, read_latency_timer_ms(port), not wrong, " ".join((*found_texts, *wrong))
     )
 
 
-def _is_wanted(servo: FoundServo, wanted: ServoScene) -> bool:
+def _is_expected(servo: FoundServo, wanted: ServoSection) -> bool:
     return (servo.model, servo.protocol, servo.baudrate) == (
         wanted.model,
         wanted.protocol,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from devices.scene.file import Scene
-from devices.scene.hardware import EMULATED
-from service.rig.emulated import EmulatedFoot
+from devices.scene.hardware_sections import EMULATED
+from devices.scene.scene_file import Scene
+from service.rig.emulated_foot import EmulatedFoot
 
 
 @dataclass(frozen=True)
@@ -15,13 +15,13 @@ class RigOptions:
     """Options of a rig; `foot` is for emulation only."""
 
     scene: Scene
-    node: str
+    node_name: str
     foot: EmulatedFoot = EmulatedFoot()  # noqa: RUF009  # frozen, so one for all is safe
-    streams: Path | None = None
+    journals_folder: Path | None = None
     """Folder of the node's journals, for the files of frames in flight in a subfolder per stream.
     """
 
     @property
-    def emulated(self) -> bool:
+    def is_emulated(self) -> bool:
         """True if the tiles are emulated."""
         return self.scene.array.bus == EMULATED

@@ -12,25 +12,25 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from devices.acquisition import Acquisition
-from devices.array.startup import Ready, make_ready, renew
+from devices.array.startup import ReadyArray, prepare_array, reidentify_replaced_tiles
 from devices.buses.i2c import open_bus
 from devices.buses.spi import open_spi
-from devices.chips.dynamixel.reader import open_servo
-from devices.chips.dynamixel.servo import ServoReader
+from devices.chips.dynamixel.driver import open_servo
+from devices.chips.dynamixel.position_sources import ThreadedServoSource
 from devices.chips.mcp3208 import Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
 from devices.errors import FootTileError, I2cError, TileSetupError, UsageError
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus
-from devices.realtime import clock_is_set, run_before_others, sharpen_timers
-from devices.recovery.recovery import BusRecovery, GpioRecovery, open_recovery
-from devices.reference import ReferenceForce
-from devices.scene.file import Scene
-from devices.scene.hardware import EMULATED, ServoScene
-from service.rig.description import describe
-from service.rig.lead import Lead
+from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from devices.realtime import is_clock_set, set_timer_slack, use_realtime_priority
+from devices.recovery.bus_recovery import BusRecovery, GpioRecovery, open_gpio_recovery
+from devices.reference_force import ReferenceForceSensor
+from devices.scene.hardware_sections import EMULATED, ServoSection
+from devices.scene.scene_file import Scene
+from service.rig.array_info import make_array_info
+from service.rig.frame_rate import FrameRateMonitor, estimate_undisturbed_rate_hz
+from service.rig.load_trigger import LoadTrigger
 from service.rig.options import RigOptions
-from service.rig.pace import Pace, undisturbed_hz
-from storage.journal.node.in_flight import InFlight, open_in_flight
+from storage.journal.node.in_flight import InFlightWriter, create_in_flight_writer
 
 if TYPE_CHECKING:
     from devices.emulation.world import World
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 def open_reference_sensor(
     scene: Scene, world: World | None, stack: ExitStack
-) -> ReferenceForce | None:
+) -> ReferenceForceSensor | None:
     """Open the scene's reference force sensor; None if it has none.
 
     Raises:
@@ -50,34 +50,34 @@ def open_reference_sensor(
         return None
     emulated = None
     if reference.port == EMULATED:
-        mill = world.mill if world is not None else None
+        mill = world.indenter if world is not None else None
         if world is None or mill is None:
             raise UsageError(
                 f"scene {scene.name!r} has an emulated reference sensor and no emulated mill",
                 remedy='Set ground.kind = "indentation", or reference.port to a device',
             )
-        emulated = mill.adc(reference, world.clock)
+        emulated = mill.make_adc(reference, world.clock)
     device = open_spi(reference.port, emulated)
     stack.callback(device.close)
-    return ReferenceForce(Mcp3208(device, where=reference.port), reference)
+    return ReferenceForceSensor(Mcp3208(device, where=reference.port), reference)
 
 
-def open_recovery_lines(scene: Scene, clock: Clock, world: World | None) -> BusRecovery | None:
+def open_scene_recovery(scene: Scene, clock: Clock, world: World | None) -> BusRecovery | None:
     """Open the recovery of the scene's bus; None if no lines are wired.
 
     Raises:
         BusSetupError: the lines cannot be requested.
     """
     if scene.recovery is None or world is None or scene.array.bus != EMULATED:
-        return open_recovery(scene.recovery, clock)
-    from devices.emulation.buses.gpio import EmulatedLines
+        return open_gpio_recovery(scene.recovery, clock)
+    from devices.emulation.buses.gpio import EmulatedGpioLines
 
-    return GpioRecovery(EmulatedLines(world.i2c_adapter, clock), clock)
+    return GpioRecovery(EmulatedGpioLines(world.i2c_adapter, clock), clock)
 
 
 _TRIAL_FRAMES = 100
 """Frames of the rate measurement: a fifth of a second with four tiles."""
-_RENEW_AGAIN_NS = 2_000_000_000
+_REIDENTIFY_INTERVAL_NS = 2_000_000_000
 """Interval of attempts to identify a replaced part."""
 
 # Python's switch interval: an emulated servo's thread may hold the lock for about a bit at most.
@@ -98,165 +98,176 @@ class Rig:
 
     def __init__(self, options: RigOptions, stack: ExitStack) -> None:
         scene = options.scene
-        sharpen_timers()
+        set_timer_slack()
         self._options = options
         self._clock: Clock = SpinningClock()
         # Other threads, and the emulated wires, must not spin on the loop's core.
         self._line_clock = SystemClock()
-        self._lead: Lead | None = None
-        world = self._world(options, stack)
+        self._lead: LoadTrigger | None = None
+        world = self._make_world(options, stack)
         self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
         stack.callback(self._bus.close)
-        self._recovery = open_recovery_lines(scene, self._clock, world)
+        self._recovery = open_scene_recovery(scene, self._clock, world)
         self._reference = open_reference_sensor(scene, world, stack)
-        self._reference_n = None if self._reference is None else self._reference.read_n
-        self._ready = make_ready(
+        self._read_reference_n = None if self._reference is None else self._reference.read_force_n
+        self._ready = prepare_array(
             self._bus,
             scene,
             self._clock,
             recovery=self._recovery,
-            reference_n=self._reference_n,
+            read_reference_n=self._read_reference_n,
         )
-        self.remarks = [f"schedule {self._ready.choice.schedule}: {self._ready.choice.reason}"]
+        self.startup_messages = [
+            f"schedule {self._ready.choice.schedule}: {self._ready.choice.reason}"
+        ]
         """Start-up messages for the user."""
-        self.remarks += [
+        self.startup_messages += [
             f"the conversion time of tile {serial} could not be measured; 3 ms is assumed"
-            for serial in self._ready.unmeasured
+            for serial in self._ready.unmeasured_serials
         ]
         self._servo_source = (
-            self._servo(scene.servo, world, stack) if scene.servo is not None else None
+            self._open_servo_source(scene.servo, world, stack) if scene.servo is not None else None
         )
-        self._renew_at_ns = 0
-        self._in_flight: InFlight | None = None
-        bus_hz = self._bus_hz(self._ready)
+        self._reidentify_at_ns = 0
+        self._in_flight: InFlightWriter | None = None
+        bus_hz = self._estimate_max_rate_hz(self._ready)
         # Last: on a busy machine the start-up before would use up the lead.
-        if world is not None and options.emulated:
-            self._lead = Lead(world, options.foot.lead_s)
+        if world is not None and options.is_emulated:
+            self._lead = LoadTrigger(world, options.foot.lead_s)
             stack.callback(self._write_plates, world)
         elif world is not None:
-            world.begin()
-        self._begin_stream(bus_hz, is_new=False)
-        if not options.emulated:
+            world.begin_scene_time()
+        self._begin_stream(bus_hz, is_reidentified=False)
+        if not options.is_emulated:
             # Last, and only this thread: an emulated world would starve the rest of the machine.
-            run_before_others()
+            use_realtime_priority()
 
-    def _begin_stream(self, bus_hz: float, *, is_new: bool) -> None:
+    def _begin_stream(self, bus_hz: float, *, is_reidentified: bool) -> None:
         scene, ready = self._options.scene, self._ready
-        anchor = UtcAnchor.now(clock_set=clock_is_set())
-        self.info: ArrayInfo = describe(
+        anchor = UtcAnchor.measure(clock_set=is_clock_set())
+        self.info: ArrayInfo = make_array_info(
             scene,
             ready.tiles,
             anchor,
-            node=self._options.node,
-            boot_id=uuid.uuid4().hex,
+            node=self._options.node_name,
+            stream_id=uuid.uuid4().hex,
             schedule=ready.choice.schedule,
             rate_hz=min(scene.rate_hz or bus_hz, bus_hz),
         )
         if self._in_flight is not None:
             self._in_flight.close()
-        streams = self._options.streams
-        folder = None if streams is None else streams / self.info.boot_id
-        self._in_flight = open_in_flight(folder, self.info)
+        streams = self._options.journals_folder
+        folder = None if streams is None else streams / self.info.stream_id
+        self._in_flight = create_in_flight_writer(folder, self.info)
         if folder is not None and self._in_flight is None:
-            self.remarks.append("no room for frames in flight: a crash may cost the last batches")
+            self.startup_messages.append(
+                "no room for frames in flight: a crash may cost the last batches"
+            )
         self.acquisition = Acquisition(
             ready.array,
             ready.tiles,
             self._clock,
             anchor,
             rate_hz=scene.rate_hz,
-            expected_hz=bus_hz,
+            expected_rate_hz=bus_hz,
             servo=self._servo_source,
-            is_new=is_new,
-            keeper=self._in_flight,
+            is_reidentified=is_reidentified,
+            frame_sink=self._in_flight,
             lead_end_ns=None if self._lead is None else self._lead.end_ns,
         )
-        self._pace = Pace(self.info.nominal_rate_hz)
+        self._rate_monitor = FrameRateMonitor(self.info.nominal_rate_hz)
 
-    def batches(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
+    def acquire_batches(self, should_stop: Callable[[], bool]) -> Iterator[FrameBatch]:
         """Acquire batches of one stream until `stop()` returns True.
 
         Frames before the begin of an emulated load are flagged as lead. The stream also ends when a
         part was replaced, or when it is faster than its nominal rate: then `info` describes a new
         stream, which the next call acquires.
         """
-        while not stop():
-            for batch in self.acquisition.run(lambda: stop() or self._is_renewal_due()):
+        while not should_stop():
+            for batch in self.acquisition.acquire_batches(
+                lambda: should_stop() or self._is_reidentification_due()
+            ):
                 if self._lead is not None:
-                    self._lead.see(batch)
+                    self._lead.add_batch(batch)
                     self.acquisition.lead_end_ns = self._lead.end_ns
-                if not batch.frame_status[-1] & FrameStatus.LEAD:  # a lead is of one stream
-                    self._pace.see(batch)
+                if not batch.frame_flags[-1] & FrameFlag.LEAD:  # a lead is of one stream
+                    self._rate_monitor.add_batch(batch)
                 yield batch
-                if self._pace.found_hz is not None:
-                    self._begin_stream(self._pace.found_hz, is_new=False)
+                if self._rate_monitor.exceeding_rate_hz is not None:
+                    self._begin_stream(self._rate_monitor.exceeding_rate_hz, is_reidentified=False)
                     return
-            if not stop() and self._renew():
+            if not should_stop() and self._reidentify():
                 return
 
-    def troubles(self) -> dict[str, str]:
+    def get_warnings(self) -> dict[str, str]:
         """Return the present warnings, by tile's serial or device."""
-        found = self._ready.array.troubles()
-        if self._reference is not None and self._reference.trouble:
-            found["reference"] = self._reference.trouble
-        if self._servo_source is not None and self._servo_source.trouble:
-            found["servo"] = f"servo: {self._servo_source.trouble}"
+        found = self._ready.array.get_warnings()
+        if self._reference is not None and self._reference.warning:
+            found["reference"] = self._reference.warning
+        if self._servo_source is not None and self._servo_source.warning:
+            found["servo"] = f"servo: {self._servo_source.warning}"
         return found
 
-    def counts(self) -> dict[str, dict[str, int]]:
+    def get_fault_counts(self) -> dict[str, dict[str, int]]:
         """Return the fault counts of the stream, by serial and reason."""
         array = self._ready.array
         return {
-            tile.serial: dict(health.counts)
+            tile.serial: dict(health.fault_counts)
             for tile, health in zip(array.tiles, array.health, strict=True)
-            if health.counts
+            if health.fault_counts
         }
 
-    def _is_renewal_due(self) -> bool:
-        return bool(self._ready.array.replaced) and self._clock.now_ns() >= self._renew_at_ns
+    def _is_reidentification_due(self) -> bool:
+        return (
+            bool(self._ready.array.replaced_serials)
+            and self._clock.now_ns() >= self._reidentify_at_ns
+        )
 
-    def _renew(self) -> bool:
+    def _reidentify(self) -> bool:
         try:
-            self._ready = renew(
+            self._ready = reidentify_replaced_tiles(
                 self._bus,
                 self._options.scene,
                 self._clock,
                 self._ready,
                 recovery=self._recovery,
-                reference_n=self._reference_n,
+                read_reference_n=self._read_reference_n,
             )
         except (I2cError, TileSetupError):  # perhaps half plugged in: go on with the others
-            self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS
-            self._ready.array.resume()
+            self._reidentify_at_ns = self._clock.now_ns() + _REIDENTIFY_INTERVAL_NS
+            self._ready.array.discard_bus_state()
             return False
-        self._begin_stream(self._bus_hz(self._ready), is_new=True)
+        self._begin_stream(self._estimate_max_rate_hz(self._ready), is_reidentified=True)
         return True
 
-    def _world(self, options: RigOptions, stack: ExitStack) -> World | None:
+    def _make_world(self, options: RigOptions, stack: ExitStack) -> World | None:
         scene = options.scene
-        if not options.emulated and (scene.servo is None or scene.servo.port != EMULATED):
+        if not options.is_emulated and (scene.servo is None or scene.servo.port != EMULATED):
             return None
         sys.setswitchinterval(_SWITCH_S)
-        pressed = options.foot.pressed_on(scene)
+        pressed = options.foot.compute_tile_load(scene)
         clock: Clock = self._line_clock
-        if options.emulated:
-            from devices.emulation.hosted_clock import HostedClock, WireClock
+        if options.is_emulated:
+            from devices.emulation.driver_clock import DriverClock, WireClock
 
-            self._clock = driver = HostedClock(self._clock)
+            self._clock = driver = DriverClock(self._clock)
             clock = WireClock(driver, self._line_clock)
-        return options.foot.world(scene, clock, pressed, looped=True, in_real_time=True)
+        return options.foot.make_world(scene, clock, pressed, is_repeated=True, in_real_time=True)
 
     def _write_plates(self, world: World) -> None:
         """Write the plates' files on closing; print errors, as no caller can handle them."""
         try:
-            self._options.foot.write_plates(world, self._clock.now_ns())
+            self._options.foot.write_plate_recordings(world, self._clock.now_ns())
         except FootTileError as error:
             sys.stderr.write(f"foottile: {error}\n")
 
-    def _servo(self, scene: ServoScene, world: World | None, stack: ExitStack) -> ServoReader:
+    def _open_servo_source(
+        self, scene: ServoSection, world: World | None, stack: ExitStack
+    ) -> ThreadedServoSource:
         port: str | Callable[[], str] = scene.port
         if port == EMULATED and world is not None:
-            emulated = stack.enter_context(world.servo(scene, self._line_clock))
+            emulated = stack.enter_context(world.open_servo(scene, self._line_clock))
             port = lambda: emulated.port  # noqa: E731
         servo = open_servo(
             port,
@@ -265,13 +276,15 @@ class Rig:
             servo_id=scene.id,
             model=scene.model,
             protocol=scene.protocol,
-            waits=True,
+            allows_missing_port=True,
         )
         stack.callback(servo.close)
-        self.remarks += servo.remarks
-        return stack.enter_context(ServoReader(servo, self._line_clock, rate_hz=scene.rate_hz))
+        self.startup_messages += servo.opening_warnings
+        return stack.enter_context(
+            ThreadedServoSource(servo, self._line_clock, rate_hz=scene.rate_hz)
+        )
 
-    def _bus_hz(self, ready: Ready) -> float:
+    def _estimate_max_rate_hz(self, ready: ReadyArray) -> float:
         """Estimate the highest frame rate of the bus: the predicted or a measured one.
 
         The prediction uses timings measured under the machine's other load. Trial frames that are
@@ -279,6 +292,6 @@ class Rig:
         """
         t_ns = [self._clock.now_ns()]
         for _ in range(_TRIAL_FRAMES):
-            ready.array.scan()
+            ready.array.scan_frame()
             t_ns.append(self._clock.now_ns())
-        return max(ready.predicted_hz, undisturbed_hz(t_ns))
+        return max(ready.predicted_rate_hz, estimate_undisturbed_rate_hz(t_ns))

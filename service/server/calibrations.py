@@ -18,14 +18,14 @@ from devices.errors import (
     UnknownError,
 )
 from service.estimation.calibration import Calibration
-from service.sessions.calibration_file import calibration_of, content_of
-from storage.durable import (
-    make_folder,
-    put_aside,
-    read_whole,
-    storage_errors,
+from service.sessions.calibration_file import encode_calibration, parse_calibration
+from storage.durable_files import (
+    make_synced_folder,
+    read_small_file,
+    set_aside_and_describe,
     sync_folder,
-    write_whole,
+    translate_storage_errors,
+    write_atomically,
 )
 
 CALIBRATIONS_MAX = 1000
@@ -35,7 +35,7 @@ CALIBRATION_ID = re.compile(r"[0-9a-f]{16}")
 
 
 @dataclass(frozen=True)
-class Kept:
+class CalibrationSummary:
     """Facts of a calibration that are kept in memory."""
 
     id: str
@@ -44,13 +44,13 @@ class Kept:
     date: str
     serials: tuple[str, ...]
     refused: tuple[str, ...]
-    is_assumed: bool
+    has_assumed_scale: bool
     """True if the scale of any tile is an assumption."""
-    is_mounted: bool
+    has_mount_gains: bool
     """True if a force plate has shown how its tiles are mounted."""
 
     @classmethod
-    def of(cls, calibration: Calibration) -> Kept:
+    def from_calibration(cls, calibration: Calibration) -> CalibrationSummary:
         """Return the summary of a calibration."""
         return cls(
             id=calibration.id,
@@ -59,12 +59,12 @@ class Kept:
             date=calibration.date,
             serials=tuple(tile.serial for tile in calibration.tiles),
             refused=tuple(calibration.refused),
-            is_assumed=any(tile.absolute_scale == "assumed" for tile in calibration.tiles),
-            is_mounted=calibration.mounted is not None,
+            has_assumed_scale=any(tile.absolute_scale == "assumed" for tile in calibration.tiles),
+            has_mount_gains=calibration.mounted is not None,
         )
 
 
-class CalibrationBook:
+class CalibrationStore:
     """Calibrations of a data folder; a damaged file is set aside and not listed.
 
     Args:
@@ -76,27 +76,27 @@ class CalibrationBook:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._kept: dict[str, Kept] = {}
+        self._summaries: dict[str, CalibrationSummary] = {}
         self.problems: list[str] = []
-        with storage_errors(folder):
+        with translate_storage_errors(folder):
             paths = sorted(folder.glob("*.json"))
         for path in paths:
             if not CALIBRATION_ID.fullmatch(path.stem):
                 continue
             try:
-                calibration = self._read(path.stem)
+                calibration = self._read_file(path.stem)
             except (CalibrationError, FileFormatError) as error:
-                self.problems.append(f"a calibration: {put_aside(path, error)}")
+                self.problems.append(f"a calibration: {set_aside_and_describe(path, error)}")
             except FootTileError as error:
                 self.problems.append(f"a calibration is left out: {error}")
             else:
-                self._kept[path.stem] = Kept.of(calibration)
+                self._summaries[path.stem] = CalibrationSummary.from_calibration(calibration)
 
-    def all(self) -> list[Kept]:
+    def list_all(self) -> list[CalibrationSummary]:
         """Return the summaries of all calibrations, the newest recordings first."""
-        return sorted(self._kept.values(), key=lambda kept: (kept.date, kept.id), reverse=True)
+        return sorted(self._summaries.values(), key=lambda kept: (kept.date, kept.id), reverse=True)
 
-    def get(self, calibration_id: str) -> Calibration:
+    def load(self, calibration_id: str) -> Calibration:
         """Load a calibration from the disk.
 
         Raises:
@@ -104,35 +104,35 @@ class CalibrationBook:
             StateError: its file is damaged or was deleted.
             StorageError: it cannot be read now.
         """
-        if calibration_id not in self._kept:
+        if calibration_id not in self._summaries:
             raise UnknownError(
                 f"no calibration {calibration_id[:80]!r}",
                 expected="the id of one that was uploaded or fitted here",
             )
         try:
-            return self._read(calibration_id)
+            return self._read_file(calibration_id)
         except (CalibrationError, FileFormatError, FileNotFoundError) as error:
             raise StateError(
                 f"calibration {calibration_id} is damaged: {error}", remedy="Upload it again"
             ) from error
 
-    def keep(self, calibration: Calibration) -> Kept:
+    def save(self, calibration: Calibration) -> CalibrationSummary:
         """Save a calibration atomically; the same content twice is one calibration.
 
         Raises:
             StateError: the store is full.
             StorageError: it cannot be written.
         """
-        summary = Kept.of(calibration)
-        if summary.id not in self._kept and len(self._kept) >= CALIBRATIONS_MAX:
+        summary = CalibrationSummary.from_calibration(calibration)
+        if summary.id not in self._summaries and len(self._summaries) >= CALIBRATIONS_MAX:
             raise StateError(
-                f"this server keeps {len(self._kept)} calibrations already",
+                f"this server keeps {len(self._summaries)} calibrations already",
                 remedy="Delete unused ones",
             )
-        with storage_errors(self._folder):
-            make_folder(self._folder)
-        write_whole(self._path(summary.id), content_of(calibration))
-        self._kept[summary.id] = summary
+        with translate_storage_errors(self._folder):
+            make_synced_folder(self._folder)
+        write_atomically(self._path(summary.id), encode_calibration(calibration))
+        self._summaries[summary.id] = summary
         return summary
 
     def delete(self, calibration_id: str) -> None:
@@ -142,20 +142,20 @@ class CalibrationBook:
             UnknownError: no calibration has this id.
             StorageError: it cannot be deleted.
         """
-        if calibration_id not in self._kept:
+        if calibration_id not in self._summaries:
             raise UnknownError(f"no calibration {calibration_id[:80]!r}")
         path = self._path(calibration_id)
-        with storage_errors(path):
+        with translate_storage_errors(path):
             path.unlink(missing_ok=True)
             sync_folder(self._folder)
-        del self._kept[calibration_id]
+        del self._summaries[calibration_id]
 
     def _path(self, calibration_id: str) -> Path:
         return self._folder / f"{calibration_id}.json"
 
-    def _read(self, calibration_id: str) -> Calibration:
+    def _read_file(self, calibration_id: str) -> Calibration:
         path = self._path(calibration_id)
-        calibration = calibration_of(read_whole(path), where=str(path))
+        calibration = parse_calibration(read_small_file(path), where=str(path))
         if calibration.id != calibration_id:
             raise CalibrationError(f"it is {calibration.id}", where=str(path))
         return calibration

@@ -9,14 +9,14 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from devices.errors import DamagedFileError, FolderGoneError
-from storage.durable import (
-    is_held,
-    locked,
-    make_folder,
-    put_aside,
-    set_aside,
-    storage_errors,
-    write_whole,
+from storage.durable_files import (
+    is_still_locked_folder,
+    lock_folder,
+    make_synced_folder,
+    set_aside_and_describe,
+    set_aside_damaged,
+    translate_storage_errors,
+    write_atomically,
 )
 from storage.server_id import SERVER_ID_NAME, read_server_id, write_server_id
 
@@ -24,7 +24,7 @@ log = logging.getLogger("foottile.server")
 
 _PROBE_NAME = ".writable"
 _PROBE_BYTES = 64 << 10
-_COMES_BACK = (
+_REMEDY = (
     "Move it back or mount it: the server then goes on by itself, and nodes send again what is "
     "missing"
 )
@@ -34,7 +34,7 @@ class DataFolder:
     """Data folder, locked by one server until `close`.
 
     The server waits for a folder that was moved or unmounted; meanwhile nothing is written at its
-    path. The folder may come back mounted again, or as a copy, which its id proves: `reopen`.
+    path. The folder may come back mounted again, or as a copy, which its id proves: `ensure_open`.
 
     Args:
         path: created if absent.
@@ -45,38 +45,38 @@ class DataFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with storage_errors(path, "Choose another folder with --data"):
-            make_folder(path)
-        self._lock = self._locked()
+        with translate_storage_errors(path, "Choose another folder with --data"):
+            make_synced_folder(path)
+        self._lock = self._acquire_lock()
         self.problems: list[str] = []
         """Damage found in the folder's own files, and the consequence, as text."""
         try:
             if (path / _PROBE_NAME).is_dir():
-                set_aside(path / _PROBE_NAME)
-            self.id = self._known_id() or self._new_id(uuid.uuid4().hex)
+                set_aside_damaged(path / _PROBE_NAME)
+            self.id = self._read_id() or self._write_id(uuid.uuid4().hex)
         except BaseException:
             self._lock.close()
             raise
 
-    def check(self) -> None:
+    def check_in_place(self) -> None:
         """Check that the folder in use is at its path. Runs in any thread.
 
         Raises:
             FolderGoneError: it is not; the error names the folder that is there now.
             StorageError: that cannot be checked, or the id not be read.
         """
-        if is_held(self.path):
+        if is_still_locked_folder(self.path):
             return
-        with storage_errors(self.path, _COMES_BACK):
-            place = self._place()
+        with translate_storage_errors(self.path, _REMEDY):
+            place = self._describe_path()
         raise FolderGoneError(
             f"the data folder was moved, deleted or unmounted, and nothing is stored: {place}",
             where=str(self.path),
-            remedy=_COMES_BACK,
+            remedy=_REMEDY,
             errno=errno.ENOENT,
         )
 
-    def take_again(self) -> None:
+    def reopen(self) -> None:
         """Lock the folder at the path if it has the same id: mounted again, or a copy.
 
         Files that are open in the former folder are lost: the caller has closed them all.
@@ -85,10 +85,10 @@ class DataFolder:
             FolderGoneError: no folder with its id is there.
             StorageError: another server has locked it.
         """
-        if is_held(self.path) or self._id_there() != self.id:
-            self.check()
+        if is_still_locked_folder(self.path) or self._read_id_at_path() != self.id:
+            self.check_in_place()
             return
-        lock = self._locked()
+        lock = self._acquire_lock()
         self._lock.close()
         self._lock = lock
         log.warning("%s: the data folder was mounted anew or copied; it is used again", self.path)
@@ -100,21 +100,21 @@ class DataFolder:
             FolderGoneError: it is not in place.
             StorageError: it is not writable.
         """
-        self.check()
+        self.check_in_place()
         # The size of some seconds of frames: a full disk still accepts an empty file.
-        write_whole(self.path / _PROBE_NAME, bytes(_PROBE_BYTES))
+        write_atomically(self.path / _PROBE_NAME, bytes(_PROBE_BYTES))
 
     def close(self) -> None:
         """Release the lock."""
         self._lock.close()
 
-    def _place(self) -> str:
+    def _describe_path(self) -> str:
         """Describe the content of the path, for an error.
 
         Raises:
             OSError: it cannot be read.
         """
-        found = self._id_there()
+        found = self._read_id_at_path()
         if found is not None:
             is_ours = found == self.id
             what = (
@@ -126,24 +126,24 @@ class DataFolder:
             what = "another folder" if any(self.path.iterdir()) else "an empty mount point"
         return f"there is {what} in its place"
 
-    def _id_there(self) -> str | None:
+    def _read_id_at_path(self) -> str | None:
         """Read the id of the folder at the path; None if it has none."""
         with suppress(DamagedFileError, FileNotFoundError):
             return read_server_id(self.path / SERVER_ID_NAME).id
         return None
 
-    def _locked(self) -> ExitStack:
+    def _acquire_lock(self) -> ExitStack:
         stack = ExitStack()
         stack.enter_context(
-            locked(
+            lock_folder(
                 self.path,
-                refusal="another foottile server uses this data folder",
+                refusal_text="another foottile server uses this data folder",
                 remedy="Stop it, or choose another folder with --data",
             )
         )
         return stack
 
-    def _known_id(self) -> str | None:
+    def _read_id(self) -> str | None:
         """Read the id, rewriting it if it has no checksum; None if missing or damaged.
 
         Raises:
@@ -155,11 +155,13 @@ class DataFolder:
         except FileNotFoundError:
             return None
         except DamagedFileError as error:
-            self.problems.append(f"{put_aside(path, error)}; nodes treat this server as a new one")
+            self.problems.append(
+                f"{set_aside_and_describe(path, error)}; nodes treat this server as a new one"
+            )
             log.warning("%s", self.problems[-1])
             return None
-        return stored.id if stored.is_proven else self._new_id(stored.id)
+        return stored.id if stored.has_checksum else self._write_id(stored.id)
 
-    def _new_id(self, made: str) -> str:
-        write_server_id(self.path / SERVER_ID_NAME, made)
-        return made
+    def _write_id(self, server_id: str) -> str:
+        write_server_id(self.path / SERVER_ID_NAME, server_id)
+        return server_id

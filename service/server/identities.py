@@ -11,34 +11,34 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import ChangedError, DamagedFileError, StateError, StorageError
-from service.identity import fingerprint_of, is_proven, make_secret
-from service.link import PROTOCOL, Challenge, Close, HangUp, Proof
-from storage.durable import put_aside
+from service.node_identity import compute_fingerprint, generate_secret, is_proof_valid
+from service.protocol import PROTOCOL, Challenge, CloseConnection, LinkCloseCode, Proof
+from storage.durable_files import set_aside_and_describe
 from storage.secret_file import SECRETS_NAME, read_secrets, write_secrets
 
 log = logging.getLogger("foottile.nodes")
 
 
 @dataclass(frozen=True)
-class Claim:
+class IdentityClaim:
     """Claim of a machine to be a node.
 
     Attributes:
         node: name of the node.
         challenge: challenge sent to the machine.
-        answer: answer of the machine.
+        proof: answer of the machine.
         address: peer address of the machine.
     """
 
     node: str
     challenge: Challenge
-    answer: Proof
+    proof: Proof
     """answer of the machine."""
     address: str
 
 
 @dataclass(frozen=True)
-class Replacement:
+class RefusedMachine:
     """Machine that was refused because another one has the name.
 
     Attributes:
@@ -54,7 +54,7 @@ class Replacement:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the machine's secret."""
-        return fingerprint_of(self.secret)
+        return compute_fingerprint(self.secret)
 
 
 class NodeIdentities:
@@ -66,12 +66,12 @@ class NodeIdentities:
 
     def __init__(self, data: Path) -> None:
         self._nodes = data / "nodes"
-        self.replacements: dict[str, Replacement] = {}
+        self.refused_machines: dict[str, RefusedMachine] = {}
         """Machine that was refused last, by the name of the node."""
         self.problems: list[str] = []
         """Damage found, and the consequence, as text."""
 
-    def secret_of(self, node: str) -> str | None:
+    def read_secret(self, node: str) -> str | None:
         """Read the secret of a node; None if unknown or damaged.
 
         Args:
@@ -86,50 +86,50 @@ class NodeIdentities:
         except DamagedFileError as error:
             # The true node sends it again. Otherwise a flipped bit would lock it out.
             self.problems.append(
-                f"node {node}: {put_aside(path, error)}; "
+                f"node {node}: {set_aside_and_describe(path, error)}; "
                 "the next machine that connects under this name is taken for it"
             )
             log.warning("%s", self.problems[-1])
             return None
 
-    def challenge(self, node: str, server_id: str) -> Challenge:
+    def make_challenge(self, node: str, server_id: str) -> Challenge:
         """Make the challenge for a machine that connects as this node.
 
         Raises:
-            StorageError: as `secret_of`.
+            StorageError: as `read_secret`.
         """
-        is_known = self.secret_of(node) is not None
+        is_known = self.read_secret(node) is not None
         return Challenge(
-            protocol=PROTOCOL, server_id=server_id, nonce=make_secret(), is_known=is_known
+            protocol=PROTOCOL, server_id=server_id, nonce=generate_secret(), is_known=is_known
         )
 
-    def is_proven(self, claim: Claim, now_t_ns: int) -> bool:
+    def verify_claim(self, claim: IdentityClaim, now_t_ns: int) -> bool:
         """Return whether a claim is proven; False if the node has no secret here.
 
         Raises:
             HangUp: the name belongs to another machine.
-            StorageError: as `secret_of`.
+            StorageError: as `read_secret`.
         """
-        node, answer = claim.node, claim.answer
-        secret = self.secret_of(node)
+        node, answer = claim.node, claim.proof
+        secret = self.read_secret(node)
         if secret is None:
             return False
-        if is_proven(secret, claim.challenge, node, answer):
+        if is_proof_valid(secret, claim.challenge, node, answer):
             return True
         if answer.secret is not None:
-            self.replacements[node] = Replacement(answer.secret, claim.address, now_t_ns)
+            self.refused_machines[node] = RefusedMachine(answer.secret, claim.address, now_t_ns)
         # The remedy comes first: a close reason has 123 bytes.
-        raise HangUp(
-            Close.WRONG_IDENTITY,
+        raise CloseConnection(
+            LinkCloseCode.WRONG_IDENTITY,
             f"accept this machine with `foottile accept-node {node}`: the name is another "
             "machine's",
         )
 
-    def keep_first(self, claim: Claim) -> None:
+    def store_first_secret(self, claim: IdentityClaim) -> None:
         """Store the secret of a first contact. A failure is logged: frames matter more."""
         try:
-            if claim.answer.secret is not None:
-                self._keep(claim.node, claim.answer.secret)
+            if claim.proof.secret is not None:
+                self._store_secret(claim.node, claim.proof.secret)
                 return
             why = "its disk stores none"
         except StorageError as error:
@@ -138,7 +138,7 @@ class NodeIdentities:
             "no secret of node %s is stored; any machine may use its name: %s", claim.node, why
         )
 
-    def accept(self, node: str, fingerprint: str) -> None:
+    def accept_replacement(self, node: str, fingerprint: str) -> None:
         """Accept the machine that was refused last as the node from now on.
 
         Raises:
@@ -146,7 +146,7 @@ class NodeIdentities:
             ChangedError: another machine than this one was refused last.
             StorageError: the disk is full or not writable; the former machine stays accepted.
         """
-        asking = self.replacements.get(node)
+        asking = self.refused_machines.get(node)
         if asking is None:
             raise StateError(
                 f"no other machine was refused as {node!r}",
@@ -158,12 +158,12 @@ class NodeIdentities:
                 expected=f"the machine {fingerprint}",
                 remedy="Compare it with the fingerprint that the machine itself prints",
             )
-        self._keep(node, asking.secret)
+        self._store_secret(node, asking.secret)
         log.warning("node %s is the machine %s from now on", node, fingerprint)
 
-    def _keep(self, node: str, secret: str) -> None:
+    def _store_secret(self, node: str, secret: str) -> None:
         write_secrets(self._path(node), {node: secret})
-        self.replacements.pop(node, None)
+        self.refused_machines.pop(node, None)
 
     def _path(self, node: str) -> Path:
         return self._nodes / node / SECRETS_NAME

@@ -11,11 +11,11 @@ from collections.abc import Iterable, Iterator
 
 from storage.sessions.folder import Session
 
-Age = tuple[int, str]
+StartKey = tuple[int, str]
 """Sort key of sessions: start time, ns UTC, and id."""
 
 
-def age_of(session: Session) -> Age:
+def start_key(session: Session) -> StartKey:
     """Return the sort key of a session."""
     return session.started_t_ns, session.id
 
@@ -29,7 +29,7 @@ class SessionIndex:
 
     def __init__(self, sessions: Iterable[Session] = ()) -> None:
         self._by_id = {session.id: session for session in sessions}
-        self._ages = sorted(map(age_of, self._by_id.values()))
+        self._keys = sorted(map(start_key, self._by_id.values()))
         self._unsealed = {
             name: session for name, session in self._by_id.items() if session.state != "sealed"
         }
@@ -46,33 +46,33 @@ class SessionIndex:
     def put(self, session: Session) -> None:
         """Add a session, or replace the one with its id."""
         previous = self._by_id.get(session.id)
-        if previous is None or age_of(previous) != age_of(session):
+        if previous is None or start_key(previous) != start_key(session):
             if previous is not None:
-                self.take(session.id)
-            insort(self._ages, age_of(session))
+                self.remove(session.id)
+            insort(self._keys, start_key(session))
         self._by_id[session.id] = session
         if session.state == "sealed":
             self._unsealed.pop(session.id, None)
         else:
             self._unsealed[session.id] = session
 
-    def take(self, session_id: str) -> Session:
+    def remove(self, session_id: str) -> Session:
         """Remove a session and return it.
 
         Raises:
             KeyError: no session has this id.
         """
         session = self._by_id.pop(session_id)
-        del self._ages[bisect_left(self._ages, age_of(session))]
+        del self._keys[bisect_left(self._keys, start_key(session))]
         self._unsealed.pop(session_id, None)
         return session
 
-    def unsealed(self, node: str | None = None) -> list[Session]:
+    def list_unsealed(self, node: str | None = None) -> list[Session]:
         """Return unsealed sessions, of all nodes or of one, in order of addition."""
         return [each for each in self._unsealed.values() if node in (None, each.node)]
 
-    def newest_first(self, before: Age | None = None) -> Iterator[Session]:
+    def iterate_newest_first(self, before: StartKey | None = None) -> Iterator[Session]:
         """Yield all sessions, or those before a key, newest first; change none meanwhile."""
-        end = len(self._ages) if before is None else bisect_left(self._ages, before)
+        end = len(self._keys) if before is None else bisect_left(self._keys, before)
         for place in range(end - 1, -1, -1):
-            yield self._by_id[self._ages[place][1]]
+            yield self._by_id[self._keys[place][1]]

@@ -20,22 +20,22 @@ from devices.errors import (
     StorageError,
 )
 from devices.frames import ArrayInfo, FrameBatch
-from service.link import BOOT_ID, Hello, StreamNumbers
-from service.server.estimates.of_node import Estimated, NodeEstimates
-from service.server.pace import Pace
+from service.protocol import STREAM_ID_PATTERN, Hello, StreamNumbers
+from service.server.estimates.node_estimator import EstimatedBatch, NodeEstimator
+from service.server.frame_rate import FrameRateMeter
 from service.server.streams import ServerStream
-from service.server_clock import utc_ns
+from service.server_clock import server_utc_ns
 from service.sessions.tare_file import RecordedTare
-from storage.checked_json import write_checked
+from storage.checksummed_json import write_checksummed_json
 from storage.clock.log import ClockOffset
-from storage.durable import make_folder, storage_errors
-from storage.intervals import NO_END, NODE_RESTARTED, Intervals, with_open_ends
-from storage.journal.journal import RING_NS, Journal
+from storage.durable_files import make_synced_folder, translate_storage_errors
+from storage.intervals import NO_END, NODE_RESTARTED, Intervals, to_open_pairs
+from storage.journal.journal import RING_DURATION_NS, Journal
 
 log = logging.getLogger("foottile.nodes")
 
-IS_BOOT_ID = re.compile(BOOT_ID)
-HELLO_FILE = "hello.json"
+BOOT_ID_PATTERN = re.compile(STREAM_ID_PATTERN)
+HELLO_NAME = "hello.json"
 
 
 class ServerNode:
@@ -50,17 +50,17 @@ class ServerNode:
     def __init__(self, folder: Path, journals: Path, hello: Hello) -> None:
         self.name = hello.array_info.node
         self.hello = hello
-        self.connected = False
-        self.estimates = NodeEstimates(folder, hello)
+        self.is_connected = False
+        self.estimator = NodeEstimator(folder, hello)
         self.streams: dict[str, ServerStream] = {}
         """Streams by id: stored here, or listed in hello."""
-        self.unread: set[str] = set()
+        self.unreadable_streams: set[str] = set()
         """Ids of streams whose journals cannot be read now: their frames are unknown."""
-        self.has_words = False
+        self.is_dirty = False
         """True if hello is not saved yet; `save` saves it before its frames are acknowledged."""
-        self.has_spoken = False
+        self.has_connected = False
         """True if the node has sent hello since the server was started."""
-        self.greeted_t_ns: int | None = None
+        self.hello_t_ns: int | None = None
         """Arrival time of the last hello, server's UTC."""
         self.storage_problem: str | None = None
         self.troubles: tuple[str, ...] = ()
@@ -72,32 +72,32 @@ class ServerNode:
         self.last_seq: int | None = None
         self.last_t_ns: int | None = None
         self.last_seen_t_ns: int | None = None
-        self.shown_t_ns: int | None = None
+        self.published_t_ns: int | None = None
         """Time of the newest frame that was published to subscribers, node's UTC."""
         self._folder = folder
         self._journals_folder = journals
-        self._pace = Pace()
-        self._found: list[str] = []
+        self._rate_meter = FrameRateMeter()
+        self._problems: list[str] = []
         for path in sorted(journals.glob("*")):
-            if IS_BOOT_ID.fullmatch(path.name):
+            if BOOT_ID_PATTERN.fullmatch(path.name):
                 try:
-                    self.streams[path.name] = stream = ServerStream.open(path)
-                    self._found += stream.problems
+                    self.streams[path.name] = stream = ServerStream.open_stored(path)
+                    self._problems += stream.problems
                 except DamagedFileError as error:
-                    self._found.append(f"a journal is left out: {error}")
+                    self._problems.append(f"a journal is left out: {error}")
                 except FootTileError as error:  # a full disk, or another version's file
-                    self.unread.add(path.name)
-                    self._found.append(f"a journal is left out until it can be read: {error}")
-        self._found += self.estimates.damages
-        for text in self._found:
+                    self.unreadable_streams.add(path.name)
+                    self._problems.append(f"a journal is left out until it can be read: {error}")
+        self._problems += self.estimator.problems
+        for text in self._problems:
             log.warning("node %s: %s", self.name, text)
-        self.present = self._stream_of(self.info)
+        self.present_stream = self._get_or_create_stream(self.info)
         """Stream to which the node adds frames now."""
 
     @property
     def problems(self) -> list[str]:
         """Damage found in its files, and the consequence, as text."""
-        return [f"node {self.name}: {text}" for text in self._found]
+        return [f"node {self.name}: {text}" for text in self._problems]
 
     @property
     def info(self) -> ArrayInfo:
@@ -105,14 +105,14 @@ class ServerNode:
         return self.hello.array_info
 
     @property
-    def boot_id(self) -> str:
+    def stream_id(self) -> str:
         """Id of the present stream."""
-        return self.info.boot_id
+        return self.info.stream_id
 
     @property
-    def order(self) -> tuple[str, ...]:
+    def stream_order(self) -> tuple[str, ...]:
         """Ids of its streams from its last hello, oldest first; the present one is last."""
-        return (*(each.array_info.boot_id for each in self.hello.earlier), self.boot_id)
+        return (*(each.array_info.stream_id for each in self.hello.earlier), self.stream_id)
 
     @property
     def journals(self) -> dict[str, Journal]:
@@ -122,37 +122,40 @@ class ServerNode:
     @property
     def journal(self) -> Journal | None:
         """Journal of the present stream; None before its first frame."""
-        return self.present.journal
+        return self.present_stream.journal
 
     @property
-    def clock(self) -> ClockOffset | None:
+    def clock_offset(self) -> ClockOffset | None:
         """Latest offset of its clock in the present stream; None before the first measurement."""
-        return self.present.clock
+        return self.present_stream.clock_offset
 
     @property
-    def missing(self) -> Intervals:
+    def missing_frames(self) -> Intervals:
         """Frames of the present stream that are not stored: lost, or still to come."""
         newest = -1 if self.last_seq is None else self.last_seq
-        if self.has_spoken:
+        if self.has_connected:
             newest = max(newest, self.hello.next_seq - 1)
-        return self.present.missing(newest)
+        return self.present_stream.missing_up_to(newest)
 
     @property
     def backlog_frames(self) -> int:
         """Number of missing frames that the node can still send."""
-        return (self.missing & self.present.may_come).count
+        return (self.missing_frames & self.present_stream.obtainable).count
 
     @property
-    def lost(self) -> dict[str, int]:
+    def lost_by_reason(self) -> dict[str, int]:
         """Number of lost frames of the present stream, by reason."""
-        unobtainable = self.missing - self.present.may_come
-        named = {why: lost.count for why, lost in self.present.lost.within(unobtainable).items()}
+        unobtainable = self.missing_frames - self.present_stream.obtainable
+        named = {
+            why: lost.count
+            for why, lost in self.present_stream.lost.restricted_to(unobtainable).items()
+        }
         if unnamed := unobtainable.count - sum(named.values()):
             named[NODE_RESTARTED] = named.get(NODE_RESTARTED, 0) + unnamed
         return named
 
     @property
-    def refusals(self) -> list[str]:
+    def refusal_warnings(self) -> list[str]:
         """Warnings about refused frames of the present stream."""
         if not self.refused_ahead_frames:
             return []
@@ -164,66 +167,68 @@ class ServerNode:
     @property
     def rate_hz(self) -> float | None:
         """Frames per second over the last second, by the node's clock; 0 if none came."""
-        seen_t_ns = self.present.last_seen_t_ns
-        silent_ns = None if seen_t_ns is None else utc_ns() - seen_t_ns
-        return self._pace.rate_hz(self.info.nominal_rate_hz, silent_ns)
+        seen_t_ns = self.present_stream.last_seen_t_ns
+        silent_ns = None if seen_t_ns is None else server_utc_ns() - seen_t_ns
+        return self._rate_meter.rate_hz(self.info.nominal_rate_hz, silent_ns)
 
-    def attach(self, hello: Hello, now_t_ns: int) -> None:
+    def on_hello(self, hello: Hello, now_t_ns: int) -> None:
         """Update streams and estimates from hello of a node that has connected.
 
         Args:
             hello: its message; every known stream in it has the array of before.
             now_t_ns: the server's UTC.
         """
-        if hello.array_info.boot_id != self.boot_id or self.last_seq is None:
+        if hello.array_info.stream_id != self.stream_id or self.last_seq is None:
             self.last_seq = self.last_t_ns = None
             self.troubles, self.fault_counts = (), {}
             self.refused_ahead_frames = 0
-            self._pace.clear()
+            self._rate_meter.clear()
         self.hello = hello
-        self.has_spoken, self.greeted_t_ns = True, now_t_ns
+        self.has_connected, self.hello_t_ns = True, now_t_ns
         for stream in list(self.streams.values()):
-            stream.owed = Intervals()
-            if stream.boot_id not in self.order and not hello.has_more:
-                stream.is_gone()
+            stream.unacked = Intervals()
+            if stream.stream_id not in self.stream_order and not hello.has_more:
+                stream.on_unlisted()
                 if stream.journal is None:  # no frame ever came
-                    del self.streams[stream.boot_id]
+                    del self.streams[stream.stream_id]
         for earlier in hello.earlier:
-            self._stream_of(earlier.array_info).has_ended(earlier)
-        self.present = self._stream_of(hello.array_info)
-        self.present.is_present(hello, now_t_ns)
+            self._get_or_create_stream(earlier.array_info).on_earlier(earlier)
+        self.present_stream = self._get_or_create_stream(hello.array_info)
+        self.present_stream.on_present(hello, now_t_ns)
         # Acknowledge stored frames again: a link may have broken before their acknowledgement.
-        for name in self.order:
+        for name in self.stream_order:
             stream = self.streams[name]
-            stream.owed = stream.held & stream.may_come
-        self.estimates.greet(hello)
-        self.has_words = True
+            stream.unacked = stream.stored & stream.obtainable
+        self.estimator.on_hello(hello)
+        self.is_dirty = True
 
-    def lacks(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
+    def missing_ranges(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
         """Return the frames to request: first those needed by sessions, then the others.
 
         Args:
             needed: frames that sessions need, by stream id.
         """
         found = []
-        for name in self.order:
-            stream, present = self.streams[name], name == self.boot_id
+        for name in self.stream_order:
+            stream, present = self.streams[name], name == self.stream_id
             wanted = needed.get(name, Intervals())
-            requested = stream.lacks(wanted, all_of_it=present)
-            first = (requested & wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
-            numbers = _joined([*first, *requested - first])
+            requested = stream.frames_to_request(wanted, include_unneeded=present)
+            first = (requested & wanted).restricted_to(
+                0, self.hello.next_seq - 1 if present else NO_END
+            )
+            numbers = _join_adjacent([*first, *requested - first])
             if numbers:
-                found.append(StreamNumbers(boot_id=name, numbers=with_open_ends(numbers)))
+                found.append(StreamNumbers(stream_id=name, numbers=to_open_pairs(numbers)))
         return tuple(found)
 
-    def detach(self) -> None:
+    def on_disconnect(self) -> None:
         """Mark the node as disconnected; its frames stay."""
-        self.connected = False
-        self._pace.clear()
+        self.is_connected = False
+        self._rate_meter.clear()
 
-    def take(
+    def receive_frames(
         self, stream: ServerStream, payload: bytes, now_t_ns: int
-    ) -> tuple[int, int, list[Estimated]]:
+    ) -> tuple[int, int, list[EstimatedBatch]]:
         """Store one message of frames, and estimate the frames newer than all before.
 
         Args:
@@ -239,30 +244,30 @@ class ServerNode:
         """
         try:
             frames = stream.decoder.decode(payload)
-            if ahead := stream.check(frames, now_t_ns):
-                self._refuse_ahead(frames, ahead)
+            if ahead := stream.check_frames(frames, now_t_ns):
+                self._count_ahead_frames(frames, ahead)
                 return int(frames.seq[0]), int(frames.seq[-1]), []
-            stream.take(frames, payload, now_t_ns)
+            stream.append_frames(frames, payload, now_t_ns)
         except FileFormatError as error:
             raise LinkError(f"node {self.name!r}: {error}") from error
         except StorageError as error:  # live goes on; nothing is acknowledged
             self.storage_problem = str(error)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         self.last_seen_t_ns = now_t_ns
-        if stream is not self.present:
+        if stream is not self.present_stream:
             return first, last, []
         if self.last_seq is not None and last <= self.last_seq:
-            self._look_for_tare()  # resent for the journal; live is further
+            self._update_tare()  # resent for the journal; live is further
             return first, last, []
         if self.last_seq is not None and first <= self.last_seq:
-            frames = frames.rows(self.last_seq + 1 - first, len(frames))
+            frames = frames.slice_rows(self.last_seq + 1 - first, len(frames))
         self.last_seq, self.last_t_ns = last, int(frames.t_ns[-1])
-        self._pace.note(int(frames.t_mono_ns[-1]), last)
-        due = self.estimates.feed(frames)
-        self._look_for_tare()
+        self._rate_meter.add_frame(int(frames.t_mono_ns[-1]), last)
+        due = self.estimator.feed_frames(frames)
+        self._update_tare()
         return first, last, due
 
-    def take_tare(self, reason: str = "") -> RecordedTare:
+    def tare_now(self, reason: str = "") -> RecordedTare:
         """Tare from an unloaded interval of the last seconds, and put the tare in force.
 
         Raises:
@@ -270,38 +275,42 @@ class ServerNode:
             StateError: the node is not connected.
             StorageError: the tare cannot be stored.
         """
-        if not self.connected:
+        if not self.is_connected:
             raise StateError(f"node {self.name!r} is not connected", remedy="Connect it and retry")
-        return self.estimates.tare_keeper.by_hand(reason)
+        return self.estimator.tare_controller.tare_by_hand(reason)
 
-    def read_again(self) -> None:
+    def retry_unreadable(self) -> None:
         """Retry opening the journals that could not be read."""
-        for name in sorted(self.unread):
+        for name in sorted(self.unreadable_streams):
             stream = self.streams.get(name)
             try:
                 if stream is None or stream.journal is None:
-                    opened = ServerStream.open(self._journals_folder / name)
+                    opened = ServerStream.open_stored(self._journals_folder / name)
                     if stream is not None:  # the node has listed it
                         stream.journal = opened.journal
                     else:
                         self.streams[name] = opened
-                        if self.has_spoken:
-                            opened.is_gone()
+                        if self.has_connected:
+                            opened.on_unlisted()
             except DamagedFileError as error:
-                self._found.append(f"a journal is left out: {error}")
+                self._problems.append(f"a journal is left out: {error}")
             except FootTileError:
                 continue
-            self.unread.discard(name)
+            self.unreadable_streams.discard(name)
 
-    def server_t_ns(self, t_ns: int) -> int:
+    def to_server_t_ns(self, t_ns: int) -> int:
         """Convert a time of the node's UTC to the server's; unchanged without an offset."""
-        return t_ns + (self.clock.server_minus_node_ns if self.clock is not None else 0)
+        return t_ns + (
+            self.clock_offset.server_minus_node_ns if self.clock_offset is not None else 0
+        )
 
-    def node_t_ns(self, t_ns: int) -> int:
+    def to_node_t_ns(self, t_ns: int) -> int:
         """Convert a time of the server's UTC to the node's."""
-        return t_ns - (self.clock.server_minus_node_ns if self.clock is not None else 0)
+        return t_ns - (
+            self.clock_offset.server_minus_node_ns if self.clock_offset is not None else 0
+        )
 
-    def prune(self, keep: Mapping[str, Intervals]) -> bool:
+    def delete_unneeded_step(self, keep: Mapping[str, Intervals]) -> bool:
         """Delete frames older than the ring and not in `keep`, at most one whole journal per call.
 
         Args:
@@ -316,32 +325,32 @@ class ServerNode:
         """
         for name, stream in list(self.streams.items()):
             needed = keep.get(name, Intervals())
-            if stream is self.present:
+            if stream is self.present_stream:
                 if self.last_t_ns is not None:
-                    stream.prune(self.last_t_ns - RING_NS, needed)
+                    stream.delete_older(self.last_t_ns - RING_DURATION_NS, needed)
             elif not needed:
                 is_there = stream.journal is not None
-                stream.delete()
-                if name not in self.order:
+                stream.delete_journal()
+                if name not in self.stream_order:
                     del self.streams[name]
                 if is_there:
                     return True
         return False
 
-    def keep(self) -> None:
+    def save(self) -> None:
         """Save hello for after a restart. Runs in any thread.
 
         Raises:
             StorageError: the disk is full or not writable.
         """
         hello = self.hello
-        with storage_errors(self._folder):
-            make_folder(self._folder)
-        write_checked(self._folder / HELLO_FILE, hello.model_dump_json().encode())
+        with translate_storage_errors(self._folder):
+            make_synced_folder(self._folder)
+        write_checksummed_json(self._folder / HELLO_NAME, hello.model_dump_json().encode())
         if hello is self.hello:  # a newer hello may have come meanwhile
-            self.has_words = False
+            self.is_dirty = False
 
-    def _refuse_ahead(self, frames: FrameBatch, why: str) -> None:
+    def _count_ahead_frames(self, frames: FrameBatch, why: str) -> None:
         """Count frames that are ahead of time; log the first ones of a stream."""
         if not self.refused_ahead_frames:
             first, last = int(frames.seq[0]), int(frames.seq[-1])
@@ -351,21 +360,23 @@ class ServerNode:
             )
         self.refused_ahead_frames += len(frames)
 
-    def _stream_of(self, info: ArrayInfo) -> ServerStream:
-        if info.boot_id not in self.streams:
-            self.streams[info.boot_id] = ServerStream(self._journals_folder / info.boot_id, info)
-        return self.streams[info.boot_id]
+    def _get_or_create_stream(self, info: ArrayInfo) -> ServerStream:
+        if info.stream_id not in self.streams:
+            self.streams[info.stream_id] = ServerStream(
+                self._journals_folder / info.stream_id, info
+            )
+        return self.streams[info.stream_id]
 
-    def _look_for_tare(self) -> None:
+    def _update_tare(self) -> None:
         if self.storage_problem is not None:  # a tare could not be stored
             return
         try:
-            self.estimates.look_for_tare(self.journal, lambda: self.present.may_come)
+            self.estimator.update_tare(self.journal, lambda: self.present_stream.obtainable)
         except StorageError as error:
             self.storage_problem = str(error)
 
 
-def _joined(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:
+def _join_adjacent(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the same ranges in the same order, with adjacent ones joined."""
     joined: list[tuple[int, int]] = []
     for first, last in numbers:

@@ -16,11 +16,11 @@ from devices.errors import (
     StorageError,
     UnknownError,
 )
-from devices.words import printable
-from service.link import PROTOCOL, Hello
-from service.server.node import HELLO_FILE, IS_BOOT_ID, ServerNode
-from storage.checked_json import read_checked
-from storage.durable import put_aside, storage_errors
+from devices.text import escape_control_chars
+from service.protocol import PROTOCOL, Hello
+from service.server.node import BOOT_ID_PATTERN, HELLO_NAME, ServerNode
+from storage.checksummed_json import read_checksummed_json
+from storage.durable_files import set_aside_and_describe, translate_storage_errors
 
 log = logging.getLogger("foottile.nodes")
 
@@ -29,7 +29,7 @@ _NODES_MAX = 1000
 _NODE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 
 
-class ServerNodes:
+class NodeRegistry:
     """All nodes of a server.
 
     A node whose description is damaged is unknown until its next hello; its journals, sessions and
@@ -46,36 +46,38 @@ class ServerNodes:
         self._data = data
         self._nodes: dict[str, ServerNode] = {}
         self._problems: list[str] = []
-        with storage_errors(data):
+        with translate_storage_errors(data):
             folders = sorted(path for path in (data / "nodes").glob("*") if path.is_dir())
         for folder in folders:
             try:
-                hello = _read_hello(folder / HELLO_FILE)
+                hello = _read_hello(folder / HELLO_NAME)
             except FileNotFoundError:
                 continue
             except DamagedFileError as error:
-                self._problem(f"node {folder.name}: {put_aside(folder / HELLO_FILE, error)}")
+                self._add_problem(
+                    f"node {folder.name}: {set_aside_and_describe(folder / HELLO_NAME, error)}"
+                )
                 continue
             except FileFormatError as error:
-                self._problem(f"node {folder.name}: {error}")
+                self._add_problem(f"node {folder.name}: {error}")
                 continue
             except StorageError as error:
-                self._problem(f"node {folder.name} is left out until it connects: {error}")
+                self._add_problem(f"node {folder.name} is left out until it connects: {error}")
                 continue
             try:
-                self._nodes[folder.name] = self._make(hello)
+                self._nodes[folder.name] = self._create_node(hello)
             except FootTileError as error:
-                self._problem(f"node {folder.name} is left out: {error}")
+                self._add_problem(f"node {folder.name} is left out: {error}")
 
     @property
     def problems(self) -> list[str]:
         """Damage found in the files of nodes, and the consequence, as text."""
         return self._problems + [text for node in self for text in node.problems]
 
-    def _problem(self, what: str) -> None:
-        what = printable(what)
-        log.warning("%s", what)
-        self._problems.append(what)
+    def _add_problem(self, text: str) -> None:
+        text = escape_control_chars(text)
+        log.warning("%s", text)
+        self._problems.append(text)
 
     def __iter__(self) -> Iterator[ServerNode]:
         return iter(self._nodes.values())
@@ -95,7 +97,7 @@ class ServerNodes:
             raise UnknownError(f"no node {name[:80]!r}", expected=f"one of: {names}")
         return self._nodes[name]
 
-    def greet(self, hello: Hello) -> ServerNode:
+    def get_or_create(self, hello: Hello) -> ServerNode:
         """Return the node that sent this hello, created if new. It is not connected yet.
 
         Raises:
@@ -103,7 +105,7 @@ class ServerNodes:
                 earlier hello, or the node's files are damaged.
         """
         info = hello.array_info
-        _check(hello)
+        _check_hello(hello)
         if info.node not in self._nodes:
             if len(self._nodes) >= _NODES_MAX:
                 raise LinkError(
@@ -111,21 +113,21 @@ class ServerNodes:
                     remedy="Delete the folders of unused nodes in nodes/, and restart the server",
                 )
             try:
-                self._nodes[info.node] = self._make(hello)
+                self._nodes[info.node] = self._create_node(hello)
             except FootTileError as error:
                 raise LinkError(f"node {info.node!r} cannot be accepted: {error}") from error
         node = self._nodes[info.node]
         for announced in (info, *(each.array_info for each in hello.earlier)):
-            stored = node.streams.get(announced.boot_id)
+            stored = node.streams.get(announced.stream_id)
             if stored is not None and stored.info != announced:
-                raise LinkError(f"stream {announced.boot_id} was announced with another array")
+                raise LinkError(f"stream {announced.stream_id} was announced with another array")
         return node
 
-    def forget(self, name: str) -> None:
+    def remove(self, name: str) -> None:
         """Remove a node whose first hello could not be accepted."""
         self._nodes.pop(name, None)
 
-    def _make(self, hello: Hello) -> ServerNode:
+    def _create_node(self, hello: Hello) -> ServerNode:
         name = hello.array_info.node
         return ServerNode(self._data / "nodes" / name, self._data / "journal" / name, hello)
 
@@ -139,14 +141,14 @@ def _read_hello(path: Path) -> Hello:
         FileFormatError: it is of another protocol version.
         StorageError: it cannot be read now.
     """
-    text = read_checked(path).text
+    text = read_checksummed_json(path).text
     again = "the node is unknown until it connects"
     try:
         content = json.loads(text)
         protocol = content["protocol"]
         hello = Hello.model_validate_json(text) if protocol == PROTOCOL else None
         if hello is not None:
-            _check(hello)
+            _check_hello(hello)
     except (ValueError, KeyError, TypeError, RecursionError, LinkError) as error:
         what = " ".join(str(error).split())[:200]
         raise DamagedFileError(
@@ -166,17 +168,17 @@ def is_node_name(name: str) -> bool:
     return _NODE_NAME.fullmatch(name) is not None
 
 
-def _check(hello: Hello) -> None:
+def _check_hello(hello: Hello) -> None:
     streams = [hello.array_info, *(each.array_info for each in hello.earlier)]
     for info in streams:
-        if not is_node_name(info.node) or not IS_BOOT_ID.fullmatch(info.boot_id):
+        if not is_node_name(info.node) or not BOOT_ID_PATTERN.fullmatch(info.stream_id):
             raise LinkError(
-                f"node {info.node[:80]!r} with boot_id {info.boot_id[:80]!r}",
+                f"node {info.node[:80]!r} with stream_id {info.stream_id[:80]!r}",
                 expected="a name of letters, digits, '.', '_' and '-', and 32 hex digits",
             )
         if not info.tiles:
             raise LinkError(f"node {info.node!r} has no tiles")
         if info.node != hello.array_info.node:
             raise LinkError(f"an earlier stream of node {hello.array_info.node!r} is {info.node!r}")
-    if len({info.boot_id for info in streams}) < len(streams):
+    if len({info.stream_id for info in streams}) < len(streams):
         raise LinkError(f"node {hello.array_info.node!r} names a stream twice")

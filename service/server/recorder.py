@@ -1,7 +1,7 @@
 """Recording commands: start, stop, abandon, delete and restore sessions, and report them.
 
 Starting and stopping only note numbers and times; the frames are in the journals anyway.
-`service.server.settling` does the rest.
+`service.server.sealer` does the rest.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from devices.errors import (
     StateError,
     StorageError,
 )
-from service.link import ClockRow, StreamNumbers, Wanted
-from service.server import following
-from service.server.book import SessionBook, expect, said_of
-from service.server.following import ledger_now
+from service.protocol import ClockSample, RetentionMessage, StreamNumbers
+from service.server import session_parts
 from service.server.node import ServerNode
-from service.server.nodes import ServerNodes
-from service.server.settling import Settling
-from service.server_clock import utc_ns
-from service.sessions.begin import begun
-from service.sessions.sources import Sources
-from storage.intervals import NO_END, Intervals, with_open_ends
-from storage.sessions.folder import Asked, Completeness, Ledger, Session
-from storage.sessions.ledger import numbers_of
+from service.server.nodes import NodeRegistry
+from service.server.sealer import SessionSealer
+from service.server.session_parts import current_ledger
+from service.server.session_store import SessionStore, check_revision, session_revision
+from service.server_clock import server_utc_ns
+from service.sessions.creation import create_session
+from service.sessions.inputs import SessionInputs
+from storage.intervals import NO_END, Intervals, to_open_pairs
+from storage.sessions.folder import Completeness, IdempotencyRecord, Ledger, Session
+from storage.sessions.ledger import group_numbers_by_stream
 
 log = logging.getLogger("foottile.recorder")
 
-BEHIND_S = 2.0
-CLOCK_ROW_OFF_NS = 60_000_000_000
+MAX_DELAY_S = 2.0
+CLOCK_ERROR_MAX_NS = 60_000_000_000
 """Tolerance: eight probes take up to 40 s on a very poor link."""
 
 
@@ -38,32 +38,32 @@ class Recorder:
     """Recording on the nodes of a server.
 
     Args:
-        book: sessions of the server.
+        store: sessions of the server.
         nodes: nodes to record on.
-        settling: ends and seals sessions.
+        sealer: ends and seals sessions.
     """
 
-    def __init__(self, book: SessionBook, nodes: ServerNodes, settling: Settling) -> None:
-        self._book = book
+    def __init__(self, store: SessionStore, nodes: NodeRegistry, sealer: SessionSealer) -> None:
+        self._store = store
         self._nodes = nodes
-        self._settling = settling
-        for session in book.unsealed():
-            book.note(self._with_clock(session))
+        self._sealer = sealer
+        for session in store.list_unsealed():
+            store.cache(self._with_clock_offsets(session))
 
-    def know(self, node: ServerNode) -> None:
+    def on_node_hello(self, node: ServerNode) -> None:
         """Add missing clock measurements to the sessions of a node that has connected.
 
         Those are missing after a first contact, and for streams into which a session was extended.
         """
-        for session in self._book.unsealed(node.name):
+        for session in self._store.list_unsealed(node.name):
             if session.state != "sealing":
-                self._book.note(self._with_clock(session))
+                self._store.cache(self._with_clock_offsets(session))
 
-    def recording_on(self, node: str) -> list[Session]:
+    def list_recording(self, node: str) -> list[Session]:
         """Return the sessions that are being recorded on a node."""
-        return [s for s in self._book.unsealed(node) if s.state == "recording"]
+        return [s for s in self._store.list_unsealed(node) if s.state == "recording"]
 
-    def start(
+    def start_session(
         self,
         node_name: str,
         name: str,
@@ -73,12 +73,12 @@ class Recorder:
         notes: str = "",
         tags: tuple[str, ...] = (),
         take: str | None = None,
-        asked: Asked | None = None,
+        request: IdempotencyRecord | None = None,
     ) -> Session:
         """Start a session with the next frame, or `pre_roll_s` earlier if still stored.
 
         Several sessions may be recorded on one node at a time. The caller looks up an earlier
-        sending of the same request: `SessionBook.begun_by`.
+        sending of the same request: `SessionStore.find_by_idempotency_key`.
 
         Raises:
             UnknownError: no node has this name.
@@ -86,33 +86,33 @@ class Recorder:
             StorageError: the session cannot be saved; nothing was started then.
         """
         node = self._nodes.get(node_name)
-        if not node.connected or node.last_seq is None or node.last_t_ns is None:
+        if not node.is_connected or node.last_seq is None or node.last_t_ns is None:
             raise StateError(f"node {node_name!r} sends no frames", remedy="Connect it and retry")
-        behind_s = (node.node_t_ns(utc_ns()) - node.last_t_ns) * 1e-9
-        if node.clock is not None and behind_s > BEHIND_S:
+        behind_s = (node.to_node_t_ns(server_utc_ns()) - node.last_t_ns) * 1e-9
+        if node.clock_offset is not None and behind_s > MAX_DELAY_S:
             raise StateError(
                 f"node {node_name!r} is {behind_s:.1f} s behind: its link is too slow",
                 remedy="Retry when it has caught up",
             )
-        part = following.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
-        session = begun(
+        part = session_parts.initial_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
+        session = create_session(
             node.info,
             name,
             part,
             scene_content=node.hello.scene,
-            calibration=node.estimates.live.calibration,
-            calibration_source=node.estimates.calibration_source,
+            calibration=node.estimator.live.calibration,
+            calibration_source=node.estimator.calibration_source,
             subject=subject,
             notes=notes,
             tags=tags,
             take=take,
-            asked=asked,
-            missed_slots_at_start=node.present.missed_slots,
-            clock=following.clock_at_start(node, part),
+            asked=request,
+            missed_slots_at_start=node.present_stream.missed_slots,
+            clock=session_parts.clock_offsets_at_start(node, part),
         )
-        return self._book.keep(session)
+        return self._store.save(session)
 
-    def stop(self, session_id: str) -> Session:
+    def stop_session(self, session_id: str) -> Session:
         """Stop a session now; it is sealed as soon as all its frames are here.
 
         A stopped session is unchanged: a repeated stop is the same stop.
@@ -121,14 +121,14 @@ class Recorder:
             UnknownError: no session has this id.
             StorageError: the session cannot be saved.
         """
-        session = self._book.get(session_id)
+        session = self._store.get_session(session_id)
         if session.state != "recording":
             return session
-        self._book.keep(following.stopped(session, self._nodes.find(session.node)))
-        self._settling.settle()
-        return self._book.get(session_id)
+        self._store.save(session_parts.mark_stopped(session, self._nodes.find(session.node)))
+        self._sealer.poll()
+        return self._store.get_session(session_id)
 
-    def give_up(self, session_id: str) -> Session:
+    def abandon_missing(self, session_id: str) -> Session:
         """Seal a pending session without its missing frames: its node never comes back.
 
         Raises:
@@ -136,7 +136,7 @@ class Recorder:
             StateError: it is not pending.
             StorageError: the session cannot be saved.
         """
-        session = self._book.get(session_id)
+        session = self._store.get_session(session_id)
         if session.state != "pending":
             raise StateError(
                 f"session {session_id} is {session.state}",
@@ -144,22 +144,22 @@ class Recorder:
                 remedy="Stop it first" if session.state == "recording" else "",
             )
         node = self._nodes.find(session.node)
-        if node is not None and following.is_unread(session, node):
+        if node is not None and session_parts.has_unreadable_journal(session, node):
             # Frames in an unreadable journal are abandoned; later streams have their own journals.
-            self._book.keep(session.model_copy(update={"given_up": True}))
-            self._settling.follow(node)
-            session = self._book.get(session_id)
-        self._book.keep(following.given_up(session, node))
-        self._settling.forget(session_id)
-        self._settling.settle()
-        return self._book.get(session_id)
+            self._store.save(session.model_copy(update={"given_up": True}))
+            self._sealer.on_node_hello(node)
+            session = self._store.get_session(session_id)
+        self._store.save(session_parts.abandon_missing(session, node))
+        self._sealer.reset_retry(session_id)
+        self._sealer.poll()
+        return self._store.get_session(session_id)
 
-    def discard(self, session_id: str, *, only_if: str | None = None) -> None:
+    def delete_session(self, session_id: str, *, if_revision: str | None = None) -> None:
         """Move a session to the trash.
 
         Args:
             session_id: id of the session.
-            only_if: expected `said_of`; None: any.
+            if_revision: expected `said_of`; None: any.
 
         Raises:
             UnknownError: no session has this id.
@@ -167,31 +167,31 @@ class Recorder:
             StateError: it is being recorded, or sealed.
             StorageError: it cannot be moved.
         """
-        session = self._book.get(session_id)
-        expect(only_if, said_of(session), f"session {session_id}")
+        session = self._store.get_session(session_id)
+        check_revision(if_revision, session_revision(session), f"session {session_id}")
         if session.state == "recording":
             raise StateError(f"session {session_id} is being recorded", remedy="Stop it first")
-        if self._settling.is_sealing(session_id):
+        if self._sealer.is_sealing(session_id):
             raise StateError(
                 f"session {session_id} is being sealed", remedy="Delete it in some seconds"
             )
-        self._book.take_out(session)
-        self._settling.forget(session_id)
+        self._store.move_to_trash(session)
+        self._sealer.reset_retry(session_id)
 
-    def restore(self, session_id: str) -> Session:
+    def restore_session(self, session_id: str) -> Session:
         """Restore a session from the trash; a pending one stays pending.
 
         Raises:
             UnknownError: it is not in the trash.
             StorageError: it cannot be moved.
         """
-        book = self._book
-        book.note(self._with_clock(book.trash.give_back(session_id, book.folder)))
-        self._settling.settle()
-        book.changed(book.get(session_id))
-        return book.get(session_id)
+        book = self._store
+        book.cache(self._with_clock_offsets(book.trash.restore(session_id, book.folder)))
+        self._sealer.poll()
+        book.on_change(book.get_session(session_id))
+        return book.get_session(session_id)
 
-    def note_clock(self, node: ServerNode, row: ClockRow, now_t_ns: int) -> None:
+    def record_clock_offset(self, node: ServerNode, row: ClockSample, now_t_ns: int) -> None:
         """Record a measurement of a node's clock, in its stream and its sessions.
 
         The stream's log has it already; sessions are saved with their next change. A measurement
@@ -199,7 +199,7 @@ class Recorder:
         node's clock as hello stated it.
         """
         said_t_ns = row.t_mono_ns + node.info.utc_offset_ns + row.server_minus_node_ns
-        if abs(said_t_ns - now_t_ns) > CLOCK_ROW_OFF_NS + row.uncertainty_ns:
+        if abs(said_t_ns - now_t_ns) > CLOCK_ERROR_MAX_NS + row.uncertainty_ns:
             log.warning(
                 "node %s: a measurement of its clock is not kept: it has this server's clock "
                 "%.0f s off. Was that set just now?",
@@ -207,8 +207,10 @@ class Recorder:
                 (said_t_ns - now_t_ns) * 1e-9,
             )
             return
-        limit = node.present.limit
-        if limit is not None and not limit.is_of_clock(row.t_mono_ns, row.uncertainty_ns, now_t_ns):
+        limit = node.present_stream.limit
+        if limit is not None and not limit.is_plausible_time(
+            row.t_mono_ns, row.uncertainty_ns, now_t_ns
+        ):
             log.warning(
                 "node %s: a measurement of its clock is not kept: its time is not the one that the "
                 "node stated at connecting",
@@ -216,37 +218,37 @@ class Recorder:
             )
             return
         try:
-            node.present.note_clock(row)
+            node.present_stream.record_clock_offset(row)
         except StorageError as error:  # the measurement is used all the same
             log.warning("node %s: %s", node.name, error)
-        offset = node.present.clock_rows[-1]
-        for session in self._book.unsealed(node.name):
-            is_its_own = any(part.boot_id == node.boot_id for part in session.parts)
+        offset = node.present_stream.clock_offsets[-1]
+        for session in self._store.list_unsealed(node.name):
+            is_its_own = any(part.stream_id == node.stream_id for part in session.parts)
             if is_its_own and session.state != "sealing":
                 clock = (*session.clock, offset)
-                self._book.note(session.model_copy(update={"clock": clock}))
+                self._store.cache(session.model_copy(update={"clock": clock}))
 
-    def ledger(self, session_id: str) -> Ledger:
+    def get_ledger(self, session_id: str) -> Ledger:
         """Return the present ledger of a session: the fate of every frame.
 
         Raises:
             UnknownError: no session has this id.
         """
-        return self.ledger_of(self._book.get(session_id))
+        return self.compute_ledger(self._store.get_session(session_id))
 
-    def ledger_of(self, session: Session) -> Ledger:
+    def compute_ledger(self, session: Session) -> Ledger:
         """Return the present ledger of a session that may be in the trash."""
-        return ledger_now(session, self._nodes.find(session.node))
+        return current_ledger(session, self._nodes.find(session.node))
 
-    def completeness_of(self, session: Session) -> Completeness:
+    def compute_completeness(self, session: Session) -> Completeness:
         """Return the present completeness of a session."""
-        return self.ledger_of(session).completeness
+        return self.compute_ledger(session).completeness
 
-    def problem_of(self, session: Session) -> str | None:
+    def find_problem(self, session: Session) -> str | None:
         """Return the user-visible problem of a session, if any."""
-        return self._settling.problem_of(session)
+        return self._sealer.find_problem(session)
 
-    def duration_s(self, session: Session, frames: int) -> float:
+    def compute_duration_s(self, session: Session, frame_count: int) -> float:
         """Return the session's length: exact if sealed, else the time over which frames have come.
 
         It is at least the time of its frames at the nominal rate, which is the fastest.
@@ -254,12 +256,12 @@ class Recorder:
         node = self._nodes.find(session.node)
         if session.state == "sealed" or node is None:
             return session.duration_s
-        seen_t_ns = node.last_seen_t_ns if frames else None
+        seen_t_ns = node.last_seen_t_ns if frame_count else None
         end_t_ns = min(session.stopped_t_ns or NO_END, seen_t_ns or 0)
         lasted_s = (end_t_ns - session.started_t_ns) * 1e-9
-        return max(frames / node.info.nominal_rate_hz, lasted_s)
+        return max(frame_count / node.info.nominal_rate_hz, lasted_s)
 
-    def waits_for(self, session: Session, ledger: Ledger) -> Literal["frames", "end"] | None:
+    def pending_reason(self, session: Session, ledger: Ledger) -> Literal["frames", "end"] | None:
         """Return the reason why a session is pending: missing frames, or an unknown end."""
         if session.state != "pending":
             return None
@@ -267,53 +269,53 @@ class Recorder:
             return "frames"
         return "end" if session.parts[-1].seq_last is None else None
 
-    def sources(self, session_id: str) -> Sources:
+    def collect_inputs(self, session_id: str) -> SessionInputs:
         """Collect the inputs from which a session can be sealed or exported.
 
         Raises:
             UnknownError: no session has this id, or its node is unknown here.
         """
-        session = self._book.get(session_id)
-        return self._settling.sources(session)
+        session = self._store.get_session(session_id)
+        return self._sealer.collect_inputs(session)
 
-    def needed(self, node_name: str) -> dict[str, Intervals]:
+    def needed_frames(self, node_name: str) -> dict[str, Intervals]:
         """Return the frames that unsealed sessions of a node need in its journals, by stream id.
 
         A session in the trash can be restored, so its frames count as well.
         """
         node = self._nodes.find(node_name)
-        if self._book.has_unreadable and node is not None:
-            return {boot_id: Intervals([(0, NO_END)]) for boot_id in node.streams}
-        return numbers_of(
+        if self._store.has_unreadable and node is not None:
+            return {stream_id: Intervals([(0, NO_END)]) for stream_id in node.streams}
+        return group_numbers_by_stream(
             part
-            for session in (*self._book.unsealed(), *self._book.trash.unsealed())
+            for session in (*self._store.list_unsealed(), *self._store.trash.list_unsealed())
             if session.node == node_name
-            for part in following.parts_needed(session, node)
+            for part in session_parts.iterate_needed_parts(session, node)
         )
 
-    def wanted(self, node_name: str) -> Wanted:
-        """Return `needed` as the message to the node."""
+    def retention_request(self, node_name: str) -> RetentionMessage:
+        """Return `needed_frames` as the message to the node."""
         streams = tuple(
-            StreamNumbers(boot_id=boot_id, numbers=with_open_ends(numbers))
-            for boot_id, numbers in sorted(self.needed(node_name).items())
+            StreamNumbers(stream_id=stream_id, numbers=to_open_pairs(numbers))
+            for stream_id, numbers in sorted(self.needed_frames(node_name).items())
         )
-        return Wanted(streams=streams, recording=bool(self.recording_on(node_name)))
+        return RetentionMessage(streams=streams, recording=bool(self.list_recording(node_name)))
 
-    def _with_clock(self, session: Session) -> Session:
+    def _with_clock_offsets(self, session: Session) -> Session:
         node = self._nodes.find(session.node)
         if session.state == "sealed" or node is None:
             return session
         try:
-            for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
-                stream = node.streams.get(boot_id)
-                times_ns = [row.t_mono_ns for row in session.clock if row.boot_id == boot_id]
+            for stream_id in dict.fromkeys(part.stream_id for part in session.parts):
+                stream = node.streams.get(stream_id)
+                times_ns = [row.t_mono_ns for row in session.clock if row.stream_id == stream_id]
                 # A log may be long: read it only if the session lacks its newest row.
                 if (
                     stream is not None
-                    and stream.clock is not None
-                    and (stream.clock.t_mono_ns > max(times_ns, default=-1))
+                    and stream.clock_offset is not None
+                    and (stream.clock_offset.t_mono_ns > max(times_ns, default=-1))
                 ):
-                    session = session.with_clock(stream.all_clock_rows())
+                    session = session.with_clock_rows(stream.read_clock_offsets())
         except StorageError as error:  # frames matter more than clock measurements
             log.warning("session %s: %s", session.id, error)
         return session

@@ -13,9 +13,9 @@ import math
 from dataclasses import dataclass
 
 from devices.frames import FrameBatch
-from service.link import Hello
-from storage.clock.bounds import FAST
-from storage.layout import FRAMES_MAX
+from service.protocol import Hello
+from storage.clock.bounds import DISCIPLINE_RATE_LIMIT
+from storage.message_layout import MAX_MESSAGE_FRAMES
 
 AHEAD_MAX_NS = 60_000_000_000
 """Tolerance: hello is some seconds old when it comes over a poor link, and a server may be busy."""
@@ -40,12 +40,12 @@ class StreamLimit:
     rate_hz: float
 
     @classmethod
-    def of(cls, hello: Hello, now_t_ns: int) -> StreamLimit:
+    def from_hello(cls, hello: Hello, now_t_ns: int) -> StreamLimit:
         """Return the limit for the present stream of a node, from its hello."""
         rate_hz = hello.array_info.nominal_rate_hz
         return cls(now_t_ns, hello.t_mono_ns, hello.next_seq, rate_hz)
 
-    def violation(self, frames: FrameBatch, now_t_ns: int) -> str:
+    def find_violation(self, frames: FrameBatch, now_t_ns: int) -> str:
         """Return why frames are ahead of time, as text; empty if they are plausible.
 
         Args:
@@ -56,12 +56,14 @@ class StreamLimit:
         if ahead_ns > self._tolerance_ns(now_t_ns):
             return f"they are dated {ahead_ns * 1e-9:.0f} s ahead of the node's clock"
         since_s = (now_t_ns - self.hello_t_ns + AHEAD_MAX_NS) * 1e-9
-        possible = self.next_seq + FRAMES_MAX + math.ceil(_RATE_TOLERANCE * self.rate_hz * since_s)
+        possible = (
+            self.next_seq + MAX_MESSAGE_FRAMES + math.ceil(_RATE_TOLERANCE * self.rate_hz * since_s)
+        )
         if int(frames.seq[-1]) > possible:
             return f"by now no frame can have a number above {possible}"
         return ""
 
-    def is_of_clock(self, t_mono_ns: int, uncertainty_ns: int, now_t_ns: int) -> bool:
+    def is_plausible_time(self, t_mono_ns: int, uncertainty_ns: int, now_t_ns: int) -> bool:
         """Return whether a time that was just measured fits the node's clock.
 
         Args:
@@ -76,4 +78,4 @@ class StreamLimit:
         return self.t_mono_ns + now_t_ns - self.hello_t_ns
 
     def _tolerance_ns(self, now_t_ns: int) -> int:
-        return AHEAD_MAX_NS + math.ceil(FAST * abs(now_t_ns - self.hello_t_ns))
+        return AHEAD_MAX_NS + math.ceil(DISCIPLINE_RATE_LIMIT * abs(now_t_ns - self.hello_t_ns))

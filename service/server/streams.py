@@ -13,11 +13,11 @@ from pathlib import Path
 
 from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
-from service.link import ClockRow, EarlierStream, Hello, PairsByReason
+from service.protocol import ClockSample, EarlierStream, Hello, SeqIntervalsByReason
 from service.server.stream_limit import StreamLimit
-from service.sessions.ends import SessionStream, around_in
+from service.sessions.part_end import SessionStream, find_seqs_around
 from storage.clock.log import ClockLog, ClockOffset
-from storage.frame_rules import broken_rule
+from storage.frame_rules import find_broken_rule
 from storage.intervals import CORRUPT, NO_END, REFUSED, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
@@ -26,9 +26,9 @@ from storage.wire import Decoder
 
 log = logging.getLogger("foottile.streams")
 
-CLOCK_ROWS = 128
+CLOCK_OFFSETS_MAX = 128
 """Clock measurements kept in memory for a pre-roll; the log has all."""
-_AROUND_MAX = 32
+_CACHED_INSTANTS_MAX = 32
 
 
 class ServerStream:
@@ -45,11 +45,11 @@ class ServerStream:
         self.decoder = Decoder(wire_schema(info))
         self.journal: Journal | None = None
         self.notes = StreamNotes(array_info=info)
-        self.node_has: Intervals | None = None
+        self.node_ranges: Intervals | None = None
         """Frames that the node can still send; None: no report since the server was started."""
-        self.t_ns_first: int | None = None
+        self.first_t_ns: int | None = None
         """Time of the oldest frame that the node has of an earlier stream, node's UTC."""
-        self.clock_rows: deque[ClockOffset] = deque(maxlen=CLOCK_ROWS)
+        self.clock_offsets: deque[ClockOffset] = deque(maxlen=CLOCK_OFFSETS_MAX)
         """Measured offsets of the node's clock, oldest first."""
         self.last_seen_t_ns: int | None = None
         """Arrival time of the last frame, server's UTC."""
@@ -58,32 +58,32 @@ class ServerStream:
         """Upper bounds of its frames; None: not the present stream since the server was started."""
         self.unsynced = Intervals()
         """Frames appended to the journal since the last sync."""
-        self.owed = Intervals()
+        self.unacked = Intervals()
         """Frames to acknowledge once the journal is synced."""
         self.problems: list[str] = []
         """Damage found when the stream was opened, and the consequence, as text."""
         self._first_seq: int | None = None
         self._refused = Intervals()
-        self._forgotten = Intervals()
-        self._guessed = False
+        self._dropped = Intervals()
+        self._are_gaps_assumed_dropped = False
         self._notes_on_disk: StreamNotes | None = None
-        self._around: dict[tuple[int, int], tuple[int, int]] = {}
+        self._seqs_around_cache: dict[tuple[int, int], tuple[int, int]] = {}
         self._clock_log = ClockLog(folder)
-        self._clock_unsynced = False
+        self._is_clock_unsynced = False
 
     @classmethod
-    def open(cls, folder: Path) -> ServerStream:
+    def open_stored(cls, folder: Path) -> ServerStream:
         """Open a stream that is on the disk.
 
         Raises:
             FileFormatError: nothing in its folder is readable.
             StorageError: it cannot be read.
         """
-        journal = Journal.open(folder, writes_later=True)
+        journal = Journal.open(folder, is_write_deferred=True)
         stream = cls(folder, journal.info)
         stream.journal = journal
         stream.problems = list(journal.problems)
-        notes = StreamNotes.load_whole(
+        notes = StreamNotes.load_or_set_aside(
             folder, stream.problems
         )  # without notes the node reports again
         if notes is not None:
@@ -91,57 +91,57 @@ class ServerStream:
             stream.missed_slots = notes.missed_slots
             stream._refused = Intervals(notes.lost.get(REFUSED, ()))
         with suppress(StorageError):
-            lines = stream._clock_log.lines()
-            stream.clock_rows.extend(lines.rows)
-            if lines.damaged:
-                log.warning("%s: %d damaged clock rows are left out", folder, lines.damaged)
-        newest = journal.held.last
+            lines = stream._clock_log.read_content()
+            stream.clock_offsets.extend(lines.rows)
+            if lines.damaged_lines:
+                log.warning("%s: %d damaged clock rows are left out", folder, lines.damaged_lines)
+        newest = journal.stored.last
         if newest is not None:
-            stream._first_seq = next(iter(journal.held))[0]
+            stream._first_seq = next(iter(journal.stored))[0]
             # Most likely these frames were deleted as unneeded.
-            stream._guessed = True
-            stream._forgotten = journal.held.missing(0, newest) - stream.lost.all
+            stream._are_gaps_assumed_dropped = True
+            stream._dropped = journal.stored.missing_in(0, newest) - stream.lost.numbers
         return stream
 
     @property
-    def boot_id(self) -> str:
+    def stream_id(self) -> str:
         """Id of the stream."""
-        return self.info.boot_id
+        return self.info.stream_id
 
     @property
-    def clock(self) -> ClockOffset | None:
+    def clock_offset(self) -> ClockOffset | None:
         """Latest offset of the node's clock; None before the first measurement."""
-        return self.clock_rows[-1] if self.clock_rows else None
+        return self.clock_offsets[-1] if self.clock_offsets else None
 
-    def all_clock_rows(self) -> tuple[ClockOffset, ...]:
+    def read_clock_offsets(self) -> tuple[ClockOffset, ...]:
         """Read all clock measurements of the stream, oldest first.
 
         Raises:
             StorageError: the log cannot be read.
         """
-        return self._clock_log.rows()
+        return self._clock_log.read_rows()
 
-    def note_clock(self, row: ClockRow) -> None:
+    def record_clock_offset(self, row: ClockSample) -> None:
         """Record a measurement of the node's clock.
 
         Raises:
             StorageError: the log cannot be written; the measurement is used all the same.
         """
-        offset = ClockOffset(boot_id=self.boot_id, **row.model_dump(exclude={"type"}))
-        self.clock_rows.append(offset)
+        offset = ClockOffset(stream_id=self.stream_id, **row.model_dump(exclude={"type"}))
+        self.clock_offsets.append(offset)
         if self.journal is not None:
-            self._log_clock(offset)
+            self._append_to_clock_log(offset)
 
     @property
-    def held(self) -> Intervals:
+    def stored(self) -> Intervals:
         """Frames in the journal."""
-        return self.journal.held if self.journal is not None else Intervals()
+        return self.journal.stored if self.journal is not None else Intervals()
 
     @property
-    def may_come(self) -> Intervals:
+    def obtainable(self) -> Intervals:
         """Frames that the node can still send, or has sent."""
-        reported = Intervals([(0, NO_END)]) if self.node_has is None else self.node_has
-        return reported - Losses(self.notes.lost).all
+        reported = Intervals([(0, NO_END)]) if self.node_ranges is None else self.node_ranges
+        return reported - Losses(self.notes.lost).numbers
 
     @property
     def lost(self) -> Losses:
@@ -149,107 +149,117 @@ class ServerStream:
         lost = Losses(self.notes.lost)
         if self.journal is not None:
             for reason, numbers in self.journal.lost.by_reason.items():
-                lost.add(numbers - self.may_come, reason)
+                lost.add(numbers - self.obtainable, reason)
         return lost
 
-    def for_session(self, offset_ns: int | None) -> SessionStream:
+    def make_session_stream(self, offset_ns: int | None) -> SessionStream:
         """Return the stream's facts for the rules of sessions.
 
         Args:
             offset_ns: added to the stream's times to get server time.
         """
         return SessionStream(
-            held=self.held,
+            stored=self.stored,
             lost=Losses(self.notes.lost),
-            damaged=self.journal.lost.all if self.journal is not None else Intervals(),
-            may_come=self.may_come,
+            damaged=self.journal.lost.numbers if self.journal is not None else Intervals(),
+            obtainable=self.obtainable,
             next_seq=self.notes.next_seq,
-            unsynced_tail_max=self.notes.unsynced_tail_max,
+            max_lost_tail_frames=self.notes.max_lost_tail_frames,
             missed_slots=self.missed_slots,
             info=self.info,
             journal=self.journal,
-            around=self.around,
+            find_seqs_around=self.find_seqs_around,
             offset_ns=offset_ns,
             last_seen_t_ns=self.last_seen_t_ns,
         )
 
-    def around(self, t_ns: int, *, at_least: int, waiting: bool = False) -> tuple[int, int] | None:
+    def find_seqs_around(
+        self, t_ns: int, *, min_seq: int, wait_for_missing: bool = False
+    ) -> tuple[int, int] | None:
         """Return the stored frames next to a time: the last one until it, the first one after.
 
         The result is cached: callers repeat the query while frames are missing. The journal's index
         is read again only when frames between the two have come.
 
-        Args, result and errors as for the function `around_in`; with `waiting` the
+        Args, result and errors as for the function `find_seqs_around`; with `wait_for_missing` the
         cached result is kept until all frames between have come or are lost.
         """
         if self.journal is None:
             return None
-        found, stored = self._around.get((t_ns, at_least)), self.held
+        found, stored = self._seqs_around_cache.get((t_ns, min_seq)), self.stored
         if found is not None:
             last, after = found
-            ends = stored.within(after, after) and (last < at_least or stored.within(last, last))
-            missing = stored.missing(last + 1, after - 1) if after > last + 1 else Intervals()
+            ends = stored.restricted_to(after, after) and (
+                last < min_seq or stored.restricted_to(last, last)
+            )
+            missing = stored.missing_in(last + 1, after - 1) if after > last + 1 else Intervals()
             none_came = missing.count == after - last - 1
-            if ends and (none_came or (waiting and missing & self.may_come)):
+            if ends and (none_came or (wait_for_missing and missing & self.obtainable)):
                 return found
-        found = around_in(self.journal, t_ns, at_least=at_least)
+        found = find_seqs_around(self.journal, t_ns, min_seq=min_seq)
         if found is None:
             return None
-        if len(self._around) >= _AROUND_MAX:
-            self._around.clear()
-        self._around[t_ns, at_least] = found
+        if len(self._seqs_around_cache) >= _CACHED_INSTANTS_MAX:
+            self._seqs_around_cache.clear()
+        self._seqs_around_cache[t_ns, min_seq] = found
         return found
 
-    def missing(self, newest: int) -> Intervals:
-        """Return the frames that are not stored, from the first known one to `newest`."""
-        if self._first_seq is None or newest < self._first_seq:
+    def missing_up_to(self, newest_seq: int) -> Intervals:
+        """Return the frames that are not stored, from the first known one to `newest_seq`."""
+        if self._first_seq is None or newest_seq < self._first_seq:
             return Intervals()
-        return self.held.missing(self._first_seq, newest) - self._forgotten
+        return self.stored.missing_in(self._first_seq, newest_seq) - self._dropped
 
-    def lacks(self, needed: Intervals, *, all_of_it: bool) -> Intervals:
+    def frames_to_request(self, needed: Intervals, *, include_unneeded: bool) -> Intervals:
         """Return the frames to request: the node has them, and they are not stored.
 
         Args:
             needed: frames that sessions need.
-            all_of_it: request all missing frames; False: only those in `needed`.
+            include_unneeded: request all missing frames; False: only those in `needed`.
         """
-        if self.node_has is None:
+        if self.node_ranges is None:
             return Intervals()
-        requested = self.may_come - self.held
-        if all_of_it:
-            return requested - (self._forgotten - needed)
+        requested = self.obtainable - self.stored
+        if include_unneeded:
+            return requested - (self._dropped - needed)
         return requested & needed
 
-    def is_present(self, hello: Hello, now_t_ns: int) -> None:
+    def on_present(self, hello: Hello, now_t_ns: int) -> None:
         """Handle hello of the node for which this is the present stream."""
-        self.limit = StreamLimit.of(hello, now_t_ns)
-        self.node_has = Intervals((*hello.held, (hello.next_seq, NO_END)))
-        self._said(hello.lost, next_seq=None)
-        self._see_from(min((first for first, _ in hello.held), default=hello.next_seq))
+        self.limit = StreamLimit.from_hello(hello, now_t_ns)
+        self.node_ranges = Intervals((*hello.stored, (hello.next_seq, NO_END)))
+        self._update_notes(hello.lost, next_seq=None)
+        self._extend_start(min((first for first, _ in hello.stored), default=hello.next_seq))
 
-    def has_ended(self, said: EarlierStream) -> None:
+    def on_earlier(self, report: EarlierStream) -> None:
         """Handle the node's report of how this stream ended."""
-        self.node_has = Intervals(said.held)
-        self.t_ns_first = said.t_ns_first
+        self.node_ranges = Intervals(report.stored)
+        self.first_t_ns = report.t_ns_first
         # A node that was killed may have an older count than it had reported.
-        self.missed_slots = max(self.missed_slots, said.missed_slots)
+        self.missed_slots = max(self.missed_slots, report.missed_slots)
         # Frames that a node lost in a power failure may be stored here.
-        beyond = max(0, (-1 if self.held.last is None else self.held.last) + 1 - said.next_seq)
-        tail = max(0, said.unsynced_tail_max - beyond)
-        self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)
+        beyond = max(
+            0, (-1 if self.stored.last is None else self.stored.last) + 1 - report.next_seq
+        )
+        tail = max(0, report.max_lost_tail_frames - beyond)
+        self._update_notes(
+            report.lost, next_seq=report.next_seq + beyond, max_lost_tail_frames=tail
+        )
 
-    def is_gone(self) -> None:
+    def on_unlisted(self) -> None:
         """Handle a hello without this stream: nothing more will come; the next sync closes it."""
-        self.node_has = Intervals()
+        self.node_ranges = Intervals()
         if self.journal is not None:
-            self.journal.retire()
+            self.journal.retire_open_segments()
 
-    def note_losses(self, lost: PairsByReason) -> None:
+    def set_losses(self, lost: SeqIntervalsByReason) -> None:
         """Replace the losses that the node has reported for this stream."""
         notes = self.notes
-        self._said(lost, next_seq=notes.next_seq, unsynced_tail_max=notes.unsynced_tail_max)
+        self._update_notes(
+            lost, next_seq=notes.next_seq, max_lost_tail_frames=notes.max_lost_tail_frames
+        )
 
-    def check(self, frames: FrameBatch, now_t_ns: int) -> str:
+    def check_frames(self, frames: FrameBatch, now_t_ns: int) -> str:
         """Check received frames; frames that break a rule are never requested again.
 
         Args:
@@ -266,41 +276,41 @@ class ServerStream:
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         end = self.notes.next_seq
-        wrong = broken_rule(frames, self.info)
+        wrong = find_broken_rule(frames, self.info)
         if not wrong and self.limit is not None:
-            ahead = self.limit.violation(frames, now_t_ns)
+            ahead = self.limit.find_violation(frames, now_t_ns)
             if ahead:
                 return ahead
         if not wrong and end is not None and last >= end:
             wrong = f"the stream has ended with frame {end - 1}"
         if not wrong and self.journal is not None:
-            wrong = self.journal.misplaced(frames)
+            wrong = self.journal.find_time_conflict(frames)
         if wrong:
-            refused = Intervals([(first, last)]) - self.held
+            refused = Intervals([(first, last)]) - self.stored
             self._refused = self._refused | refused
-            self.note_losses(self.notes.lost)
+            self.set_losses(self.notes.lost)
             raise FileFormatError(
-                f"frames {first} to {last} of stream {self.boot_id} are refused: {wrong}",
+                f"frames {first} to {last} of stream {self.stream_id} are refused: {wrong}",
                 expected="frames as docs/formats.md says",
             )
         return ""
 
-    def take(self, frames: FrameBatch, payload: bytes, now_t_ns: int) -> None:
+    def append_frames(self, frames: FrameBatch, payload: bytes, now_t_ns: int) -> None:
         """Append received frames to the journal.
 
         Raises:
             StorageError: the disk is full or not writable; the frames are not stored.
         """
         if self.journal is None:
-            self.journal = Journal(self.folder, self.info, writes_later=True)
-            for row in self.clock_rows:
-                self._log_clock(row)
+            self.journal = Journal(self.folder, self.info, is_write_deferred=True)
+            for row in self.clock_offsets:
+                self._append_to_clock_log(row)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         self.last_seen_t_ns = now_t_ns
-        self._see_from(first)
-        for interval in self.journal.append(frames, payload):
+        self._extend_start(first)
+        for interval in self.journal.append_new_frames(frames, payload):
             self.unsynced.add(*interval)
-        self.owed.add(first, last)
+        self.unacked.add(first, last)
 
     def sync(self) -> None:
         """Sync journal and notes to the disk. Runs in any thread.
@@ -310,42 +320,42 @@ class ServerStream:
         """
         if self.journal is not None:
             self.journal.sync()
-        notes = self._notes_to_keep
+        notes = self._current_notes
         if notes != self._notes_on_disk and self.folder.is_dir():
             notes.save(self.folder)
             self._notes_on_disk = notes
-        if self._clock_unsynced:
-            self._clock_unsynced = False
+        if self._is_clock_unsynced:
+            self._is_clock_unsynced = False
             self._clock_log.sync()
 
     @property
-    def has_news(self) -> bool:
+    def needs_sync(self) -> bool:
         """True if anything has to be synced or acknowledged."""
-        unsaved = self._notes_to_keep != self._notes_on_disk and self.journal is not None
-        closing = self.journal is not None and self.journal.is_closing
-        return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced or closing)
+        unsaved = self._current_notes != self._notes_on_disk and self.journal is not None
+        closing = self.journal is not None and self.journal.has_closing_segment
+        return bool(self.unsynced or self.unacked or unsaved or self._is_clock_unsynced or closing)
 
     @property
-    def is_open(self) -> bool:
+    def has_open_files(self) -> bool:
         """True if a file of the stream is open."""
-        return self.journal is not None and self.journal.is_open
+        return self.journal is not None and self.journal.has_open_segment
 
-    def disown(self, doubtful: Intervals, *, corrupt: bool = False) -> None:
+    def invalidate(self, frames: Intervals, *, are_corrupt: bool = False) -> None:
         """Remove frames from the stored ones: the disk may not have them."""
         if self.journal is None:
             return
-        self.journal.disown(doubtful)
-        if corrupt:
-            self.journal.lost.add(doubtful - self.held, CORRUPT)
+        self.journal.invalidate(frames)
+        if are_corrupt:
+            self.journal.lost.add(frames - self.stored, CORRUPT)
 
-    def prune(self, before_t_ns: int, keep: Intervals) -> None:
+    def delete_older(self, before_t_ns: int, keep: Intervals) -> None:
         """Delete frames older than `before_t_ns` and not in `keep`.
 
         Raises:
             StorageError: a file cannot be deleted.
         """
         if self.journal is not None:
-            self._forgotten = self._forgotten | self.journal.prune(before_t_ns, keep)
+            self._dropped = self._dropped | self.journal.delete_old_segments(before_t_ns, keep)
 
     def close(self) -> None:
         """Sync everything and close the journal.
@@ -359,36 +369,36 @@ class ServerStream:
             if self.journal is not None:
                 self.journal.close()
 
-    def let_go(self) -> None:
+    def drop_unsynced(self) -> None:
         """Drop unsynced frames: the data folder is away. The next `sync` closes open files."""
-        self.disown(self.unsynced)
-        self.unsynced, self.owed = Intervals(), Intervals()
+        self.invalidate(self.unsynced)
+        self.unsynced, self.unacked = Intervals(), Intervals()
 
-    def delete(self) -> None:
+    def delete_journal(self) -> None:
         """Delete the journal."""
         if self.journal is not None:
-            self.journal.delete()
+            self.journal.close_and_delete()
         self.journal = self._notes_on_disk = None
-        self.unsynced, self.owed = Intervals(), Intervals()
+        self.unsynced, self.unacked = Intervals(), Intervals()
 
-    def _said(
-        self, lost: PairsByReason, *, next_seq: int | None, unsynced_tail_max: int = 0
+    def _update_notes(
+        self, lost: SeqIntervalsByReason, *, next_seq: int | None, max_lost_tail_frames: int = 0
     ) -> None:
         losses = Losses(lost)
         losses.add(self._refused, REFUSED)
         self.notes = StreamNotes(
             array_info=self.info,
             next_seq=next_seq,
-            unsynced_tail_max=unsynced_tail_max,
+            max_lost_tail_frames=max_lost_tail_frames,
             missed_slots=self.missed_slots,
-            lost=losses.as_pairs(),
+            lost=losses.to_pairs(),
         )
-        if self._guessed:
-            self._guessed = False
-            self._forgotten = self._forgotten - self.may_come
+        if self._are_gaps_assumed_dropped:
+            self._are_gaps_assumed_dropped = False
+            self._dropped = self._dropped - self.obtainable
 
     @property
-    def _notes_to_keep(self) -> StreamNotes:
+    def _current_notes(self) -> StreamNotes:
         """Notes with the damage found here and the missed slots counted up to now."""
         lost = self.journal.lost.by_reason if self.journal is not None else {}
         now = {"damaged": tuple(lost.get(CORRUPT, ())), "missed_slots": self.missed_slots}
@@ -396,9 +406,9 @@ class ServerStream:
             return self.notes
         return self.notes.model_copy(update=now)
 
-    def _log_clock(self, row: ClockOffset) -> None:
+    def _append_to_clock_log(self, row: ClockOffset) -> None:
         self._clock_log.append(row)
-        self._clock_unsynced = True
+        self._is_clock_unsynced = True
 
-    def _see_from(self, seq: int) -> None:
+    def _extend_start(self, seq: int) -> None:
         self._first_seq = seq if self._first_seq is None else min(self._first_seq, seq)

@@ -13,14 +13,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from devices.errors import FootTileError, StateError, UnknownError
-from service.server.book import SessionBook
-from service.server.nodes import ServerNodes
+from service.server.nodes import NodeRegistry
 from service.server.recorder import Recorder
-from service.server_clock import utc_ns
-from storage.sessions.folder import Asked, Session
+from service.server.session_store import SessionStore
+from service.server_clock import server_utc_ns
+from storage.sessions.folder import IdempotencyRecord, Session
 
-_FAILED_KEPT = 1000
-_NOT_THEN = "it could not be recorded when this take was started"
+_ERRORS_KEPT = 1000
+_FAILED_BEFORE = "it could not be recorded when this take was started"
 TAKE_ID = re.compile(r"[0-9a-f]{12}")
 
 
@@ -31,27 +31,27 @@ class Take:
     id: str
     sessions: list[Session] = field(default_factory=list)
     """One session of each node, and more for a node that came back with other tiles."""
-    failed: dict[str, str] = field(default_factory=dict)
+    errors_by_node: dict[str, str] = field(default_factory=dict)
     """Error by node, where the command failed."""
 
 
-class Takes:
+class TakeRecorder:
     """Records, marks and stops several nodes together.
 
     Args:
         recorder: starts and stops sessions.
-        book: all sessions.
+        store: all sessions.
         nodes: all nodes.
     """
 
-    def __init__(self, recorder: Recorder, book: SessionBook, nodes: ServerNodes) -> None:
+    def __init__(self, recorder: Recorder, store: SessionStore, nodes: NodeRegistry) -> None:
         self._recorder = recorder
-        self._book = book
+        self._store = store
         self._nodes = nodes
-        self._failed: OrderedDict[str, dict[str, str]] = OrderedDict()
+        self._errors_by_take: OrderedDict[str, dict[str, str]] = OrderedDict()
         """Errors of the nodes that could not be recorded, by take, the newest last."""
 
-    def start(
+    def start_take(
         self,
         name: str,
         nodes: Sequence[str] | None = None,
@@ -60,7 +60,7 @@ class Takes:
         subject: str = "",
         notes: str = "",
         tags: tuple[str, ...] = (),
-        asked: Asked | None = None,
+        request: IdempotencyRecord | None = None,
     ) -> Take:
         """Start a session on each node, with the same name.
 
@@ -74,20 +74,20 @@ class Takes:
             subject: of each session.
             notes: of each session.
             tags: of each session.
-            asked: request with its idempotency key; None: without a key.
+            request: request with its idempotency key; None: without a key.
 
         Raises:
             StateError: no node could be recorded.
             UsageError: the key came with another request before.
         """
-        if earlier := self._book.begun_by(asked):
-            return self._begun(earlier, nodes or ())
+        if earlier := self._store.find_by_idempotency_key(request):
+            return self._repeat_result(earlier, nodes or ())
         if nodes is None:
-            nodes = sorted(node.name for node in self._nodes if node.connected)
+            nodes = sorted(node.name for node in self._nodes if node.is_connected)
         take = Take(secrets.token_hex(6))
         for node in dict.fromkeys(nodes):
             try:
-                session = self._recorder.start(
+                session = self._recorder.start_session(
                     node,
                     name,
                     pre_roll_s=pre_roll_s,
@@ -95,65 +95,69 @@ class Takes:
                     notes=notes,
                     tags=tags,
                     take=take.id,
-                    asked=asked,
+                    request=request,
                 )
             except FootTileError as error:
-                take.failed[node] = str(error)
+                take.errors_by_node[node] = str(error)
             else:
                 take.sessions.append(session)
         if not take.sessions:
             raise StateError(
-                "no node is connected" if not take.failed else _in_words(take.failed),
+                "no node is connected"
+                if not take.errors_by_node
+                else _format_errors(take.errors_by_node),
                 remedy="Connect a node and retry",
             )
-        if asked is not None:
-            self._failed[take.id] = take.failed
-            while len(self._failed) > _FAILED_KEPT:
-                self._failed.popitem(last=False)
+        if request is not None:
+            self._errors_by_take[take.id] = take.errors_by_node
+            while len(self._errors_by_take) > _ERRORS_KEPT:
+                self._errors_by_take.popitem(last=False)
         return take
 
-    def _begun(self, begun: list[Session], nodes: Sequence[str]) -> Take:
-        take_id = str(begun[0].take)
-        recorded = {session.node for session in begun}
-        lacking = {node: _NOT_THEN for node in nodes if node not in recorded}
-        return Take(take_id, begun, dict(self._failed.get(take_id, lacking)))
+    def _repeat_result(self, sessions: list[Session], nodes: Sequence[str]) -> Take:
+        take_id = str(sessions[0].take)
+        recorded = {session.node for session in sessions}
+        lacking = {node: _FAILED_BEFORE for node in nodes if node not in recorded}
+        return Take(take_id, sessions, dict(self._errors_by_take.get(take_id, lacking)))
 
-    def get(self, take_id: str) -> Take:
+    def get_take(self, take_id: str) -> Take:
         """Return a take with its present sessions, by node; without those in the trash.
 
         Raises:
             UnknownError: no session names this take.
         """
-        found = [one for one in self._book.newest_first() if one.take == take_id]
+        found = [one for one in self._store.iterate_newest_first() if one.take == take_id]
         if not TAKE_ID.fullmatch(take_id) or not found:
             raise UnknownError(f"no take {take_id[:80]!r}")
         return Take(take_id, sorted(found, key=lambda one: (one.node, one.started_t_ns)))
 
-    def stop(self, take_id: str) -> Take:
+    def stop_take(self, take_id: str) -> Take:
         """Stop all of its sessions that are being recorded; stopped ones are unchanged.
 
         Raises:
             UnknownError: no session names this take.
             StateError: no session could be stopped.
         """
-        take = self.get(take_id)
+        take = self.get_take(take_id)
         for session in take.sessions:
             try:
-                self._recorder.stop(session.id)
+                self._recorder.stop_session(session.id)
             except FootTileError as error:
-                take.failed[session.node] = str(error)
-        return self._of_those_done(take, take.sessions)
+                take.errors_by_node[session.node] = str(error)
+        return self._succeeded(take, take.sessions)
 
-    def mark(self, take_id: str, label: str, t_ns: int | None, event_id: str | None = None) -> Take:
+    def add_marker(
+        self, take_id: str, label: str, t_ns: int | None, marker_id: str | None = None
+    ) -> Take:
         """Add a marker at one time to all of its sessions that are being recorded.
 
         Raises:
             UnknownError: no session names this take.
             StateError: no session is being recorded.
         """
-        t_ns = utc_ns() if t_ns is None else t_ns
-        event_id = event_id or secrets.token_hex(6)
-        take = self.get(take_id)
+        t_ns = server_utc_ns() if t_ns is None else t_ns
+        marker_id = marker_id or secrets.token_hex(6)
+        take = self.get_take(take_id)
         running = [one for one in take.sessions if one.state == "recording"]
         if not running:
             raise StateError(
@@ -162,21 +166,23 @@ class Takes:
             )
         for session in running:
             try:
-                self._book.mark(session.id, label, t_ns, event_id)
+                self._store.add_marker(session.id, label, t_ns, marker_id)
             except FootTileError as error:
-                take.failed[session.node] = str(error)
-        return self._of_those_done(take, running)
+                take.errors_by_node[session.node] = str(error)
+        return self._succeeded(take, running)
 
-    def _of_those_done(self, take: Take, tried: Iterable[Session]) -> Take:
-        done = [self._book.get(one.id) for one in tried if one.node not in take.failed]
+    def _succeeded(self, take: Take, tried: Iterable[Session]) -> Take:
+        done = [
+            self._store.get_session(one.id) for one in tried if one.node not in take.errors_by_node
+        ]
         if not done:
-            raise StateError(_in_words(take.failed))
-        return Take(take.id, done, take.failed)
+            raise StateError(_format_errors(take.errors_by_node))
+        return Take(take.id, done, take.errors_by_node)
 
 
-def _in_words(failed: dict[str, str]) -> str:
-    return "; ".join(_once(failed.values()))
+def _format_errors(failed: dict[str, str]) -> str:
+    return "; ".join(_unique(failed.values()))
 
 
-def _once(texts: Iterable[str]) -> list[str]:
+def _unique(texts: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(texts))

@@ -1,8 +1,8 @@
 """Steps of a calibration with known weights, which follow from the tile's pressure.
 
-Hands stay free: the pressure shows when a weight is put on or taken off. `Weighing`
-waits until the pressure is steady, marks the beginning of a step, watches it for some seconds, and
-goes on. A step in which something moves is withdrawn and repeated.
+The operator has no hand free for a key: the pressure shows when a weight is put on or taken off.
+`Weighing` waits until the pressure is steady, marks the beginning of a step, watches it for some
+seconds, and goes on. A step in which something moves is withdrawn and repeated.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ REST_S = 4.0
 HOLD_S = 5.0
 """A fit refuses a step shorter than 2 s."""
 STEADY_S = 1.0
-"""So long the pressure has to stand still before a step begins."""
+"""Time of steady pressure before a step begins."""
 LOADED_KPA = 0.3
-"""A pressure that is so far above that of the rest is a load; a light weight gives 0.5 kPa."""
+"""Least pressure of a load above that of the rest; a light weight gives 0.5 kPa."""
 MOVED_PART = 0.15
-"""A step whose pressure moves by more than that part of it is repeated: creep stays below."""
+"""A step whose pressure changes by more than this part of it is repeated; creep stays below."""
 TRACE_S = 20.0
 """Length of `Weighing.recent_kpa`."""
 _MOVED_KPA = 0.15  # or by more than this, where the part is less
@@ -65,7 +65,7 @@ Action = Begin | End | Withdraw
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Pressure of a step so far, in kPa; of a weight above the rest before it."""
+    """Pressure of a step up to now, in kPa; of a weight, relative to the rest before it."""
 
     mean_kpa: float
     spread_kpa: float
@@ -90,7 +90,7 @@ class Weighing:
         self.held: list[Repeatability] = []
         """Weights that are done."""
         self.repeatability: Repeatability | None = None
-        """Of the step under way, or of the last one."""
+        """Pressure of the step under way, or of the last one."""
         self.recent_kpa: deque[float] = deque(maxlen=round(TRACE_S / _BIN_S))
         """Absolute pressure of the newest quarter seconds."""
         self.rest_kpa = np.nan
@@ -140,11 +140,11 @@ class Weighing:
                 return f"All weights are done: unload {tile}"
 
     def push(self, t_ns: npt.NDArray[np.int64], kpa: Floats) -> list[Action]:
-        """Take readings of the tile, and return the actions for the markers, in order.
+        """Take readings of the tile, and return the changes of markers, in order.
 
         Args:
             t_ns: (n,), instants, rising from call to call.
-            kpa: (n,), absolute pressures; NaN where there was none.
+            kpa: (n,), absolute pressures; NaN without a reading.
         """
         actions: list[Action] = []
         for at_ns, reading_kpa in zip(t_ns.tolist(), kpa.tolist(), strict=True):
@@ -166,7 +166,7 @@ class Weighing:
         """Go back to the weight that is held, or else to the last one, and rest before it.
 
         Returns:
-            Actions that withdraw markers.
+            Withdrawals of markers.
         """
         reason = "repeated by hand"
         actions: list[Action] = []

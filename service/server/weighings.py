@@ -19,13 +19,13 @@ from devices.chips.compensation import Compensation
 from devices.errors import CalibrationError, FootTileError, StateError, UnknownError, UsageError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration
-from service.server.book import SessionBook, expect
-from service.server.calibrations import CalibrationBook
-from service.server.estimates.of_node import Estimated
-from service.server.fits import FRAMES_MAX, Fit, Fits
+from service.server.calibration_jobs import FRAMES_MAX, CalibrationJob, CalibrationJobs
+from service.server.calibrations import CalibrationStore
+from service.server.estimates.node_estimator import EstimatedBatch
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
-from service.server.settling import Settling
+from service.server.sealer import SessionSealer
+from service.server.session_store import SessionStore, check_revision
 from service.server.weighing import Action, Begin, End, Method, Weighing, Withdraw
 from storage.sessions.folder import FRAMES_NAME, Session
 
@@ -67,8 +67,8 @@ class NodeWeighing:
 
     plan: WeighingPlan
     session_id: str
-    """Session of its recording; also its own id."""
-    boot_id: str
+    """Session of the recording; also identifies the weighing."""
+    stream_id: str
     passes: list[Weighing]
     """One per tile."""
     progress_s: float
@@ -95,23 +95,23 @@ class NodeWeighing:
 
 
 class Weighings:
-    """Guided calibrations of a server; used from the server's event loop only.
+    """Guided calibrations of a server, for use in the server's event loop only.
 
     Args:
-        sessions: store of sessions.
+        sessions: store of the recordings.
         recorder: starts and stops recordings.
         settling: seals recordings.
-        fits: jobs that fit them.
-        calibrations: fitted calibrations.
+        fits: jobs that fit recordings.
+        calibrations: store of the fitted calibrations.
     """
 
     def __init__(
         self,
-        sessions: SessionBook,
+        sessions: SessionStore,
         recorder: Recorder,
-        settling: Settling,
-        fits: Fits,
-        calibrations: CalibrationBook,
+        settling: SessionSealer,
+        fits: CalibrationJobs,
+        calibrations: CalibrationStore,
     ) -> None:
         self._sessions = sessions
         self._recorder = recorder
@@ -121,7 +121,7 @@ class Weighings:
         self._of: dict[str, NodeWeighing] = {}
 
     def find(self, node: str) -> NodeWeighing | None:
-        """Return the weighing of a node, running or last ended; None: there is none."""
+        """Return a node's weighing, under way or the last to end; None if there was none."""
         return self._of.get(node)
 
     def get(self, node: str, session_id: str | None = None) -> NodeWeighing:
@@ -129,11 +129,11 @@ class Weighings:
 
         Args:
             node: its name.
-            session_id: expected session of the weighing; None: any.
+            session_id: id that the weighing must have; None: any.
 
         Raises:
-            UnknownError: there is none.
-            ChangedError: it is another one.
+            UnknownError: the node has no weighing.
+            ChangedError: the weighing has another id.
         """
         found = self._of.get(node)
         if found is None:
@@ -141,7 +141,7 @@ class Weighings:
                 f"no guided calibration on node {node!r}",
                 remedy="Start one, on the page /calibrate",
             )
-        expect(session_id, found.session_id, f"the guided calibration of {node!r}")
+        check_revision(session_id, found.session_id, f"the guided calibration of {node!r}")
         return found
 
     def start(self, node: ServerNode, plan: WeighingPlan) -> NodeWeighing:
@@ -149,7 +149,7 @@ class Weighings:
 
         Raises:
             StateError: one is under way on this node, or the node cannot be recorded now.
-            UsageError: no such tile, or more of them than a fit takes.
+            UsageError: no such tile, or more tiles than a fit takes.
             StorageError: the recording cannot be written down.
         """
         before = self._of.get(node.name)
@@ -175,29 +175,29 @@ class Weighings:
                 expected=f"at most {FRAMES_MAX} frames",
                 remedy="Calibrate fewer tiles at once",
             )
-        if node.connected and node.clock is None:
+        if node.is_connected and node.clock_offset is None:
             raise StateError(
                 f"the clock of node {node.name!r} was not compared with the server's yet",
                 remedy="Start again in some seconds",
             )
-        session = self._recorder.start(
+        session = self._recorder.start_session(
             node.name, f"weights on {', '.join(plan.tiles)}"[:200], tags=("calibration",)
         )
         now_s = time.monotonic()
         self._of[node.name] = NodeWeighing(
             plan=plan,
             session_id=session.id,
-            boot_id=node.boot_id,
+            stream_id=node.stream_id,
             passes=[Weighing(serial, plan.weights, plan.method) for serial in plan.tiles],
             progress_s=now_s,
             seen_s=now_s,
         )
         return self._of[node.name]
 
-    def push(self, node: ServerNode, due: Sequence[Estimated]) -> None:
+    def push(self, node: ServerNode, due: Sequence[EstimatedBatch]) -> None:
         """Take the newest frames of a node; cheap if none of its tiles is calibrated."""
         weighing = self._of.get(node.name)
-        if weighing is None or node.boot_id != weighing.boot_id:
+        if weighing is None or node.stream_id != weighing.stream_id:
             return
         for frames, _ in due:
             if weighing.state == "weighing" and len(frames):
@@ -241,11 +241,11 @@ class Weighings:
         if weighing is None or weighing.state != "weighing":
             return
         with self._failing(weighing):
-            if node.boot_id != weighing.boot_id:
+            if node.stream_id != weighing.stream_id:
                 raise StateError(
                     f"node {node.name!r} was restarted", remedy="Repeat: begin with the first rest"
                 )
-            if self._sessions.get(weighing.session_id).state != "recording":
+            if self._sessions.get_session(weighing.session_id).state != "recording":
                 raise StateError(
                     "its recording was stopped", remedy="Repeat, and leave the recording alone"
                 )
@@ -261,13 +261,13 @@ class Weighings:
                 )
 
     async def close(self) -> None:
-        """Cancel all of them: the server ends."""
+        """Cancel all weighings, as the server ends."""
         await asyncio.gather(*(self._cancel(weighing) for weighing in self._of.values()))
 
     def _take(self, weighing: NodeWeighing, node: ServerNode, frames: FrameBatch) -> None:
         weighing.seen_s = time.monotonic()
         i = node.info.serials.index(weighing.now.serial)
-        kpa = Compensation(node.info.tiles).readable_kpa(frames)[:, i]
+        kpa = Compensation(node.info.tiles).compute_usable_kpa(frames)[:, i]
         self._mark(weighing, node, weighing.now.push(frames.t_ns, kpa))
         if weighing.now.step != "done":
             return
@@ -278,30 +278,34 @@ class Weighings:
             weighing.task = asyncio.get_running_loop().create_task(self._finish(weighing))
 
     def _mark(self, weighing: NodeWeighing, node: ServerNode, actions: Sequence[Action]) -> None:
-        """Add and remove markers of the session."""
+        """Write the steps as markers of the session, and remove those of withdrawn steps."""
         for action in actions:
             match action:
                 case Begin(label, t_ns):
-                    event = self._sessions.mark(weighing.session_id, label, node.server_t_ns(t_ns))
+                    event = self._sessions.add_marker(
+                        weighing.session_id, label, node.to_server_t_ns(t_ns)
+                    )
                     weighing.marks.append((event.id, True))
                 case End(t_ns):
-                    event = self._sessions.mark(weighing.session_id, "end", node.server_t_ns(t_ns))
+                    event = self._sessions.add_marker(
+                        weighing.session_id, "end", node.to_server_t_ns(t_ns)
+                    )
                     weighing.marks.append((event.id, False))
                     weighing.progress_s, weighing.warning = time.monotonic(), None
                 case Withdraw(reason):
                     weighing.warning = reason
                     while weighing.marks:
-                        event_id, is_begin = weighing.marks.pop()
+                        marker_id, is_begin = weighing.marks.pop()
                         with suppress(UnknownError):  # a person was quicker
-                            self._sessions.remove_mark(weighing.session_id, event_id)
+                            self._sessions.remove_marker(weighing.session_id, marker_id)
                         if is_begin:
                             break
 
     async def _finish(self, weighing: NodeWeighing) -> None:
         """Seal the recording and fit it."""
         with self._failing(weighing):
-            self._recorder.stop(weighing.session_id)
-            session = await self._settling.settled(weighing.session_id, _SEAL_S)
+            self._recorder.stop_session(weighing.session_id)
+            session = await self._settling.wait_until_sealed(weighing.session_id, _SEAL_S)
             if session.state != "sealed":
                 raise StateError(
                     f"the recording is not sealed: {self._why_not(session)}",
@@ -309,31 +313,31 @@ class Weighings:
                 )
             fit = await self._fit(weighing)
             if fit.calibration_id is None:
-                file = self._sessions.folder.path(weighing.session_id) / FRAMES_NAME
+                file = self._sessions.folder.get_path(weighing.session_id) / FRAMES_NAME
                 problem = fit.problem or f"the fit was {fit.state}"
                 raise CalibrationError(problem.replace(f"{file}, ", ""))
             weighing.calibration = await asyncio.to_thread(
-                self._calibrations.get, fit.calibration_id
+                self._calibrations.load, fit.calibration_id
             )
             weighing.state = "done"
 
-    async def _fit(self, weighing: NodeWeighing) -> Fit:
+    async def _fit(self, weighing: NodeWeighing) -> CalibrationJob:
         """Fit the recording, after the fits of others."""
         while self._fits.is_busy:
             await asyncio.sleep(_LOOK_S)
         plan = weighing.plan
-        fit = self._fits.start(plan.name, [weighing.session_id], {"sensor": plan.reference})
+        fit = self._fits.start_job(plan.name, [weighing.session_id], {"sensor": plan.reference})
         try:
             while fit.state == "running":
                 await asyncio.sleep(_LOOK_S)
         except asyncio.CancelledError:
-            await self._fits.cancel(fit.id)
+            await self._fits.cancel_job(fit.id)
             raise
         return fit
 
     def _why_not(self, session: Session) -> str:
-        ledger = self._recorder.ledger_of(session)
-        return self._recorder.problem_of(session) or (
+        ledger = self._recorder.compute_ledger(session)
+        return self._recorder.find_problem(session) or (
             f"the node still has {ledger.pending} frames of it"
         )
 
@@ -360,6 +364,6 @@ class Weighings:
     def _stop(self, weighing: NodeWeighing) -> None:
         """End the recording, if it goes on."""
         try:
-            self._recorder.stop(weighing.session_id)
+            self._recorder.stop_session(weighing.session_id)
         except FootTileError as error:
             log.warning("session %s: %s", weighing.session_id, error)

@@ -6,12 +6,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from devices.errors import CalibrationError, DamagedFileError
-from devices.inputs import decode_text
-from service.estimation.calibration import EDITED, Calibration
-from storage.checked_json import checked, with_check, write_checked
+from devices.input_files import decode_text
+from service.estimation.calibration import EDITED_REMEDY, Calibration
+from storage.checksummed_json import append_checksum, parse_checksummed_json, write_checksummed_json
 
 
-def calibration_of(content: bytes, *, where: str) -> Calibration:
+def parse_calibration(content: bytes, *, where: str) -> Calibration:
     """Parse a calibration file; the name of a file written by hand is marked as such.
 
     Raises:
@@ -20,29 +20,29 @@ def calibration_of(content: bytes, *, where: str) -> Calibration:
     with suppress(UnicodeDecodeError):  # `checked` reports this as damage
         content = decode_text(content).encode()  # encodings of editors
     try:
-        text = checked(content, where=where).text
+        text = parse_checksummed_json(content, where=where).text
     except DamagedFileError as error:
-        raise not_one(error.what, where) from error
+        raise invalid_calibration(error.what, where) from error
     try:
         return Calibration.from_json(text.decode("utf-8", "replace"), where=where)
     except RecursionError as error:
-        raise not_one("it is nested too deeply", where) from error
+        raise invalid_calibration("it is nested too deeply", where) from error
 
 
-def not_one(what: str, where: str) -> CalibrationError:
+def invalid_calibration(what: str, where: str) -> CalibrationError:
     """Return the error for a file that is no calibration."""
-    return CalibrationError(f"not a calibration: {what}", where=where, remedy=EDITED)
+    return CalibrationError(f"not a calibration: {what}", where=where, remedy=EDITED_REMEDY)
 
 
-def content_of(calibration: Calibration) -> bytes:
+def encode_calibration(calibration: Calibration) -> bytes:
     """Return all bytes of a calibration's file."""
-    return with_check(calibration.to_json().encode())
+    return append_checksum(calibration.to_json().encode())
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
     """Write a calibration file.
 
     Raises:
-        StorageError: the disk is full or not writable; raises as `whole_file`.
+        StorageError: the disk is full or not writable; raises as `open_for_atomic_write`.
     """
-    write_checked(path, calibration.to_json().encode())
+    write_checksummed_json(path, calibration.to_json().encode())

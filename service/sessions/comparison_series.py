@@ -15,17 +15,28 @@ import pyarrow as pa
 
 from storage.formats.slice import Slice
 from storage.schema import Array
-from storage.sessions.comparisons import SERIES_NAME, read_series, series_footer, series_within
-from storage.sessions.footer import stamps_of
-from storage.sessions.pyramid import FACTOR, ROWS, Bins, levels_over, merged
+from storage.sessions.comparisons import (
+    SERIES_NAME,
+    read_series,
+    read_series_footer,
+    read_series_range,
+)
+from storage.sessions.footer import read_file_stamps
+from storage.sessions.pyramid import (
+    BINS_PER_COARSER_BIN,
+    FRAMES_PER_FINEST_BIN,
+    Bins,
+    build_levels,
+    merge_bins,
+)
 
 GAP_STEPS = 3.5
 """Distance of two frames that counts as a gap, in median steps."""
 _BINNED = ("reference_grf_n", "reference_cop_x_m", "reference_cop_y_m")
-_KEPT = 4
+_SERIES_KEPT = 4
 
 
-class Series:
+class ComparisonSeries:
     """Series of one comparison, with its coarser levels in memory: 1.3 MB for a million frames.
 
     Args:
@@ -38,20 +49,20 @@ class Series:
     """
 
     def __init__(self, folder: Path, table: pa.Table) -> None:
-        self._folder, self._footer = folder, series_footer(folder)
+        self._folder, self._footer = folder, read_series_footer(folder)
         steps = np.diff(table["t_ns"].to_numpy())
         self._gap_ns = GAP_STEPS * float(np.median(steps)) if len(steps) else np.inf
-        frames = _bins_of(table, self._gap_ns)
-        self._levels = levels_over(merged(frames, ROWS)) if len(table) else []
+        frames = _make_bins(table, self._gap_ns)
+        self._levels = build_levels(merge_bins(frames, FRAMES_PER_FINEST_BIN)) if len(table) else []
 
-    def seen(self, begin_ns: int, part: Slice, points: int) -> tuple[Bins, int]:
+    def get_bins(self, begin_ns: int, time_slice: Slice, points: int) -> tuple[Bins, int]:
         """Return a slice as `points` to four times as many bins.
 
         Fewer where there are fewer frames, and more where gaps split them: no bin spans a gap.
 
         Args:
             begin_ns: time of the session's first frame.
-            part: time interval; its columns are ignored.
+            time_slice: time interval; its columns are ignored.
             points: least number of bins.
 
         Returns:
@@ -63,26 +74,26 @@ class Series:
             DamagedFileError: a row group is damaged.
             StorageError: it cannot be read now.
         """
-        bounds_ns = part.bounds_ns(begin_ns)
+        bounds_ns = time_slice.compute_bounds_ns(begin_ns)
         for above in reversed(range(len(self._levels))):
-            found = _within(self._levels[above], *bounds_ns)
+            found = _slice_bins(self._levels[above], *bounds_ns)
             if len(found["frames"]) >= points:
-                return found, ROWS * FACTOR**above
-        bins = _bins_of(series_within(self._folder, self._footer, *bounds_ns), self._gap_ns)
+                return found, FRAMES_PER_FINEST_BIN * BINS_PER_COARSER_BIN**above
+        bins = _make_bins(read_series_range(self._folder, self._footer, *bounds_ns), self._gap_ns)
         size = 1
-        while len(bins["frames"]) // (size * FACTOR) >= points:
-            size *= FACTOR
-        return (bins if size == 1 else merged(bins, size)), size
+        while len(bins["frames"]) // (size * BINS_PER_COARSER_BIN) >= points:
+            size *= BINS_PER_COARSER_BIN
+        return (bins if size == 1 else merge_bins(bins, size)), size
 
 
-class SeriesKept:
+class ComparisonSeriesCache:
     """Cache of the most recently used series, while their files are unchanged."""
 
     def __init__(self) -> None:
-        self._of: OrderedDict[Path, tuple[tuple[int, ...], Series]] = OrderedDict()
+        self._entries: OrderedDict[Path, tuple[tuple[int, ...], ComparisonSeries]] = OrderedDict()
         self._one_at_a_time = threading.Lock()
 
-    def of(self, folder: Path) -> Series | None:
+    def get(self, folder: Path) -> ComparisonSeries | None:
         """Return the series of a comparison; None: an older version wrote none.
 
         Raises:
@@ -91,20 +102,20 @@ class SeriesKept:
         """
         path = folder / SERIES_NAME
         with self._one_at_a_time:
-            stamps = stamps_of(path)
-            cached = self._of.pop(path, None)
+            stamps = read_file_stamps(path)
+            cached = self._entries.pop(path, None)
             if cached is None or cached[0] != stamps:
                 table = read_series(folder)
                 if table is None:
                     return None
-                cached = stamps, Series(folder, table)
-            self._of[path] = cached
-            while len(self._of) > _KEPT:
-                self._of.popitem(last=False)
+                cached = stamps, ComparisonSeries(folder, table)
+            self._entries[path] = cached
+            while len(self._entries) > _SERIES_KEPT:
+                self._entries.popitem(last=False)
             return cached[1]
 
 
-def _bins_of(table: pa.Table, gap_ns: float) -> Bins:
+def _make_bins(table: pa.Table, gap_ns: float) -> Bins:
     """Return a bin for each frame; gaps separate parts."""
     t_ns: Array = table["t_ns"].to_numpy()
     gaps = np.zeros(len(t_ns), np.bool_)
@@ -123,7 +134,7 @@ def _bins_of(table: pa.Table, gap_ns: float) -> Bins:
     return bins
 
 
-def _within(bins: Bins, begin_ns: int | None, end_ns: int | None) -> Bins:
+def _slice_bins(bins: Bins, begin_ns: int | None, end_ns: int | None) -> Bins:
     """Return the bins with frames in an interval; they are in its order."""
     first = 0 if begin_ns is None else int(np.searchsorted(bins["t_last_ns"], begin_ns))
     end = None if end_ns is None else int(np.searchsorted(bins["t_first_ns"], end_ns))

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.errors import FootTileError, needs_extra
+from devices.errors import FootTileError, require_extra
 from devices.frames import FrameBatch
 from service.estimation import OFFLINE_LAG_MS
-from service.sessions.sources import Sources
+from service.sessions.inputs import SessionInputs
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
 TARE_LOST = (
     "a tare is damaged and lost: where it may have been in force, forces are not known (bit 512 of "
-    "estimate_status)"
+    "estimate_flags)"
 )
 
 
@@ -33,31 +33,31 @@ class SessionFrames:
     reason why there are none, or not for all frames.
     """
 
-    def __init__(self, sources: Sources) -> None:
+    def __init__(self, inputs: SessionInputs) -> None:
         self.notes: dict[str, Any] = {}
         self.problem: str | None = None
-        self._sources = sources
+        self._inputs = inputs
 
     def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        if self._sources.calibration is None:
-            self._without_estimates(self._sources.problem)
-            yield from self.raw()
+        if self._inputs.calibration is None:
+            self._note_no_estimates(self._inputs.problem)
+            yield from self.iterate_raw()
             return
         try:
-            pieces = self._estimated()
+            pieces = self._iterate_estimated()
             first = next(pieces, None)
         except FootTileError as error:  # no tare, a calibration of other tiles, no estimator
-            self._without_estimates(error)
-            yield from self.raw()
+            self._note_no_estimates(error)
+            yield from self.iterate_raw()
             return
         if first is not None:
             yield first
             yield from pieces
 
-    def _estimated(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        sources = self._sources
-        with needs_extra("server", "the estimator", remedy=_LATER):
-            from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
+    def _iterate_estimated(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        sources = self._inputs
+        with require_extra("server", "the estimator", remedy=_REMEDY):
+            from service.sessions.pipeline import EstimateOptions, EstimateStream, make_notes
         assert sources.calibration is not None  # noqa: S101  # or there is nothing to estimate with
         options = EstimateOptions(
             sources.calibration,
@@ -67,16 +67,16 @@ class SessionFrames:
             exact=sources.exact,
         )
         stream = EstimateStream(sources.info, options)
-        for frames, columns in stream.run(self.raw()):
+        for frames, columns in stream.estimate_batches(self.iterate_raw()):
             if not self.notes and stream.plan is not None:
-                self.notes = notes_of(stream.plan, stream.rounding, sources.tares)
+                self.notes = make_notes(stream.plan, stream.rounding, sources.tares)
                 if any(tare.is_lost for tare in sources.tares):
                     self.problem = TARE_LOST
             yield frames, columns
 
-    def _without_estimates(self, reason: object) -> None:
+    def _note_no_estimates(self, reason: object) -> None:
         """Note why there are no estimates, and what `foottile estimate` needs to add them."""
-        calibration, tares = self._sources.calibration, self._sources.tares
+        calibration, tares = self._inputs.calibration, self._inputs.tares
         self.problem = f"no estimates: {reason}"
         self.notes = {"estimates": self.problem}
         if calibration is not None:
@@ -84,31 +84,31 @@ class SessionFrames:
         if tares:
             self.notes["tares"] = [tare.as_dict() for tare in tares]
 
-    def raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
+    def iterate_raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
         """Yield frames with the column `part` only."""
-        return raw_from(self._sources)
+        return iterate_raw_frames(self._inputs)
 
 
-def raw_from(
-    sources: Sources, number: int = 0, seq: int = 0
+def iterate_raw_frames(
+    inputs: SessionInputs, first_part: int = 0, first_seq: int = 0
 ) -> Iterator[tuple[FrameBatch, Columns]]:
     """Yield frames from the journals in order, with the column `part` only.
 
     Args:
-        sources: inputs of the session.
-        number: number of the first part.
-        seq: frames of this part before this number are left out.
+        inputs: inputs of the session.
+        first_part: number of the first part.
+        first_seq: frames of this part before this number are left out.
     """
-    for i, part in list(enumerate(sources.session.parts))[number:]:
-        journal = sources.journals.get(part.boot_id)
-        first = max(seq, part.seq_first) if i == number else part.seq_first
-        last = journal.held.last if journal is not None else None
+    for i, part in list(enumerate(inputs.session.parts))[first_part:]:
+        journal = inputs.journals.get(part.stream_id)
+        first = max(first_seq, part.seq_first) if i == first_part else part.seq_first
+        last = journal.stored.last if journal is not None else None
         last = part.seq_last if part.seq_last is not None else last
         if journal is None or last is None or last < first:
             continue
-        for batch in journal.read(first, last):
+        for batch in journal.read_frames(first, last):
             if len(batch):
                 yield batch, {"part": np.full(len(batch), i, dtype=np.uint16)}
 
 
-_LATER = "`foottile estimate` adds them where foottile[server] is installed"
+_REMEDY = "`foottile estimate` adds them where foottile[server] is installed"

@@ -6,50 +6,50 @@ from pathlib import Path
 
 from devices.errors import FileFormatError
 from service.sessions.frames import SessionFrames
-from service.sessions.overview import OverviewBeside
-from service.sessions.sources import Sources
-from service.sessions.stances import StancesBeside
-from storage.clock.file import CLOCK_NAME, write_clock
-from storage.file_hash import sha256_of
-from storage.sessions.beside import write_events
-from storage.sessions.file import SessionWriter
+from service.sessions.inputs import SessionInputs
+from service.sessions.overview import OverviewWriter
+from service.sessions.stances import StancesWriter
+from storage.clock.file import CLOCK_NAME, write_clock_file
+from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME, Ledger, Session
+from storage.sessions.sidecars import write_markers
+from storage.sessions.writer import SealedFileWriter
 
 
-def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
+def seal_session(inputs: SessionInputs, folder: Path, ledger: Ledger) -> Session:
     """Write the session's files; return the sealed session.
 
     Args:
-        sources: inputs to seal; every part is closed.
+        inputs: inputs to seal; every part is closed.
         folder: folder of the session.
         ledger: final ledger.
 
     Raises:
         FootTileError: the disk is full, or a journal is damaged. The journals are untouched.
     """
-    session = sources.session
+    session = inputs.session
     if not ledger.recorded:
         update = {"state": "sealed", "ledger": ledger, "problem": "no frame was recorded"}
         return session.model_copy(update=update)
-    frames, stances = SessionFrames(sources), StancesBeside()
-    overview = OverviewBeside(len(sources.info.tiles))
+    frames, stances = SessionFrames(inputs), StancesWriter()
+    overview = OverviewWriter(len(inputs.info.tiles))
     path = folder / FRAMES_NAME
     count = duration_ns = earlier_ns = part_begin_ns = 0
     notes: dict[str, object] = {
-        **sources.notes,
+        **inputs.notes,
         "session": session.model_dump(
-            mode="json", include=_IN_FILE | ({"take"} if session.take else set())
+            mode="json", include=_FIELDS_IN_FILE | ({"take"} if session.take else set())
         ),
         "ledger": ledger.model_dump(mode="json"),
     }
     last_part = -1
-    with SessionWriter(path, sources.info, notes) as writer:
+    with SealedFileWriter(path, inputs.info, notes) as writer:
         for batch, columns in frames:
             if not count:
                 writer.add_notes(frames.notes)
-            writer.append(batch, columns)
-            stances.feed(batch.seq, batch.t_ns, columns)
-            overview.feed(batch, columns)
+            writer.append_frames(batch, columns)
+            stances.add_frames(batch.seq, batch.t_ns, columns)
+            overview.add_frames(batch, columns)
             count += len(batch)
             part = int(columns["part"][0])
             if part != last_part:
@@ -60,11 +60,11 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
         raise FileFormatError(
             f"{count} frames were sealed, the ledger has {ledger.recorded}", where=str(path)
         )
-    write_events(session, folder)
-    write_clock(folder / CLOCK_NAME, session.clock, sources.streams)
-    sha256 = sha256_of(path)
-    stances.write(folder, sha256)
-    overview.write(folder, sha256)
+    write_markers(session, folder)
+    write_clock_file(folder / CLOCK_NAME, session.clock, inputs.stream_facts)
+    sha256 = compute_sha256(path)
+    stances.write_file(folder, sha256)
+    overview.write_file(folder, sha256)
     problems = session.problem, frames.problem, stances.problem, overview.problem
     return session.model_copy(
         update={
@@ -81,5 +81,5 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     )
 
 
-_IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
+_FIELDS_IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
 """Fields of a session in the sealed file; names and notes may change later and are not in it."""

@@ -18,8 +18,8 @@ from typing import Any
 from devices.errors import DamagedFileError
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare
-from storage.checked_json import checked, write_checked
-from storage.durable import ASIDE, read_whole
+from storage.checksummed_json import parse_checksummed_json, write_checksummed_json
+from storage.durable_files import ASIDE_SUFFIX, read_small_file
 
 REASONS = {
     "lead": "unloaded lead of the emulation",
@@ -44,12 +44,12 @@ class RecordedTare:
     chips: tuple[tuple[int, ...], ...] | None = None
     """Coefficients of the tiles' chips; None in tares of older versions."""
 
-    def is_of(self, info: ArrayInfo) -> bool:
+    def is_of_array(self, info: ArrayInfo) -> bool:
         """Return whether it is of these tiles, by serials and chips.
 
         A swapped part has the same serial but another chip.
         """
-        return self.serials == info.serials and self.chips in (None, chips_of(info))
+        return self.serials == info.serials and self.chips in (None, chip_coefficients(info))
 
     @property
     def is_automatic(self) -> bool:
@@ -67,7 +67,7 @@ LOST = LostTares()
 
 
 @dataclass(frozen=True)
-class TaresFound:
+class TareFileContent:
     """Content of a file.
 
     Attributes:
@@ -81,35 +81,35 @@ class TaresFound:
     is_damaged: bool = False
 
 
-def chips_of(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
+def chip_coefficients(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
     """Return the coefficients of an array's chips."""
     return tuple(tuple(tile.coefficient_words) for tile in info.tiles)
 
 
-def read_tares(path: Path) -> TaresFound:
+def read_tares(path: Path) -> TareFileContent:
     """Read all intact tares of a file, with a `LostTares` in place of others.
 
     Raises:
         StorageError: it cannot be read now.
     """
     try:
-        text = read_whole(path)
+        text = read_small_file(path)
     except FileNotFoundError:
-        return _missing(path)
+        return _content_without_file(path)
     except DamagedFileError as error:
-        return TaresFound((LOST,), f"{error.what}: all of its tares are lost", is_damaged=True)
+        return TareFileContent((LOST,), f"{error.what}: all of its tares are lost", is_damaged=True)
     is_proven, what = False, "not a complete list of tares"
     try:
-        is_proven = checked(text, where=str(path)).is_proven
-        older = None if is_proven else _of_older_version(text)
+        is_proven = parse_checksummed_json(text, where=str(path)).has_checksum
+        older = None if is_proven else _parse_older_version(text)
     except DamagedFileError as error:
         older, what = None, error.what
     if older is not None:
-        return TaresFound(older, "it is of an older version, which wrote no hashes: unproven")
-    entries, lost = _proven(text)
+        return TareFileContent(older, "it is of an older version, which wrote no hashes: unproven")
+    entries, lost = _parse_intact(text)
     if is_proven and lost == 0:
-        return TaresFound(entries)
-    return TaresFound(entries, f"{what}: {_in_words(lost)}", is_damaged=True)
+        return TareFileContent(entries)
+    return TareFileContent(entries, f"{what}: {_format_lost(lost)}", is_damaged=True)
 
 
 def write_tares(path: Path, entries: Sequence[Entry]) -> None:
@@ -120,24 +120,26 @@ def write_tares(path: Path, entries: Sequence[Entry]) -> None:
     """
     lines = []
     for number, entry in enumerate(entries):
-        content = {"number": number, "of": len(entries), **_content(entry)}
+        content = {"number": number, "of": len(entries), **_encode_entry(entry)}
         body = json.dumps(content).encode()[:-1]
         lines.append(body + b', "sha256": "' + _hash(body) + b'"}')
-    write_checked(path, b'{"tares": [\n' + b",\n".join(lines) + b"\n]}")
+    write_checksummed_json(path, b'{"tares": [\n' + b",\n".join(lines) + b"\n]}")
 
 
-def _missing(path: Path) -> TaresFound:
+def _content_without_file(path: Path) -> TareFileContent:
     """Return the content without a file: none, unless a damaged file was set aside."""
     try:
-        was_set_aside = any(path.parent.glob(path.name + ASIDE + "*"))
+        was_set_aside = any(path.parent.glob(path.name + ASIDE_SUFFIX + "*"))
     except OSError:
         was_set_aside = False
     if not was_set_aside:
-        return TaresFound(())
-    return TaresFound((LOST,), "a damaged one was set aside, and no other written: all are lost")
+        return TareFileContent(())
+    return TareFileContent(
+        (LOST,), "a damaged one was set aside, and no other written: all are lost"
+    )
 
 
-def _in_words(lost: int | None) -> str:
+def _format_lost(lost: int | None) -> str:
     if lost is None:
         return "all of its tares are lost"
     if lost == 0:
@@ -145,7 +147,7 @@ def _in_words(lost: int | None) -> str:
     return "1 tare is lost" if lost == 1 else f"{lost} tares are lost"
 
 
-def _proven(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
+def _parse_intact(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
     """Return entries in order, and the number of lost ones; None: not even that is known."""
     places: dict[int, set[bytes]] = {}
     totals = set()
@@ -160,13 +162,13 @@ def _proven(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
     lost = 0
     for number in range(totals.pop()):
         bodies = places.get(number, set())
-        entry = _entry(json.loads(bodies.pop() + b"}")) if len(bodies) == 1 else None
+        entry = _parse_entry(json.loads(bodies.pop() + b"}")) if len(bodies) == 1 else None
         lost += entry is None
         entries.append(entry or LOST)
-    return in_order(entries), lost
+    return merge_lost_runs(entries), lost
 
 
-def in_order(entries: Iterable[Entry]) -> tuple[Entry, ...]:
+def merge_lost_runs(entries: Iterable[Entry]) -> tuple[Entry, ...]:
     """Return the entries with each run of lost ones merged into one."""
     merged: list[Entry] = []
     for entry in entries:
@@ -175,7 +177,7 @@ def in_order(entries: Iterable[Entry]) -> tuple[Entry, ...]:
     return tuple(merged)
 
 
-def _content(entry: Entry) -> dict[str, object]:
+def _encode_entry(entry: Entry) -> dict[str, object]:
     if isinstance(entry, LostTares):
         return {"lost": True}
     return {
@@ -188,17 +190,17 @@ def _content(entry: Entry) -> dict[str, object]:
     }
 
 
-def _entry(content: Mapping[str, Any]) -> Entry | None:
+def _parse_entry(content: Mapping[str, Any]) -> Entry | None:
     """Parse an entry; None if it is of another version."""
     if content.get("lost") is True:
         return LOST
     try:
-        return _recorded(content)
+        return _parse_tare(content)
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
-def _recorded(entry: Mapping[str, Any]) -> RecordedTare:
+def _parse_tare(entry: Mapping[str, Any]) -> RecordedTare:
     chips = entry.get("chips")
     return RecordedTare(
         str(entry["id"]),
@@ -210,13 +212,13 @@ def _recorded(entry: Mapping[str, Any]) -> RecordedTare:
     )
 
 
-def _of_older_version(text: bytes) -> tuple[RecordedTare, ...] | None:
+def _parse_older_version(text: bytes) -> tuple[RecordedTare, ...] | None:
     """Parse a plain list of an older version, without hashes; None if it is none."""
     try:
         content = json.loads(text)
         if not isinstance(content, list):
             return None
-        return tuple(_recorded(entry) for entry in content) or None
+        return tuple(_parse_tare(entry) for entry in content) or None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
 

@@ -20,12 +20,12 @@ from service.sessions.tare_file import (
     Entry,
     LostTares,
     RecordedTare,
-    chips_of,
-    in_order,
+    chip_coefficients,
+    merge_lost_runs,
     read_tares,
     write_tares,
 )
-from storage.durable import make_folder, set_aside, storage_errors
+from storage.durable_files import make_synced_folder, set_aside_damaged, translate_storage_errors
 
 KEPT_MAX = 1000
 AUTOMATIC_KEPT_MAX = 200
@@ -55,61 +55,67 @@ class TareHistory:
         self.problem: str | None = None
         """Damage of the file when it was read, and the consequence."""
         if found.problem is not None:
-            self._mend(found.problem, is_damaged=found.is_damaged)
+            self._rewrite(found.problem, is_damaged=found.is_damaged)
 
-    def _mend(self, problem: str, *, is_damaged: bool) -> None:
-        done = f"it is kept as {set_aside(self._path).name}" if is_damaged else "it is rewritten"
+    def _rewrite(self, problem: str, *, is_damaged: bool) -> None:
+        done = (
+            f"it is kept as {set_aside_damaged(self._path).name}"
+            if is_damaged
+            else "it is rewritten"
+        )
         try:
-            self._keep(self._entries)
+            self._store(self._entries)
         except StorageError as error:
             done = f"it cannot be rewritten: {error}"
         self.problem = f"{self._path}: {problem}; {done}"
 
     @property
-    def all(self) -> list[RecordedTare]:
+    def tares(self) -> list[RecordedTare]:
         """All known tares, oldest first."""
         return [entry for entry in self._entries if isinstance(entry, RecordedTare)]
 
     def is_empty(self, info: ArrayInfo) -> bool:
         """Return whether no tare of this array is in the history, counting lost ones."""
-        return not self._of(info) and not any(isinstance(e, LostTares) for e in self._entries)
+        return not self._valid_tares(info) and not any(
+            isinstance(e, LostTares) for e in self._entries
+        )
 
-    def in_force(self, info: ArrayInfo) -> RecordedTare | None:
+    def tare_in_force(self, info: ArrayInfo) -> RecordedTare | None:
         """Return the tare in force for an array; None if there is none, or if it is lost.
 
         Tares of other tiles do not count.
         """
-        fitting = self._since_lost(info)
+        fitting = self._valid_since_lost(info)
         return fitting[-1] if fitting else None
 
-    def is_lost(self, info: ArrayInfo) -> bool:
+    def is_tare_lost(self, info: ArrayInfo) -> bool:
         """Return whether a lost tare may be the one in force."""
         lost = any(isinstance(entry, LostTares) for entry in self._entries)
-        return lost and not self._since_lost(info)
+        return lost and not self._valid_since_lost(info)
 
-    def may_have_held(self, t_ns: int) -> bool:
+    def may_be_lost(self, t_ns: int) -> bool:
         """Return whether a lost tare may have this time."""
-        return any(first <= t_ns <= last for first, last in self._gaps())
+        return any(first <= t_ns <= last for first, last in self._lost_intervals())
 
-    def to_use(self, info: ArrayInfo) -> Tare | None:
+    def tare_for_estimates(self, info: ArrayInfo) -> Tare | None:
         """Return the tare for estimates: in force, the stand-in of a lost one, or None."""
-        in_force = self.in_force(info)
+        in_force = self.tare_in_force(info)
         if in_force is not None:
             return in_force.tare
-        return Tare.lost(tiles=len(info.tiles), t_ns=0) if self.is_lost(info) else None
+        return Tare.make_lost(tiles=len(info.tiles), t_ns=0) if self.is_tare_lost(info) else None
 
-    def anchor(self, info: ArrayInfo) -> RecordedTare | None:
+    def automatic_reference(self, info: ArrayInfo) -> RecordedTare | None:
         """Return the reference of automatic tares: the last other one, else the oldest.
 
         Tares before a lost one do not count: the lost one may have been the last other tare.
         """
-        fitting = self._since_lost(info)
+        fitting = self._valid_since_lost(info)
         return next((t for t in reversed(fitting) if not t.is_automatic), (*fitting, None)[0])
 
     def is_automatic_paused(self, info: ArrayInfo) -> bool:
         """Return whether an automatic tare was undone, with no other kind of tare since."""
-        for recorded in reversed(self.all):
-            if not recorded.is_of(info):
+        for recorded in reversed(self.tares):
+            if not recorded.is_of_array(info):
                 continue
             if recorded.is_automatic and recorded.undone:
                 return True
@@ -117,19 +123,19 @@ class TareHistory:
                 return False
         return False
 
-    def valid(self, info: ArrayInfo) -> tuple[Tare, ...]:
+    def valid_tares(self, info: ArrayInfo) -> tuple[Tare, ...]:
         """Return all tares that were not undone, in their order of time."""
-        return tuple(recorded.tare for recorded in self._of(info))
+        return tuple(recorded.tare for recorded in self._valid_tares(info))
 
-    def during(self, info: ArrayInfo, begin_t_ns: int, end_t_ns: int) -> tuple[Tare, ...]:
+    def tares_between(self, info: ArrayInfo, begin_t_ns: int, end_t_ns: int) -> tuple[Tare, ...]:
         """Return the tares in force at some time of an interval, oldest first.
 
         Those are the last one before it and all within; without one before, the first within is
         used from the beginning on. `Tare.lost` stands for a lost one, from the earliest time at
         which it may have been in force.
         """
-        gaps = list(self._gaps())
-        valid = [(recorded.tare.t_ns, recorded.tare) for recorded in self._of(info)]
+        gaps = list(self._lost_intervals())
+        valid = [(recorded.tare.t_ns, recorded.tare) for recorded in self._valid_tares(info)]
         fitting = [
             (t_ns, tare)
             for t_ns, tare in valid
@@ -139,25 +145,28 @@ class TareHistory:
         tiles = len(info.tiles)
         for first, _ in gaps:
             t_ns = max(first, min(begin_t_ns, end_t_ns))
-            fitting.append((first, Tare.lost(tiles=tiles, t_ns=t_ns)))
+            fitting.append((first, Tare.make_lost(tiles=tiles, t_ns=t_ns)))
         fitting.sort(key=lambda item: (item[0], item[1].is_lost))
         before = [tare for t_ns, tare in fitting if t_ns <= begin_t_ns][-1:]
         within = [tare for t_ns, tare in fitting if begin_t_ns < t_ns <= end_t_ns]
         return tuple(before + within)
 
-    def _gaps(self) -> Iterator[tuple[int, int]]:
+    def _lost_intervals(self) -> Iterator[tuple[int, int]]:
         """Yield the intervals of lost tares: between the times of their neighbours."""
         for index, entry in enumerate(self._entries):
             if isinstance(entry, LostTares):
-                beside = self._t_ns(index - 1, _EVER[0]), self._t_ns(index + 1, _EVER[1])
+                beside = (
+                    self._neighbour_t_ns(index - 1, _ANY_TIME_NS[0]),
+                    self._neighbour_t_ns(index + 1, _ANY_TIME_NS[1]),
+                )
                 # A clock that was set back reverses their order.
                 yield min(beside), max(beside)
 
-    def _t_ns(self, at: int, otherwise: int) -> int:
+    def _neighbour_t_ns(self, at: int, otherwise: int) -> int:
         entry = self._entries[at] if 0 <= at < len(self._entries) else None
         return entry.tare.t_ns if isinstance(entry, RecordedTare) else otherwise
 
-    def add(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
+    def add_tare(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
         """Add a tare and put it in force.
 
         Args:
@@ -170,21 +179,21 @@ class TareHistory:
         """
         reason = (reason or REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
         recorded = RecordedTare(
-            uuid.uuid4().hex[:12], info.serials, tare, reason=reason, chips=chips_of(info)
+            uuid.uuid4().hex[:12], info.serials, tare, reason=reason, chips=chip_coefficients(info)
         )
-        self._keep(_bounded((*self._entries, recorded)))
+        self._store(_thin_out((*self._entries, recorded)))
         return recorded
 
-    def undo(self, tare_id: str) -> None:
+    def undo_tare(self, tare_id: str) -> None:
         """Undo a tare; the one before it is in force again.
 
         Raises:
             UnknownError: no such tare, or it was undone already.
             StorageError: that cannot be stored; nothing has changed then.
         """
-        if not any(tare.id == tare_id and not tare.undone for tare in self.all):
+        if not any(tare.id == tare_id and not tare.undone for tare in self.tares):
             raise UnknownError(f"no tare {tare_id!r} that could be undone")
-        self._keep(
+        self._store(
             tuple(
                 replace(entry, undone=True)
                 if isinstance(entry, RecordedTare) and entry.id == tare_id
@@ -193,30 +202,30 @@ class TareHistory:
             )
         )
 
-    def _of(self, info: ArrayInfo) -> list[RecordedTare]:
-        return [t for t in self.all if t.is_of(info) and not t.undone]
+    def _valid_tares(self, info: ArrayInfo) -> list[RecordedTare]:
+        return [t for t in self.tares if t.is_of_array(info) and not t.undone]
 
-    def _since_lost(self, info: ArrayInfo) -> list[RecordedTare]:
+    def _valid_since_lost(self, info: ArrayInfo) -> list[RecordedTare]:
         """Return the valid tares after the last lost one."""
         fitting: list[RecordedTare] = []
         for entry in self._entries:
             if isinstance(entry, LostTares):
                 fitting.clear()
-            elif entry.is_of(info) and not entry.undone:
+            elif entry.is_of_array(info) and not entry.undone:
                 fitting.append(entry)
         return fitting
 
-    def _keep(self, entries: tuple[Entry, ...]) -> None:
-        with storage_errors(self._path):
-            make_folder(self._path.parent)
+    def _store(self, entries: tuple[Entry, ...]) -> None:
+        with translate_storage_errors(self._path):
+            make_synced_folder(self._path.parent)
         write_tares(self._path, entries)
         self._entries = entries
 
 
-_EVER = (-(2**63), 2**63 - 1)
+_ANY_TIME_NS = (-(2**63), 2**63 - 1)
 
 
-def _bounded(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+def _thin_out(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
     automatic = [t for t in entries if isinstance(t, RecordedTare) and t.is_automatic]
     if len(automatic) > AUTOMATIC_KEPT_MAX:
         # Drop the least informative tare: in the older half, the closest to its neighbours. The
@@ -228,4 +237,4 @@ def _bounded(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
         older = automatic[1 : len(automatic) // 2]
         least = min(older, key=lambda tare: gaps_ns[tare.id])
         entries = tuple(entry for entry in entries if entry is not least)
-    return in_order(entries[-KEPT_MAX:])
+    return merge_lost_runs(entries[-KEPT_MAX:])

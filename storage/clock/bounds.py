@@ -5,7 +5,7 @@ bound however asymmetric the two ways were. So rows are intersected, never avera
 asymmetric ways would have a small sigma around a wrong value. Two instants are connected by how
 fast one clock can gain on the other:
 
-- never more than `CRYSTAL`, two uncompensated crystals of 50 ppm each, and
+- never more than `CRYSTAL_RATE_LIMIT`, two uncompensated crystals of 50 ppm each, and
 - within `RATE_TOLERANCE` of its mean over the stretch, the frequency tolerance of RFC 5905 (PHI).
 
 From every row the offset can thus only lie in a cone that opens with time; the intersection of all
@@ -27,25 +27,25 @@ import numpy.typing as npt
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 
-CRYSTAL = 100e-6
+CRYSTAL_RATE_LIMIT = 100e-6
 """Rate limit of two uncompensated crystals, each 50 ppm off at most over temperature and age."""
-WANDER = 15e-6
+RATE_TOLERANCE = 15e-6
 """Frequency tolerance around the measured rate (RFC 5905, PHI)."""
-FAST = 500e-6
+DISCIPLINE_RATE_LIMIT = 500e-6
 """Linux's limit of clock discipline (`tolerance` of adjtimex); accepted only for a steady rate."""
 
-_READING_NS = 1.0
+_CLOCK_RESOLUTION_NS = 1.0
 """Resolution of both clocks' readings."""
 _ROUNDING_NS = 4
 """Rounding of bounds and their middle to whole ns."""
-_FIRST_LOOK_ROWS = 64
+_FIRST_WINDOW_ROWS = 64
 """First search window in rows, doubled each time: frequent steps cost no quadratic time."""
-_STEADY_ROWS_MIN = 4
+_MIN_STEADY_ROWS = 4
 """Fewest rows of a steady rate: a step between two or three rows looks like one."""
 
 
 @dataclass(frozen=True)
-class Rows:
+class OffsetRows:
     """Measurements in order of time: int64[n] each; their ranges are checked at reading.
 
     Attributes:
@@ -61,10 +61,10 @@ class Rows:
     def __len__(self) -> int:
         return len(self.t_mono_ns)
 
-    def part(self, begin: int, end: int) -> Rows:
+    def slice_rows(self, begin: int, end: int) -> OffsetRows:
         """Return rows `begin` to `end`, the latter not included."""
         s = slice(begin, end)
-        return Rows(self.t_mono_ns[s], self.offset_ns[s], self.uncertainty_ns[s])
+        return OffsetRows(self.t_mono_ns[s], self.offset_ns[s], self.uncertainty_ns[s])
 
 
 class _Cones:
@@ -86,7 +86,7 @@ class _Cones:
         self._behind_high = np.concatenate((least((high - slowest * x)[::-1])[::-1], none))
         self._behind_low = np.concatenate((most((low - fastest * x)[::-1])[::-1], -none))
 
-    def at(self, x: Float64, rows_before: npt.NDArray[np.intp]) -> tuple[Float64, Float64]:
+    def bounds_at(self, x: Float64, rows_before: npt.NDArray[np.intp]) -> tuple[Float64, Float64]:
         """Return least and greatest offset at `x`, given the number of rows up to it."""
         high = np.minimum(
             self.fastest * x + self._ahead_high[rows_before],
@@ -99,57 +99,60 @@ class _Cones:
         return low, high
 
 
-class Stretch:
+class OffsetStretch:
     """Measurements that one clock without a step can explain.
 
     Args:
         rows: at least one, in order of time.
-        limit: bound of its rate.
+        rate_limit: bound of its rate.
     """
 
-    def __init__(self, rows: Rows, limit: float = CRYSTAL) -> None:
+    def __init__(self, rows: OffsetRows, rate_limit: float = CRYSTAL_RATE_LIMIT) -> None:
         self.rows = rows
-        self.steady = True
+        self.is_steady = True
         """True: a rate within `RATE_TOLERANCE` of its mean explains all rows."""
-        self.mean_rate: tuple[float, float] = (-limit, limit)
+        self.mean_rate_bounds: tuple[float, float] = (-rate_limit, rate_limit)
         """Bounds of the mean rate from the first row to the last."""
-        self._limit = limit
+        self._limit = rate_limit
         self._begin_ns = rows.t_mono_ns[0]
         self._reference_ns = rows.offset_ns[0]
-        x = self._x(rows.t_mono_ns)
-        low, high = _intervals(rows)
-        wander = WANDER
-        while not self._fit(x, low, high, limit, wander) and wander < 2 * limit:
+        x = self._ns_since_begin(rows.t_mono_ns)
+        low, high = _offset_intervals(rows)
+        wander = RATE_TOLERANCE
+        while not self._fit(x, low, high, rate_limit, wander) and wander < 2 * rate_limit:
             # The rate wanders more than assumed: double the limit until it fits the rows.
-            self.steady = False
+            self.is_steady = False
             wander *= 2
 
     @property
-    def begin_ns(self) -> int:
+    def begin_t_mono_ns(self) -> int:
         """Instant of its first row, `t_mono_ns`."""
         return int(self._begin_ns)
 
     @property
-    def end_ns(self) -> int:
+    def end_t_mono_ns(self) -> int:
         """Instant of its last row, `t_mono_ns`."""
         return int(self.rows.t_mono_ns[-1])
 
     @property
     def drift_bounds(self) -> tuple[float, float] | None:
         """Bounds of the mean rate; None if the rows do not narrow it beyond a crystal's."""
-        return None if self.mean_rate == (-self._limit, self._limit) else self.mean_rate
+        return (
+            None if self.mean_rate_bounds == (-self._limit, self._limit) else self.mean_rate_bounds
+        )
 
-    def bounds(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
+    def offset_bounds_at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
         """Compute least and greatest offset in ns at any instants, also outside the rows."""
-        low, high = self._cones.at(
-            self._x(t_mono_ns), np.searchsorted(self.rows.t_mono_ns, t_mono_ns, side="right")
+        low, high = self._cones.bounds_at(
+            self._ns_since_begin(t_mono_ns),
+            np.searchsorted(self.rows.t_mono_ns, t_mono_ns, side="right"),
         )
         return (
             self._reference_ns + np.floor(low).astype(np.int64),
             self._reference_ns + np.ceil(high).astype(np.int64),
         )
 
-    def _x(self, t_mono_ns: Int64) -> Float64:
+    def _ns_since_begin(self, t_mono_ns: Int64) -> Float64:
         # Exact up to 104 days; beyond, a rate's 1e-4 of the rounding is still below 1 ns.
         x: Float64 = (t_mono_ns - self._begin_ns).astype(np.float64)
         return x
@@ -157,40 +160,42 @@ class Stretch:
     def _fit(self, x: Float64, low: Float64, high: Float64, limit: float, wander: float) -> bool:
         """Fit bounds of rate and offset; False if no rate within `wander` of its mean fits."""
         before = np.searchsorted(x, x, side="right")
-        self.mean_rate = (-limit, limit)
+        self.mean_rate_bounds = (-limit, limit)
         self._cones = _Cones(x, low, high, -limit, limit)
         if not x[-1]:
             return True
         for _ in range(3):  # a narrower rate narrows the ends, and these the rate
-            lowest, highest = self._cones.at(x, before)
+            lowest, highest = self._cones.bounds_at(x, before)
             if np.any(lowest > highest):
                 return False
-            self.mean_rate = (
+            self.mean_rate_bounds = (
                 max(-limit, float((lowest[-1] - highest[0]) / x[-1])),
                 min(limit, float((highest[-1] - lowest[0]) / x[-1])),
             )
-            slowest = max(-limit, self.mean_rate[0] - wander)
-            fastest = min(limit, self.mean_rate[1] + wander)
+            slowest = max(-limit, self.mean_rate_bounds[0] - wander)
+            fastest = min(limit, self.mean_rate_bounds[1] + wander)
             self._cones = _Cones(x, low, high, slowest, fastest)
-        lowest, highest = self._cones.at(x, before)
+        lowest, highest = self._cones.bounds_at(x, before)
         return not np.any(lowest > highest)
 
 
-class ClockMap:
+class ClockOffsets:
     """Offset of one stream's clock to the server's, with its bound, at every instant.
 
     Args:
         rows: at least one, in any order.
     """
 
-    def __init__(self, rows: Rows) -> None:
+    def __init__(self, rows: OffsetRows) -> None:
         order = np.argsort(rows.t_mono_ns, kind="stable")
-        self.rows = Rows(rows.t_mono_ns[order], rows.offset_ns[order], rows.uncertainty_ns[order])
-        self.stretches = _stretches(self.rows)
-        self._begins_ns = np.array([s.begin_ns for s in self.stretches], dtype=np.int64)
-        self._ends_ns = np.array([s.end_ns for s in self.stretches], dtype=np.int64)
+        self.rows = OffsetRows(
+            rows.t_mono_ns[order], rows.offset_ns[order], rows.uncertainty_ns[order]
+        )
+        self.stretches = _split_into_stretches(self.rows)
+        self._begins_ns = np.array([s.begin_t_mono_ns for s in self.stretches], dtype=np.int64)
+        self._ends_ns = np.array([s.end_t_mono_ns for s in self.stretches], dtype=np.int64)
 
-    def at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
+    def offset_at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
         """Compute the offset and its bound at each instant, in ns; every instant independently.
 
         Between two stretches the instant of the step is unknown, and the bound covers both
@@ -207,16 +212,18 @@ class ClockMap:
         high = np.empty(len(t_mono_ns), dtype=np.int64)
         for i in np.unique(number):
             here = number == i
-            low[here], high[here] = self.stretches[i].bounds(t_mono_ns[here])
+            low[here], high[here] = self.stretches[i].offset_bounds_at(t_mono_ns[here])
             torn = here & between
             if torn.any():
-                later_low, later_high = self.stretches[i + 1].bounds(t_mono_ns[torn])
+                later_low, later_high = self.stretches[i + 1].offset_bounds_at(t_mono_ns[torn])
                 low[torn] = np.minimum(low[torn], later_low)
                 high[torn] = np.maximum(high[torn], later_high)
         offset = (low >> 1) + (high >> 1) + (low & high & 1)  # the sum might not fit
         return offset, np.maximum(high - offset, offset - low)
 
-    def reach(self, begins_ns: Int64, ends_ns: Int64) -> tuple[Int64, Int64, npt.NDArray[np.bool_]]:
+    def bound_ranges(
+        self, begins_ns: Int64, ends_ns: Int64
+    ) -> tuple[Int64, Int64, npt.NDArray[np.bool_]]:
         """Compute bounds of the offset over n time ranges.
 
         Args:
@@ -232,33 +239,37 @@ class ClockMap:
             for begun_ns, ended_ns in zip(self._begins_ns, self._ends_ns, strict=True):
                 sure &= (ends_ns < begun_ns) | (begins_ns >= begun_ns)
                 sure &= (ends_ns <= ended_ns) | (begins_ns > ended_ns)
-        one, other = self.at(begins_ns)[0], self.at(ends_ns)[0]
+        one, other = self.offset_at(begins_ns)[0], self.offset_at(ends_ns)[0]
         # Within a stretch the offset has no jumps, and no clock gains faster than this limit.
-        slack_ns = np.ceil(FAST * (ends_ns - begins_ns)).astype(np.int64) + _ROUNDING_NS
+        slack_ns = (
+            np.ceil(DISCIPLINE_RATE_LIMIT * (ends_ns - begins_ns)).astype(np.int64) + _ROUNDING_NS
+        )
         return np.minimum(one, other) - slack_ns, np.maximum(one, other) + slack_ns, sure
 
 
-def _intervals(rows: Rows) -> tuple[Float64, Float64]:
+def _offset_intervals(rows: OffsetRows) -> tuple[Float64, Float64]:
     """Return lowest and highest offset at each row, relative to the first row's."""
-    offset = _since(rows.offset_ns, rows.offset_ns[0])
+    offset = _subtract_first(rows.offset_ns, rows.offset_ns[0])
     # The server read its clock at some instant of the round trip; the row is about the middle.
-    half = rows.uncertainty_ns.astype(np.float64) * (1 + FAST) + _READING_NS
+    half = (
+        rows.uncertainty_ns.astype(np.float64) * (1 + DISCIPLINE_RATE_LIMIT) + _CLOCK_RESOLUTION_NS
+    )
     return offset - half, offset + half
 
 
-def _since(values: Int64, first: np.int64) -> Float64:
+def _subtract_first(values: Int64, first: np.int64) -> Float64:
     """Return differences to `first`: exact, or, where they wrap in 64 bits, to a microsecond."""
     steps = values - first
     does_wrap = ((values ^ first) & (values ^ steps)) < 0
     return np.where(does_wrap, values.astype(np.float64) - float(first), steps.astype(np.float64))
 
 
-def _reach(rows: Rows, limit: float) -> int:
+def _count_explained_rows(rows: OffsetRows, limit: float) -> int:
     """Count the first rows that one clock with a rate within the limit can explain."""
-    look = _FIRST_LOOK_ROWS
+    look = _FIRST_WINDOW_ROWS
     while True:
-        part = rows.part(0, look)
-        low, high = _intervals(part)
+        part = rows.slice_rows(0, look)
+        low, high = _offset_intervals(part)
         x = (part.t_mono_ns - part.t_mono_ns[0]).astype(np.float64)
         highest = limit * x + np.minimum.accumulate(high - limit * x)
         lowest = np.maximum.accumulate(low + limit * x) - limit * x
@@ -270,43 +281,50 @@ def _reach(rows: Rows, limit: float) -> int:
         look *= 2
 
 
-def _steady_reach(rows: Rows, at_least: int) -> int:
+def _count_steady_rows(rows: OffsetRows, min_rows: int) -> int:
     """Count the first rows that a clock with a steady rate beyond a crystal's explains; or 0."""
-    shortest, longest = at_least, _reach(rows, FAST)
-    if longest <= at_least or not Stretch(rows.part(0, at_least + 1), FAST).steady:
+    shortest, longest = min_rows, _count_explained_rows(rows, DISCIPLINE_RATE_LIMIT)
+    if (
+        longest <= min_rows
+        or not OffsetStretch(rows.slice_rows(0, min_rows + 1), DISCIPLINE_RATE_LIMIT).is_steady
+    ):
         return 0
     while longest - shortest > 1:
         middle = (shortest + longest) // 2
-        if Stretch(rows.part(0, middle), FAST).steady:
+        if OffsetStretch(rows.slice_rows(0, middle), DISCIPLINE_RATE_LIMIT).is_steady:
             shortest = middle
         else:
             longest = middle
-    return longest if Stretch(rows.part(0, longest), FAST).steady else shortest
+    return (
+        longest
+        if OffsetStretch(rows.slice_rows(0, longest), DISCIPLINE_RATE_LIMIT).is_steady
+        else shortest
+    )
 
 
-def _stretches(rows: Rows) -> tuple[Stretch, ...]:
+def _split_into_stretches(rows: OffsetRows) -> tuple[OffsetStretch, ...]:
     pieces: list[tuple[int, int, float]] = []
     begin = 0
     while begin < len(rows):
-        rest = rows.part(begin, len(rows))
-        reach, limit = _reach(rest, CRYSTAL), CRYSTAL
+        rest = rows.slice_rows(begin, len(rows))
+        reach, limit = _count_explained_rows(rest, CRYSTAL_RATE_LIMIT), CRYSTAL_RATE_LIMIT
         if reach < len(rest):
-            further = _steady_reach(rest, reach)
-            if further >= max(reach + 1, _STEADY_ROWS_MIN):
-                reach, limit = further, FAST
+            further = _count_steady_rows(rest, reach)
+            if further >= max(reach + 1, _MIN_STEADY_ROWS):
+                reach, limit = further, DISCIPLINE_RATE_LIMIT
         pieces.append((begin, begin + reach, limit))
         begin += reach
-    stretches: list[Stretch] = []
+    stretches: list[OffsetStretch] = []
     for begin, end, limit in reversed(pieces):
-        certain = _certain_end(rows, begin, end, stretches[-1]) if stretches else end
-        stretches.append(Stretch(rows.part(begin, certain), limit))
+        certain = _find_certain_end(rows, begin, end, stretches[-1]) if stretches else end
+        stretches.append(OffsetStretch(rows.slice_rows(begin, certain), limit))
     return tuple(reversed(stretches))
 
 
-def _certain_end(rows: Rows, begin: int, end: int, later: Stretch) -> int:
+def _find_certain_end(rows: OffsetRows, begin: int, end: int, later: OffsetStretch) -> int:
     """Return the end of the rows that cannot belong to the later stretch."""
-    part = rows.part(begin, end)
-    low, high = later.bounds(part.t_mono_ns)
+    part = rows.slice_rows(begin, end)
+    low, high = later.offset_bounds_at(part.t_mono_ns)
     half = part.uncertainty_ns + part.uncertainty_ns // 2000 + 2  # as in _intervals, rounded up
     foreign = (part.offset_ns - half > high) | (part.offset_ns + half < low)
     last = np.flatnonzero(foreign)

@@ -13,26 +13,28 @@ import pyarrow as pa
 from pydantic import TypeAdapter
 
 from devices.errors import DamagedFileError
-from storage.checked_table import read_table, write_table
-from storage.clock.bounds import Rows
+from storage.clock.bounds import OffsetRows
 from storage.clock.log import ClockOffset
-from storage.clock.table import StreamFacts, check_rows
+from storage.clock.table import StreamClockFacts, check_rows_in_range
+from storage.hashed_table import read_hashed_table, write_hashed_table
 
 CLOCK_NAME = "clock.parquet"
 STREAMS_KEY = b"foottile.streams"
 
 _NUMBERS = ("t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
 _FIELDS: list[pa.Field[Any]] = [
-    pa.field("boot_id", pa.string(), nullable=False),
+    pa.field("stream_id", pa.string(), nullable=False),
     *(pa.field(name, pa.int64(), nullable=False) for name in _NUMBERS),
 ]
 _SCHEMA = pa.schema(_FIELDS)
 
 
-_STREAMS = TypeAdapter(tuple[StreamFacts, ...])
+_STREAMS = TypeAdapter(tuple[StreamClockFacts, ...])
 
 
-def write_clock(path: Path, rows: Sequence[ClockOffset], streams: Sequence[StreamFacts]) -> None:
+def write_clock_file(
+    path: Path, rows: Sequence[ClockOffset], streams: Sequence[StreamClockFacts]
+) -> None:
     """Write a session's clock measurements, with the facts about its streams as metadata.
 
     Raises:
@@ -42,7 +44,7 @@ def write_clock(path: Path, rows: Sequence[ClockOffset], streams: Sequence[Strea
     facts = [vars(stream) for stream in streams]
     columns = {name: [getattr(row, name) for row in rows] for name in _SCHEMA.names}
     schema = _SCHEMA.with_metadata({STREAMS_KEY: json.dumps(facts).encode()})
-    write_table(path, pa.table(columns, schema=schema))
+    write_hashed_table(path, pa.table(columns, schema=schema))
 
 
 @dataclass(frozen=True)
@@ -50,26 +52,26 @@ class StoredClock:
     """Content of `clock.parquet`.
 
     Attributes:
-        rows: measurements by stream_id.
+        rows_by_stream: measurements by stream_id.
         facts: facts about streams, by stream_id.
-        is_proven: False: an older version wrote it without a hash.
+        has_hash: False: an older version wrote it without a hash.
     """
 
-    rows: dict[str, Rows]
-    facts: dict[str, StreamFacts]
-    is_proven: bool
+    rows_by_stream: dict[str, OffsetRows]
+    facts: dict[str, StreamClockFacts]
+    has_hash: bool
 
     @property
     def offsets(self) -> tuple[ClockOffset, ...]:
         """Measurements as single rows, stream by stream."""
         return tuple(
             ClockOffset(
-                boot_id=boot_id,
+                stream_id=stream_id,
                 t_mono_ns=t_mono_ns,
                 server_minus_node_ns=offset_ns,
                 uncertainty_ns=uncertainty_ns,
             )
-            for boot_id, rows in self.rows.items()
+            for stream_id, rows in self.rows_by_stream.items()
             for t_mono_ns, offset_ns, uncertainty_ns in zip(
                 rows.t_mono_ns.tolist(),
                 rows.offset_ns.tolist(),
@@ -79,31 +81,31 @@ class StoredClock:
         )
 
 
-def read_clock(path: Path) -> StoredClock:
+def read_clock_file(path: Path) -> StoredClock:
     """Read `clock.parquet` and verify it.
 
     Raises:
         FileNotFoundError: there is no such file.
         FileFormatError: it is damaged, no clock table, or a row has impossible numbers.
     """
-    read = read_table(path)
+    read = read_hashed_table(path)
     try:
         table = read.table.select(_SCHEMA.names).cast(_SCHEMA)
         table.validate(full=True)
         metadata = read.table.schema.metadata or {}
         facts = _STREAMS.validate_json(metadata.get(STREAMS_KEY, b"[]"))
-        boot_ids = np.asarray(table.column("boot_id").to_pylist(), dtype=object)
+        stream_ids = np.asarray(table.column("stream_id").to_pylist(), dtype=object)
         arrays = [table.column(name).to_numpy() for name in _NUMBERS]
     except Exception as error:  # unproven bytes may cause any error
         raise DamagedFileError(
             f"cannot be read as a clock table: {' '.join(str(error).split())[:300]}",
             where=str(path),
-            expected=f"columns boot_id, {', '.join(_NUMBERS)} without empty values",
+            expected=f"columns stream_id, {', '.join(_NUMBERS)} without empty values",
         ) from error
     rows = {
-        str(boot_id): Rows(*(values[boot_ids == boot_id] for values in arrays))
-        for boot_id in dict.fromkeys(boot_ids.tolist())
+        str(stream_id): OffsetRows(*(values[stream_ids == stream_id] for values in arrays))
+        for stream_id in dict.fromkeys(stream_ids.tolist())
     }
-    for boot_id, own in rows.items():
-        check_rows(own, boot_id, str(path))
-    return StoredClock(rows, {stream.boot_id: stream for stream in facts}, read.is_proven)
+    for stream_id, own in rows.items():
+        check_rows_in_range(own, stream_id, str(path))
+    return StoredClock(rows, {stream.stream_id: stream for stream in facts}, read.has_hash)

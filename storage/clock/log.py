@@ -17,15 +17,15 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from devices.errors import DamagedFileError, StorageError
-from storage.durable import (
-    check_held,
-    make_folder,
-    read_whole,
-    storage_errors,
+from storage.durable_files import (
+    make_synced_folder,
+    raise_if_locked_folder_gone,
+    read_small_file,
     sync_folder,
+    translate_storage_errors,
 )
 
-NAME = "clock.jsonl"
+CLOCK_LOG_NAME = "clock.jsonl"
 _BYTES_MAX = 1 << 30
 """Upper limit of a log: a stream of two years."""
 _WINDOW = 1024
@@ -33,17 +33,17 @@ _WINDOW = 1024
 
 
 @dataclass(frozen=True)
-class ClockLines:
+class ClockLogContent:
     """Content of a log.
 
     Attributes:
         rows: rows of whole lines, in the order of the file.
-        damaged: number of other lines before the last whole one.
+        damaged_lines: number of other lines before the last whole one.
         is_torn: True: the log ends with an incomplete line, as after a power cut or during a write.
     """
 
     rows: tuple[ClockOffset, ...] = ()
-    damaged: int = 0
+    damaged_lines: int = 0
     is_torn: bool = False
 
 
@@ -57,7 +57,7 @@ class ClockLog:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.path = folder / NAME
+        self.path = folder / CLOCK_LOG_NAME
 
     def append(self, row: ClockOffset) -> None:
         """Append a row in constant time; it is on the disk after `sync`.
@@ -65,18 +65,18 @@ class ClockLog:
         Raises:
             StorageError: the disk is full or not writable. Earlier rows are untouched.
         """
-        check_held(self.path)
-        with storage_errors(self.path):
+        raise_if_locked_folder_gone(self.path)
+        with translate_storage_errors(self.path):
             if not self.path.parent.is_dir():
-                make_folder(self.path.parent)
+                make_synced_folder(self.path.parent)
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
             try:
                 size = os.fstat(descriptor).st_size
-                end = _end_of_whole(descriptor, size)
+                end = _find_valid_end(descriptor, size)
                 if end < size:
                     os.ftruncate(descriptor, end)
                 try:
-                    _write(descriptor, _line(row))
+                    _write_all(descriptor, _encode_line(row))
                 except OSError:
                     with suppress(OSError):
                         os.ftruncate(descriptor, end)
@@ -90,7 +90,7 @@ class ClockLog:
         Raises:
             StorageError: the disk refused.
         """
-        with storage_errors(self.path):
+        with translate_storage_errors(self.path):
             try:
                 descriptor = os.open(self.path, os.O_RDONLY)
             except FileNotFoundError:  # not one row yet
@@ -101,37 +101,37 @@ class ClockLog:
                 os.close(descriptor)
             sync_folder(self.path.parent)
 
-    def rows(self) -> tuple[ClockOffset, ...]:
+    def read_rows(self) -> tuple[ClockOffset, ...]:
         """Read all readable rows in the order of the file; empty if there is no log.
 
         Raises:
             StorageError: the log cannot be read.
         """
-        return self.lines().rows
+        return self.read_content().rows
 
-    def lines(self) -> ClockLines:
+    def read_content(self) -> ClockLogContent:
         """Read the rows, with the number of damaged lines and whether the end is torn.
 
         Raises:
             StorageError: the log cannot be read.
         """
         try:
-            content = read_whole(self.path, bytes_max=_BYTES_MAX)
+            content = read_small_file(self.path, max_bytes=_BYTES_MAX)
         except FileNotFoundError:
-            return ClockLines()
+            return ClockLogContent()
         except DamagedFileError as error:
             raise StorageError(error.what, where=error.where) from error
         *lines, rest = content.split(b"\n")
-        read = [_row(line) for line in lines]
+        read = [_parse_line(line) for line in lines]
         is_torn = bool(rest)
         while read and read[-1] is None:
             is_torn = True
             read.pop()
         rows = tuple(row for row in read if row is not None)
-        return ClockLines(rows, damaged=len(read) - len(rows), is_torn=is_torn)
+        return ClockLogContent(rows, damaged_lines=len(read) - len(rows), is_torn=is_torn)
 
 
-def _end_of_whole(descriptor: int, size: int) -> int:
+def _find_valid_end(descriptor: int, size: int) -> int:
     """Return the offset behind the last whole line; reads no further back than that.
 
     If no line is whole, only an unterminated last line is cut.
@@ -144,7 +144,7 @@ def _end_of_whole(descriptor: int, size: int) -> int:
         end = content.rfind(b"\n") + 1
         while end > first:
             start = content.rfind(b"\n", first, end - 1) + 1 or first
-            if _row(content[start : end - 1]) is not None:
+            if _parse_line(content[start : end - 1]) is not None:
                 return begin + end
             end = start
         if begin == 0:
@@ -152,13 +152,13 @@ def _end_of_whole(descriptor: int, size: int) -> int:
         window *= 16
 
 
-def _line(row: ClockOffset) -> bytes:
+def _encode_line(row: ClockOffset) -> bytes:
     content = row.model_dump()
     text = json.dumps(content)
     return json.dumps({**content, "crc32": f"{zlib.crc32(text.encode()):08x}"}).encode() + b"\n"
 
 
-def _row(line: bytes) -> ClockOffset | None:
+def _parse_line(line: bytes) -> ClockOffset | None:
     try:
         content = json.loads(line)
         del content["crc32"]
@@ -166,10 +166,10 @@ def _row(line: bytes) -> ClockOffset | None:
     except (ValueError, ValidationError, TypeError, KeyError, RecursionError):
         return None
     # The checksum is not enough: a line of equal content in another spelling was edited.
-    return row if _line(row) == line + b"\n" else None
+    return row if _encode_line(row) == line + b"\n" else None
 
 
-def _write(descriptor: int, data: bytes) -> None:
+def _write_all(descriptor: int, data: bytes) -> None:
     view = memoryview(data)
     while view:
         view = view[os.write(descriptor, view) :]
@@ -180,7 +180,7 @@ class ClockOffset(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    boot_id: str
+    stream_id: str
     t_mono_ns: int
     server_minus_node_ns: int
     uncertainty_ns: int

@@ -16,26 +16,26 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from devices.errors import FileFormatError
-from devices.facts import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
-from storage.clock.bounds import ClockMap, Int64, Rows, Stretch
+from devices.types import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
+from storage.clock.bounds import ClockOffsets, Int64, OffsetRows, OffsetStretch
 from storage.clock.log import ClockOffset
-from storage.schema import NO_INSTANT, Array
+from storage.schema import UNKNOWN_T_NS, Array
 
 UNCERTAINTY_END_NS = 2**59
 """Exclusive upper limit of an uncertainty, 18 years; with `OFFSET_NS_END` it fits 64 bits."""
 
 
 @dataclass(frozen=True)
-class StreamFacts:
+class StreamClockFacts:
     """Facts about a stream besides its measurements.
 
     Attributes:
-        boot_id: its id.
+        stream_id: its id.
         utc_offset_ns: `t_ns` minus `t_mono_ns` of its frames; None: unknown.
         clock_set: True: the node's clock was set before the stream started; None: unknown.
     """
 
-    boot_id: str
+    stream_id: str
     utc_offset_ns: int | None = None
     clock_set: bool | None = None
 
@@ -55,22 +55,24 @@ class ClockTable:
 
     def __init__(
         self,
-        rows: Mapping[str, Rows],
-        streams: Sequence[StreamFacts],
+        rows: Mapping[str, OffsetRows],
+        streams: Sequence[StreamClockFacts],
         parts: Sequence[str],
         *,
         where: str = "",
     ) -> None:
         self._streams = tuple(streams)
         self._parts = tuple(parts)
-        self._maps: dict[str, ClockMap] = {}
+        self._maps: dict[str, ClockOffsets] = {}
         for stream in streams:
-            own = rows.get(stream.boot_id)
+            own = rows.get(stream.stream_id)
             if own is not None and len(own):
-                check_rows(own, stream.boot_id, where)
-                self._maps[stream.boot_id] = ClockMap(own)
+                check_rows_in_range(own, stream.stream_id, where)
+                self._maps[stream.stream_id] = ClockOffsets(own)
 
-    def columns(self, t_mono_ns: Int64, t_ns: Int64, part: Array | None) -> dict[str, Array]:
+    def compute_server_time(
+        self, t_mono_ns: Int64, t_ns: Int64, part: Array | None
+    ) -> dict[str, Array]:
         """Compute the server's time of frames; every frame independently of the others.
 
         Args:
@@ -79,25 +81,25 @@ class ClockTable:
             part: uint16[n]; None: all are of the first part.
 
         Returns:
-            `t_server_ns` and `t_server_uncertainty_ns`, int64[n]; `NO_INSTANT` in both where the
+            `t_server_ns` and `t_server_uncertainty_ns`, int64[n]; `UNKNOWN_T_NS` in both where the
                 stream's offset was not measured.
         """
-        t_server_ns = np.full(len(t_ns), NO_INSTANT, dtype=np.int64)
+        t_server_ns = np.full(len(t_ns), UNKNOWN_T_NS, dtype=np.int64)
         uncertainty_ns = t_server_ns.copy()
-        sane = _is_within(t_mono_ns, T_MONO_NS_END) & _is_within(t_ns, T_NS_END)
-        for number, boot_id in enumerate(self._parts):
-            clock = self._maps.get(boot_id)
+        sane = _mask_within(t_mono_ns, T_MONO_NS_END) & _mask_within(t_ns, T_NS_END)
+        for number, stream_id in enumerate(self._parts):
+            clock = self._maps.get(stream_id)
             here = np.flatnonzero(sane if part is None else sane & (part == number))
             if clock is None or not len(here) or (part is None and number):
                 continue
-            offset, bound = clock.at(t_mono_ns[here])
+            offset, bound = clock.offset_at(t_mono_ns[here])
             sums = t_ns[here] + offset
             fits = ((t_ns[here] ^ sums) & (offset ^ sums)) >= 0
             t_server_ns[here[fits]] = sums[fits]
             uncertainty_ns[here[fits]] = bound[fits]
         return {"t_server_ns": t_server_ns, "t_server_uncertainty_ns": uncertainty_ns}
 
-    def reach(
+    def bound_offset_in_ranges(
         self, begins_ns: Int64, ends_ns: Int64, part: int
     ) -> tuple[Int64, Int64, npt.NDArray[np.bool_]] | None:
         """Compute bounds of `t_server_ns - t_ns` over n time ranges of a part.
@@ -108,37 +110,41 @@ class ClockTable:
             part: number of the part.
 
         Returns:
-            As of `ClockMap.reach`; None: this part's clock was never measured.
+            As of `ClockOffsets.bound_ranges`; None: this part's clock was never measured.
         """
         clock = self._maps.get(self._parts[part]) if part < len(self._parts) else None
         if clock is None:
             return None
-        sane = _is_within(begins_ns, T_MONO_NS_END) & _is_within(ends_ns, T_MONO_NS_END)
-        least, greatest, sure = clock.reach(
+        sane = _mask_within(begins_ns, T_MONO_NS_END) & _mask_within(ends_ns, T_MONO_NS_END)
+        least, greatest, sure = clock.bound_ranges(
             np.where(sane, begins_ns, 0), np.where(sane, ends_ns, 0)
         )
         return least, greatest, sure & sane
 
-    def summary(self) -> ClockSummary:
+    def summarize(self) -> ClockSummary:
         """Return stretches, drifts, steps and state of every stream, in the session's order."""
-        return ClockSummary(streams=tuple(self._summary(stream) for stream in self._streams))
+        return ClockSummary(
+            streams=tuple(self._summarize_stream(stream) for stream in self._streams)
+        )
 
-    def _summary(self, stream: StreamFacts) -> StreamSummary:
-        clock = self._maps.get(stream.boot_id)
-        state: State = "measured"
+    def _summarize_stream(self, stream: StreamClockFacts) -> StreamSummary:
+        clock = self._maps.get(stream.stream_id)
+        state: ClockState = "measured"
         if clock is None:
             state = "unsynchronised" if stream.clock_set is False else "unmeasured"
         stretches = clock.stretches if clock is not None else ()
         return StreamSummary(
-            boot_id=stream.boot_id,
+            stream_id=stream.stream_id,
             state=state,
             rows=len(clock.rows) if clock is not None else 0,
-            stretches=tuple(_stretch(stretch, stream) for stretch in stretches),
-            steps=tuple(_step(one, next_one, stream) for one, next_one in pairwise(stretches)),
+            stretches=tuple(_summarize_stretch(stretch, stream) for stretch in stretches),
+            steps=tuple(
+                _summarize_step(one, next_one, stream) for one, next_one in pairwise(stretches)
+            ),
         )
 
 
-def rows_by_stream(rows: Iterable[ClockOffset], *, where: str = "") -> dict[str, Rows]:
+def group_rows_by_stream(rows: Iterable[ClockOffset], *, where: str = "") -> dict[str, OffsetRows]:
     """Group the measurements of a session by stream_id, as columns.
 
     Raises:
@@ -147,25 +153,25 @@ def rows_by_stream(rows: Iterable[ClockOffset], *, where: str = "") -> dict[str,
     found: dict[str, list[tuple[int, int, int]]] = {}
     for row in rows:
         numbers = (row.t_mono_ns, row.server_minus_node_ns, row.uncertainty_ns)
-        found.setdefault(row.boot_id, []).append(numbers)
+        found.setdefault(row.stream_id, []).append(numbers)
     try:
         return {
-            boot_id: Rows(*np.array(numbers, dtype=np.int64).T.copy())
-            for boot_id, numbers in found.items()
+            stream_id: OffsetRows(*np.array(numbers, dtype=np.int64).T.copy())
+            for stream_id, numbers in found.items()
         }
     except OverflowError as error:
         raise FileFormatError(f"a clock row is out of range: {error}", where=where) from error
 
 
-def check_rows(rows: Rows, boot_id: str, where: str) -> None:
+def check_rows_in_range(rows: OffsetRows, stream_id: str, where: str) -> None:
     """Refuse measurements that no clock can give.
 
     Raises:
         FileFormatError: a row is out of range.
     """
     sane = {
-        "t_mono_ns": _is_within(rows.t_mono_ns, T_MONO_NS_END),
-        "server_minus_node_ns": _is_within(rows.offset_ns, OFFSET_NS_END),
+        "t_mono_ns": _mask_within(rows.t_mono_ns, T_MONO_NS_END),
+        "server_minus_node_ns": _mask_within(rows.offset_ns, OFFSET_NS_END),
         "uncertainty_ns": (rows.uncertainty_ns >= 0) & (rows.uncertainty_ns < UNCERTAINTY_END_NS),
     }
     for (name, good), values in zip(
@@ -173,24 +179,24 @@ def check_rows(rows: Rows, boot_id: str, where: str) -> None:
     ):
         if not good.all():
             raise FileFormatError(
-                f"a clock row of stream {boot_id} has {name} = {values[~good][0]}",
+                f"a clock row of stream {stream_id} has {name} = {values[~good][0]}",
                 where=where,
                 expected=f"t_mono_ns within {T_MONO_NS_END} ns, an offset within {OFFSET_NS_END}, "
                 f"an uncertainty from 0 to {UNCERTAINTY_END_NS}",
             )
 
 
-def _is_within(values: Int64, end: int) -> npt.NDArray[np.bool_]:
+def _mask_within(values: Int64, end: int) -> npt.NDArray[np.bool_]:
     return (values > -end) & (values < end)
 
 
-def _stretch(stretch: Stretch, stream: StreamFacts) -> StretchSummary:
-    middle_ns = (stretch.begin_ns + stretch.end_ns) // 2
-    low, high = _bounds(stretch, middle_ns)
+def _summarize_stretch(stretch: OffsetStretch, stream: StreamClockFacts) -> StretchSummary:
+    middle_ns = (stretch.begin_t_mono_ns + stretch.end_t_mono_ns) // 2
+    low, high = _bounds_at(stretch, middle_ns)
     drift = stretch.drift_bounds
     return StretchSummary(
-        begin_t_ns=_utc(stretch.begin_ns, stream),
-        end_t_ns=_utc(stretch.end_ns, stream),
+        begin_t_ns=_to_utc_ns(stretch.begin_t_mono_ns, stream),
+        end_t_ns=_to_utc_ns(stretch.end_t_mono_ns, stream),
         rows=len(stretch.rows),
         offset_ns=(low + high) // 2,
         uncertainty_ns=(high - low + 1) // 2,
@@ -199,37 +205,39 @@ def _stretch(stretch: Stretch, stream: StreamFacts) -> StretchSummary:
     )
 
 
-def _step(one: Stretch, next_one: Stretch, stream: StreamFacts) -> StepSummary:
-    middle_ns = (one.end_ns + next_one.begin_ns) // 2
-    low, high = _bounds(one, middle_ns)
-    later_low, later_high = _bounds(next_one, middle_ns)
+def _summarize_step(
+    one: OffsetStretch, next_one: OffsetStretch, stream: StreamClockFacts
+) -> StepSummary:
+    middle_ns = (one.end_t_mono_ns + next_one.begin_t_mono_ns) // 2
+    low, high = _bounds_at(one, middle_ns)
+    later_low, later_high = _bounds_at(next_one, middle_ns)
     least, most = later_low - high, later_high - low
     return StepSummary(
-        after_t_ns=_utc(one.end_ns, stream),
-        before_t_ns=_utc(next_one.begin_ns, stream),
+        after_t_ns=_to_utc_ns(one.end_t_mono_ns, stream),
+        before_t_ns=_to_utc_ns(next_one.begin_t_mono_ns, stream),
         jump_ns=(least + most) // 2,
         jump_uncertainty_ns=(most - least + 1) // 2,
     )
 
 
-def _bounds(stretch: Stretch, t_mono_ns: int) -> tuple[int, int]:
-    low, high = stretch.bounds(np.array([t_mono_ns], dtype=np.int64))
+def _bounds_at(stretch: OffsetStretch, t_mono_ns: int) -> tuple[int, int]:
+    low, high = stretch.offset_bounds_at(np.array([t_mono_ns], dtype=np.int64))
     return int(low[0]), int(high[0])
 
 
-def _utc(t_mono_ns: int, stream: StreamFacts) -> int | None:
+def _to_utc_ns(t_mono_ns: int, stream: StreamClockFacts) -> int | None:
     return None if stream.utc_offset_ns is None else t_mono_ns + stream.utc_offset_ns
 
 
-State = Literal["measured", "unmeasured", "unsynchronised"]
+ClockState = Literal["measured", "unmeasured", "unsynchronised"]
 """Clock state of a stream."""
 
 
-class _Fact(BaseModel):
+class _FrozenModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class StretchSummary(_Fact):
+class StretchSummary(_FrozenModel):
     """Measurements between which neither clock was set."""
 
     begin_t_ns: int | None = Field(
@@ -246,7 +254,7 @@ class StretchSummary(_Fact):
     drift_uncertainty_ppm: float | None = Field(description="Bound of `drift_ppm`.")
 
 
-class StepSummary(_Fact):
+class StepSummary(_FrozenModel):
     """Step of one of the clocks: it was set, or stood still while its machine slept."""
 
     after_t_ns: int | None = Field(
@@ -257,11 +265,11 @@ class StepSummary(_Fact):
     jump_uncertainty_ns: int = Field(description="Bound of `jump_ns`.")
 
 
-class StreamSummary(_Fact):
+class StreamSummary(_FrozenModel):
     """Clock of one stream."""
 
-    boot_id: str
-    state: State = Field(
+    stream_id: str
+    state: ClockState = Field(
         description="unmeasured: offset unknown; unsynchronised: the node's clock was unset, too."
     )
     rows: int = Field(description="Measurements of the offset.")
@@ -269,7 +277,7 @@ class StreamSummary(_Fact):
     steps: tuple[StepSummary, ...]
 
 
-class ClockSummary(_Fact):
+class ClockSummary(_FrozenModel):
     """Clocks of a session's streams against the server's."""
 
     streams: tuple[StreamSummary, ...]

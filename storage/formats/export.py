@@ -19,80 +19,84 @@ from devices.arrays import Times
 from devices.errors import UsageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
-from storage.formats.facts import facts_of
-from storage.formats.marks import Marks
+from storage.formats.export_facts import make_export_facts
+from storage.formats.markers import PlacedMarkers
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
 from storage.schema import (
     ARRAY_INFO_KEY,
-    FRAMES,
-    KNOWN,
-    MARKS,
-    SERVER_TIME,
-    TIMES,
+    COLUMNS_BY_NAME,
+    MARKER_COLUMNS,
+    MEASURED_COLUMNS,
+    SERVER_TIME_COLUMNS,
+    TIME_COLUMNS,
     Array,
-    flat_column,
+    to_flat_column,
 )
-from storage.sessions.file import EXPORT_KEY
 from storage.sessions.footer import NOTES_KEY
 from storage.sessions.time_axis import NODE_AXIS, TIME_AXIS_NOTE, TimeAxis
+from storage.sessions.writer import EXPORT_KEY
 
 ClockName = Literal["node", "server"]
-CLOCKS: tuple[ClockName, ...] = get_args(ClockName)
+CLOCK_NAMES: tuple[ClockName, ...] = get_args(ClockName)
 """Clocks of an export: the node's time only, or the server's time as well."""
 
-_MADE = {column.name: "Ask for the clock `server` as well" for column in SERVER_TIME}
-_MADE |= {column.name: "Ask for marks as well" for column in MARKS}
+_DERIVED_COLUMN_REMEDIES = {
+    column.name: "Ask for the clock `server` as well" for column in SERVER_TIME_COLUMNS
+}
+_DERIVED_COLUMN_REMEDIES |= {column.name: "Ask for marks as well" for column in MARKER_COLUMNS}
 
-_TIME_NAMES = tuple(column.name for column in TIMES)
+_TIME_NAMES = tuple(column.name for column in TIME_COLUMNS)
 
-Flat = Mapping[str, Array]
+FlatColumns = Mapping[str, Array]
 """Flat columns by name, n rows each; unknown numbers as in memory."""
 
 
 @dataclass(frozen=True)
-class Content:
+class FrameSource:
     """Source of the frames of a session.
 
     Attributes:
-        names: its quantities, of `storage.schema.KNOWN`, in the order of their columns.
-        read: reads the named flat columns, and possibly more, of frames in order, in chunks.
+        quantity_names: its quantities, of `storage.schema.COLUMNS_BY_NAME`, in the order of their
+            columns.
+        read_columns: reads the named flat columns, and possibly more, of frames in order, in
+            chunks.
         begin_t_ns: `t_ns` of the session's first frame.
         end_t_ns: latest instant on the time axis; None: `read` yields all frames of the session,
             also outside of the slice, and can be called once.
         axis: time axis of the session.
     """
 
-    names: Sequence[str]
-    read: Callable[[Sequence[str]], Iterable[Flat]]
+    quantity_names: Sequence[str]
+    read_columns: Callable[[Sequence[str]], Iterable[FlatColumns]]
     begin_t_ns: int
     end_t_ns: int | None = None
     axis: TimeAxis = NODE_AXIS
 
 
-def content_of(
-    pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]],
+def make_frame_source(
+    frame_chunks: Iterable[tuple[FrameBatch, Mapping[str, Array]]],
     span_ns: tuple[int, int] | None = None,
     axis: TimeAxis = NODE_AXIS,
-) -> Content:
+) -> FrameSource:
     """Return the source of given frames; consumes the first batch that is not empty.
 
     Args:
-        pieces: frames with their further columns, in order.
+        frame_chunks: frames with their further columns, in order.
         span_ns: first and last instant on the session's time axis; None: `pieces` has all frames.
         axis: time axis of the session.
 
     Raises:
         UsageError: there are no frames.
     """
-    nonempty = ((frames, extra) for frames, extra in pieces if len(frames))
+    nonempty = ((frames, extra) for frames, extra in frame_chunks if len(frames))
     first = next(nonempty, None)
     if first is None:
         raise UsageError("the session has no frames")
-    names = [column.name for column in FRAMES] + list(first[1])
-    flat = (_flat(frames, extra) for frames, extra in chain((first,), nonempty))
+    names = [column.name for column in MEASURED_COLUMNS] + list(first[1])
+    flat = (_flatten_frames(frames, extra) for frames, extra in chain((first,), nonempty))
     begin_t_ns, end_t_ns = span_ns or (int(first[0].t_ns[0]), None)
-    return Content(names, lambda _: flat, begin_t_ns, end_t_ns, axis)
+    return FrameSource(names, lambda _: flat, begin_t_ns, end_t_ns, axis)
 
 
 @dataclass(frozen=True)
@@ -100,68 +104,70 @@ class Export:
     """Input of an export format: frames of a session or slice, with metadata.
 
     Attributes:
-        content: source of the frames.
-        info: array of the node.
+        frame_source: source of the frames.
+        array_info: array of the node.
         notes: notes of the session.
-        part: requested rows and columns.
+        selection: requested rows and columns.
         clock: clock table; adds `t_server_ns`, its bound, and a summary to the notes; None: none.
-        marks: placed markers; adds `event`, and each marker to the notes; None: none.
-        source: session and its hashes.
+        markers: placed markers; adds `marker`, and each marker to the notes; None: none.
+        provenance: session and its hashes.
         options: options of the format.
     """
 
-    content: Content
-    info: ArrayInfo
+    frame_source: FrameSource
+    array_info: ArrayInfo
     notes: Mapping[str, object]
-    part: Slice
+    selection: Slice
     clock: ClockTable | None = None
-    marks: Marks | None = None
-    source: Mapping[str, object] = field(default_factory=dict)
+    markers: PlacedMarkers | None = None
+    provenance: Mapping[str, object] = field(default_factory=dict)
     options: FormatOptions = NO_OPTIONS
 
     @property
-    def called(self) -> str:
+    def display_name(self) -> str:
         """Name of the session, for error messages and notes."""
-        session = self.source.get("session")
+        session = self.provenance.get("session")
         return (
-            f"session {session} of {self.info.node}" if session else f"session of {self.info.node}"
+            f"session {session} of {self.array_info.node}"
+            if session
+            else f"session of {self.array_info.node}"
         )
 
     @property
-    def about(self) -> dict[str, object]:
-        """Metadata of the file as JSON: session, slice, clock, facts (`storage.formats.facts`).
+    def metadata(self) -> dict[str, object]:
+        """Metadata of the file as JSON: session, slice, clock, `storage.formats.export_facts`.
 
         A format that resamples or fills replaces the facts concerned.
         """
-        part = self.part
+        part = self.selection
         chosen: dict[str, object] = {
             "start_s": part.start_s,
             "end_s": part.end_s,
             "columns": list(part.columns),
         }
         chosen["clock"] = "node" if self.clock is None else "server"
-        if self.content.axis.is_shifted:
-            chosen[TIME_AXIS_NOTE] = self.content.axis.as_dicts()
+        if self.frame_source.axis.is_shifted:
+            chosen[TIME_AXIS_NOTE] = self.frame_source.axis.to_json_list()
         has_server_time = self.clock is not None
-        facts = facts_of(self.notes, self.source, has_server_time=has_server_time)
-        return {**self.source, "node": self.info.node, **chosen, **facts}
+        facts = make_export_facts(self.notes, self.provenance, has_server_time=has_server_time)
+        return {**self.provenance, "node": self.array_info.node, **chosen, **facts}
 
     @property
-    def all_notes(self) -> dict[str, object]:
+    def full_notes(self) -> dict[str, object]:
         """Notes of the session as JSON, with the clock's summary and the markers if included."""
         notes = dict(self.notes)
         if self.clock is not None:
-            notes["clock"] = self.clock.summary().model_dump(mode="json")
-        if self.marks is not None:
-            notes["marks"] = [mark.as_dict() for mark in self.marks.all]
+            notes["clock"] = self.clock.summarize().model_dump(mode="json")
+        if self.markers is not None:
+            notes["marks"] = [mark.as_dict() for mark in self.markers.markers]
         return notes
 
     @property
     def has_forces(self) -> bool:
         """True if the session has estimates."""
-        return "grf_n" in self.content.names
+        return "grf_n" in self.frame_source.quantity_names
 
-    def chosen(self, columns: Sequence[str] = ()) -> dict[str, str]:
+    def select_columns(self, columns: Sequence[str] = ()) -> dict[str, str]:
         """Return the quantity of each selected column by flat name, in order.
 
         Args:
@@ -170,25 +176,27 @@ class Export:
         Raises:
             UsageError: a column does not exist.
         """
-        present = [*_TIME_NAMES, *self.content.names, *self._made]
-        chosen = _chosen(present, len(self.info.tiles), columns or self.part.columns)
-        if columns or self.part.columns or self.options.times is not False:
+        present = [*_TIME_NAMES, *self.frame_source.quantity_names, *self._derived_column_names]
+        chosen = _resolve_columns(
+            present, len(self.array_info.tiles), columns or self.selection.columns
+        )
+        if columns or self.selection.columns or self.options.times is not False:
             return chosen
         return {name: of for name, of in chosen.items() if of not in _TIME_NAMES}
 
-    def at_ns(self, columns: Mapping[str, Array]) -> Times:
+    def to_session_axis_ns(self, columns: Mapping[str, Array]) -> Times:
         """Return the instants of frames on the session's time axis, int64[n].
 
         Args:
             columns: `t_ns`, and `part` if the session has parts.
         """
-        return self.content.axis.at(columns["t_ns"], columns.get("part"))
+        return self.frame_source.axis.shift_to_axis(columns["t_ns"], columns.get("part"))
 
-    def pieces(self, columns: Sequence[str] = ()) -> Iterator[dict[str, Array]]:
+    def read_chunks(self, columns: Sequence[str] = ()) -> Iterator[dict[str, Array]]:
         """Read the flat columns of the slice's frames in chunks of some thousand rows.
 
         Args:
-            columns: as for `chosen`.
+            columns: as for `select_columns`.
 
         Yields:
             At least one chunk; it has no rows if the slice has no frames, else all chunks have
@@ -198,22 +206,28 @@ class Export:
             UsageError: a column does not exist, or the slice begins after the session's end;
                 raised before the first chunk.
         """
-        chosen, made, content = self.chosen(columns), self._made, self.content
+        chosen, made, content = (
+            self.select_columns(columns),
+            self._derived_column_names,
+            self.frame_source,
+        )
         end_t_ns = content.begin_t_ns if content.end_t_ns is None else content.end_t_ns
         header: dict[str, Array] | None = None
         has_rows = False
         has_parts = bool(made) or content.axis.is_shifted
-        for flat in content.read(_needed(chosen, made, content.names, has_parts=has_parts)):
-            at_ns = self.at_ns(flat)
+        for flat in content.read_columns(
+            _columns_to_read(chosen, made, content.quantity_names, has_parts=has_parts)
+        ):
+            at_ns = self.to_session_axis_ns(flat)
             if content.end_t_ns is None:
                 end_t_ns = max(end_t_ns, int(at_ns.max()))
-            values = _of_rows(flat, self.part.rows(at_ns, content.begin_t_ns))
+            values = _select_rows(flat, self.selection.compute_row_mask(at_ns, content.begin_t_ns))
             if self.clock is not None:
                 times = (values["t_mono_ns"], values["t_ns"], values.get("part"))
-                values |= self.clock.columns(*times)
-            if self.marks is not None:
-                values["event"] = self.marks.column(values["seq"], values.get("part"))
-            values["time_s"] = (self.at_ns(values) - content.begin_t_ns) * 1e-9
+                values |= self.clock.compute_server_time(*times)
+            if self.markers is not None:
+                values["marker"] = self.markers.get_frame_labels(values["seq"], values.get("part"))
+            values["time_s"] = (self.to_session_axis_ns(values) - content.begin_t_ns) * 1e-9
             values["time_utc"] = values["t_ns"].view("datetime64[ns]")
             piece = {name: values[name] for name in chosen}
             header = header or piece
@@ -223,69 +237,69 @@ class Export:
         if has_rows or header is None:
             return
         end_s = (end_t_ns - content.begin_t_ns) * 1e-9
-        if self.part.begins_after(end_s):
+        if self.selection.starts_after(end_s):
             raise UsageError(
-                f"the slice starts at {self.part.start_s:g} s, and the session ends at "
+                f"the slice starts at {self.selection.start_s:g} s, and the session ends at "
                 f"{end_s:.3f} s",
-                where=self.called,
+                where=self.display_name,
                 expected="a start before the session's end",
             )
         yield header
 
-    def tables(self) -> Iterator[pa.Table]:
+    def read_tables(self) -> Iterator[pa.Table]:
         """Read the slice's frames as Arrow tables, with units, array and notes as metadata."""
-        chosen, notes = self.chosen(), self.all_notes
+        chosen, notes = self.select_columns(), self.full_notes
         metadata: dict[bytes | str, bytes | str] = {
-            ARRAY_INFO_KEY: self.info.model_dump_json().encode(),
+            ARRAY_INFO_KEY: self.array_info.model_dump_json().encode(),
             NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
-            EXPORT_KEY: json.dumps(self.about).encode(),
+            EXPORT_KEY: json.dumps(self.metadata).encode(),
         }
-        tiles = self._tile_of(chosen)
-        for piece in self.pieces():
+        tiles = self._tile_numbers(chosen)
+        for piece in self.read_chunks():
             fields, arrays = [], []
             for name, values in piece.items():
-                plain, array = flat_column(KNOWN[chosen[name]], name, values, notes)
-                fields.append(self._with_tile(plain, tiles[name]))
+                plain, array = to_flat_column(COLUMNS_BY_NAME[chosen[name]], name, values, notes)
+                fields.append(self._annotate_tile(plain, tiles[name]))
                 arrays.append(array)
             yield pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=metadata))
 
-    def whole(self, columns: Sequence[str], *, frames_max: int) -> dict[str, Array]:
+    def read_all(self, columns: Sequence[str], *, frames_max: int) -> dict[str, Array]:
         """Read all frames of the slice at once, for a format that cannot be written in chunks.
 
         Args:
-            columns: as for `chosen`, including `t_ns`.
+            columns: as for `select_columns`, including `t_ns`.
             frames_max: limit of the format.
 
         Raises:
-            UsageError: as for `pieces`, or there are too many frames; the error names a slice
+            UsageError: as for `read_chunks`, or there are too many frames; the error names a slice
                 that fits.
         """
         pieces: list[dict[str, Array]] = []
         left = frames_max
-        for piece in self.pieces(columns):
+        for piece in self.read_chunks(columns):
             left -= len(piece["t_ns"])
             pieces.append(piece)
             if left < 0:
-                fits_ns = int(self.at_ns(piece)[left]) - self.content.begin_t_ns
-                start_s, end_s = self.part.start_s or 0.0, np.floor(fits_ns * 1e-6) * 1e-3
+                fits_ns = int(self.to_session_axis_ns(piece)[left]) - self.frame_source.begin_t_ns
+                start_s, end_s = self.selection.start_s or 0.0, np.floor(fits_ns * 1e-6) * 1e-3
                 raise UsageError(
                     f"there are more than {frames_max} frames, the limit of this format",
-                    where=self.called,
+                    where=self.display_name,
                     expected=f"a slice: here {start_s:g} s to {end_s:.3f} s fits",
                 )
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-    def _tile_of(self, chosen: Mapping[str, str]) -> dict[str, int | None]:
+    def _tile_numbers(self, chosen: Mapping[str, str]) -> dict[str, int | None]:
         return {
-            name: int(name.removeprefix(f"{of}_")) if KNOWN[of].per_tile else None
+            name: int(name.removeprefix(f"{of}_")) if COLUMNS_BY_NAME[of].per_tile else None
             for name, of in chosen.items()
         }
 
-    def _with_tile(self, plain: pa.Field[Any], tile: int | None) -> pa.Field[Any]:
+    def _annotate_tile(self, plain: pa.Field[Any], tile: int | None) -> pa.Field[Any]:
         """Return the field with its tile as metadata, and the serial in its name on request."""
         if tile is None:
             return plain
-        serial = self.info.tiles[tile].serial
+        serial = self.array_info.tiles[tile].serial
         metadata: dict[bytes | str, bytes | str] = dict((plain.metadata or {}).items())
         metadata |= {b"tile": str(tile).encode(), b"serial": serial.encode()}
         if self.options.names == "serial":
@@ -293,21 +307,25 @@ class Export:
         return plain.with_metadata(metadata)
 
     @property
-    def _made(self) -> list[str]:
-        made = [column.name for column in SERVER_TIME] if self.clock is not None else []
-        return made + ([column.name for column in MARKS] if self.marks is not None else [])
+    def _derived_column_names(self) -> list[str]:
+        made = [column.name for column in SERVER_TIME_COLUMNS] if self.clock is not None else []
+        return made + (
+            [column.name for column in MARKER_COLUMNS] if self.markers is not None else []
+        )
 
 
-def _flat(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:
-    values = {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
+def _flatten_frames(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:
+    values = {column.name: getattr(frames, column.name) for column in MEASURED_COLUMNS} | dict(
+        extra
+    )
     flat: dict[str, Array] = {}
     for name, value in values.items():
-        parts = value.T if KNOWN[name].per_tile else value[None]
-        flat |= zip(KNOWN[name].flat_names(len(parts)), parts, strict=True)
+        parts = value.T if COLUMNS_BY_NAME[name].per_tile else value[None]
+        flat |= zip(COLUMNS_BY_NAME[name].flat_names(len(parts)), parts, strict=True)
     return flat
 
 
-def _of_rows(flat: Flat, rows: Array) -> dict[str, Array]:
+def _select_rows(flat: FlatColumns, rows: Array) -> dict[str, Array]:
     """Return the selected rows, without a copy if they are contiguous."""
     at = np.flatnonzero(rows)
     begin, end = (int(at[0]), int(at[-1]) + 1) if len(at) else (0, 0)
@@ -316,30 +334,32 @@ def _of_rows(flat: Flat, rows: Array) -> dict[str, Array]:
     return {name: value[at] for name, value in flat.items()}
 
 
-def _needed(
-    chosen: Mapping[str, str], made: Sequence[str], names: Sequence[str], *, has_parts: bool
+def _columns_to_read(
+    chosen: Mapping[str, str], derived: Sequence[str], names: Sequence[str], *, has_parts: bool
 ) -> list[str]:
     """Return the columns to read: selected columns, and those needed to select rows and derive."""
-    by = ["t_ns", *(("t_mono_ns", "seq") if made else ()), *(("part",) if has_parts else ())]
-    read = [name for name, of in chosen.items() if of not in (*made, *_TIME_NAMES)]
+    by = ["t_ns", *(("t_mono_ns", "seq") if derived else ()), *(("part",) if has_parts else ())]
+    read = [name for name, of in chosen.items() if of not in (*derived, *_TIME_NAMES)]
     return list(dict.fromkeys([*read, *(name for name in by if name in names)]))
 
 
-def _chosen(present: Sequence[str], tiles: int, asked: Sequence[str]) -> dict[str, str]:
+def _resolve_columns(
+    present: Sequence[str], tiles: int, requested: Sequence[str]
+) -> dict[str, str]:
     """Return the quantity of every requested column by flat name, in order, without duplicates."""
-    flat = {f: name for name in present for f in KNOWN[name].flat_names(tiles)}
-    if not asked:
+    flat = {f: name for name in present for f in COLUMNS_BY_NAME[name].flat_names(tiles)}
+    if not requested:
         return flat
     chosen: dict[str, str] = {}
-    for name in asked:
+    for name in requested:
         if name in present:
-            chosen |= dict.fromkeys(KNOWN[name].flat_names(tiles), name)
+            chosen |= dict.fromkeys(COLUMNS_BY_NAME[name].flat_names(tiles), name)
         elif name in flat:
             chosen[name] = flat[name]
         else:
             raise UsageError(
                 f"no column {name[:80]!r} in this session",
                 expected=f"some of {', '.join(present)}",
-                remedy=_MADE.get(name, ""),
+                remedy=_DERIVED_COLUMN_REMEDIES.get(name, ""),
             )
     return chosen

@@ -17,32 +17,32 @@ import numpy as np
 from devices.arrays import Floats
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import FileFormatError, LoadTraceError, UsageError
-from storage.formats.reference import Stated, as_reference
-from storage.formats.session_load import SESSION_COLUMN, as_load
-from storage.formats.tables.registry import read_table
-from storage.formats.tables.session import read_axis
-from storage.formats.tables.table import INSTANTS, OURS, Column, Table
-from storage.formats.tables.times import spread_even
+from storage.formats.readers.registry import read_table
+from storage.formats.readers.sample_times import respace_repeated_times
+from storage.formats.readers.session import read_time_axis
+from storage.formats.readers.table import INSTANT_COLUMN, STANDARD_UNITS, Column, ForceTable
+from storage.formats.reference import ReferenceOptions, table_to_reference
+from storage.formats.session_load import SESSION_COLUMN_PATTERN, session_to_load_columns
 
-NUMBERS_MAX = 20_000_000
+VALUES_MAX = 20_000_000
 """Limit of rows times columns: an hour of eight cells at 500 Hz, 160 MB in memory."""
 
-NUMBER_MAX = 1e9
+PLAUSIBLE_MAX = 1e9
 """Limit of plausible values, in s, N and m."""
 
-_COLUMN = re.compile(r"time_s|fz_n|cop_[xy]_m|angle_rad|cell\d+_n")
+_TRACE_COLUMN_PATTERN = re.compile(r"time_s|fz_n|cop_[xy]_m|angle_rad|cell\d+_n")
 """Pattern of the columns that are read."""
 
-_NAME_THEM = "Or name them: --map time_s=COLUMN,grf_n=COLUMN,cop_x_m=COLUMN,cop_y_m=COLUMN"
+_MAP_REMEDY = "Or name them: --map time_s=COLUMN,grf_n=COLUMN,cop_x_m=COLUMN,cop_y_m=COLUMN"
 _UNITS = {"time": "time_s", "fz": "fz_n", "cop_x": "cop_x_m", "cop_y": "cop_y_m"}
 
 
-def read_load_trace(path: Path, stated: Stated | None = None) -> LoadTrace:
+def read_load_trace(path: Path, options: ReferenceOptions | None = None) -> LoadTrace:
     """Read a load trace.
 
     Args:
         path: path of the file.
-        stated: options of the user. With columns, units, sign or rate the file is read like a
+        options: options of the user. With columns, units, sign or rate the file is read like a
             reference.
 
     Raises:
@@ -50,12 +50,12 @@ def read_load_trace(path: Path, stated: Stated | None = None) -> LoadTrace:
             is missing or in another unit, times do not rise, or a force is not a number.
     """
     where = str(path)
-    columns, names = _read(path, stated or Stated())
+    columns, names = _read_columns(path, options or ReferenceOptions())
 
     def numbers(name: str, *, may_be_empty: bool = False) -> Floats:
-        return _numbers(columns, names, name, where, may_be_empty=may_be_empty)
+        return _checked_column(columns, names, name, where, may_be_empty=may_be_empty)
 
-    time_s, _ = spread_even(numbers("time_s"))
+    time_s, _ = respace_repeated_times(numbers("time_s"))
     if len(time_s) < 2:
         raise LoadTraceError(f"{len(time_s)} rows", where=where, expected="at least two")
     steps = np.flatnonzero(np.diff(time_s) <= 0.0)
@@ -81,8 +81,8 @@ def read_load_trace(path: Path, stated: Stated | None = None) -> LoadTrace:
         raise LoadTraceError(
             f"no load in its columns ({', '.join(names)})",
             where=where,
-            expected=_other_unit(names, "fz_n") or "fz_n, or cell1_n, cell2_n, ...",
-            remedy=_NAME_THEM,
+            expected=_other_unit_hint(names, "fz_n") or "fz_n, or cell1_n, cell2_n, ...",
+            remedy=_MAP_REMEDY,
         )
     fz_n = numbers("fz_n") if has_total else None
     cells_n = np.stack([numbers(name) for _, name in cells], axis=1) if cells else None
@@ -109,43 +109,49 @@ def read_load_trace(path: Path, stated: Stated | None = None) -> LoadTrace:
     )
 
 
-def _is_needed(name: str) -> bool:
+def _is_trace_column(name: str) -> bool:
     name = name.lower()
-    return bool(_COLUMN.fullmatch(name) or SESSION_COLUMN.fullmatch(name)) or name in OURS
+    return (
+        bool(_TRACE_COLUMN_PATTERN.fullmatch(name) or SESSION_COLUMN_PATTERN.fullmatch(name))
+        or name in STANDARD_UNITS
+    )
 
 
-def _read(path: Path, stated: Stated) -> tuple[dict[str, Column], list[str]]:
+def _read_columns(path: Path, options: ReferenceOptions) -> tuple[dict[str, Column], list[str]]:
     """Return the columns of a trace by lower-case name, and the names of all columns."""
-    named = stated.names
+    named = options.source_columns
     try:
         table = read_table(
-            path, lambda name: name in named or _is_needed(name), NUMBERS_MAX, stated.text
+            path, lambda name: name in named or _is_trace_column(name), VALUES_MAX, options.text
         )
         names = [name.lower() for name in table.names if name]
-        if stated != Stated(text=stated.text):
-            columns = _of_reference(table, stated)
+        if options != ReferenceOptions(text=options.text):
+            columns = _reference_to_columns(table, options)
             return columns, list(dict.fromkeys([*names, *columns]))
-        columns = _lower(table)
-        if INSTANTS in columns:
-            columns = as_load(columns, table.schema, where=table.where, axis=read_axis(path))
+        columns = _lowercase_names(table)
+        if INSTANT_COLUMN in columns:
+            columns = session_to_load_columns(
+                columns, table.schema, where=table.where, axis=read_time_axis(path)
+            )
         elif "grf_n" in columns and "fz_n" not in columns and "cell1_n" not in columns:
-            columns = _of_reference(table, stated)
+            columns = _reference_to_columns(table, options)
     except (FileFormatError, UsageError) as error:
         raise LoadTraceError(
             error.what, where=error.where, expected=error.expected, remedy=error.remedy
         ) from error
-    if not any(_COLUMN.fullmatch(name) for name in columns):
+    if not any(_TRACE_COLUMN_PATTERN.fullmatch(name) for name in columns):
         raise LoadTraceError(
             f"no load in its columns ({', '.join(names)[:200]})",
             where=table.where,
-            expected=_other_unit(names, "time_s") or "time_s, and fz_n or cell1_n, cell2_n, ...",
-            remedy=_NAME_THEM,
+            expected=_other_unit_hint(names, "time_s")
+            or "time_s, and fz_n or cell1_n, cell2_n, ...",
+            remedy=_MAP_REMEDY,
         )
     return columns, list(dict.fromkeys([*names, *columns]))
 
 
-def _of_reference(table: Table, stated: Stated) -> dict[str, Column]:
-    found = as_reference(table, stated)
+def _reference_to_columns(table: ForceTable, options: ReferenceOptions) -> dict[str, Column]:
+    found = table_to_reference(table, options)
     count = len(next(iter(table.columns.values())))
     if len(found.time_s) < count:
         raise LoadTraceError(
@@ -160,7 +166,7 @@ def _of_reference(table: Table, stated: Stated) -> dict[str, Column]:
     return columns
 
 
-def _lower(table: Table) -> dict[str, Column]:
+def _lowercase_names(table: ForceTable) -> dict[str, Column]:
     columns: dict[str, Column] = {}
     for name, column in table.columns.items():
         if name.lower() in columns and columns[name.lower()] is not column:
@@ -171,17 +177,17 @@ def _lower(table: Table) -> dict[str, Column]:
     return columns
 
 
-def _numbers(
+def _checked_column(
     columns: dict[str, Column], names: list[str], name: str, where: str, *, may_be_empty: bool
 ) -> Floats:
     if name not in columns:
         raise LoadTraceError(
             f"column {name} is missing (it has {', '.join(names)})",
             where=where,
-            expected=_other_unit(names, name) or name,
+            expected=_other_unit_hint(names, name) or name,
         )
     values = columns[name].astype(np.float64)
-    bad = ~(np.abs(values) < NUMBER_MAX)  # NaN too
+    bad = ~(np.abs(values) < PLAUSIBLE_MAX)  # NaN too
     if may_be_empty:
         bad &= ~np.isnan(values)
     if bad.any():
@@ -189,13 +195,13 @@ def _numbers(
         raise LoadTraceError(
             f"column {name} is {values[row]:g} at row {row + 1}",
             where=where,
-            expected=f"a number below {NUMBER_MAX:g} in every row",
+            expected=f"a number below {PLAUSIBLE_MAX:g} in every row",
             remedy="Cut the row out, or fill it from its neighbours on purpose",
         )
     return values
 
 
-def _other_unit(columns: Iterable[str], name: str) -> str:
+def _other_unit_hint(columns: Iterable[str], name: str) -> str:
     """Return the expected text of an error if the quantity exists in another unit; else empty."""
     stem = next((stem for stem, full in _UNITS.items() if full == name), None)
     for other in columns:

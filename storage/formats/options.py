@@ -11,7 +11,7 @@ class FormatOptions(BaseModel):
     """Options of export formats. None: the format's default.
 
     REST and the command line offer these fields unchanged. A format refuses an option that it does
-    not support (`storage.formats.written.format.Format.options`).
+    not support (`storage.formats.written.format.Format.describe_options`).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -53,7 +53,7 @@ class FormatOptions(BaseModel):
     )
 
     @property
-    def set_names(self) -> list[str]:
+    def specified_names(self) -> list[str]:
         """Names of the options that are not None."""
         return [name for name, value in self if value is not None]
 

@@ -16,45 +16,45 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
-from storage.formats.tables.registry import check_nothing_stated, read_table
-from storage.formats.tables.session import read_session
-from storage.formats.tables.stated_text import StatedText
-from storage.formats.tables.table import OURS, SOLE_UNITS, Table
-from storage.formats.tables.times import spread_even
+from storage.formats.readers.registry import read_table, refuse_text_options
+from storage.formats.readers.sample_times import respace_repeated_times
+from storage.formats.readers.session import read_session_table
+from storage.formats.readers.table import SOLE_UNITS, STANDARD_UNITS, ForceTable
+from storage.formats.readers.text_options import TextOptions
 
 QUANTITIES = ("time_s", "grf_n", "cop_x_m", "cop_y_m")
-FACTORS: Mapping[str, Mapping[str, float]] = {
+UNIT_FACTORS: Mapping[str, Mapping[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "grf": {"N": 1.0, "kN": 1e3, "mN": 1e-3},
     "cop": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
 }
 """Factors to SI units by quantity and unit."""
 
-SIGNS: Mapping[str, float] = {"+": 1.0, "-": -1.0}
+SIGN_FACTORS: Mapping[str, float] = {"+": 1.0, "-": -1.0}
 """Factors by the stated sign of a force under load."""
 
-NUMBER_MAX = 1e9
+PLAUSIBLE_MAX = 1e9
 TIME_MAX_S = 1e11
 """Limit of times: Unix time in seconds is far below it, and above it in any other unit."""
-GAP_STEPS = 3.5
-PEAK_S = 0.02
-LOADED_SIGMA = 12.0
+GAP_MIN_STEPS = 3.5
+PEAK_DURATION_S = 0.02
+LOAD_RANGE_MIN_SIGMA = 12.0
 """Lowest range of a loaded plate's force, in sigma of its noise."""
-SIGN_RATIO = 3.0
+PEAK_RATIO_MIN = 3.0
 """Lowest ratio of the peaks of both signs that tells the sign of the load."""
-BEARS = 0.05
+LOAD_FRACTION_MIN = 0.05
 """Load threshold relative to the peak force; below it the centre of pressure is noise."""
-TURNED = 2.0
+REVERSED_RATIO = 2.0
 """Ratio of negative to positive range from which a force counts as negative under load."""
 
 
 @dataclass(frozen=True)
-class Stated:
+class ReferenceOptions:
     """Options of the user for reading a reference file.
 
     Attributes:
         columns: name of the file's column by quantity of `QUANTITIES`; a leading "-" negates it.
-        units: units of "time", "grf" and "cop", as in `FACTORS`.
+        units: units of "time", "grf" and "cop", as in `UNIT_FACTORS`.
         sign: sign of the force under load, "+" or "-".
         rate_hz: sample rate, if the file has no times, or sample numbers instead.
         text: layout of a text file.
@@ -65,27 +65,27 @@ class Stated:
     units: Mapping[str, str] = field(default_factory=dict)
     sign: str | None = None
     rate_hz: float | None = None
-    text: StatedText = field(default_factory=StatedText)
+    text: TextOptions = field(default_factory=TextOptions)
     sole_m: tuple[float, ...] = ()
 
     @property
-    def names(self) -> set[str]:
+    def source_columns(self) -> set[str]:
         """Names of the mapped columns of the file; for a sum, the sum and its summands."""
         given = {name.removeprefix("-") for name in self.columns.values()}
-        return given | {part for name in given for part in _parts(name)}
+        return given | {part for name in given for part in _split_summands(name)}
 
     def __post_init__(self) -> None:
         for name in self.columns:
             if name not in QUANTITIES:
                 raise UsageError(f"--map {name}", expected=" or ".join(QUANTITIES))
         for name, unit in self.units.items():
-            if name not in FACTORS:
-                raise UsageError(f"--units {name}", expected=" or ".join(FACTORS))
-            if unit not in FACTORS[name]:
-                raise UsageError(f"--units {name}={unit}", expected=" or ".join(FACTORS[name]))
-        if self.sign is not None and self.sign not in SIGNS:
+            if name not in UNIT_FACTORS:
+                raise UsageError(f"--units {name}", expected=" or ".join(UNIT_FACTORS))
+            if unit not in UNIT_FACTORS[name]:
+                raise UsageError(f"--units {name}={unit}", expected=" or ".join(UNIT_FACTORS[name]))
+        if self.sign is not None and self.sign not in SIGN_FACTORS:
             raise UsageError(f"--sign {self.sign!r}", expected="+ or -, of the force under load")
-        if self.rate_hz is not None and not 0.0 < self.rate_hz < NUMBER_MAX:
+        if self.rate_hz is not None and not 0.0 < self.rate_hz < PLAUSIBLE_MAX:
             raise UsageError(f"--rate-hz {self.rate_hz:g}", expected="samples a second, above 0")
 
 
@@ -110,7 +110,7 @@ class ReferenceData:
     notes: tuple[str, ...]
 
 
-def read_reference(path: Path, stated: Stated) -> ReferenceData:
+def read_reference(path: Path, options: ReferenceOptions) -> ReferenceData:
     """Read a reference.
 
     Raises:
@@ -118,35 +118,37 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
             a force.
         UsageError: neither user nor file states a unit or the sign, or they contradict each other.
     """
-    named = stated.names
-    table = read_session(path, named)
+    named = options.source_columns
+    table = read_session_table(path, named)
     if table is not None:
-        check_nothing_stated(path, stated.text)
+        refuse_text_options(path, options.text)
     else:
         table = read_table(
-            path, lambda name: name in named or name.lower() in OURS, stated=stated.text
+            path,
+            lambda name: name in named or name.lower() in STANDARD_UNITS,
+            text_options=options.text,
         )
-    return as_reference(table, stated)
+    return table_to_reference(table, options)
 
 
-def as_reference(table: Table, stated: Stated) -> ReferenceData:
+def table_to_reference(table: ForceTable, options: ReferenceOptions) -> ReferenceData:
     """Return force and centre of pressure of a table, in SI units.
 
     Raises:
         FileFormatError, UsageError: as for `read_reference`.
     """
     where = table.where
-    grf_n = _column(table, stated, "grf_n")
-    time_s = _times(table, stated, len(grf_n))
-    grf_n, sign_note = _with_sign(table, stated, grf_n, time_s)
+    grf_n = _column_in_si(table, options, "grf_n")
+    time_s = _sample_times_s(table, options, len(grf_n))
+    grf_n, sign_note = _orient_force(table, options, grf_n, time_s)
     cop = [
-        _column(table, stated, name)
+        _column_in_si(table, options, name)
         for name in ("cop_x_m", "cop_y_m")
-        if name in stated.columns or name in table.columns
+        if name in options.columns or name in table.columns
     ]
     notes = [*table.notes, *sign_note]
     if len(cop) == 1:  # a treadmill, or a line of cells
-        has_x = "cop_x_m" in stated.columns or "cop_x_m" in table.columns
+        has_x = "cop_x_m" in options.columns or "cop_x_m" in table.columns
         nothing = np.full(len(grf_n), np.nan)
         cop = [cop[0], nothing] if has_x else [nothing, cop[0]]
         notes.append(f"the centre of pressure is known along {'x' if has_x else 'y'} only")
@@ -156,10 +158,10 @@ def as_reference(table: Table, stated: Stated) -> ReferenceData:
         time_s, grf_n, cop = time_s[timed], grf_n[timed], [column[timed] for column in cop]
     if len(time_s) < 2:
         raise FileFormatError(f"{len(time_s)} samples", where=where, expected="at least two")
-    time_s, spread_note = spread_even(time_s)
+    time_s, spread_note = respace_repeated_times(time_s)
     notes += filter(None, [spread_note])
     _check_time(time_s, where)
-    if abs(time_s[0]) >= NUMBER_MAX:
+    if abs(time_s[0]) >= PLAUSIBLE_MAX:
         notes.append(
             f"the reference's time begins at {time_s[0]:.3f} s, as Unix time does: the lag is to "
             "its time since then"
@@ -172,7 +174,7 @@ def as_reference(table: Table, stated: Stated) -> ReferenceData:
         notes.append(f"{int((~known).sum())} of {len(known)} samples have no force: left out")
     _check_force(grf_n[known], where)
     steps_s = np.diff(time_s[known])
-    gaps = steps_s > GAP_STEPS * np.median(steps_s)
+    gaps = steps_s > GAP_MIN_STEPS * np.median(steps_s)
     if gaps.any():
         notes.append(
             f"{int(gaps.sum())} gaps, the longest of {steps_s.max():.3f} s: nothing is compared in "
@@ -191,51 +193,51 @@ def as_reference(table: Table, stated: Stated) -> ReferenceData:
     )
 
 
-def _parts(name: str) -> list[str]:
+def _split_summands(name: str) -> list[str]:
     return [part.strip() for part in name.split("+")]
 
 
-def _times(table: Table, stated: Stated, count: int) -> Floats:
+def _sample_times_s(table: ForceTable, options: ReferenceOptions, count: int) -> Floats:
     """Return the times of all samples in s, computed from their numbers if the rate is stated."""
-    if stated.rate_hz is None:
-        return _column(table, stated, "time_s")
-    numbers = table.columns.get(stated.columns.get("time_s", ""), np.arange(count))
+    if options.rate_hz is None:
+        return _column_in_si(table, options, "time_s")
+    numbers = table.columns.get(options.columns.get("time_s", ""), np.arange(count))
     if not np.array_equal(numbers, np.rint(numbers)):
         raise UsageError(
-            f"--rate-hz needs sample numbers, and {stated.columns['time_s']!r} has others",
+            f"--rate-hz needs sample numbers, and {options.columns['time_s']!r} has others",
             where=table.where,
             remedy="Leave out --rate-hz, or the time from --map",
         )
-    return np.asarray(numbers / stated.rate_hz, dtype=np.float64)
+    return np.asarray(numbers / options.rate_hz, dtype=np.float64)
 
 
-def _column(table: Table, stated: Stated, name: str) -> Floats:
+def _column_in_si(table: ForceTable, options: ReferenceOptions, name: str) -> Floats:
     """Return a quantity in SI units, with NaN for empty cells.
 
     Raises:
         FileFormatError: the column is missing, or a time or force is implausibly large.
         UsageError: the unit is not stated, or differs from the file's.
     """
-    given = stated.columns.get(name, name)
+    given = options.columns.get(name, name)
     turned, theirs = given.startswith("-"), given.removeprefix("-")
-    parts = [theirs] if theirs in table.columns else _parts(theirs)
+    parts = [theirs] if theirs in table.columns else _split_summands(theirs)
     if absent := [part for part in parts if part not in table.columns]:
         raise FileFormatError(
             f"no column {absent[0]!r} for {name} (it has "
             f"{', '.join(filter(None, table.names))[:200]})",
             where=table.where,
-            expected=table.form,
-            remedy=_remedy_of_absent(table, name),
+            expected=table.expected_form,
+            remedy=_missing_column_remedy(table, name),
         )
     quantity = name.partition("_")[0]
-    factors = dict(FACTORS[quantity])
-    unit = stated.units.get(quantity)
+    factors = dict(UNIT_FACTORS[quantity])
+    unit = options.units.get(quantity)
     of_parts = {table.units.get(part) for part in parts}
     of_file = of_parts.pop() if len(of_parts) == 1 else None
     if of_parts:
         raise UsageError(f"the columns of {theirs!r} have different units", where=table.where)
     if of_file in SOLE_UNITS:
-        factors[of_file] = _size_of_sole(theirs, of_file, stated, table.where)
+        factors[of_file] = _sole_size_m(theirs, of_file, options, table.where)
     if of_file not in factors:
         of_file = None
     if unit is not None and of_file is not None and unit != of_file:
@@ -254,7 +256,7 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
     total = sum(table.columns[part] for part in parts)
     values = np.asarray(total * factors[unit], dtype=np.float64)
     # Without load a centre of pressure may be arbitrarily large: `_drop_far_cop`.
-    greatest = {"time": TIME_MAX_S, "grf": NUMBER_MAX}.get(quantity)
+    greatest = {"time": TIME_MAX_S, "grf": PLAUSIBLE_MAX}.get(quantity)
     if greatest is not None and len(bad := np.flatnonzero(np.abs(values) >= greatest)):
         raise FileFormatError(
             f"column {theirs!r} is {values[bad[0]]:g} at sample {bad[0] + 1}",
@@ -265,7 +267,7 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
     return -values if turned else values
 
 
-def _remedy_of_absent(table: Table, name: str) -> str:
+def _missing_column_remedy(table: ForceTable, name: str) -> str:
     """Return the remedy for a quantity without a column."""
     remedies = [f"Name it: --map {name}=COLUMN"]
     if "column1" in table.names and not any(one.endswith("_fz") for one in table.names):
@@ -277,35 +279,35 @@ def _remedy_of_absent(table: Table, name: str) -> str:
     return "; ".join(remedies)
 
 
-def _size_of_sole(column: str, unit: str, stated: Stated, where: str) -> float:
+def _sole_size_m(column: str, unit: str, options: ReferenceOptions, where: str) -> float:
     """Return the length or width of an insole, in m.
 
     Raises:
         UsageError: it is not stated.
     """
     axis = SOLE_UNITS.index(unit)
-    if axis >= len(stated.sole_m):
+    if axis >= len(options.sole_m):
         raise UsageError(
             f"column {column!r} is in {unit}, and the file does not state how long they are",
             where=where,
             remedy=f"Add --sole-m {('LENGTH', 'LENGTH,WIDTH')[axis]}, of the insole in metres",
         )
-    return stated.sole_m[axis]
+    return options.sole_m[axis]
 
 
-def _with_sign(
-    table: Table, stated: Stated, grf_n: Floats, time_s: Floats
+def _orient_force(
+    table: ForceTable, options: ReferenceOptions, grf_n: Floats, time_s: Floats
 ) -> tuple[Floats, tuple[str, ...]]:
     """Return the force, positive under load, and a note about how its sign was found."""
-    name = stated.columns.get("grf_n", "grf_n")
-    if stated.sign is not None:
-        return SIGNS[stated.sign] * grf_n, ()
+    name = options.columns.get("grf_n", "grf_n")
+    if options.sign is not None:
+        return SIGN_FACTORS[options.sign] * grf_n, ()
     bare = name.removeprefix("-")
-    parts = {bare} if bare in table.columns else set(_parts(bare))
-    if parts <= table.positive:
+    parts = {bare} if bare in table.columns else set(_split_summands(bare))
+    if parts <= table.positive_forces:
         return grf_n, ()
-    if parts <= table.plates:  # the user's "-" states the sign
-        return (grf_n, ()) if name != bare else _positive_under_load(grf_n, time_s, table.where)
+    if parts <= table.plate_forces:  # the user's "-" states the sign
+        return (grf_n, ()) if name != bare else _orient_force_by_load(grf_n, time_s, table.where)
     raise UsageError(
         f"the sign of column {name!r} is not stated",
         where=table.where,
@@ -313,12 +315,12 @@ def _with_sign(
     )
 
 
-def _positive_under_load(
+def _orient_force_by_load(
     grf_n: Floats, time_s: Floats, where: str
 ) -> tuple[Floats, tuple[str, ...]]:
     """Return the force of a plate, positive under load: a plate pushes and never pulls.
 
-    A peak is exceeded for `PEAK_S` in total, so that a spike does not count.
+    A peak is exceeded for `PEAK_DURATION_S` in total, so that a spike does not count.
 
     Raises:
         UsageError: the load is too small, or peaks of both signs are similar.
@@ -327,15 +329,15 @@ def _positive_under_load(
     if len(known) < 2:
         return grf_n, ()
     step_s = float(np.median(np.diff(time_s)))
-    rank = min(len(known) - 1, max(1, round(PEAK_S / step_s)) if step_s > 0.0 else 1)
+    rank = min(len(known) - 1, max(1, round(PEAK_DURATION_S / step_s)) if step_s > 0.0 else 1)
     low_n, high_n = min(0.0, float(known[rank - 1])), max(0.0, float(known[-rank]))
     small_n, great_n = sorted((-low_n, high_n))
     middle_n = float(np.median(known))
     # Third differences are mostly noise: a load changes little in three samples.
     third_n = np.diff(grf_n[np.isfinite(grf_n)], 3)
     noise_n = 1.4826 * float(np.median(np.abs(third_n))) / np.sqrt(20.0) if len(third_n) else 0.0
-    is_loaded = float(known[-rank] - known[rank - 1]) > LOADED_SIGMA * noise_n
-    if not is_loaded or great_n < SIGN_RATIO * small_n or great_n == 0.0:
+    is_loaded = float(known[-rank] - known[rank - 1]) > LOAD_RANGE_MIN_SIGMA * noise_n
+    if not is_loaded or great_n < PEAK_RATIO_MIN * small_n or great_n == 0.0:
         raise UsageError(
             "the load does not tell the sign of the force: it goes from "
             f"{known[0]:.4g} to {known[-1]:.4g} N, and is {middle_n:.4g} N at its median",
@@ -358,17 +360,17 @@ def _drop_far_cop(cop_m: Floats, grf_n: Floats, where: str) -> list[str]:
     Raises:
         FileFormatError: a centre of pressure is implausibly far under load.
     """
-    far = (np.abs(cop_m) >= NUMBER_MAX).any(axis=1)
+    far = (np.abs(cop_m) >= PLAUSIBLE_MAX).any(axis=1)
     if not far.any():
         return []
-    bears = far & (grf_n > BEARS * np.max(grf_n))
+    bears = far & (grf_n > LOAD_FRACTION_MIN * np.max(grf_n))
     if bears.any():
         sample = int(np.flatnonzero(bears)[0])
         raise FileFormatError(
             f"the centre of pressure is {np.nanmax(np.abs(cop_m[sample])):g} m away at sample "
             f"{sample + 1}, under {grf_n[sample]:.4g} N",
             where=where,
-            expected=f"numbers below {NUMBER_MAX:g}",
+            expected=f"numbers below {PLAUSIBLE_MAX:g}",
         )
     cop_m[far] = np.nan
     return [f"in {int(far.sum())} samples without load there is no centre of pressure: left out"]
@@ -388,7 +390,7 @@ def _check_time(time_s: Floats, where: str) -> None:
 
 def _check_force(grf_n: Floats, where: str) -> None:
     low_n, high_n = float(np.percentile(grf_n, 0.1)), float(np.percentile(grf_n, 99.9))
-    if -low_n > TURNED * abs(high_n) and low_n < 0.0:
+    if -low_n > REVERSED_RATIO * abs(high_n) and low_n < 0.0:
         raise FileFormatError(
             f"the force is negative under load: {low_n:.4g} to {high_n:.4g} N",
             where=where,

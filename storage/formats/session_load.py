@@ -15,19 +15,19 @@ import numpy as np
 import pyarrow as pa
 
 from devices.errors import FileFormatError, LoadTraceError
-from storage.formats.tables.table import INSTANTS, Column
-from storage.schema import array_info
+from storage.formats.readers.table import INSTANT_COLUMN, Column
+from storage.schema import read_array_info
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
-SESSION_COLUMN = re.compile(
+SESSION_COLUMN_PATTERN = re.compile(
     r"t_ns|part|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)",
 )
 """Pattern of the needed columns."""
 
-_TOTAL = ("grf_n", "cop_x_m", "cop_y_m")
+_TOTAL_FORCE_COLUMNS = ("grf_n", "cop_x_m", "cop_y_m")
 
 
-def as_load(
+def session_to_load_columns(
     columns: Mapping[str, Column],
     schema: pa.Schema | None,
     *,
@@ -37,7 +37,7 @@ def as_load(
     """Return `time_s` and `cell1_n, ...` or `fz_n, cop_x_m, cop_y_m`, and `angle_rad` if known.
 
     Args:
-        columns: columns of a session that match `SESSION_COLUMN`.
+        columns: columns of a session that match `SESSION_COLUMN_PATTERN`.
         schema: schema of its Parquet file, which may describe the array; None for text.
         where: path of the file, for errors.
         axis: time axis of the session.
@@ -47,11 +47,14 @@ def as_load(
     """
     found: dict[str, Column] = {}
     for stem in ("true_", ""):
-        if cells := _cells(columns, schema, stem, where=where):
+        if cells := _load_bearing_forces(columns, schema, stem, where=where):
             found = {f"cell{i + 1}_n": column for i, column in enumerate(cells)}
-        elif all(stem + name in columns for name in _TOTAL):
-            names = ("fz_n", *_TOTAL[1:])
-            found = {name: columns[stem + old] for name, old in zip(names, _TOTAL, strict=True)}
+        elif all(stem + name in columns for name in _TOTAL_FORCE_COLUMNS):
+            names = ("fz_n", *_TOTAL_FORCE_COLUMNS[1:])
+            found = {
+                name: columns[stem + old]
+                for name, old in zip(names, _TOTAL_FORCE_COLUMNS, strict=True)
+            }
             found |= _across_row(found)
         if found:
             break
@@ -66,11 +69,11 @@ def as_load(
         if name in columns and not np.isnan(columns[name]).all():
             found["angle_rad"] = columns[name]
             break
-    t_ns = columns[INSTANTS]
+    t_ns = columns[INSTANT_COLUMN]
     if t_ns.dtype.kind != "i":
         raise LoadTraceError("t_ns are no instants", where=where, expected="nanoseconds")
     if axis.is_shifted:  # only in sealed files, where each row has a part
-        t_ns = axis.at(np.asarray(t_ns, np.int64), columns["part"].astype(np.int64))
+        t_ns = axis.shift_to_axis(np.asarray(t_ns, np.int64), columns["part"].astype(np.int64))
     found["time_s"] = np.asarray((t_ns - t_ns[:1]) * 1e-9, dtype=np.float64)
     # Rows without load need no centre of pressure.
     needed = [column for name, column in found.items() if not name.startswith("cop_")]
@@ -86,13 +89,13 @@ def _across_row(found: Mapping[str, Column]) -> dict[str, Column]:
 
     Any constant gives the same load: a trace's COP counts from its mean.
     """
-    stated = {name: ~np.isnan(found[name]) for name in _TOTAL[1:]}
+    stated = {name: ~np.isnan(found[name]) for name in _TOTAL_FORCE_COLUMNS[1:]}
     if not any(rows.any() for rows in stated.values()):
         return {}
     return {name: np.zeros(len(rows)) for name, rows in stated.items() if not rows.any()}
 
 
-def _cells(
+def _load_bearing_forces(
     columns: Mapping[str, Column], schema: pa.Schema | None, stem: str, *, where: str
 ) -> list[Column]:
     """Return the forces of the load-bearing tiles, in order of their numbers."""
@@ -105,7 +108,7 @@ def _cells(
             where=where,
             expected=f"{stem}force_n of all tiles",
         )
-    bare = _bare(schema)
+    bare = _reference_tile_numbers(schema)
     cells = []
     for i in numbers:
         estimated = columns.get(f"force_n_{i}")
@@ -115,12 +118,12 @@ def _cells(
     return cells
 
 
-def _bare(schema: pa.Schema | None) -> set[int] | None:
+def _reference_tile_numbers(schema: pa.Schema | None) -> set[int] | None:
     """Return the numbers of reference tiles; None if the file has no array info, as CSV."""
     if schema is None:
         return None
     try:
-        tiles = array_info(schema, where="").tiles
+        tiles = read_array_info(schema, where="").tiles
     except FileFormatError:
         return None
     return {i for i, tile in enumerate(tiles) if tile.reference}

@@ -45,16 +45,16 @@ class Slice:
             )
 
     @property
-    def is_all(self) -> bool:
+    def is_whole_session(self) -> bool:
         """True for the whole session with all columns."""
         return self == Slice()
 
     @property
-    def is_some(self) -> bool:
+    def has_time_bounds(self) -> bool:
         """True if the slice bounds time."""
         return self.start_s is not None or self.end_s is not None
 
-    def bounds_ns(self, begin_t_ns: int) -> tuple[int | None, int | None]:
+    def compute_bounds_ns(self, begin_t_ns: int) -> tuple[int | None, int | None]:
         """Return the slice's first instant, and its end, exclusive; None: no bound.
 
         Args:
@@ -66,14 +66,14 @@ class Slice:
         )
         return start, end
 
-    def rows(self, t_ns: Array, begin_t_ns: int) -> Array:
+    def compute_row_mask(self, t_ns: Array, begin_t_ns: int) -> Array:
         """Return the mask of the frames in the slice, bool[n].
 
         Args:
             t_ns: int64[n], instants of frames on the session's time axis.
             begin_t_ns: instant of the session's first frame.
         """
-        start_ns, end_ns = self.bounds_ns(begin_t_ns)
+        start_ns, end_ns = self.compute_bounds_ns(begin_t_ns)
         rows = np.ones(len(t_ns), dtype=np.bool_)
         if start_ns is not None:
             rows &= t_ns >= start_ns
@@ -81,6 +81,6 @@ class Slice:
             rows &= t_ns < end_ns
         return rows
 
-    def begins_after(self, end_s: float) -> bool:
+    def starts_after(self, end_s: float) -> bool:
         """Return whether the slice begins after `end_s`, in seconds after the first frame."""
         return self.start_s is not None and self.start_s > end_s

@@ -11,14 +11,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from devices.errors import StorageError
-from storage.durable import check_held, storage_errors, sync_folder
+from storage.durable_files import raise_if_locked_folder_gone, sync_folder, translate_storage_errors
 from storage.journal.segment import SUFFIX
 from storage.journal.segment_writer import SegmentWriter
 from storage.wire import EncodedBatch
 
-SEGMENT_NS = 60_000_000_000
+SEGMENT_DURATION_NS = 60_000_000_000
 """Longest segment: a minute of frames, since only complete segments are deleted."""
-_OPEN_MAX = 2
+_MAX_OPEN_SEGMENTS = 2
 
 
 class OpenSegments:
@@ -27,13 +27,13 @@ class OpenSegments:
     Args:
         folder: the journal's folder.
         header: schema message with which a segment begins.
-        writes_later: `append` does not write; `write` and `sync` do, in any thread.
+        is_write_deferred: `append` does not write; `write` and `sync` do, in any thread.
     """
 
-    def __init__(self, folder: Path, header: bytes, *, writes_later: bool) -> None:
+    def __init__(self, folder: Path, header: bytes, *, is_write_deferred: bool) -> None:
         self._folder = folder
         self._header = header
-        self._writes_later = writes_later
+        self._writes_later = is_write_deferred
         self._open: list[SegmentWriter] = []
         self._closing: list[SegmentWriter] = []
         self._has_new_names = False
@@ -47,7 +47,7 @@ class OpenSegments:
             return {writer.segment.path for writer in (*self._open, *self._closing)}
 
     @property
-    def is_closing(self) -> bool:
+    def has_closing_segment(self) -> bool:
         """True if the next sync closes a file."""
         return bool(self._closing)
 
@@ -57,9 +57,9 @@ class OpenSegments:
         Raises:
             StorageError: the disk is full or not writable.
         """
-        writer = self._writer_for(message.seq_first, message.t_ns_first)
+        writer = self._get_writer(message.seq_first, message.t_ns_first)
         try:
-            with storage_errors(writer.segment.path):
+            with translate_storage_errors(writer.segment.path):
                 writer.append(message)
         except StorageError:
             # The end of the file is unknown now: the next batch begins another file.
@@ -67,7 +67,7 @@ class OpenSegments:
             raise
         return writer
 
-    def write(self) -> None:
+    def write_waiting(self) -> None:
         """Return when all earlier batches are in the files.
 
         Raises:
@@ -75,12 +75,12 @@ class OpenSegments:
         """
         with self._lock:
             writers = [*self._open, *self._closing]
-        with storage_errors(self._folder):
+        with translate_storage_errors(self._folder):
             for writer in writers:
                 # A segment that is closed meanwhile is written completely, or its sync has failed:
                 # then its waiting batches were not acknowledged, and are requested again.
                 with suppress(ValueError):
-                    writer.write()
+                    writer.write_waiting()
 
     def sync(self) -> None:
         """Return when all earlier batches are on the disk.
@@ -90,7 +90,7 @@ class OpenSegments:
         """
         with self._lock:
             closing, self._closing = self._closing, []
-            writers = [writer for writer in self._open if writer.has_news]
+            writers = [writer for writer in self._open if writer.has_unsynced]
             has_new_names, self._has_new_names = self._has_new_names, False
         failed: OSError | None = None
         for writer in closing:
@@ -98,7 +98,7 @@ class OpenSegments:
                 writer.close()
             except OSError as error:
                 failed = error
-        with storage_errors(self._folder):
+        with translate_storage_errors(self._folder):
             for writer in writers:
                 # A segment that is closed meanwhile was synced when it was closed.
                 with suppress(ValueError):
@@ -114,23 +114,23 @@ class OpenSegments:
             self._closing += self._open
             self._open = []
 
-    def abandon(self) -> None:
+    def close_without_sync(self) -> None:
         """Close all files as they are: they are about to be deleted."""
         with self._lock:
             writers = [*self._open, *self._closing]
             self._open, self._closing, self._has_new_names = [], [], False
         for writer in writers:
-            writer.abandon()
+            writer.close_without_sync()
 
-    def _writer_for(self, seq_first: int, t_ns: int) -> SegmentWriter:
+    def _get_writer(self, seq_first: int, t_ns: int) -> SegmentWriter:
         """Return the open segment that ends last before these frames, or a new one."""
-        fitting = [w for w in self._open if w.segment.span[1] < seq_first]
+        fitting = [w for w in self._open if w.segment.seq_range[1] < seq_first]
         if fitting:
-            writer = max(fitting, key=lambda w: w.segment.span[1])
-            if t_ns - writer.segment.t_ns_first < SEGMENT_NS:
+            writer = max(fitting, key=lambda w: w.segment.seq_range[1])
+            if t_ns - writer.segment.t_ns_first < SEGMENT_DURATION_NS:
                 return writer
             self._retire(writer)
-        if len(self._open) >= _OPEN_MAX:
+        if len(self._open) >= _MAX_OPEN_SEGMENTS:
             self._retire(self._open[0])
         # After a failed write the name may be taken.
         path = self._folder / f"{seq_first:020d}{SUFFIX}"
@@ -138,9 +138,9 @@ class OpenSegments:
         while path.exists():
             path = self._folder / f"{seq_first:020d}-{suffix_number}{SUFFIX}"
             suffix_number += 1
-        check_held(path)
-        with storage_errors(path):
-            writer = SegmentWriter(path, self._header, writes_later=self._writes_later)
+        raise_if_locked_folder_gone(path)
+        with translate_storage_errors(path):
+            writer = SegmentWriter(path, self._header, is_write_deferred=self._writes_later)
         with self._lock:
             self._open.append(writer)
             self._has_new_names = True
@@ -150,9 +150,9 @@ class OpenSegments:
         """Stop appending to this segment; the next sync closes it."""
         with self._lock:
             self._open.remove(writer)
-            if writer.segment.held:
+            if writer.segment.stored:
                 self._closing.append(writer)
                 return
-        writer.abandon()
+        writer.close_without_sync()
         with suppress(OSError):
-            writer.segment.delete()
+            writer.segment.delete_files()

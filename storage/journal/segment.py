@@ -20,23 +20,23 @@ import numpy as np
 import pyarrow as pa
 
 from devices.errors import DamagedFileError, StorageError
-from storage.durable import put_aside, write_whole
+from storage.durable_files import set_aside_and_describe, write_atomically
 from storage.intervals import Intervals, union
 from storage.journal.segment_format import (
     INDEX_SUFFIX,
-    RECORD,
+    RECORD_DTYPE,
     Records,
-    batches_in,
-    closing_record,
-    end_of,
-    is_closed,
-    is_whole,
-    messages_from,
-    numbers,
-    payload_of,
-    read_header,
+    find_end_offset,
+    is_index_closed,
+    is_record_valid,
+    make_closing_record,
+    make_record,
     read_index,
-    record_of,
+    read_messages_from,
+    read_payload,
+    read_schema_and_first_offset,
+    select_batches,
+    seq_range_of,
 )
 from storage.wire import EncodedBatch
 
@@ -50,7 +50,7 @@ class Segment:
 
     Attributes:
         path: the file; its index has the same name with another suffix.
-        held: numbers of frames, without numbers that were invalidated or are in another segment as
+        stored: numbers of frames, without numbers that were invalidated or are in another segment as
             well.
         t_ns_first: instant of its oldest frame, in the node's UTC.
         t_ns_last: instant of its newest frame.
@@ -58,22 +58,22 @@ class Segment:
     """
 
     path: Path
-    held: Intervals = field(default_factory=Intervals)
+    stored: Intervals = field(default_factory=Intervals)
     t_ns_first: int = 0
     t_ns_last: int = 0
     size_bytes: int = 0
-    is_doubtful: bool = False
+    has_invalidated_frames: bool = False
     """True: frames were invalidated while it was written, so it is checked when it is opened."""
 
     @property
-    def span(self) -> tuple[int, int]:
+    def seq_range(self) -> tuple[int, int]:
         """First and last number."""
-        intervals = list(self.held)
+        intervals = list(self.stored)
         return intervals[0][0], intervals[-1][1]
 
-    def take_in(self, records: Records) -> None:
+    def register_records(self, records: Records) -> None:
         """Add the numbers, times and size of batches in the file."""
-        self.held.add_stretches(records["seq_first"], records["count"])
+        self.stored.add_ranges(records["seq_first"], records["count"])
         if len(records):
             begin, end = int(records["t_ns_first"].min()), int(records["t_ns_last"].max())
             fresh = not self.size_bytes
@@ -81,40 +81,42 @@ class Segment:
             self.t_ns_last = end if fresh else max(self.t_ns_last, end)
             self.size_bytes += int(records["length"].sum()) + records.nbytes
 
-    def note(self, message: EncodedBatch) -> None:
-        """Add the numbers, times and size of one written batch; faster than `take_in`."""
-        self.held.add(message.seq_first, message.seq_last)
+    def register_message(self, message: EncodedBatch) -> None:
+        """Add the numbers, times and size of one written batch; faster than `register_records`."""
+        self.stored.add(message.seq_first, message.seq_last)
         fresh = not self.size_bytes
         begin, end = message.t_ns_first, message.t_ns_last
         self.t_ns_first = begin if fresh else min(self.t_ns_first, begin)
         self.t_ns_last = end if fresh else max(self.t_ns_last, end)
-        self.size_bytes += len(message.payload) + RECORD.itemsize
+        self.size_bytes += len(message.payload) + RECORD_DTYPE.itemsize
 
-    def records(self) -> Records:
+    def read_records(self) -> Records:
         """Read the index of the batches that count, in order of their frames.
 
         Raises:
             StorageError: the index cannot be read.
         """
         try:
-            found = batches_in(read_index(self.path))
+            found = select_batches(read_index(self.path))
         except OSError as error:
             raise StorageError(
                 f"cannot be read: {error}", where=str(self.path), errno=error.errno
             ) from error
-        found = found[self.held.covers(found["seq_first"], found["count"])]
+        found = found[self.stored.contains_ranges(found["seq_first"], found["count"])]
         return found[np.argsort(found["seq_first"], kind="stable")]
 
-    def disown(self, doubtful: Intervals) -> None:
+    def invalidate(self, doubtful_numbers: Intervals) -> None:
         """Remove batches within these numbers, also batches that are not in the index.
 
         The file under its name may be a copy that was made before they were written.
         """
         records: Records | tuple[()] = ()
         with suppress(StorageError):  # gone, or no descriptor is left
-            records = self.records()
-        batches = [Intervals([numbers(record)]) for record in records]
-        self.held = (self.held - doubtful) | union(b for b in batches if b - doubtful)
+            records = self.read_records()
+        batches = [Intervals([seq_range_of(record)]) for record in records]
+        self.stored = (self.stored - doubtful_numbers) | union(
+            b for b in batches if b - doubtful_numbers
+        )
 
     def rewrite_index(self) -> None:
         """Write an index of only the batches that count, and mark it as closed.
@@ -122,9 +124,9 @@ class Segment:
         Raises:
             StorageError: the disk is full or not writable; the old index is still there then.
         """
-        _write_index(self.path, self.records())
+        _write_index(self.path, self.read_records())
 
-    def delete(self) -> None:
+    def delete_files(self) -> None:
         """Delete the segment and its index.
 
         Raises:
@@ -135,29 +137,29 @@ class Segment:
         self.path.unlink(missing_ok=True)
 
 
-def set_aside_no_files(folder: Path) -> list[str]:
+def set_aside_unreadable_segments(folder: Path) -> list[str]:
     """Set aside segments and indexes that are no regular files or not readable.
 
     Returns:
-        Messages: each fault, and the new name of the file.
+        Messages with the files found and their new places.
     """
     problems = []
     for path in sorted((*folder.glob("*" + SUFFIX), *folder.glob("*" + INDEX_SUFFIX))):
         is_file = stat.S_ISREG(path.lstat().st_mode)
         if not is_file or not os.access(path, os.R_OK):
             what = "it cannot be read" if is_file else "it is not a file"
-            problems.append(put_aside(path, DamagedFileError(what, where=str(path))))
+            problems.append(set_aside_and_describe(path, DamagedFileError(what, where=str(path))))
     return problems
 
 
-def unread_of(path: Path) -> Path:
+def make_unread_path(path: Path) -> Path:
     """Return a free path beside a segment for its unreadable bytes."""
     existing = {each.name for each in path.parent.iterdir()}
     names = (f"{path.stem}{f'.{n}' if n > 1 else ''}{UNREAD_SUFFIX}" for n in count(1))
     return path.with_name(next(name for name in names if name not in existing))
 
 
-def had_records(path: Path, schema: pa.Schema) -> bool:
+def has_indexed_batches(path: Path, schema: pa.Schema) -> bool:
     """Return whether the segment's index has or had batches; only the newest may lack its record.
 
     Raises:
@@ -165,11 +167,11 @@ def had_records(path: Path, schema: pa.Schema) -> bool:
     """
     if path.with_suffix(INDEX_SUFFIX).stat().st_size > 0:
         return True
-    _, begin = read_header(path)
-    return len(list(islice(messages_from(path, begin, schema), 2))) > 1
+    _, begin = read_schema_and_first_offset(path)
+    return len(list(islice(read_messages_from(path, begin, schema), 2))) > 1
 
 
-def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
+def recover_segment(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
     """Open an existing segment; return it and the numbers of its damaged frames.
 
     The segment is None, and deleted, if no batch in it is complete. Bytes without an index record
@@ -182,27 +184,27 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
     """
     size = path.stat().st_size
     damaged, doubtful = Intervals(), Intervals()
-    _, end = read_header(path)
+    _, end = read_schema_and_first_offset(path)
     try:
         index = read_index(path)
     except FileNotFoundError:
-        index = _rebuilt_index(path, end, schema)
+        index = _rebuild_index(path, end, schema)
     else:
-        batches = batches_in(index)
-        was_closed = is_closed(index) and len(batches) == len(index) - 1
-        if was_closed and len(batches) and end_of(batches) == size:
+        batches = select_batches(index)
+        was_closed = is_index_closed(index) and len(batches) == len(index) - 1
+        if was_closed and len(batches) and find_end_offset(batches) == size:
             segment = Segment(path)
-            segment.take_in(batches)
+            segment.register_records(batches)
             return segment, damaged
     good = []
     read: dict[int, EncodedBatch | None] = {}
     with path.open("rb") as file:
         for record in index:
-            if not is_whole(record) and end not in read:
-                read[end] = next(messages_from(path, end, schema), None)
-            found = _checked(file.fileno(), record, end, read.get(end))
-            if found is None and is_whole(record):
-                doubtful.add(*numbers(record))
+            if not is_record_valid(record) and end not in read:
+                read[end] = next(read_messages_from(path, end, schema), None)
+            found = _verify_record(file.fileno(), record, end, read.get(end))
+            if found is None and is_record_valid(record):
+                doubtful.add(*seq_range_of(record))
             elif found is not None:
                 # Damage followed by a good batch happened after writing; a damaged end of an
                 # unclosed file was never promised.
@@ -212,13 +214,13 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
                     end = max(end, int(found["offset"]) + int(found["length"]))
         if end < size:
             file.seek(end)
-            _set_aside(unread_of(path), file.read())
+            _write_all_or_none(make_unread_path(path), file.read())
     segment = Segment(path)
     if not good:
-        segment.delete()
+        segment.delete_files()
         return None, damaged
-    records = np.array(good, RECORD)
-    segment.take_in(records)
+    records = np.array(good, RECORD_DTYPE)
+    segment.register_records(records)
     os.truncate(path, end)
     # A killed process leaves frames that only the kernel has; from now on they are promised.
     with path.open("rb") as file:
@@ -227,7 +229,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
     return segment, damaged
 
 
-def _set_aside(path: Path, content: bytes) -> None:
+def _write_all_or_none(path: Path, content: bytes) -> None:
     """Write all bytes or no file: on a full disk recovery is retried again and again."""
     try:
         path.write_bytes(content)
@@ -238,24 +240,26 @@ def _set_aside(path: Path, content: bytes) -> None:
 
 def _write_index(path: Path, records: Records) -> None:
     """Replace a segment's index, marked as closed."""
-    content = records.tobytes() + closing_record()
-    write_whole(path.with_suffix(INDEX_SUFFIX), content)
+    content = records.tobytes() + make_closing_record()
+    write_atomically(path.with_suffix(INDEX_SUFFIX), content)
 
 
-def _checked(descriptor: int, record: Any, end: int, message: EncodedBatch | None) -> Any | None:
+def _verify_record(
+    descriptor: int, record: Any, end: int, message: EncodedBatch | None
+) -> Any | None:
     """Return the record if the batch's bytes match it, repaired if only the record is damaged."""
-    if is_whole(record):
-        is_right = not record["count"] or payload_of(descriptor, record) is not None
+    if is_record_valid(record):
+        is_right = not record["count"] or read_payload(descriptor, record) is not None
         return record if is_right else None
     if message is None or zlib.crc32(message.payload) != record["crc32"]:
         return None
-    return np.frombuffer(record_of(message, end), RECORD)[0]
+    return np.frombuffer(make_record(message, end), RECORD_DTYPE)[0]
 
 
-def _rebuilt_index(path: Path, begin: int, schema: pa.Schema) -> Records:
+def _rebuild_index(path: Path, begin: int, schema: pa.Schema) -> Records:
     records = bytearray()
     # Without a whole header no bytes after it can be trusted as a batch.
-    for message in messages_from(path, begin, schema) if begin else ():
-        records += record_of(message, begin)
+    for message in read_messages_from(path, begin, schema) if begin else ():
+        records += make_record(message, begin)
         begin += len(message.payload)
-    return np.frombuffer(bytes(records), RECORD)
+    return np.frombuffer(bytes(records), RECORD_DTYPE)

@@ -18,13 +18,13 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from devices.errors import FileFormatError
-from devices.facts import SEQ_END
-from storage.run import Run
-from storage.wire import EncodedBatch, decode
+from devices.types import SEQ_END
+from storage.message_batch import MessageBatch
+from storage.wire import EncodedBatch, decode_message
 
 INDEX_SUFFIX = ".idx"
 
-RECORD = np.dtype(
+RECORD_DTYPE = np.dtype(
     [
         ("seq_first", "<u8"),
         ("t_ns_first", "<i8"),
@@ -38,16 +38,16 @@ RECORD = np.dtype(
 )
 """Index record of one batch: `crc32` is of the batch's bytes, `check` of the record before it."""
 
-_CHECKED = RECORD.itemsize - 4
+_CHECKED_BYTES = RECORD_DTYPE.itemsize - 4
 _PACKED = struct.Struct("<QqqQIII")
 _OFFSET_END = 1 << 62
 
 Records = npt.NDArray[np.void]
 
 
-def record_of(message: EncodedBatch, offset: int) -> bytes:
+def make_record(message: EncodedBatch, offset: int) -> bytes:
     """Return the index record of a batch as bytes."""
-    return _sealed(
+    return _pack_with_checksum(
         message.seq_first,
         message.t_ns_first,
         message.t_ns_last,
@@ -58,45 +58,45 @@ def record_of(message: EncodedBatch, offset: int) -> bytes:
     )
 
 
-def closing_record() -> bytes:
+def make_closing_record() -> bytes:
     """Return the record that ends an index, as bytes."""
-    return _sealed(0, 0, 0, 0, 0, 0, 0)
+    return _pack_with_checksum(0, 0, 0, 0, 0, 0, 0)
 
 
-def numbers(record: Any) -> tuple[int, int]:
+def seq_range_of(record: Any) -> tuple[int, int]:
     """Return the first and last frame number of a record."""
     first = int(record["seq_first"])
     return first, first + int(record["count"]) - 1
 
 
-def is_whole(record: Any) -> bool:
+def is_record_valid(record: Any) -> bool:
     """Return whether the record's checksum is right, and its numbers are possible."""
-    is_checked = zlib.crc32(record.tobytes()[:_CHECKED]) == int(record["check"])
+    is_checked = zlib.crc32(record.tobytes()[:_CHECKED_BYTES]) == int(record["check"])
     return is_checked and int(record["seq_first"]) < SEQ_END and int(record["offset"]) < _OFFSET_END
 
 
-def are_whole(index: Records) -> npt.NDArray[np.bool_]:
-    """Return a mask of the records that `is_whole` accepts."""
+def mask_valid_records(index: Records) -> npt.NDArray[np.bool_]:
+    """Return a mask of the records that `is_record_valid` accepts."""
     content = memoryview(np.ascontiguousarray(index).tobytes())
-    begins = range(0, len(content), RECORD.itemsize)
-    checks = [zlib.crc32(content[at : at + _CHECKED]) for at in begins]
+    begins = range(0, len(content), RECORD_DTYPE.itemsize)
+    checks = [zlib.crc32(content[at : at + _CHECKED_BYTES]) for at in begins]
     found: npt.NDArray[np.bool_] = np.array(checks, np.uint32) == index["check"]
     return found & (index["seq_first"] < SEQ_END) & (index["offset"] < _OFFSET_END)
 
 
-def is_closed(index: Records) -> bool:
+def is_index_closed(index: Records) -> bool:
     """Return whether the index marks its segment as closed in order."""
-    return bool(len(index)) and is_whole(index[-1]) and not index[-1]["count"]
+    return bool(len(index)) and is_record_valid(index[-1]) and not index[-1]["count"]
 
 
-def batches_in(index: Records) -> Records:
+def select_batches(index: Records) -> Records:
     """Return the valid records with frames."""
-    return index[(index["count"] > 0) & are_whole(index)]
+    return index[(index["count"] > 0) & mask_valid_records(index)]
 
 
-def end_of(index: Records) -> int:
+def find_end_offset(records: Records) -> int:
     """Return the offset behind the last of some batches in the segment; 0 without any."""
-    return int((index["offset"] + index["length"]).max(initial=0))
+    return int((records["offset"] + records["length"]).max(initial=0))
 
 
 def read_index(path: Path) -> Records:
@@ -106,10 +106,10 @@ def read_index(path: Path) -> Records:
         OSError: there is none, or it cannot be read.
     """
     content = path.with_suffix(INDEX_SUFFIX).read_bytes()
-    return np.frombuffer(content, RECORD, len(content) // RECORD.itemsize)
+    return np.frombuffer(content, RECORD_DTYPE, len(content) // RECORD_DTYPE.itemsize)
 
 
-def read_header(path: Path) -> tuple[pa.Schema | None, int]:
+def read_schema_and_first_offset(path: Path) -> tuple[pa.Schema | None, int]:
     """Read a segment's schema and the offset of its first batch; None and 0 if it is cut off.
 
     Raises:
@@ -122,7 +122,7 @@ def read_header(path: Path) -> tuple[pa.Schema | None, int]:
             return None, 0
 
 
-def messages_from(path: Path, begin: int, schema: pa.Schema) -> Iterator[EncodedBatch]:
+def read_messages_from(path: Path, begin_offset: int, schema: pa.Schema) -> Iterator[EncodedBatch]:
     """Yield batches from an offset on, up to the first bytes that are not a complete batch.
 
     Raises:
@@ -131,17 +131,19 @@ def messages_from(path: Path, begin: int, schema: pa.Schema) -> Iterator[Encoded
     with pa.OSFile(str(path), "r") as file:
         while True:
             try:
-                file.seek(begin)
+                file.seek(begin_offset)
                 pa.ipc.read_message(file)
-                payload = file.read_at(file.tell() - begin, begin)  # type: ignore[call-arg]  # stubs
-                message = EncodedBatch.of(decode(payload, schema), payload)
+                payload = file.read_at(file.tell() - begin_offset, begin_offset)  # type: ignore[call-arg]  # stubs
+                message = EncodedBatch.from_frames_and_payload(
+                    decode_message(payload, schema), payload
+                )
             except (pa.ArrowException, EOFError, OSError, FileFormatError):
                 return
             yield message
-            begin += len(payload)
+            begin_offset += len(payload)
 
 
-def payload_of(descriptor: int, record: Any) -> bytes | None:
+def read_payload(descriptor: int, record: Any) -> bytes | None:
     """Read a batch's bytes from an open segment; None if their CRC-32 is wrong.
 
     Args:
@@ -156,7 +158,7 @@ def payload_of(descriptor: int, record: Any) -> bytes | None:
     return payload if whole else None
 
 
-def run_of(records: Records, content: bytes) -> Run:
+def make_message_batch(records: Records, content: bytes) -> MessageBatch:
     """Combine index records and bytes into a batch of messages to decode at once.
 
     Args:
@@ -164,10 +166,10 @@ def run_of(records: Records, content: bytes) -> Run:
         content: bytes of the batches, in the same order.
     """
     columns = (records[name] for name in ("length", "seq_first", "count", "crc32"))
-    return Run(content, *columns)
+    return MessageBatch(content, *columns)
 
 
-def _sealed(*values: int) -> bytes:
+def _pack_with_checksum(*values: int) -> bytes:
     # `struct` takes a tenth of the time of filling in an array of one record.
     content = _PACKED.pack(*values)
     return content + zlib.crc32(content).to_bytes(4, "little")

@@ -11,10 +11,15 @@ from typing import BinaryIO
 
 from devices.errors import StorageError
 from storage.journal.segment import Segment
-from storage.journal.segment_format import INDEX_SUFFIX, closing_record, end_of, record_of
+from storage.journal.segment_format import (
+    INDEX_SUFFIX,
+    find_end_offset,
+    make_closing_record,
+    make_record,
+)
 from storage.wire import EncodedBatch
 
-_WAITING_MAX_BYTES = 4 << 20
+_MAX_WAITING_BYTES = 4 << 20
 """Upper limit of bytes that wait in memory: beyond it the appending thread waits for the disk."""
 
 
@@ -24,18 +29,19 @@ class SegmentWriter:
     Args:
         path: the file, which must not exist.
         header: its schema message.
-        writes_later: appended batches wait in memory for `write` or `sync`, in any thread. Even to
-            query a file's end may wait until the disk has taken what another thread is syncing.
+        is_write_deferred: appended batches wait in memory for `write` or `sync`, in any thread.
+            Even to query a file's end may wait until the disk has taken what another thread is
+            syncing.
 
     Raises:
         OSError: it cannot be created; no file is left behind.
     """
 
-    def __init__(self, path: Path, header: bytes, *, writes_later: bool = False) -> None:
+    def __init__(self, path: Path, header: bytes, *, is_write_deferred: bool = False) -> None:
         self.segment = Segment(path)
-        self.has_news = True
+        self.has_unsynced = True
         """True if any appended batch is not synced."""
-        self._writes_later = writes_later
+        self._writes_later = is_write_deferred
         self._waiting: list[tuple[bytes, bytes]] = []
         self._writing = threading.Lock()
         self._end = self._written = len(header)
@@ -47,10 +53,10 @@ class SegmentWriter:
             path.unlink(missing_ok=True)
             raise
         try:
-            write_all(self._data, header)
+            write_all_or_none(self._data, header)
         except OSError:
-            self.abandon()
-            self.segment.delete()
+            self.close_without_sync()
+            self.segment.delete_files()
             raise
 
     def append(self, message: EncodedBatch) -> None:
@@ -59,18 +65,18 @@ class SegmentWriter:
         Raises:
             OSError: the disk is full or refuses it.
         """
-        record = record_of(message, self._end)
-        if self._writes_later and self._end - self._written < _WAITING_MAX_BYTES:
+        record = make_record(message, self._end)
+        if self._writes_later and self._end - self._written < _MAX_WAITING_BYTES:
             self._waiting.append((message.payload, record))
         else:
             with self._writing:
                 self._write_waiting()
-                self._put(message.payload, record)
+                self._write_bytes(message.payload, record)
         self._end += len(message.payload)
-        self.has_news = True
-        self.segment.note(message)
+        self.has_unsynced = True
+        self.segment.register_message(message)
 
-    def write(self) -> None:
+    def write_waiting(self) -> None:
         """Return when all earlier batches are in the files.
 
         Raises:
@@ -85,9 +91,9 @@ class SegmentWriter:
         Raises:
             OSError: the disk failed; the segment's content on disk is unknown then.
         """
-        self.has_news = False
+        self.has_unsynced = False
         try:
-            self.write()
+            self.write_waiting()
             os.fsync(self._data.fileno())
             os.fsync(self._index.fileno())
             # A file that was moved or deleted accepts writes, too, but under another name or none.
@@ -95,7 +101,7 @@ class SegmentWriter:
             if (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino):
                 raise FileNotFoundError(errno.ENOENT, "another file is in its place")
         except OSError:
-            self.has_news = True
+            self.has_unsynced = True
             raise
 
     def close(self) -> None:
@@ -106,27 +112,27 @@ class SegmentWriter:
         """
         try:
             self.sync()
-            if self.segment.is_doubtful:
-                self._forget_doubtful()
+            if self.segment.has_invalidated_frames:
+                self._drop_invalidated()
                 return
             with suppress(OSError):  # without it the batches are checked at the next open
-                write_all(self._index, closing_record())
+                write_all_or_none(self._index, make_closing_record())
                 os.fsync(self._index.fileno())
         finally:
-            self.abandon()
+            self.close_without_sync()
 
-    def _forget_doubtful(self) -> None:
+    def _drop_invalidated(self) -> None:
         """Remove invalidated batches: they were written again elsewhere."""
         with suppress(OSError, StorageError):
-            records = self.segment.records()
+            records = self.segment.read_records()
             if not len(records):
-                self.segment.delete()
+                self.segment.delete_files()
                 return
-            self._data.truncate(end_of(records))
+            self._data.truncate(find_end_offset(records))
             os.fsync(self._data.fileno())
             self.segment.rewrite_index()
 
-    def abandon(self) -> None:
+    def close_without_sync(self) -> None:
         """Close the files without a sync."""
         self._data.close()
         self._index.close()
@@ -134,16 +140,16 @@ class SegmentWriter:
     def _write_waiting(self) -> None:
         waiting = self._waiting[:]  # more may be appended meanwhile
         if waiting:
-            self._put(
+            self._write_bytes(
                 b"".join(data for data, _ in waiting), b"".join(index for _, index in waiting)
             )
             del self._waiting[: len(waiting)]
 
-    def _put(self, data: bytes, records: bytes) -> None:
+    def _write_bytes(self, data: bytes, records: bytes) -> None:
         self._data.seek(self._written)
-        write_all(self._data, data)
+        write_all_or_none(self._data, data)
         try:
-            write_all(self._index, records)
+            write_all_or_none(self._index, records)
         except OSError:
             with suppress(OSError):
                 self._data.truncate(self._written)
@@ -151,7 +157,7 @@ class SegmentWriter:
         self._written += len(data)
 
 
-def write_all(file: BinaryIO, data: bytes) -> None:
+def write_all_or_none(file: BinaryIO, data: bytes) -> None:
     """Write all of `data`, or leave the file at its old length."""
     begin = file.tell()
     view = memoryview(data)

@@ -9,25 +9,25 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
-from storage.checked_json import read_checked, write_checked
-from storage.durable import put_aside
-from storage.intervals import AsPairs
+from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.durable_files import set_aside_and_describe
+from storage.intervals import LossPairs
 
 NOTES_FILE = "stream.json"
-PROMISE_S = 0.5
+MAX_UNSYNCED_S = 0.5
 """Upper limit of the time that a node's frame is unsynced, unless its disk is slower."""
 _BATCH_S = 0.033
 """Longest batch of a node."""
 
 
-def unsynced_tail_max(rate_hz: float, waited_s: float = 0.0) -> int:
+def compute_max_lost_tail_frames(rate_hz: float, waited_s: float = 0.0) -> int:
     """Compute how many frames a power cut loses at most: waiting frames and one batch.
 
     Args:
         rate_hz: frame rate of the stream.
         waited_s: longest time that frames have waited for the disk.
     """
-    return math.ceil(rate_hz * max(PROMISE_S, waited_s)) + math.ceil(rate_hz * _BATCH_S)
+    return math.ceil(rate_hz * max(MAX_UNSYNCED_S, waited_s)) + math.ceil(rate_hz * _BATCH_S)
 
 
 class StreamNotes(BaseModel):
@@ -42,13 +42,13 @@ class StreamNotes(BaseModel):
     """Kernel's boot id while it was acquired; None if unknown."""
     next_seq: int | None = None
     """Number after its last frame; None while it runs, or if unknown."""
-    unsynced_tail_max: int = 0
+    max_lost_tail_frames: int = 0
     """Upper limit of further frames, lost if the end was not recorded."""
     missed_slots: int = 0
     """Slots without a frame; they never had a number."""
     sync_max_s: float = 0.0
     """Longest time that frames waited for the disk."""
-    lost: AsPairs = Field(default_factory=dict)
+    lost: LossPairs = Field(default_factory=dict)
     damaged: tuple[tuple[int, int], ...] = ()
     """Unreadable numbers on a server; the node may send them once more."""
 
@@ -63,16 +63,16 @@ class StreamNotes(BaseModel):
         Raises:
             StorageError: the disk is full or not writable.
         """
-        write_checked(folder / NOTES_FILE, self.model_dump_json(indent=1).encode())
+        write_checksummed_json(folder / NOTES_FILE, self.model_dump_json(indent=1).encode())
 
     @classmethod
     def load(cls, folder: Path) -> StreamNotes | None:
-        """Read `stream.json`; None if there is none. Raises as `load_checked`."""
-        notes, _ = cls.load_checked(folder)
+        """Read `stream.json`; None if there is none. Raises as `load_with_proof`."""
+        notes, _ = cls.load_with_proof(folder)
         return notes
 
     @classmethod
-    def load_checked(cls, folder: Path) -> tuple[StreamNotes | None, bool]:
+    def load_with_proof(cls, folder: Path) -> tuple[StreamNotes | None, bool]:
         """Read `stream.json`; also return whether a checksum proves it (not in older versions).
 
         Raises:
@@ -82,14 +82,14 @@ class StreamNotes(BaseModel):
         """
         path = folder / NOTES_FILE
         try:
-            read = read_checked(path)
+            read = read_checksummed_json(path)
         except FileNotFoundError:
             return None, True
         try:
-            return cls.model_validate_json(read.text), read.is_proven
+            return cls.model_validate_json(read.text), read.has_checksum
         except ValidationError as error:
             what = f"not a stream's notes: {' '.join(str(error).split())[:300]}"
-            if not read.is_proven:
+            if not read.has_checksum:
                 raise DamagedFileError(what, where=str(path)) from error
             # An unknown field is not dropped silently: it may bound the losses.
             raise FileFormatError(
@@ -99,7 +99,7 @@ class StreamNotes(BaseModel):
             ) from error
 
     @classmethod
-    def load_whole(cls, folder: Path, problems: list[str]) -> StreamNotes | None:
+    def load_or_set_aside(cls, folder: Path, problems: list[str]) -> StreamNotes | None:
         """Read `stream.json`; set a damaged one aside and return None.
 
         Args:
@@ -113,5 +113,5 @@ class StreamNotes(BaseModel):
         try:
             return cls.load(folder)
         except DamagedFileError as error:
-            problems.append(put_aside(folder / NOTES_FILE, error))
+            problems.append(set_aside_and_describe(folder / NOTES_FILE, error))
             return None

@@ -19,12 +19,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from devices.errors import DamagedFileError, StorageError, UnknownError
-from storage.checked_json import read_checked
-from storage.checked_table import read_table, write_table
-from storage.durable import open_own
+from storage.checksummed_json import read_checksummed_json
+from storage.durable_files import open_regular_file
+from storage.hashed_table import read_hashed_table, write_hashed_table
 from storage.schema import Column
 
-COMPARISONS = "comparisons"
+COMPARISONS_FOLDER = "comparisons"
 """Folder in a session's folder with a subfolder for each reference."""
 REPORT_NAME = "compare.json"
 SERIES_NAME = "series.parquet"
@@ -32,10 +32,10 @@ SERIES_NAME = "series.parquet"
 _F32 = pa.float32()
 _GROUP_ROWS = 1 << 16
 """Rows of a row group: two minutes."""
-ROWS_MAX = 2_500_000
-"""Most rows of a series: a longer one would not be read at once (`BYTES_MAX`)."""
+MAX_SERIES_ROWS = 2_500_000
+"""Most rows of a series: a longer one would not be read at once (`MAX_READ_BYTES`)."""
 
-SERIES = (
+SERIES_COLUMNS = (
     Column("t_ns", pa.int64(), "ns", "of our frame, on the session's time axis"),
     Column("grf_n", _F32, "N", "ours"),
     Column("reference_grf_n", _F32, "N", "of the reference at our frame; less its zero if asked"),
@@ -44,35 +44,38 @@ SERIES = (
 )
 """Columns of a series: our frames with a reference value, in the order of time."""
 
-SCHEMA = pa.schema(
-    [column.field(column.name, column.type, nullable=column.type == _F32) for column in SERIES]
+SERIES_SCHEMA = pa.schema(
+    [
+        column.make_field(column.name, column.type, nullable=column.type == _F32)
+        for column in SERIES_COLUMNS
+    ]
 )
 
 
 @dataclass(frozen=True)
-class Report:
+class ComparisonReport:
     """Content of `compare.json`.
 
     Attributes:
         content: by name (docs/compare.md).
-        is_proven: True: it has a checksum, which is right.
+        has_checksum: True: it has a checksum, which is right.
     """
 
     content: dict[str, Any]
-    is_proven: bool
+    has_checksum: bool
 
 
-def comparisons_of(session: Path) -> dict[str, Path]:
+def find_comparison_folders(session_folder: Path) -> dict[str, Path]:
     """List a session's comparison folders by the reference's name, sorted.
 
     Args:
-        session: folder of the session.
+        session_folder: folder of the session.
 
     Raises:
         StorageError: it cannot be read now.
     """
     try:
-        found = sorted((session / COMPARISONS).iterdir())
+        found = sorted((session_folder / COMPARISONS_FOLDER).iterdir())
         # A link may lead out of the session's folder.
         return {path.name: path for path in found if path.is_dir() and not path.is_symlink()}
     except (FileNotFoundError, NotADirectoryError):
@@ -80,19 +83,19 @@ def comparisons_of(session: Path) -> dict[str, Path]:
     except OSError as error:
         raise StorageError(
             f"cannot be read: {error.strerror}",
-            where=str(session / COMPARISONS),
+            where=str(session_folder / COMPARISONS_FOLDER),
             errno=error.errno,
         ) from error
 
 
-def comparison_of(session: Path, name: str) -> Path:
+def find_comparison_folder(session_folder: Path, name: str) -> Path:
     """Find the folder of one comparison.
 
     Raises:
         UnknownError: there is none of this name.
         StorageError: it cannot be read now.
     """
-    found = comparisons_of(session)
+    found = find_comparison_folders(session_folder)
     if name not in found:
         raise UnknownError(
             f"the session was not compared with {name!r}",
@@ -102,7 +105,7 @@ def comparison_of(session: Path, name: str) -> Path:
     return found[name]
 
 
-def read_report(folder: Path) -> Report:
+def read_comparison_report(folder: Path) -> ComparisonReport:
     """Read the report of a comparison and verify its checksum.
 
     Raises:
@@ -111,7 +114,7 @@ def read_report(folder: Path) -> Report:
     """
     path = folder / REPORT_NAME
     try:
-        read = read_checked(path)
+        read = read_checksummed_json(path)
     except FileNotFoundError as error:
         raise DamagedFileError("the comparison has no report", where=str(path)) from error
     content = json.loads(read.text)
@@ -125,7 +128,7 @@ def read_report(folder: Path) -> Report:
             expected=", ".join(wanted),
             remedy="Compare again",
         )
-    return Report(content, read.is_proven)
+    return ComparisonReport(content, read.has_checksum)
 
 
 def write_series(path: Path, table: pa.Table) -> None:
@@ -133,12 +136,12 @@ def write_series(path: Path, table: pa.Table) -> None:
 
     Args:
         path: the file.
-        table: of `SCHEMA`.
+        table: of `SERIES_SCHEMA`.
 
     Raises:
         StorageError: the disk is full or not writable.
     """
-    write_table(path, table, group_rows=_GROUP_ROWS)
+    write_hashed_table(path, table, max_group_rows=_GROUP_ROWS)
 
 
 def read_series(folder: Path) -> pa.Table | None:
@@ -150,31 +153,34 @@ def read_series(folder: Path) -> pa.Table | None:
     """
     path = folder / SERIES_NAME
     try:
-        read = read_table(path)
+        read = read_hashed_table(path)
     except FileNotFoundError:
         return None
-    if not read.is_proven or not read.table.schema.remove_metadata().equals(SCHEMA):
+    if not read.has_hash or not read.table.schema.remove_metadata().equals(SERIES_SCHEMA):
         raise DamagedFileError(
             "is no series of a comparison",
             where=str(path),
-            expected="columns " + ", ".join(SCHEMA.names) + ", with a hash",
+            expected="columns " + ", ".join(SERIES_SCHEMA.names) + ", with a hash",
             remedy="Compare again",
         )
     return read.table
 
 
-def series_footer(folder: Path) -> pq.FileMetaData:
+def read_series_footer(folder: Path) -> pq.FileMetaData:
     """Read the footer of a series that `read_series` has verified just now.
 
     Raises:
         DamagedFileError: it cannot be read as Parquet any more.
         StorageError: it cannot be read now.
     """
-    with open_own(folder / SERIES_NAME) as content, _damage(folder / SERIES_NAME):
+    with (
+        open_regular_file(folder / SERIES_NAME) as content,
+        _translate_damage(folder / SERIES_NAME),
+    ):
         return pq.read_metadata(content)
 
 
-def series_within(
+def read_series_range(
     folder: Path, footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None
 ) -> pa.Table:
     """Read a time range of a series: only its row groups, with their page checksums.
@@ -194,14 +200,19 @@ def series_within(
         where &= pc.field("t_ns") >= begin_ns
     if end_ns is not None:
         where &= pc.field("t_ns") < end_ns
-    with open_own(folder / SERIES_NAME) as content, _damage(folder / SERIES_NAME):
+    with (
+        open_regular_file(folder / SERIES_NAME) as content,
+        _translate_damage(folder / SERIES_NAME),
+    ):
         options: dict[str, Any] = {"metadata": footer, "page_checksum_verification": True}
         with pq.ParquetFile(content, **options) as file:
-            groups = _groups_within(footer, begin_ns, end_ns)
+            groups = _find_row_groups(footer, begin_ns, end_ns)
             return file.read_row_groups(groups, use_threads=False).filter(where)
 
 
-def _groups_within(footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None) -> list[int]:
+def _find_row_groups(
+    footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None
+) -> list[int]:
     found = []
     for group in range(footer.num_row_groups):
         statistics: Any = footer.row_group(group).column(0).statistics
@@ -212,7 +223,7 @@ def _groups_within(footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | 
 
 
 @contextmanager
-def _damage(path: Path) -> Iterator[None]:
+def _translate_damage(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # damaged bytes may cause any error

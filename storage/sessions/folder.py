@@ -1,7 +1,7 @@
 """Models of a recorded session, and the folder of all sessions.
 
 A session has a folder `<sessions>/<id>/` with `session.json`, replaced atomically at every change,
-and, once it is sealed, `frames.parquet`, `events.parquet` and `clock.parquet`.
+and, once it is sealed, `frames.parquet`, `markers.parquet` and `clock.parquet`.
 """
 
 from __future__ import annotations
@@ -24,15 +24,20 @@ from devices.errors import (
     StorageError,
     UnknownError,
 )
-from storage.checked_json import read_checked, write_checked
+from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from storage.clock.log import ClockOffset
-from storage.durable import ASIDE, make_folder, storage_errors, sync_folder
+from storage.durable_files import (
+    ASIDE_SUFFIX,
+    make_synced_folder,
+    sync_folder,
+    translate_storage_errors,
+)
 
 FRAMES_NAME = "frames.parquet"
-DOOMED_PREFIX = ".deleted-"
+DELETED_PREFIX = ".deleted-"
 SESSION_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
-State = Literal["recording", "pending", "sealing", "sealed"]
+SessionState = Literal["recording", "pending", "sealing", "sealed"]
 Completeness = bool | Literal["lossy"]
 """True: all frames are stored; False: some may still come; "lossy": some will not."""
 
@@ -44,7 +49,7 @@ class _Record(BaseModel):
 class Part(_Record):
     """Interval of one stream, both ends included; `seq_last` is None during the recording."""
 
-    boot_id: str
+    stream_id: str
     seq_first: int
     seq_last: int | None = None
 
@@ -52,13 +57,13 @@ class Part(_Record):
 class PartLedger(_Record):
     """Counts of a part's numbers, each once: recorded, lost for a reason, or pending."""
 
-    boot_id: str
+    stream_id: str
     seq_first: int
     seq_last: int
     recorded: int
     lost: dict[str, int]
     pending: int
-    unsynced_tail_max: int = 0
+    max_lost_tail_frames: int = 0
     """Upper limit of further frames when the node stopped unexpectedly."""
 
 
@@ -92,12 +97,12 @@ class Ledger(_Record):
         return dict(sum((Counter(part.lost) for part in self.parts), Counter()))
 
     @property
-    def unsynced_tail_max(self) -> int:
+    def max_lost_tail_frames(self) -> int:
         """Upper limit of further frames behind unexpected ends of parts."""
-        return sum(part.unsynced_tail_max for part in self.parts)
+        return sum(part.max_lost_tail_frames for part in self.parts)
 
 
-class Event(_Record):
+class Marker(_Record):
     """Marker that a person set."""
 
     id: str
@@ -106,7 +111,7 @@ class Event(_Record):
     """Instant in the server's UTC."""
 
 
-class Asked(_Record):
+class IdempotencyRecord(_Record):
     """Idempotency key and request that started a recording, both as digests.
 
     The record is stored with the session: a repeated request returns that session and starts no
@@ -123,7 +128,7 @@ class Session(_Record):
     id: str
     name: str
     node: str
-    state: State
+    state: SessionState
     started_t_ns: int
     """Start in the server's UTC."""
     stopped_t_ns: int | None = None
@@ -138,18 +143,18 @@ class Session(_Record):
     """Calibration at the start; a later one does not change a recording."""
     calibration_source: Literal["node", "server"] = "node"
     """Origin of the calibration: the node itself, or an assignment on the server."""
-    events: tuple[Event, ...] = ()
+    markers: tuple[Marker, ...] = ()
     clock: tuple[ClockOffset, ...] = ()
     missed_slots_at_start: int = 0
     missed_slots_at_stop: dict[str, int] = Field(default_factory=dict)
     """Count by stream_id, of the stream at the stop, if the node was connected."""
-    unsynced_tail_max: dict[str, int] = Field(default_factory=dict)
+    max_lost_tail_frames: dict[str, int] = Field(default_factory=dict)
     """Count by stream_id, of parts that ended because the node went away."""
     given_up: bool = False
     """True: a person has given up the pending frames."""
     take: str | None = None
     """Id of the take that it was recorded in together with other nodes."""
-    asked: Asked | None = None
+    asked: IdempotencyRecord | None = None
     """Record of the request that started it, if that had an `Idempotency-Key`."""
     continues: str | None = None
     """Id of the session that this one continues, with other tiles."""
@@ -164,15 +169,15 @@ class Session(_Record):
     calibration_id: str | None = None
     absolute_scale: Literal["measured", "assumed"] | None = None
 
-    def with_clock(self, rows: Iterable[ClockOffset]) -> Session:
+    def with_clock_rows(self, rows: Iterable[ClockOffset]) -> Session:
         """Return the session with newer clock measurements of one of its streams."""
         sorted_rows = sorted(self.clock, key=lambda row: row.t_mono_ns)
-        newest = {row.boot_id: row.t_mono_ns for row in sorted_rows}
-        further = [row for row in rows if row.t_mono_ns > newest.get(row.boot_id, -1)]
+        newest = {row.stream_id: row.t_mono_ns for row in sorted_rows}
+        further = [row for row in rows if row.t_mono_ns > newest.get(row.stream_id, -1)]
         return self.model_copy(update={"clock": (*self.clock, *further)})
 
 
-def new_session_id(now: datetime) -> str:
+def make_session_id(now: datetime) -> str:
     """Return an id that sorts by time and is the name of its folder."""
     return f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
 
@@ -192,13 +197,13 @@ class StraySession:
     may_need_frames: bool
 
 
-class SessionFolder:
+class SessionsFolder:
     """Folder of all sessions, or of those in the trash."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def path(self, session_id: str) -> Path:
+    def get_path(self, session_id: str) -> Path:
         """Return the folder of a session.
 
         Raises:
@@ -214,13 +219,13 @@ class SessionFolder:
         Raises:
             StorageError: the disk is full or not writable; the old file is unchanged.
         """
-        folder = self.path(session.id)
+        folder = self.get_path(session.id)
         is_new = not folder.exists()
         text = session.model_dump_json(indent=1).encode()
         try:
-            with storage_errors(folder):
-                make_folder(folder)
-            write_checked(folder / "session.json", text)
+            with translate_storage_errors(folder):
+                make_synced_folder(folder)
+            write_checksummed_json(folder / "session.json", text)
         except StorageError:
             if is_new:  # a full disk still accepts an empty folder, and perhaps a file's name
                 shutil.rmtree(folder, ignore_errors=True)
@@ -234,51 +239,53 @@ class SessionFolder:
             FileFormatError: it is damaged.
             StorageError: it cannot be read now.
         """
-        path = self.path(session_id) / "session.json"
+        path = self.get_path(session_id) / "session.json"
         try:
-            session = Session.model_validate_json(read_checked(path).text)
+            session = Session.model_validate_json(read_checksummed_json(path).text)
         except FileNotFoundError as error:
             raise UnknownError(f"no session {session_id!r}") from error
         except ValidationError as error:
             raise FileFormatError(f"not a session: {error}", where=str(path)) from error
         if session.id != session_id:
-            raise self._stray(path.parent, session.id)
+            raise self._make_stray_error(path.parent, session.id)
         return session
 
     def load_all(self) -> tuple[list[Session], dict[str, FootTileError]]:
         """Load all sessions, newest first, and errors by id of unreadable ones."""
         found, unreadable = [], {}
-        for session_id in self.ids():
+        for session_id in self.list_ids():
             try:
                 found.append(self.load(session_id))
             except FootTileError as error:
                 unreadable[session_id] = error
         return found, unreadable
 
-    def strays(self) -> list[StraySession]:
+    def find_strays(self) -> list[StraySession]:
         """Find sessions in folders without a session's name; they are not moved."""
         found: list[StraySession] = []
         if not self._folder.is_dir():
             return found
         for path in sorted(self._folder.iterdir()):
             is_named = SESSION_ID.fullmatch(path.name) or path.name.startswith(".")
-            if is_named or ASIDE in path.name or not path.is_dir():
+            if is_named or ASIDE_SUFFIX in path.name or not path.is_dir():
                 continue
             try:
-                session = Session.model_validate_json(read_checked(path / "session.json").text)
+                session = Session.model_validate_json(
+                    read_checksummed_json(path / "session.json").text
+                )
             except FileNotFoundError:
                 if (path / FRAMES_NAME).is_file():
-                    found.append(StraySession(path.name, self._stray(path, None), True))
+                    found.append(StraySession(path.name, self._make_stray_error(path, None), True))
             except (FootTileError, ValidationError):
-                found.append(StraySession(path.name, self._stray(path, None), True))
+                found.append(StraySession(path.name, self._make_stray_error(path, None), True))
             else:
                 is_copy = (self._folder / session.id).is_dir()
                 needs_frames = session.state != "sealed" and not is_copy
-                error = self._stray(path, session.id)
+                error = self._make_stray_error(path, session.id)
                 found.append(StraySession(path.name, error, needs_frames))
         return found
 
-    def _stray(self, path: Path, session_id: str | None) -> FileFormatError:
+    def _make_stray_error(self, path: Path, session_id: str | None) -> FileFormatError:
         if session_id is None:
             return FileFormatError(
                 "its folder was renamed, and its session.json cannot be read",
@@ -300,23 +307,23 @@ class SessionFolder:
             remedy=f"Rename it to {session_id}",
         )
 
-    def move(self, session_id: str, to: SessionFolder) -> None:
+    def move_to(self, session_id: str, destination: SessionsFolder) -> None:
         """Move a session's folder to `to`, atomically.
 
         Raises:
             UnknownError: there is no such session.
             StorageError: it cannot be moved, and is where it was.
         """
-        source, target = self.path(session_id), to.path(session_id)
+        source, target = self.get_path(session_id), destination.get_path(session_id)
         if not source.is_dir():
             raise UnknownError(f"no session {session_id!r}")
-        with storage_errors(target):
-            make_folder(target.parent)
+        with translate_storage_errors(target):
+            make_synced_folder(target.parent)
             source.rename(target)
             sync_folder(target.parent)
             sync_folder(source.parent)
 
-    def doom(self, session_id: str) -> Path:
+    def rename_for_deletion(self, session_id: str) -> Path:
         """Rename a session's folder for deletion, so that it is no session any more.
 
         Returns:
@@ -326,28 +333,28 @@ class SessionFolder:
             UnknownError: there is no such session.
             StorageError: it cannot be renamed; the session is unchanged.
         """
-        folder = self.path(session_id)
+        folder = self.get_path(session_id)
         if not folder.is_dir():
             raise UnknownError(f"no session {session_id!r}")
         # A half-deleted folder must not look like a session.
-        doomed = folder.with_name(DOOMED_PREFIX + session_id)
-        with storage_errors(folder):
+        doomed = folder.with_name(DELETED_PREFIX + session_id)
+        with translate_storage_errors(folder):
             folder.rename(doomed)
             sync_folder(self._folder)
         return doomed
 
-    def ids(self) -> Iterator[str]:
+    def list_ids(self) -> Iterator[str]:
         """Yield the ids of all sessions, newest first."""
         if self._folder.is_dir():
             names = [
                 path.name
                 for path in self._folder.iterdir()
-                if SESSION_ID.fullmatch(path.name) and not _holds_nothing(path)
+                if SESSION_ID.fullmatch(path.name) and not _has_no_complete_file(path)
             ]
             yield from sorted(names, reverse=True)
 
 
-def _holds_nothing(folder: Path) -> bool:
+def _has_no_complete_file(folder: Path) -> bool:
     """Return whether the folder has no complete file: its session was never created."""
     try:
         return all(path.match(".*.tmp") for path in folder.iterdir())

@@ -1,7 +1,7 @@
 """Footer of a sealed session: array, notes, content, and column positions.
 
 Reading it takes time with the number of row groups and columns, and it never changes. So a server
-caches it (`storage.sessions.checked_files`).
+caches it (`storage.sessions.verified_file_cache`).
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from devices.errors import FileFormatError
-from devices.inputs import check_file
-from storage.file_hash import (
+from devices.input_files import check_regular_file
+from storage.parquet_hash import (
     FORMAT,
     FORMAT_KEY,
     FORMAT_WITHOUT_HASH,
-    check_footer,
-    check_hash,
-    file_hashes,
-    footer_hashes,
-    footer_in,
+    check_file_hash,
+    check_footer_hash,
+    footer_stated_and_actual_hash,
     read_footer,
+    read_footer_from,
+    read_stated_and_actual_hash,
 )
-from storage.schema import ARRAY_INFO_KEY, array_info
-from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, content_hash
+from storage.schema import ARRAY_INFO_KEY, read_array_info
+from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, compute_content_hash
 from storage.sessions.time_axis import TimeAxis
 
 NOTES_KEY = b"foottile.notes"
 _MAGIC = b"PAR1"
-Stamps = tuple[int, ...]
+FileStamps = tuple[int, ...]
 
 
-class Footer:
+class SealedFileFooter:
     """Parsed footer of a sealed file, with values that are computed from the file only once.
 
     Attributes:
@@ -50,17 +50,17 @@ class Footer:
         column_names: names of the flat columns.
         frame_count: rows.
         size_bytes: length of the footer.
-        is_proven: True: the footer's own hash is right.
-        is_whole: True: the file's hash is right.
+        is_footer_verified: True: the footer's own hash is right.
+        is_file_verified: True: the file's hash is right.
         span_ns: first and last instant on the session's time axis; None: not computed yet.
-        axis: time axis of the session; None: not computed yet.
+        time_axis: time axis of the session; None: not computed yet.
     """
 
     def __init__(
         self,
         path: Path,
         *,
-        is_checked: bool = False,
+        skip_verification: bool = False,
         only_slices: bool = False,
         file: BinaryIO | None = None,
     ) -> None:
@@ -68,8 +68,8 @@ class Footer:
 
         Args:
             path: the file.
-            is_checked: skip the hashes: the file was verified already, or shall not be.
-            only_slices: as for `prove`.
+            skip_verification: skip the hashes: the file was verified already, or shall not be.
+            only_slices: as for `verify_unless_done`.
             file: the open file, if it is not on this machine: then the footer must have its own
                 hash.
 
@@ -79,8 +79,8 @@ class Footer:
         self._where = where = str(path)
         try:
             if file is None:
-                check_file(path)
-            footer = read_footer(path) if file is None else footer_in(file)
+                check_regular_file(path)
+            footer = read_footer(path) if file is None else read_footer_from(file)
             length = len(footer).to_bytes(4, "little")
             # The parsed bytes are the same that are verified against the hash.
             self.metadata = pq.read_metadata(
@@ -92,28 +92,28 @@ class Footer:
                 f"cannot be read as Parquet: {error}", where=where, expected="a sealed session"
             ) from error
         self.size_bytes = len(footer)
-        hashes = None if is_checked else footer_hashes(footer)
+        hashes = None if skip_verification else footer_stated_and_actual_hash(footer)
         if hashes is not None:
-            check_footer(hashes, where=where)
-        self.is_proven = hashes is not None
-        self.is_whole = False
-        self.said: Mapping[bytes, bytes] = schema.metadata or {}
-        self.format = self._format()
-        if file is not None and not self.is_proven:
+            check_footer_hash(hashes, where=where)
+        self.is_footer_verified = hashes is not None
+        self.is_file_verified = False
+        self.schema_metadata: Mapping[bytes, bytes] = schema.metadata or {}
+        self.format = self._read_format()
+        if file is not None and not self.is_footer_verified:
             raise FileFormatError(
                 "its footer has no hash of its own: an older version wrote it",
                 where=where,
                 remedy="Copy the session to this machine",
             )
-        if not is_checked and file is None:
-            self.prove(path, only_slices=only_slices)
-        self.info = array_info(schema, where=where)
-        self.notes = _notes(self.said.get(NOTES_KEY), where=where)
-        self.content_sha256, self.content = self._content()
+        if not skip_verification and file is None:
+            self.verify_unless_done(path, only_slices=only_slices)
+        self.info = read_array_info(schema, where=where)
+        self.notes = _parse_notes(self.schema_metadata.get(NOTES_KEY), where=where)
+        self.content_sha256, self.content = self._read_content()
         self.schema = schema
         self.column_names = frozenset(schema.names)
         tiles = len(self.info.tiles)
-        if f"padc_{tiles}" in schema.names:
+        if f"pressure_raw_{tiles}" in schema.names:
             raise FileFormatError(
                 f"it describes {tiles} tiles and has columns of more", where=where
             )
@@ -121,10 +121,10 @@ class Footer:
         if not self.frame_count:
             raise FileFormatError("the session has no frames", where=where)
         self.span_ns: tuple[int, int] | None = None
-        self.axis: TimeAxis | None = None
-        self._extremes: dict[str, list[tuple[int, int] | None]] = {}
+        self.time_axis: TimeAxis | None = None
+        self._min_max_cache: dict[str, list[tuple[int, int] | None]] = {}
 
-    def prove(self, path: Path, *, only_slices: bool) -> None:
+    def verify_unless_done(self, path: Path, *, only_slices: bool) -> None:
         """Verify the file against its hash, unless that was done.
 
         Args:
@@ -136,30 +136,32 @@ class Footer:
         Raises:
             FileFormatError: it is damaged.
         """
-        if self.is_whole or (only_slices and self.is_proven):
+        if self.is_file_verified or (only_slices and self.is_footer_verified):
             return
         try:
-            hashes = file_hashes(path)
+            hashes = read_stated_and_actual_hash(path)
         except OSError as error:
             raise FileFormatError(f"cannot be read: {error}", where=self._where) from error
-        check_hash(hashes, self.said, where=self._where)
-        self.is_whole = True
+        check_file_hash(hashes, self.schema_metadata, where=self._where)
+        self.is_file_verified = True
 
     @cached_property
-    def group_rows(self) -> list[int]:
+    def rows_by_group(self) -> list[int]:
         """Number of rows of every row group."""
         return [self.metadata.row_group(i).num_rows for i in range(self.metadata.num_row_groups)]
 
-    def extremes(self, name: str) -> list[tuple[int, int] | None]:
+    def read_min_max_by_row_group(self, name: str) -> list[tuple[int, int] | None]:
         """Return minimum and maximum of an integer column in every row group.
 
         None without statistics, and for a missing column.
         """
-        if name not in self._extremes:
-            self._extremes[name] = [self._extreme(name, i) for i in range(len(self.group_rows))]
-        return self._extremes[name]
+        if name not in self._min_max_cache:
+            self._min_max_cache[name] = [
+                self._read_min_max(name, i) for i in range(len(self.rows_by_group))
+            ]
+        return self._min_max_cache[name]
 
-    def _extreme(self, name: str, group: int) -> tuple[int, int] | None:
+    def _read_min_max(self, name: str, group: int) -> tuple[int, int] | None:
         if name not in self.column_names:
             return None
         column = self.metadata.row_group(group).column(self.schema.get_field_index(name))
@@ -168,8 +170,8 @@ class Footer:
             return None
         return statistics.min, statistics.max
 
-    def _format(self) -> bytes:
-        version = self.said.get(FORMAT_KEY)
+    def _read_format(self) -> bytes:
+        version = self.schema_metadata.get(FORMAT_KEY)
         if version not in (FORMAT, FORMAT_WITHOUT_HASH):
             raise FileFormatError(
                 f"its format is {version!r}" if version else "it states no format",
@@ -179,13 +181,15 @@ class Footer:
             )
         return version
 
-    def _content(self) -> tuple[str | None, dict[str, Any] | None]:
+    def _read_content(self) -> tuple[str | None, dict[str, Any] | None]:
         """Return the content's hash and description; None if another program wrote it last."""
         metadata = self.metadata.metadata or {}
         content, stated = metadata.get(CONTENT_KEY), metadata.get(CONTENT_HASH_KEY)
         if content is None or stated is None:
             return None, None
-        found = content_hash(self.said[ARRAY_INFO_KEY], self.said[NOTES_KEY], content)
+        found = compute_content_hash(
+            self.schema_metadata[ARRAY_INFO_KEY], self.schema_metadata[NOTES_KEY], content
+        )
         if found.encode() != stated:
             raise FileFormatError(
                 "its description of array and session has changed since it was sealed",
@@ -195,7 +199,7 @@ class Footer:
         return found, json.loads(content)
 
 
-def _notes(text: bytes | None, *, where: str) -> dict[str, Any]:
+def _parse_notes(text: bytes | None, *, where: str) -> dict[str, Any]:
     try:
         notes = json.loads(text or b"")
     except ValueError as error:
@@ -205,7 +209,7 @@ def _notes(text: bytes | None, *, where: str) -> dict[str, Any]:
     return notes
 
 
-def stamps_of(path: Path) -> Stamps:
+def read_file_stamps(path: Path) -> FileStamps:
     """Return device, inode, size and times, which change with a file; empty if there is none."""
     try:
         found = path.stat()

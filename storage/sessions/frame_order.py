@@ -14,15 +14,15 @@ import numpy as np
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
-from storage.frame_rules import out_of_range
+from storage.frame_rules import mask_impossible_times
 from storage.intervals import Intervals
 from storage.schema import Array
 
-_SAID_MAX = 3
+_MAX_MESSAGES = 3
 
 
 @dataclass
-class PartFrames:
+class PartFrameSummary:
     """Frames of one part: range, count, and disorder.
 
     Attributes:
@@ -33,9 +33,9 @@ class PartFrames:
         offset_ns: `t_ns - t_mono_ns` of its first frame.
         t_mono_ns_first: instant of its first frame.
         t_mono_ns_last: instant of its last frame.
-        held: frame numbers present.
-        disorder: messages about their order; the first few.
-        disorders: how many there would be.
+        numbers: frame numbers present.
+        disorder_messages: messages about their order; the first few.
+        disorder_count: how many there would be.
     """
 
     part: int
@@ -45,37 +45,37 @@ class PartFrames:
     t_mono_ns_first: int
     t_mono_ns_last: int
     frames: int = 0
-    held: Intervals = field(default_factory=Intervals)
-    disorder: list[str] = field(default_factory=list)
-    disorders: int = 0
+    numbers: Intervals = field(default_factory=Intervals)
+    disorder_messages: list[str] = field(default_factory=list)
+    disorder_count: int = 0
 
     @property
     def gaps(self) -> Intervals:
         """Numbers between the first and the last without a frame."""
         first, last = sorted((self.seq_first, self.seq_last))
-        return self.held.missing(first, last)
+        return self.numbers.missing_in(first, last)
 
 
-class FrameOrder:
-    """Check of frame order, piece by piece; results are in `parts` and `disorder`."""
+class FrameOrderChecker:
+    """Check of frame order, piece by piece; results are in `parts` and `disorder_messages`."""
 
     def __init__(self) -> None:
-        self.parts: list[PartFrames] = []
-        self.disorder: list[str] = []
+        self.parts: list[PartFrameSummary] = []
+        self.disorder_messages: list[str] = []
         """Messages about the order of the parts."""
 
     @property
     def problems(self) -> list[str]:
         """Messages about all disorder."""
-        found = list(self.disorder)
+        found = list(self.disorder_messages)
         for part in self.parts:
-            found += [f"part {part.part}: {message}" for message in part.disorder]
-            if part.disorders > len(part.disorder):
-                more = part.disorders - len(part.disorder)
+            found += [f"part {part.part}: {message}" for message in part.disorder_messages]
+            if part.disorder_count > len(part.disorder_messages):
+                more = part.disorder_count - len(part.disorder_messages)
                 found.append(f"part {part.part}: and {more} more of the kind")
         return found
 
-    def feed(self, columns: Mapping[str, Array]) -> None:
+    def check_frames(self, columns: Mapping[str, Array]) -> None:
         """Check the next frames.
 
         Args:
@@ -88,14 +88,14 @@ class FrameOrder:
         cuts = [0, *(np.flatnonzero(numbers[1:] != numbers[:-1]) + 1).tolist(), rows]
         for begin, end in pairwise(cuts):
             cut = {name: columns[name][begin:end] for name in ("seq", "t_mono_ns", "t_ns")}
-            self._feed_part(int(numbers[begin]), cut["seq"], cut["t_mono_ns"], cut["t_ns"])
+            self._check_part_frames(int(numbers[begin]), cut["seq"], cut["t_mono_ns"], cut["t_ns"])
 
-    def _feed_part(self, number: int, seq: Array, t_mono_ns: Array, t_ns: Array) -> None:
+    def _check_part_frames(self, number: int, seq: Array, t_mono_ns: Array, t_ns: Array) -> None:
         if not self.parts or self.parts[-1].part != number:
             if self.parts and number < self.parts[-1].part:
-                self.disorder.append(f"part {number} follows part {self.parts[-1].part}")
+                self.disorder_messages.append(f"part {number} follows part {self.parts[-1].part}")
             self.parts.append(
-                PartFrames(
+                PartFrameSummary(
                     part=number,
                     seq_first=int(seq[0]),
                     seq_last=int(seq[0]),
@@ -114,11 +114,11 @@ class FrameOrder:
         falls = seq[1:] <= seq[:-1]
         back = with_before[1:] < with_before[:-1]
         for at in np.flatnonzero(falls).tolist():
-            _say(part, f"frame {seq[at + 1]} follows frame {seq[at]}")
+            _add_message(part, f"frame {seq[at + 1]} follows frame {seq[at]}")
         for at in np.flatnonzero(back & ~falls).tolist():
             late_ns = int(with_before[at]) - int(with_before[at + 1])
-            _say(part, f"time runs back by {late_ns} ns before frame {seq[at + 1]}")
-        beyond = out_of_range(t_mono_ns, t_ns)
+            _add_message(part, f"time runs back by {late_ns} ns before frame {seq[at + 1]}")
+        beyond = mask_impossible_times(t_mono_ns, t_ns)
         shifted = (t_ns - t_mono_ns != part.offset_ns) & ~beyond  # beyond, a difference may wrap
         for wrong, problem in (
             (beyond, "is in no possible year"),
@@ -126,16 +126,16 @@ class FrameOrder:
         ):
             if wrong.any():
                 first = int(seq[len(seq) - len(t_ns) + int(np.argmax(wrong))])
-                _say(part, f"t_ns of frame {first} {problem}")
+                _add_message(part, f"t_ns of frame {first} {problem}")
         breaks = np.flatnonzero((seq[1:] - seq[:-1] != 1) | falls) + 1
         cuts = [0, *breaks.tolist(), len(seq)]
         for begin, end in pairwise(cuts):
-            part.held.add(int(seq[begin]), int(seq[end - 1]))
+            part.numbers.add(int(seq[begin]), int(seq[end - 1]))
         part.frames += len(t_ns)
         part.seq_last, part.t_mono_ns_last = int(seq[-1]), int(t_mono_ns[-1])
 
 
-def in_order(
+def iterate_checking_order(
     pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]], *, where: str
 ) -> Iterator[tuple[FrameBatch, Mapping[str, Array]]]:
     """Yield the same frames, for readers that rely on their order.
@@ -143,10 +143,10 @@ def in_order(
     Raises:
         FileFormatError: the first frame out of order is reached.
     """
-    order = FrameOrder()
+    order = FrameOrderChecker()
     for frames, extra in pieces:
         columns = {"seq": frames.seq, "t_mono_ns": frames.t_mono_ns, "t_ns": frames.t_ns}
-        order.feed(columns | {name: extra[name] for name in ("part",) if name in extra})
+        order.check_frames(columns | {name: extra[name] for name in ("part",) if name in extra})
         if problems := order.problems:
             raise FileFormatError(
                 f"its frames are out of order: {problems[0]}",
@@ -157,7 +157,7 @@ def in_order(
         yield frames, extra
 
 
-def _say(part: PartFrames, text: str) -> None:
-    part.disorders += 1
-    if len(part.disorder) < _SAID_MAX:
-        part.disorder.append(text)
+def _add_message(part: PartFrameSummary, text: str) -> None:
+    part.disorder_count += 1
+    if len(part.disorder_messages) < _MAX_MESSAGES:
+        part.disorder_messages.append(text)

@@ -21,57 +21,64 @@ import numpy as np
 import pyarrow as pa
 
 from devices.errors import DamagedFileError, OtherVersionError
-from storage.durable import open_own, read_errors, whole_file
-from storage.sessions.pyramid import FACTOR, ROWS, Bins, bin_columns, joined, on_axis
+from storage.durable_files import open_for_atomic_write, open_regular_file, translate_read_errors
+from storage.sessions.pyramid import (
+    BINS_PER_COARSER_BIN,
+    FRAMES_PER_FINEST_BIN,
+    Bins,
+    bin_column_types,
+    concatenate_bins,
+    shift_bins_to_axis,
+)
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 OVERVIEW_NAME = "overview.arrow"
 _KEY, _CHECK_KEY = b"foottile.overview", b"foottile.overview_sha256"
 _VERSION = 2
-Types = Mapping[str, np.dtype[Any]]
-_PIECE = 4096
+BinColumnTypes = Mapping[str, np.dtype[Any]]
+_PIECE_BINS = 4096
 """Bins that are read and verified at a time."""
 
 
 @dataclass(frozen=True)
-class Piece:
+class OverviewPiece:
     """Index entry of some bins of a level.
 
     Attributes:
         level: 0 is the finest.
-        bins: number of bins.
+        bin_count: number of bins.
         begin_ns: least `t_first_ns`.
         end_ns: greatest `t_last_ns`.
-        crc: CRC-32 of their values.
+        crc32: CRC-32 of their values.
     """
 
     level: int
-    bins: int
+    bin_count: int
     begin_ns: int
     end_ns: int
-    crc: int
+    crc32: int
 
 
 @dataclass(frozen=True)
-class Index:
+class OverviewIndex:
     """Index in the file's metadata.
 
     Attributes:
         frames_sha256: file hash of the frames it was made from.
-        tiles: number of the array's tiles.
-        estimated: True: its bins have forces; False: raw counts.
+        tile_count: number of the array's tiles.
+        has_estimates: True: its bins have forces; False: raw counts.
         begin_ns: `t_ns` of the first frame.
         pieces: in the order of the file.
     """
 
     frames_sha256: str
-    tiles: int
-    estimated: bool
+    tile_count: int
+    has_estimates: bool
     begin_ns: int
-    pieces: tuple[Piece, ...]
+    pieces: tuple[OverviewPiece, ...]
 
     @property
-    def levels(self) -> int:
+    def level_count(self) -> int:
         """Number of levels."""
         return 1 + max((piece.level for piece in self.pieces), default=-1)
 
@@ -79,11 +86,11 @@ class Index:
         """Return the index as JSON for the file's metadata."""
         content = {
             "version": _VERSION,
-            "rows": ROWS,
-            "factor": FACTOR,
+            "rows": FRAMES_PER_FINEST_BIN,
+            "factor": BINS_PER_COARSER_BIN,
             "frames_sha256": self.frames_sha256,
-            "tiles": self.tiles,
-            "estimated": self.estimated,
+            "tiles": self.tile_count,
+            "estimated": self.has_estimates,
             "begin_ns": self.begin_ns,
             "pieces": [list(vars(piece).values()) for piece in self.pieces],
         }
@@ -98,13 +105,17 @@ class Index:
             OtherVersionError: another version wrote it.
         """
         content: dict[str, Any] = json.loads(text)
-        if (content["version"], content["rows"], content["factor"]) != (_VERSION, ROWS, FACTOR):
+        if (content["version"], content["rows"], content["factor"]) != (
+            _VERSION,
+            FRAMES_PER_FINEST_BIN,
+            BINS_PER_COARSER_BIN,
+        ):
             raise OtherVersionError(
                 f"another version of foottile wrote it: {content['version']}",
                 expected=f"version {_VERSION}",
                 remedy="None needed: it is made again from the frames",
             )
-        pieces = tuple(Piece(*row) for row in content["pieces"])
+        pieces = tuple(OverviewPiece(*row) for row in content["pieces"])
         return cls(
             content["frames_sha256"],
             content["tiles"],
@@ -114,79 +125,83 @@ class Index:
         )
 
 
-def overview_content(levels: Sequence[Bins], *, tiles: int, frames_sha256: str) -> pa.Buffer:
+def encode_overview(levels: Sequence[Bins], *, tile_count: int, frames_sha256: str) -> pa.Buffer:
     """Return the bytes of an `overview.arrow`.
 
     Args:
         levels: bins of each level, the finest first, none of them empty.
-        tiles: number of the array's tiles.
+        tile_count: number of the array's tiles.
         frames_sha256: file hash of the frames.
     """
     sink = pa.BufferOutputStream()
-    _write(sink, levels, tiles, frames_sha256)
+    _write(sink, levels, tile_count, frames_sha256)
     return sink.getvalue()
 
 
-def write_overview(path: Path, levels: Sequence[Bins], *, tiles: int, frames_sha256: str) -> None:
+def write_overview(
+    path: Path, levels: Sequence[Bins], *, tile_count: int, frames_sha256: str
+) -> None:
     """Write `overview.arrow` without building it in memory; an existing one is replaced.
 
     Args:
         path: the file.
-        levels: as for `overview_content`.
-        tiles: likewise.
+        levels: as for `encode_overview`.
+        tile_count: likewise.
         frames_sha256: likewise.
 
     Raises:
         StorageError: the disk is full or not writable; the old file is unchanged.
     """
-    with whole_file(path) as out:
-        _write(out, levels, tiles, frames_sha256)
+    with open_for_atomic_write(path) as out:
+        _write(out, levels, tile_count, frames_sha256)
 
 
 def _write(
     sink: pa.NativeFile | io.BufferedWriter, levels: Sequence[Bins], tiles: int, frames_sha256: str
 ) -> None:
-    types = bin_columns(tiles, estimated="grf_n_min" in levels[0])
-    text = _index_over(levels, types, tiles, frames_sha256).to_json()
+    types = bin_column_types(tiles, has_estimates="grf_n_min" in levels[0])
+    text = _make_index(levels, types, tiles, frames_sha256).to_json()
     schema = pa.schema(
         [pa.field(name, pa.from_numpy_dtype(t), nullable=False) for name, t in types.items()],
         metadata={_KEY: text, _CHECK_KEY: hashlib.sha256(text).hexdigest().encode()},
     )
     with pa.ipc.new_file(sink, schema) as file:
-        for _, bins in _pieces_of(levels, types):
+        for _, bins in _split_into_pieces(levels, types):
             arrays = [pa.array(values) for values in bins.values()]
             file.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
 
 
-def _index_over(levels: Sequence[Bins], types: Types, tiles: int, frames_sha256: str) -> Index:
+def _make_index(
+    levels: Sequence[Bins], types: BinColumnTypes, tiles: int, frames_sha256: str
+) -> OverviewIndex:
     pieces = tuple(
-        Piece(
+        OverviewPiece(
             level,
             len(bins["part"]),
             int(bins["t_first_ns"].min()),
             int(bins["t_last_ns"].max()),
-            _crc(bins),
+            _compute_crc32(bins),
         )
-        for level, bins in _pieces_of(levels, types)
+        for level, bins in _split_into_pieces(levels, types)
     )
     begin_ns = int(levels[0]["t_first_ns"][0])
-    return Index(frames_sha256, tiles, "grf_n_min" in types, begin_ns, pieces)
+    return OverviewIndex(frames_sha256, tiles, "grf_n_min" in types, begin_ns, pieces)
 
 
-def _pieces_of(levels: Sequence[Bins], types: Types) -> Iterator[tuple[int, Bins]]:
+def _split_into_pieces(levels: Sequence[Bins], types: BinColumnTypes) -> Iterator[tuple[int, Bins]]:
     """Yield each level's number and its bins, some at a time, in the columns' order."""
     for level, bins in enumerate(levels):
-        for at in range(0, len(bins["part"]), _PIECE):
+        for at in range(0, len(bins["part"]), _PIECE_BINS):
             yield (
                 level,
                 {
-                    name: np.ascontiguousarray(bins[name][at : at + _PIECE], type_)
+                    name: np.ascontiguousarray(bins[name][at : at + _PIECE_BINS], type_)
                     for name, type_ in types.items()
                 },
             )
 
 
-def open_overview(path: Path) -> Overview:
+def open_overview(path: Path) -> OverviewReader:
     """Open an `overview.arrow`.
 
     Raises:
@@ -197,12 +212,12 @@ def open_overview(path: Path) -> Overview:
     """
     # Not through Python's file: Arrow reads a footer on a thread of its own, and a process that
     # ends while that one waits for Python is aborted.
-    with open_own(path), read_errors(path):
+    with open_regular_file(path), translate_read_errors(path):
         source = pa.OSFile(str(path), "r")
-    return Overview(source, where=str(path))
+    return OverviewReader(source, where=str(path))
 
 
-class Overview:
+class OverviewReader:
     """Reader of an `overview.arrow`.
 
     Args:
@@ -218,13 +233,13 @@ class Overview:
         self._source, self._where = source, where
         try:
             self._file = pa.ipc.open_file(source)
-            self.index = _index_of(self._file)
+            self.index = _read_index(self._file)
         except OtherVersionError:
             source.close()
             raise
         except Exception as error:  # damaged bytes may cause any error
             source.close()
-            raise self._damaged(error) from error
+            raise self._damage_error(error) from error
 
     def __enter__(self) -> Self:
         return self
@@ -236,7 +251,7 @@ class Overview:
         """Close the file."""
         self._source.close()
 
-    def count(
+    def estimate_bin_count(
         self,
         level: int,
         begin_ns: int | None,
@@ -244,9 +259,11 @@ class Overview:
         axis: TimeAxis = NODE_AXIS,
     ) -> int:
         """Return about how many bins of a level are in a time range: those of its pieces."""
-        return sum(self.index.pieces[i].bins for i in self._within(level, begin_ns, end_ns, axis))
+        return sum(
+            self.index.pieces[i].bin_count for i in self._find_pieces(level, begin_ns, end_ns, axis)
+        )
 
-    def bins(
+    def read_bins(
         self,
         level: int,
         begin_ns: int | None,
@@ -264,19 +281,19 @@ class Overview:
         Raises:
             DamagedFileError: a piece is damaged.
         """
-        types = bin_columns(self.index.tiles, estimated=self.index.estimated)
+        types = bin_column_types(self.index.tile_count, has_estimates=self.index.has_estimates)
         found = [{name: np.empty(0, type_) for name, type_ in types.items()}]
-        for i in self._within(level, begin_ns, end_ns, axis):
-            piece = on_axis(self._piece(i, list(types)), axis)
+        for i in self._find_pieces(level, begin_ns, end_ns, axis):
+            piece = shift_bins_to_axis(self._read_piece(i, list(types)), axis)
             rows = np.ones(len(piece["part"]), dtype=np.bool_)
             if begin_ns is not None:
                 rows &= piece["t_last_ns"] >= begin_ns
             if end_ns is not None:
                 rows &= piece["t_first_ns"] < end_ns
             found.append({name: values[rows] for name, values in piece.items()})
-        return joined(found)
+        return concatenate_bins(found)
 
-    def _within(
+    def _find_pieces(
         self, level: int, begin_ns: int | None, end_ns: int | None, axis: TimeAxis
     ) -> list[int]:
         return [
@@ -286,18 +303,18 @@ class Overview:
             and axis.may_overlap(piece.begin_ns, piece.end_ns, begin_ns, end_ns)
         ]
 
-    def _piece(self, i: int, names: list[str]) -> Bins:
+    def _read_piece(self, i: int, names: list[str]) -> Bins:
         try:
             batch = self._file.get_batch(i)
             bins = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in names}
         except Exception as error:  # damaged bytes may cause any error
-            raise self._damaged(f"piece {i}: {error}") from error
+            raise self._damage_error(f"piece {i}: {error}") from error
         entry = self.index.pieces[i]
-        if len(batch) != entry.bins or _crc(bins) != entry.crc:
-            raise self._damaged(f"the checksum of piece {i} is wrong")
+        if len(batch) != entry.bin_count or _compute_crc32(bins) != entry.crc32:
+            raise self._damage_error(f"the checksum of piece {i} is wrong")
         return bins
 
-    def _damaged(self, why: object) -> DamagedFileError:
+    def _damage_error(self, why: object) -> DamagedFileError:
         return DamagedFileError(
             f"is no overview: {' '.join(str(why).split())[:300]}",
             where=self._where,
@@ -305,7 +322,7 @@ class Overview:
         )
 
 
-def _index_of(file: pa.ipc.RecordBatchFileReader) -> Index:
+def _read_index(file: pa.ipc.RecordBatchFileReader) -> OverviewIndex:
     """Read and verify the index in a file's metadata.
 
     Raises:
@@ -316,13 +333,13 @@ def _index_of(file: pa.ipc.RecordBatchFileReader) -> Index:
     text = metadata[_KEY]
     if hashlib.sha256(text).hexdigest().encode() != metadata[_CHECK_KEY]:
         raise ValueError("its index does not match its hash")
-    index = Index.from_json(text)
+    index = OverviewIndex.from_json(text)
     if file.num_record_batches != len(index.pieces):
         raise ValueError("its index is of another number of pieces")
     return index
 
 
-def _crc(bins: Bins) -> int:
+def _compute_crc32(bins: Bins) -> int:
     crc = 0
     for values in bins.values():
         crc = zlib.crc32(np.ascontiguousarray(values).data, crc)

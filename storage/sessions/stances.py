@@ -14,7 +14,7 @@ from typing import Any
 import pyarrow as pa
 
 from devices.errors import DamagedFileError, OtherVersionError
-from storage.checked_table import read_table, write_table
+from storage.hashed_table import read_hashed_table, write_hashed_table
 from storage.schema import Column
 
 STANCES_NAME = "stances.parquet"
@@ -23,7 +23,7 @@ FRAMES_HASH_KEY = b"foottile.frames_sha256"
 
 _F64 = pa.float64()
 
-STANCES = (
+STORED_STANCE_COLUMNS = (
     Column("number", pa.uint32(), "1", "of the stance in its session, from 1"),
     Column("part", pa.uint16(), "1", "part of the session in which it was"),
     Column("begin_t_ns", pa.int64(), "ns", "t_ns of its first frame"),
@@ -42,35 +42,37 @@ STANCES = (
     Column("frames", pa.uint32(), "1", "frames that are there, first and last included"),
     Column("unknown_frames", pa.uint32(), "1", "of these, without a GRF"),
     Column("missing_frames", pa.uint32(), "1", "numbers in between that are not there"),
-    Column("estimate_status", pa.uint16(), "bits", "bits that any of its frames has"),
+    Column("estimate_flags", pa.uint16(), "bits", "bits that any of its frames has"),
     Column("begun", pa.bool_(), "1", "the frame before it is there, and without contact"),
     Column("ended", pa.bool_(), "1", "the frame behind it is there, and without contact"),
     Column("is_whole", pa.bool_(), "1", "begun, ended, no frame missing, and a GRF in each"),
 )
 """Columns of a stance: `service.estimation.stances.Stance`."""
 
-_MAY_MISS = frozenset({"peak_t_ns", *(column.name for column in STANCES if column.type == _F64)})
-SCHEMA = pa.schema(
+_NULLABLE_COLUMNS = frozenset(
+    {"peak_t_ns", *(column.name for column in STORED_STANCE_COLUMNS if column.type == _F64)}
+)
+STANCE_SCHEMA = pa.schema(
     [
-        column.field(column.name, column.type, nullable=column.name in _MAY_MISS)
-        for column in STANCES
+        column.make_field(column.name, column.type, nullable=column.name in _NULLABLE_COLUMNS)
+        for column in STORED_STANCE_COLUMNS
     ]
 )
 
 
-def stances_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
+def make_stance_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
     """Convert stances to a table; NaN and None become null.
 
     Args:
-        rows: values by the names of `STANCES`.
+        rows: values by the names of `STORED_STANCE_COLUMNS`.
     """
     content = list(rows)
     arrays = [
         # from_pandas: NaN is null
         pa.array([row[column.name] for row in content], column.type, from_pandas=True)
-        for column in STANCES
+        for column in STORED_STANCE_COLUMNS
     ]
-    return pa.Table.from_arrays(arrays, schema=SCHEMA)
+    return pa.Table.from_arrays(arrays, schema=STANCE_SCHEMA)
 
 
 def write_stances(path: Path, table: pa.Table, *, frames_sha256: str) -> None:
@@ -78,14 +80,14 @@ def write_stances(path: Path, table: pa.Table, *, frames_sha256: str) -> None:
 
     Args:
         path: the file.
-        table: of `stances_table`.
+        table: of `make_stance_table`.
         frames_sha256: file hash of the stances' frames.
 
     Raises:
         StorageError: the disk is full or not writable; the old file is unchanged.
     """
     metadata = {FRAMES_HASH_KEY: frames_sha256.encode()}
-    write_table(path, table.replace_schema_metadata(metadata), is_plain=True)
+    write_hashed_table(path, table.replace_schema_metadata(metadata), is_uncompressed=True)
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class StoredStances:
     """Content of `stances.parquet`.
 
     Attributes:
-        table: table with the columns of `STANCES`.
+        table: table with the columns of `STORED_STANCE_COLUMNS`.
         frames_sha256: file hash of the frames it was made from.
     """
 
@@ -110,20 +112,20 @@ def read_stances(path: Path) -> StoredStances:
         OtherVersionError: its columns are those of another version.
         StorageError: it cannot be read now.
     """
-    read = read_table(path)
+    read = read_hashed_table(path)
     metadata = read.table.schema.metadata or {}
-    if not read.is_proven or FRAMES_HASH_KEY not in metadata:
+    if not read.has_hash or FRAMES_HASH_KEY not in metadata:
         raise DamagedFileError(
             "is no table of stances",
             where=str(path),
             expected="a table with the hash of its frames",
             remedy="Delete it: it is made again from the frames",
         )
-    if not read.table.schema.equals(SCHEMA):
+    if not read.table.schema.equals(STANCE_SCHEMA):
         raise OtherVersionError(
             "another version of foottile wrote it, with other columns",
             where=str(path),
-            expected="columns " + ", ".join(SCHEMA.names),
+            expected="columns " + ", ".join(STANCE_SCHEMA.names),
             remedy="None needed: it is made again from the frames",
         )
     return StoredStances(read.table, metadata[FRAMES_HASH_KEY].decode("ascii", "replace"))

@@ -10,7 +10,7 @@ The time between two successive parts is taken
 - else by the server's clock, where both parts were compared with it;
 - else not at all: the second part begins one frame after the first one ended.
 
-Without a comparison a step back, or one of more than `GAP_MAX_NS`, cannot be true of a recording.
+Without a comparison a step back, or one of more than `MAX_GAP_NS`, cannot be true of a recording.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from pydantic import TypeAdapter
 from devices.arrays import Times
 from devices.errors import FileFormatError
 from storage.clock.table import ClockTable
-from storage.schema import NO_INSTANT, Array
+from storage.schema import UNKNOWN_T_NS, Array
 
 TIME_AXIS_NOTE = "time_axis"
 """Key of a shifted session's time axis in the notes of an export."""
-GAP_MAX_NS = 86_400_000_000_000
+MAX_GAP_NS = 86_400_000_000_000
 """Longest gap between parts, a day, unless the server's clock confirms a longer one."""
 
 Basis = Literal["node", "server", "joined"]
@@ -70,11 +70,11 @@ class TimeAxis:
         """True if the node's date was set between two parts."""
         return any(self.shifts_ns)
 
-    def shift_ns(self, part: int) -> int:
+    def get_shift_ns(self, part: int) -> int:
         """Return the shift of a part; behind the last part with frames, that one's."""
         return self.shifts_ns[min(part, len(self.shifts_ns) - 1)]
 
-    def at(self, t_ns: Times, part: Array | None) -> Times:
+    def shift_to_axis(self, t_ns: Times, part: Array | None) -> Times:
         """Return instants on the axis, int64[n].
 
         Args:
@@ -104,7 +104,7 @@ class TimeAxis:
             for shift_ns in set(self.shifts_ns)
         )
 
-    def as_dicts(self) -> list[dict[str, object]]:
+    def to_json_list(self) -> list[dict[str, object]]:
         """Return each part's shift and its basis, for JSON."""
         parts = zip(self.shifts_ns, self.bases, strict=True)
         return [
@@ -113,8 +113,8 @@ class TimeAxis:
         ]
 
     @classmethod
-    def from_dicts(cls, stated: object, *, where: str) -> TimeAxis:
-        """Return the axis from a file's notes, as `as_dicts` made them.
+    def from_json_list(cls, content: object, *, where: str) -> TimeAxis:
+        """Return the axis from a file's notes, as `to_json_list` made them.
 
         Raises:
             FileFormatError: it is none.
@@ -122,14 +122,14 @@ class TimeAxis:
         try:
             return TypeAdapter(TimeAxis).validate_python(
                 {
-                    "shifts_ns": [part["shift_ns"] for part in stated],  # type: ignore[attr-defined]
-                    "bases": [part["by"] for part in stated],  # type: ignore[attr-defined]
+                    "shifts_ns": [part["shift_ns"] for part in content],  # type: ignore[attr-defined]
+                    "bases": [part["by"] for part in content],  # type: ignore[attr-defined]
                 }
             )
         except (TypeError, KeyError, ValueError) as error:
             raise FileFormatError("its notes state no time axis", where=where) from error
 
-    def remark(self) -> str:
+    def describe_shift(self) -> str:
         """Return a message about a shifted axis; empty: the node's date was right."""
         if not self.is_shifted:
             return ""
@@ -146,7 +146,9 @@ NODE_AXIS = TimeAxis()
 """Axis of the node's own date, as of every session of one part."""
 
 
-def time_axis(spans: Sequence[PartSpan], clock: ClockTable | None, *, period_ns: int) -> TimeAxis:
+def compute_time_axis(
+    spans: Sequence[PartSpan], clock: ClockTable | None, *, period_ns: int
+) -> TimeAxis:
     """Compute the time axis of a session.
 
     Args:
@@ -159,7 +161,7 @@ def time_axis(spans: Sequence[PartSpan], clock: ClockTable | None, *, period_ns:
     for span in spans:
         shift_ns, basis = shifts_ns[-1], bases[-1]
         if before is not None and span.stream_id != before.stream_id:
-            shift_ns, basis = _placed(before, shifts_ns[-1], span, clock, period_ns)
+            shift_ns, basis = _shift_after(before, shifts_ns[-1], span, clock, period_ns)
         # Parts without frames are as the one before them.
         while len(shifts_ns) <= span.number:
             shifts_ns.append(shifts_ns[-1])
@@ -169,22 +171,22 @@ def time_axis(spans: Sequence[PartSpan], clock: ClockTable | None, *, period_ns:
     return TimeAxis(tuple(shifts_ns), tuple(bases))
 
 
-def _placed(
+def _shift_after(
     before: PartSpan, shift_ns: int, span: PartSpan, clock: ClockTable | None, period_ns: int
 ) -> tuple[int, Basis]:
     """Return shift and basis of a part that follows another part with a known shift."""
     by_node_ns = span.t_ns[0] - before.t_ns[1]
-    change = _clock_change(before, span, clock)
+    change = _measure_clock_change(before, span, clock)
     if change is None:
-        if 0 < by_node_ns <= GAP_MAX_NS:
+        if 0 < by_node_ns <= MAX_GAP_NS:
             return shift_ns, "node"
         return shift_ns + period_ns - by_node_ns, "joined"
     change_ns, bound_ns = change
     by_server_ns = by_node_ns + change_ns
     if abs(change_ns) <= bound_ns and by_node_ns > 0:
         return shift_ns, "node"
-    is_server_sane = -bound_ns < by_server_ns <= GAP_MAX_NS
-    if not is_server_sane and 0 < by_node_ns <= GAP_MAX_NS:  # it was the server's date that was set
+    is_server_sane = -bound_ns < by_server_ns <= MAX_GAP_NS
+    if not is_server_sane and 0 < by_node_ns <= MAX_GAP_NS:  # it was the server's date that was set
         return shift_ns, "node"
     if by_server_ns <= -bound_ns:
         return shift_ns + period_ns - by_node_ns, "joined"
@@ -192,7 +194,7 @@ def _placed(
     return shift_ns + max(by_server_ns, period_ns) - by_node_ns, "server"
 
 
-def _clock_change(
+def _measure_clock_change(
     before: PartSpan, span: PartSpan, clock: ClockTable | None
 ) -> tuple[int, int] | None:
     """Return the node date's change against the server's clock, and the bound of that.
@@ -204,9 +206,9 @@ def _clock_change(
     numbers = np.array([before.number, span.number])
     t_ns = np.array([before.t_ns[1], span.t_ns[0]], dtype=np.int64)
     t_mono_ns = np.array([before.t_mono_ns[1], span.t_mono_ns[0]], dtype=np.int64)
-    found = clock.columns(t_mono_ns, t_ns, numbers)
+    found = clock.compute_server_time(t_mono_ns, t_ns, numbers)
     server_ns, bound_ns = found["t_server_ns"].tolist(), found["t_server_uncertainty_ns"].tolist()
-    if NO_INSTANT in server_ns:
+    if UNKNOWN_T_NS in server_ns:
         return None
     offsets_ns = [server - own for server, own in zip(server_ns, t_ns.tolist(), strict=True)]
     return offsets_ns[1] - offsets_ns[0], sum(bound_ns)

@@ -17,29 +17,29 @@ import pyarrow as pa
 
 from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
-from storage.frame_rules import broken_rule
+from storage.frame_rules import find_broken_rule
 from storage.intervals import Intervals
 from storage.journal.segment_format import (
     INDEX_SUFFIX,
-    RECORD,
+    RECORD_DTYPE,
     Records,
-    are_whole,
-    batches_in,
-    end_of,
-    is_closed,
-    is_whole,
-    messages_from,
-    numbers,
-    payload_of,
-    read_header,
+    find_end_offset,
+    is_index_closed,
+    is_record_valid,
+    make_message_batch,
+    mask_valid_records,
     read_index,
-    run_of,
+    read_messages_from,
+    read_payload,
+    read_schema_and_first_offset,
+    select_batches,
+    seq_range_of,
 )
-from storage.run import RunReader
-from storage.schema import array_info, older_wire_schema, wire_schema
-from storage.wire import decode
+from storage.message_batch import MessageBatchDecoder
+from storage.schema import legacy_wire_schema, read_array_info, wire_schema
+from storage.wire import decode_message
 
-_RUN_BATCHES = 256
+_BATCHES_PER_CHECK = 256
 """Batches that are checked together: some thousand frames."""
 
 
@@ -49,7 +49,7 @@ class SegmentReport:
 
     Attributes:
         path: the segment.
-        held: numbers of frames whose bytes match their checksum.
+        stored: numbers of frames whose bytes match their checksum.
         damaged: numbers of frames whose bytes do not.
         unsynced: numbers in the index at the end of an unclosed segment that are not on the disk:
             they were never promised.
@@ -61,22 +61,22 @@ class SegmentReport:
     """
 
     path: Path
-    held: Intervals = field(default_factory=Intervals)
+    stored: Intervals = field(default_factory=Intervals)
     damaged: Intervals = field(default_factory=Intervals)
     unsynced: Intervals = field(default_factory=Intervals)
     is_closed: bool = False
     info: ArrayInfo | None = None
-    index: Records = field(default_factory=lambda: np.zeros(0, RECORD))
+    index: Records = field(default_factory=lambda: np.zeros(0, RECORD_DTYPE))
     problems: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_json_dict(self) -> dict[str, Any]:
         """Return the report for JSON (docs/formats.md)."""
         return {
             "node": self.info.node if self.info is not None else None,
-            "boot_id": self.info.boot_id if self.info is not None else None,
-            "frames": self.held.count,
-            "held": list(self.held),
+            "stream_id": self.info.stream_id if self.info is not None else None,
+            "frames": self.stored.count,
+            "held": list(self.stored),
             "damaged": list(self.damaged),
             "unsynced": self.unsynced.count,
             "closed": self.is_closed,
@@ -114,11 +114,11 @@ def _verify(path: Path, report: SegmentReport) -> None:
         if not path.exists():
             raise
         index = None
-    report.is_closed = index is not None and is_closed(index)
-    schema, header_bytes = _schema_of(path, report)
+    report.is_closed = index is not None and is_index_closed(index)
+    schema, header_bytes = _read_schema(path, report)
     if schema is None:
         # A segment that was created just before a power cut may be empty; one with frames may not.
-        if report.is_closed or (index is not None and _holds_any(path, index)):
+        if report.is_closed or (index is not None and _has_any_batch(path, index)):
             report.problems.append("it does not begin with the description of an array")
         return
     if index is None:
@@ -128,10 +128,10 @@ def _verify(path: Path, report: SegmentReport) -> None:
                 "frames; it is rebuilt when the journal is next opened"
             )
         return
-    _Batches(report, schema, header_bytes).check(index)
-    end = max(header_bytes, end_of(batches_in(index)))
+    _BatchVerifier(report, schema, header_bytes).verify(index)
+    end = max(header_bytes, find_end_offset(select_batches(index)))
     behind, at = 0, end
-    for message in messages_from(path, end, schema):
+    for message in read_messages_from(path, end, schema):
         at += len(message.payload)
         if at > size:
             break
@@ -144,7 +144,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
         report.remarks.append("a batch behind its last one is in no index")
 
 
-class _Batches:
+class _BatchVerifier:
     """Verifier of the batches of one segment, in the order of its index.
 
     Args:
@@ -155,126 +155,128 @@ class _Batches:
 
     def __init__(self, report: SegmentReport, schema: pa.Schema, header_bytes: int) -> None:
         self._report = report
-        self._runs = RunReader(schema)
-        self._info = array_info(schema, where="")
+        self._runs = MessageBatchDecoder(schema)
+        self._info = read_array_info(schema, where="")
         self._end = header_bytes
         self._doubtful = Intervals()
-        self._said: list[str] = []
+        self._pending_problems: list[str] = []
         """Messages since the last undamaged batch."""
 
-    def check(self, index: Records) -> None:
+    def verify(self, index: Records) -> None:
         """Verify all batches of the index."""
-        report, undamaged = self._report, [np.zeros(0, RECORD)]
+        report, undamaged = self._report, [np.zeros(0, RECORD_DTYPE)]
         if report.is_closed:
             index = index[:-1]
         with report.path.open("rb") as file:
-            for begin in range(0, len(index), _RUN_BATCHES):
-                records = index[begin : begin + _RUN_BATCHES]
-                if self._is_right(file.fileno(), records):
+            for begin in range(0, len(index), _BATCHES_PER_CHECK):
+                records = index[begin : begin + _BATCHES_PER_CHECK]
+                if self._verify_group(file.fileno(), records):
                     undamaged.append(records)
                     continue
                 for at, record in enumerate(records):
-                    if self._is_good(file.fileno(), record, begin + at):
+                    if self._verify_batch(file.fileno(), record, begin + at):
                         undamaged.append(records[at : at + 1])
         report.index = np.concatenate(undamaged)
         if report.is_closed:
             report.damaged = report.damaged | self._doubtful
-            report.problems += self._said
-        elif self._said:
+            report.problems += self._pending_problems
+        elif self._pending_problems:
             report.unsynced = self._doubtful
             report.remarks.append(
-                f"{len(self._said)} batches at its end were not yet on the disk: they were never "
-                "promised"
+                f"{len(self._pending_problems)} batches at its end were not yet on the disk: they "
+                "were never promised"
             )
 
-    def _is_right(self, descriptor: int, records: Records) -> bool:
+    def _verify_group(self, descriptor: int, records: Records) -> bool:
         """Return whether a group of batches is undamaged; otherwise nothing is recorded."""
         offset, length = records["offset"], records["length"].astype(np.uint64)
         is_joined = bool((offset[1:] == (offset + length)[:-1]).all())
-        first, last = numbers(records[0])[0], numbers(records[-1])[1]
-        if not is_joined or offset[0] < self._end or not are_whole(records).all():
+        first, last = seq_range_of(records[0])[0], seq_range_of(records[-1])[1]
+        if not is_joined or offset[0] < self._end or not mask_valid_records(records).all():
             return False
         content = os.pread(descriptor, int(length.sum()), int(offset[0]))
-        frames = self._runs.read(run_of(records, content))
-        if frames is None or self._report.held.within(first, last):
+        frames = self._runs.decode(make_message_batch(records, content))
+        if frames is None or self._report.stored.restricted_to(first, last):
             return False
         ends = np.cumsum(records["count"], dtype=np.int64)
         t_ns_first, t_ns_last = frames.t_ns[ends - records["count"]], frames.t_ns[ends - 1]
         if (t_ns_first != records["t_ns_first"]).any() or (t_ns_last != records["t_ns_last"]).any():
             return False
-        if broken_rule(frames, self._info):
+        if find_broken_rule(frames, self._info):
             return False
-        self._report.held.add_stretches(records["seq_first"], records["count"])
-        self._found_whole()
+        self._report.stored.add_ranges(records["seq_first"], records["count"])
+        self._report_pending()
         self._end = int(offset[-1] + length[-1])
         return True
 
-    def _is_good(self, descriptor: int, record: np.void, at: int) -> bool:
+    def _verify_batch(self, descriptor: int, record: np.void, at: int) -> bool:
         """Verify one batch; return whether it is undamaged and its frames belong there."""
         report = self._report
-        if not is_whole(record):
-            self._said.append(f"record {at} of its index is damaged")
+        if not is_record_valid(record):
+            self._pending_problems.append(f"record {at} of its index is damaged")
             return False
         if not record["count"]:
             return False
-        first, last = numbers(record)
-        payload = payload_of(descriptor, record)
+        first, last = seq_range_of(record)
+        payload = read_payload(descriptor, record)
         if payload is None:
-            self._said.append(f"frames {first} to {last} do not agree with their checksum")
+            self._pending_problems.append(
+                f"frames {first} to {last} do not agree with their checksum"
+            )
             self._doubtful.add(first, last)
             return False
-        self._found_whole()
-        wrong = _wrong_in(payload, record, self._runs.schema, self._info)
+        self._report_pending()
+        wrong = _find_batch_problem(payload, record, self._runs.schema, self._info)
         if int(record["offset"]) < self._end:
             wrong = "they overlap other frames"
         self._end = int(record["offset"]) + int(record["length"])
-        if not wrong and report.held.within(first, last):
+        if not wrong and report.stored.restricted_to(first, last):
             wrong = "they are in it twice"
         if wrong:
             report.problems.append(f"frames {first} to {last}: {wrong}")
             return False
-        report.held.add(first, last)
+        report.stored.add(first, last)
         return True
 
-    def _found_whole(self) -> None:
+    def _report_pending(self) -> None:
         """Report pending damage: a good batch behind it shows that it happened after writing."""
         self._report.damaged = self._report.damaged | self._doubtful
-        self._report.problems += self._said
-        self._doubtful, self._said = Intervals(), []
+        self._report.problems += self._pending_problems
+        self._doubtful, self._pending_problems = Intervals(), []
 
 
-def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, info: ArrayInfo) -> str:
+def _find_batch_problem(payload: bytes, record: np.void, schema: pa.Schema, info: ArrayInfo) -> str:
     """Return a message where the bytes contradict the index; empty if they do not."""
     try:
-        batch = decode(payload, schema)
+        batch = decode_message(payload, schema)
     except FileFormatError as error:
         return error.what
     if (int(batch.seq[0]), len(batch)) != (int(record["seq_first"]), int(record["count"])):
         return f"the batch holds {len(batch)} frames from {int(batch.seq[0])} on"
     if (int(batch.t_ns[0]), int(batch.t_ns[-1])) != (record["t_ns_first"], record["t_ns_last"]):
         return "the index has other instants than the batch"
-    return broken_rule(batch, info)
+    return find_broken_rule(batch, info)
 
 
-def _holds_any(path: Path, index: Records) -> bool:
+def _has_any_batch(path: Path, index: Records) -> bool:
     """Return whether any batch in the segment matches the index."""
     with path.open("rb") as file:
-        batches = batches_in(index)
-        return any(payload_of(file.fileno(), record) is not None for record in batches)
+        batches = select_batches(index)
+        return any(read_payload(file.fileno(), record) is not None for record in batches)
 
 
-def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:
+def _read_schema(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:
     """Return a segment's expected schema and the length of its header; None: it has none."""
-    schema, length = read_header(path)
+    schema, length = read_schema_and_first_offset(path)
     if schema is None:
         return None, 0
     try:
-        report.info = array_info(schema, where=str(path))
+        report.info = read_array_info(schema, where=str(path))
     except FileFormatError as error:
         if isinstance(error, DamagedFileError):
             report.problems.append(error.what)
         return None, 0
-    expected, older = wire_schema(report.info), older_wire_schema(report.info)
+    expected, older = wire_schema(report.info), legacy_wire_schema(report.info)
     if not any(schema.equals(one, check_metadata=True) for one in (expected, older)):
         report.problems.append("its columns are not those of a stream of frames")
     return expected, length

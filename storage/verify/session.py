@@ -12,23 +12,33 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from devices.errors import FileFormatError, OtherVersionError, StorageError
-from storage.clock.file import CLOCK_NAME, StoredClock, read_clock
-from storage.file_hash import sha256_of
+from storage.clock.file import CLOCK_NAME, StoredClock, read_clock_file
 from storage.intervals import NO_END, Intervals
-from storage.sessions.beside import EVENTS_NAME, StoredEvents, read_events
-from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of
-from storage.sessions.folder import FRAMES_NAME, Event, Ledger, Session
-from storage.sessions.ledger import ledger_of, states_of
+from storage.parquet_hash import compute_sha256
+from storage.sessions.folder import FRAMES_NAME, Ledger, Marker, Session
+from storage.sessions.ledger import adjust_states_to_session, compute_ledger
+from storage.sessions.metadata import (
+    SESSION_NAME,
+    StoredMetadata,
+    make_session_metadata,
+    parse_session_metadata,
+    read_bytes_or_none,
+)
 from storage.sessions.overview import OVERVIEW_NAME, open_overview
+from storage.sessions.sidecars import MARKERS_NAME, StoredMarkers, read_markers
 from storage.sessions.stances import STANCES_NAME, read_stances
-from storage.verify.file import FileReport, ledger_problems, verify_file
-from storage.verify.journal import StreamReport, verify_stream
+from storage.verify.journal import StreamReport, verify_journal
+from storage.verify.sealed_file import (
+    SealedFileReport,
+    find_ledger_contradictions,
+    verify_sealed_file,
+)
 
-_TRIES = 3
-_SAME_S = 1e-6
+_MAX_ATTEMPTS = 3
+_DURATION_TOLERANCE_S = 1e-6
 
-Streams = Callable[[Path], StreamReport]
-_Stored = TypeVar("_Stored", StoredEvents, StoredClock)
+StreamVerifier = Callable[[Path], StreamReport]
+_Stored = TypeVar("_Stored", StoredMarkers, StoredClock)
 
 
 @dataclass
@@ -45,7 +55,7 @@ class SessionReport:
         sha256: hash of the sealed file; None if it is not sealed.
         problems: messages of damage; empty: it is undamaged.
         unproven: facts that these files cannot prove.
-        in_trash: True: it is in the trash.
+        is_in_trash: True: it is in the trash.
     """
 
     path: Path
@@ -57,14 +67,14 @@ class SessionReport:
     sha256: str | None = None
     problems: list[str] = field(default_factory=list)
     unproven: list[str] = field(default_factory=list)
-    in_trash: bool = False
+    is_in_trash: bool = False
 
     @property
-    def frames(self) -> int:
+    def frame_count(self) -> int:
         """Number of recorded frames."""
         return sum(part.recorded for part in self.ledger.parts) if self.ledger else 0
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_json_dict(self) -> dict[str, Any]:
         """Return ledger and findings for JSON (docs/formats.md)."""
         empty = Ledger(complete=False, lossy=False, parts=(), missed_slots=0)
         ledger = self.ledger or empty
@@ -80,14 +90,14 @@ class SessionReport:
         }
 
 
-def verify_lone_file(path: Path) -> SessionReport:
+def verify_file_without_session(path: Path) -> SessionReport:
     """Verify a sealed file without `session.json` beside it.
 
     Raises:
         FileFormatError: there is no such file, or it is no sealed session.
     """
-    file = verify_file(path)
-    report = SessionReport(path, state="file", ledger=file.ledger, sha256=sha256_of(path))
+    file = verify_sealed_file(path)
+    report = SessionReport(path, state="file", ledger=file.ledger, sha256=compute_sha256(path))
     report.id, report.node = file.session.get("id"), str(file.session.get("node", ""))
     report.name = str(file.session.get("name", ""))
     report.problems, report.unproven = file.problems, file.unproven
@@ -101,44 +111,44 @@ def verify_lone_file(path: Path) -> SessionReport:
 def verify_session(
     folder: Path,
     *,
-    data: Path | None = None,
-    session: Session | None = None,
-    streams: Streams = verify_stream,
+    data_folder: Path | None = None,
+    expected_session: Session | None = None,
+    verify_stream_journal: StreamVerifier = verify_journal,
 ) -> SessionReport:
     """Verify a session's folder.
 
     Args:
         folder: folder with `session.json`, and `frames.parquet` if it is sealed.
-        data: data folder with its journals if it is not sealed; default: a server's layout.
-        session: model to verify the files against, in place of `session.json`.
-        streams: verifies a stream's journal.
+        data_folder: data folder with its journals if it is not sealed; default: a server's layout.
+        expected_session: model to verify the files against, in place of `session.json`.
+        verify_stream_journal: verifies a stream's journal.
 
     Raises:
         FileFormatError: there is no such folder.
     """
     if not folder.is_dir():
         raise FileFormatError("no such folder", where=str(folder))
-    data = data if data is not None else folder.absolute().parent.parent
-    for _ in range(_TRIES):
-        before = bytes_of(folder / SESSION_NAME)
-        report = _once(folder, data, session, before, streams)
-        if not report.problems or before == bytes_of(folder / SESSION_NAME):
+    data_folder = data_folder if data_folder is not None else folder.absolute().parent.parent
+    for _ in range(_MAX_ATTEMPTS):
+        before = read_bytes_or_none(folder / SESSION_NAME)
+        report = _verify_once(folder, data_folder, expected_session, before, verify_stream_journal)
+        if not report.problems or before == read_bytes_or_none(folder / SESSION_NAME):
             break
     return report
 
 
-def _once(
-    folder: Path, data: Path, session: Session | None, text: bytes | None, streams: Streams
+def _verify_once(
+    folder: Path, data: Path, session: Session | None, text: bytes | None, streams: StreamVerifier
 ) -> SessionReport:
-    report = SessionReport(folder, in_trash=folder.absolute().parent.name == "trash")
+    report = SessionReport(folder, is_in_trash=folder.absolute().parent.name == "trash")
     metadata = (
-        claims_of(session)
+        make_session_metadata(session)
         if session is not None
-        else claims_in(folder, text, report.problems, report.unproven)
+        else parse_session_metadata(folder, text, report.problems, report.unproven)
     )
     if metadata is None:
         if (folder / FRAMES_NAME).is_file():
-            _add_file(report, folder)
+            _verify_frames(report, folder)
         return report
     report.id, report.name = str(metadata.content["id"]), str(metadata.content.get("name", ""))
     report.node, report.state = (
@@ -148,12 +158,12 @@ def _once(
     report.ledger = metadata.ledger
     if report.state == "sealed":
         _check_sealed(report, folder, metadata)
-    elif metadata.whole is not None:
-        _count(report, data, metadata.whole, streams)
+    elif metadata.session is not None:
+        _count_ledger(report, data, metadata.session, streams)
     return report
 
 
-def _check_sealed(report: SessionReport, folder: Path, metadata: Claims) -> None:
+def _check_sealed(report: SessionReport, folder: Path, metadata: StoredMetadata) -> None:
     problems, content = report.problems, metadata.content
     if metadata.ledger is None:
         problems.append("it is sealed, but its ledger is missing")
@@ -163,36 +173,38 @@ def _check_sealed(report: SessionReport, folder: Path, metadata: Claims) -> None
     if metadata.ledger is not None and not any(part.recorded for part in metadata.ledger.parts):
         if path.is_file():
             problems.append(f"{FRAMES_NAME} exists, but the ledger has no frame recorded")
-        problems += ledger_problems(metadata.ledger)
+        problems += find_ledger_contradictions(metadata.ledger)
         return
     if not path.is_file():
         problems.append(f"{FRAMES_NAME} is missing")
         return
-    file = _add_file(report, folder)
+    file = _verify_frames(report, folder)
     if report.sha256 != content.get("sha256"):
         problems.append(
             f"{FRAMES_NAME} is not the file that {SESSION_NAME} names: its SHA-256 is "
             f"{report.sha256}, not {content.get('sha256')}"
         )
-    _compare(problems, content, file, path.stat().st_size)
+    _compare_metadata(problems, content, file, path.stat().st_size)
     if metadata.ledger is not None:
         report.ledger = metadata.ledger
         if file.ledger is not None and file.ledger != metadata.ledger:
             problems.append(f"the ledgers of {SESSION_NAME} and {FRAMES_NAME} are not the same")
     if file.session and file.session.get("parts") != [p.model_dump() for p in metadata.parts]:
         problems.append(f"{SESSION_NAME} and {FRAMES_NAME} are not of the same parts")
-    session = metadata.whole
-    _check_events(report, folder / EVENTS_NAME, session.events if session is not None else None)
+    session = metadata.session
+    _check_events(report, folder / MARKERS_NAME, session.markers if session is not None else None)
     _check_clock(report, folder / CLOCK_NAME, session)
     _check_stances(report, folder / STANCES_NAME)
     _check_overview(report, folder / OVERVIEW_NAME)
 
 
-def _compare(problems: list[str], content: dict[str, Any], file: FileReport, size: int) -> None:
+def _compare_metadata(
+    problems: list[str], content: dict[str, Any], file: SealedFileReport, size: int
+) -> None:
     """Compare the file's facts in `session.json` with the file."""
     first_last = [(part.t_mono_ns_first, part.t_mono_ns_last) for part in file.parts]
     duration_s = sum(last - first for first, last in first_last) * 1e-9
-    found: dict[str, Any] = {"frames": file.frames, "bytes": size}
+    found: dict[str, Any] = {"frames": file.frame_count, "bytes": size}
     found |= {
         name: file.session.get(name)
         for name in ("id", "node", "started_t_ns", "stopped_t_ns", "scene")
@@ -206,23 +218,23 @@ def _compare(problems: list[str], content: dict[str, Any], file: FileReport, siz
             )
     if not file.session:
         problems.append(f"{FRAMES_NAME} is of no recorded session")
-    if abs(float(content.get("duration_s", duration_s)) - duration_s) > _SAME_S:
+    if abs(float(content.get("duration_s", duration_s)) - duration_s) > _DURATION_TOLERANCE_S:
         problems.append(
             f"{SESSION_NAME} says that it lasted {content['duration_s']} s, and {FRAMES_NAME} "
             f"{duration_s} s"
         )
 
 
-def _add_file(report: SessionReport, folder: Path) -> FileReport:
+def _verify_frames(report: SessionReport, folder: Path) -> SealedFileReport:
     """Verify the frames, and add the findings to the report."""
     path = folder / FRAMES_NAME
     try:
-        file = verify_file(path)
-        report.sha256 = sha256_of(path)
+        file = verify_sealed_file(path)
+        report.sha256 = compute_sha256(path)
     except (FileFormatError, OSError) as error:
         what = error.what if isinstance(error, FileFormatError) else str(error)
         report.problems.append(f"{FRAMES_NAME}: {what}")
-        return FileReport(path)
+        return SealedFileReport(path)
     report.problems += [f"{FRAMES_NAME}: {problem}" for problem in file.problems]
     report.unproven += file.unproven
     report.id = report.id if report.id is not None else file.session.get("id")
@@ -230,7 +242,7 @@ def _add_file(report: SessionReport, folder: Path) -> FileReport:
     return file
 
 
-def _check_events(report: SessionReport, path: Path, events: tuple[Event, ...] | None) -> None:
+def _check_events(report: SessionReport, path: Path, events: tuple[Marker, ...] | None) -> None:
     """Verify the table of markers.
 
     Args:
@@ -238,18 +250,18 @@ def _check_events(report: SessionReport, path: Path, events: tuple[Event, ...] |
         path: the table.
         events: expected markers; None: unknown, and the table may be missing.
     """
-    stored = _stored(report, path, read_events, may_lack=events is None)
-    if stored is not None and events is not None and stored.events != events:
+    stored = _read_sidecar(report, path, read_markers, is_optional=events is None)
+    if stored is not None and events is not None and stored.markers != events:
         report.problems.append(f"{path.name} has other events than {SESSION_NAME}")
 
 
 def _check_clock(report: SessionReport, path: Path, session: Session | None) -> None:
     """Verify the clock table."""
-    stored = _stored(report, path, read_clock, may_lack=session is None)
+    stored = _read_sidecar(report, path, read_clock_file, is_optional=session is None)
     if stored is None or session is None:
         return
-    by_stream = sorted(session.clock, key=lambda row: row.boot_id)
-    if by_stream and sorted(stored.offsets, key=lambda row: row.boot_id) != by_stream:
+    by_stream = sorted(session.clock, key=lambda row: row.stream_id)
+    if by_stream and sorted(stored.offsets, key=lambda row: row.stream_id) != by_stream:
         report.problems.append(f"{path.name} has other rows than {SESSION_NAME}")
 
 
@@ -273,8 +285,8 @@ def _check_overview(report: SessionReport, path: Path) -> None:
     """Verify every piece of the overview; a missing one is made again from the frames."""
     try:
         with open_overview(path) as overview:
-            for level in range(overview.index.levels):
-                overview.bins(level, None, None)
+            for level in range(overview.index.level_count):
+                overview.read_bins(level, None, None)
             frames_sha256 = overview.index.frames_sha256
     except FileNotFoundError:
         return
@@ -288,37 +300,43 @@ def _check_overview(report: SessionReport, path: Path) -> None:
         report.unproven.append(f"{path.name}: it is of other frames, and nobody reads it")
 
 
-def _stored(
-    report: SessionReport, path: Path, read: Callable[[Path], _Stored], *, may_lack: bool
+def _read_sidecar(
+    report: SessionReport, path: Path, read: Callable[[Path], _Stored], *, is_optional: bool
 ) -> _Stored | None:
     try:
         stored = read(path)
     except FileNotFoundError:
-        if not may_lack:
+        if not is_optional:
             report.problems.append(f"{path.name} is missing")
         return None
     except (FileFormatError, StorageError) as error:
         report.problems.append(f"{path.name}: {error.what}")
         return None
-    if not stored.is_proven:
+    if not stored.has_hash:
         report.unproven.append(f"{path.name}: an older foottile wrote it, without a hash")
     return stored
 
 
-def _count(report: SessionReport, data: Path, session: Session, streams: Streams) -> None:
+def _count_ledger(
+    report: SessionReport, data: Path, session: Session, streams: StreamVerifier
+) -> None:
     """Count the ledger of an unsealed session from the journals."""
     if not (data / "journal").is_dir():
         report.unproven.append("which of its frames are stored: its journals are not here")
         return
     reports: dict[str, StreamReport] = {}
     for part in session.parts:
-        folder = data / "journal" / session.node / part.boot_id
-        if part.boot_id not in reports and folder.is_dir() and not folder.is_symlink():
-            reports[part.boot_id] = found = streams(folder)
-            report.problems += [f"journal {part.boot_id}: {problem}" for problem in found.problems]
-        reports.setdefault(part.boot_id, StreamReport(session.node, part.boot_id))
+        folder = data / "journal" / session.node / part.stream_id
+        if part.stream_id not in reports and folder.is_dir() and not folder.is_symlink():
+            reports[part.stream_id] = found = streams(folder)
+            report.problems += [
+                f"journal {part.stream_id}: {problem}" for problem in found.problems
+            ]
+        reports.setdefault(part.stream_id, StreamReport(session.node, part.stream_id))
     # For a server's folder a node may still send frames; a node's own folder has all of them.
     may_come = Intervals([(0, NO_END)] if (data / "nodes").is_dir() else ())
-    states = states_of(session, {b: found.state(may_come) for b, found in reports.items()})
-    ledger = ledger_of(session.parts, states, finished=session.stopped_t_ns is not None)
+    states = adjust_states_to_session(
+        session, {b: found.to_stream_state(may_come) for b, found in reports.items()}
+    )
+    ledger = compute_ledger(session.parts, states, is_finished=session.stopped_t_ns is not None)
     report.ledger = ledger.model_copy(update={"complete": False})

@@ -18,7 +18,7 @@ def test_every_quantity_is_counted_and_now_less_than_before(
     lines = file_bytes.measured(data.emulated(4, 4.0), tmp_path, with_ladder=False)
     cells = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")][1:]
     rows = {name.strip("*`"): [float(x.strip("*")) for x in found] for name, *found in cells}
-    assert {"t_ns", "padc", "force_sigma_n", "cop_ground_x_m", "contact"} <= set(rows)
+    assert {"t_ns", "pressure_raw", "force_sigma_n", "cop_ground_x_m", "contact"} <= set(rows)
     for way in (0, 1):
         parts = rows["all raw"][way] + rows["all estimates"][way]
         assert parts == pytest.approx(rows["all"][way], abs=0.02)

@@ -37,7 +37,7 @@ def test_boxes_stand_on_who_called_them_and_are_as_wide_as_their_samples(flame: 
 @pytest.mark.parametrize(
     ("frame", "kind"),
     [
-        ("Feed.tick (service/server/screens/fan_out.py:60)", "FootTile"),
+        ("Feed.tick (service/server/broadcast/broadcaster.py:60)", "FootTile"),
         ("Protocol.data (websockets/protocol.py)", "libraries"),
         ("Thread.run (threading.py:982)", "Python itself"),
         ("something", "Python itself"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.registry import FORMATS
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 pytestmark = [pytest.mark.slow, pytest.mark.process]

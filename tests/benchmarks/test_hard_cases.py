@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from devices.frames import FrameBatch, FrameStatus, zero_columns
+from devices.frames import FrameBatch, FrameFlag, allocate_columns
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -50,9 +50,9 @@ def test_frames_are_lost_a_tenth_of_a_second_at_a_time_and_never_of_the_lead(
     hard: ModuleType,
 ) -> None:
     n = 20_000
-    columns = zero_columns(n, 1)
+    columns = allocate_columns(n, 1)
     columns["seq"][:] = np.arange(n)
-    columns["frame_status"][: n // 2] = FrameStatus.LEAD
+    columns["frame_flags"][: n // 2] = FrameFlag.LEAD
     left = hard.without(FrameBatch(**columns), 0.1, np.random.default_rng(1))
     gaps = np.diff(left.seq.astype(int)) - 1
     assert (left.seq[: n // 2] == np.arange(n // 2)).all()
@@ -78,7 +78,7 @@ def test_a_rate_is_bounded_as_that_of_a_poisson_process(hard: ModuleType, alarms
 def test_a_healthy_foot_has_a_line_for_each_share_of_lost_frames(
     hard: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hard, "NOISES", ({},))
+    monkeypatch.setattr(hard, "UNSATURATED_MARGIN_SIGMAS", ({},))
     monkeypatch.setattr(hard, "LADDERS", {"static": hard.LADDERS["static"]})
     lines = list(hard.healthy(Path(), 0.006, [0.0, 0.1], ["rolling"]))
     assert [line.split("|")[1:7] for line in lines[:2]] == [

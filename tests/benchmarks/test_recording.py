@@ -101,7 +101,7 @@ def test_the_bound_of_a_smooth_load_under_noise_is_little_more_than_the_noise(
     slow = 400.0 + 100.0 * np.sin(np.arange(n)[:, None] / 500.0 + np.arange(4))
     noise = np.random.default_rng(0).normal(0.0, 2.6, (n, 4))
     counts = np.rint(slow + noise).astype(np.uint16)
-    bound = part("entropy").bytes_per_frame(replace(frames, padc=counts))
+    bound = part("entropy").bytes_per_frame(replace(frames, pressure_raw=counts))
     noise_bits = np.log2(2.6 * np.sqrt(2.0 * np.pi * np.e))
-    assert noise_bits < bound["padc"] * 8 / 4 < noise_bits + 0.3
+    assert noise_bits < bound["pressure_raw"] * 8 / 4 < noise_bits + 0.3
     assert bound["t_ns"] < 0.05  # t_mono_ns says it already

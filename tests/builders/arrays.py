@@ -59,7 +59,7 @@ def make_array(tiles: int | Sequence[TileInfo] = 2, **facts: Any) -> ArrayInfo:
         tiles = [make_tile(number) for number in range(tiles)]
     content: dict[str, Any] = {
         "node": "bench",
-        "boot_id": "0" * 32,
+        "stream_id": "0" * 32,
         "tiles": tuple(tiles),
         "servo": None,
         "schedule": "simultaneous",

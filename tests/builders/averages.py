@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from devices.arrays import Floats, Times
-from devices.compiled import compiled
+from devices.jit import jit_cached
 from service.estimation.models import denoise
 
 
-@compiled
+@jit_cached
 def denoised(
     values: Floats,
     sigmas: Floats,
@@ -22,7 +22,7 @@ def denoised(
     look_ns: int,
     noise_left: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """What `denoise.averaged` gives of every value, arrays (n, tiles); NaN where there is none.
+    """Averages of `denoise.average_sample` for every value, (n, tiles); NaN where there is none.
 
     Args:
         values: (n, tiles), NaN where there is none.
@@ -32,17 +32,17 @@ def denoised(
         at_ns: (n, tiles), the instants that are asked for.
         run: (n,), number of the unbroken run that a frame belongs to.
         look_ns: look-ahead.
-        noise_left: (tiles, `AVERAGED_MAX` + 1).
+        noise_left: (tiles, `WINDOW_READINGS_MAX` + 1).
     """
     n, tiles = values.shape
     out = np.full((4, n, tiles), math.nan)
-    columns, scratch, rows = (values, sigmas, t_ns, run), denoise.scratch_of_windows(), (0, 0)
+    columns, scratch, rows = (values, sigmas, t_ns, run), denoise.allocate_scratch(), (0, 0)
     for i in range(n):
-        rows = denoise.in_sight(frame_t_ns, i, 0, n, rows, look_ns)
+        rows = denoise.find_window_limits(frame_t_ns, i, 0, n, rows, look_ns)
         for j in range(tiles):
             if not math.isnan(values[i, j]):
-                found, _ = denoise.averaged(
-                    columns, i, j, at_ns[i, j], rows, noise_left[j], denoise.ANYWHERE, scratch
+                found, _ = denoise.average_sample(
+                    columns, i, j, at_ns[i, j], rows, noise_left[j], denoise.ALL_ROWS, scratch
                 )
                 for part in range(4):
                     out[part, i, j] = found[part]

@@ -31,7 +31,7 @@ def c3d_bytes(
     Args:
         groups: parameters by group and name: integers, floats or texts, arrays in the order of the
             manual (the first dimension changes fastest).
-        analog: (n, channels), n being a multiple of `samples_a_frame`.
+        analog: (n, channels), n being a multiple of `samples_per_frame`.
         point_hz: frames a second.
         samples_a_frame: analog samples in each.
         is_integer: samples are stored as integers of 16 bits, which they have to be.

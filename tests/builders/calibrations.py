@@ -91,13 +91,14 @@ def make_calibration(*tiles: str | TileCalibration, name: str = "by hand") -> Ca
 def make_tare(tiles: int = 2, **changes: Any) -> Tare:
     """A second without load: every tile at 500 counts, with half a count of noise.
 
-    `baseline_kpa`, `baseline_sigma_kpa`, `noise_kpa` and `tadc_counts` may be one value for all.
+    `baseline_kpa`, `baseline_sigma_kpa`, `noise_kpa` and `temperature_raw_counts` may be one value
+    for all.
     """
     content: dict[str, Any] = {
         "baseline_kpa": UNLOADED_KPA,
         "baseline_sigma_kpa": 0.0,
         "noise_kpa": 0.5 * COUNT_KPA,
-        "tadc_counts": 480.0,
+        "temperature_raw_counts": 480.0,
         "t_ns": UTC_NS,
         "begin_s": 0.0,
         "end_s": 1.0,
@@ -105,6 +106,6 @@ def make_tare(tiles: int = 2, **changes: Any) -> Tare:
         "source": "interval",
     }
     content |= changes
-    for per_tile in ("baseline_kpa", "baseline_sigma_kpa", "noise_kpa", "tadc_counts"):
+    for per_tile in ("baseline_kpa", "baseline_sigma_kpa", "noise_kpa", "temperature_raw_counts"):
         content[per_tile] = np.array(np.broadcast_to(content[per_tile], tiles), dtype=np.float64)
     return Tare(**content)

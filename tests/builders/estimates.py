@@ -11,7 +11,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import TileCalibration
 from service.estimation.estimate import Estimator
 from service.estimation.estimates import Estimates
-from service.estimation.ladder.plan import EstimationPlan, make_plan
+from service.estimation.pipeline.plan import EstimationPlan, make_plan
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.calibrations import make_calibration, make_tare
 
@@ -33,7 +33,7 @@ def newton_plan(
 def estimate(plan: EstimationPlan, *batches: FrameBatch) -> Estimates:
     """All estimates of these batches, stepped through one after the other."""
     estimator = Estimator(plan)
-    pieces = [estimator.step(batch) for batch in batches]
+    pieces = [estimator.process_frames(batch) for batch in batches]
     last = estimator.finish()
     return joined(pieces if last is None else [*pieces, last])
 

@@ -16,7 +16,7 @@ from devices.frames import (
     NO_SERVO_COUNTS,
     NOT_READ,
     FrameBatch,
-    TileStatus,
+    TileFlag,
 )
 from tests.builders.arrays import PERIOD_NS, UNLOADED_COUNTS, UTC_NS
 
@@ -62,13 +62,13 @@ def make_frames(
         "seq": seq,
         "t_mono_ns": t_mono_ns,
         "t_ns": np.asarray(t_mono_ns, np.int64) + utc_offset_ns,
-        "padc": UNLOADED_COUNTS,
-        "tadc": 480,
+        "pressure_raw": UNLOADED_COUNTS,
+        "temperature_raw": 480,
         "sample_offset_us": 0,
         "servo_counts": NO_SERVO_COUNTS,
         "servo_age_us": NO_SERVO_AGE,
-        "status": 0,
-        "frame_status": 0,
+        "tile_flags": 0,
+        "frame_flags": 0,
         "reference_force_n": np.nan,
     }
     return _batch(values | columns, len(seq), tiles)
@@ -91,9 +91,9 @@ def loaded_frames(forces_n: npt.ArrayLike, **columns: Any) -> FrameBatch:
     silent = np.isnan(forces)
     counts = np.mod(UNLOADED_COUNTS - np.rint(np.where(silent, 0.0, forces)), 1024)
     reading = {
-        "padc": np.where(silent, NOT_READ, counts),
-        "tadc": np.where(silent, NOT_READ, 480),
-        "status": np.where(silent, TileStatus.NO_ANSWER, 0),
+        "pressure_raw": np.where(silent, NOT_READ, counts),
+        "temperature_raw": np.where(silent, NOT_READ, 480),
+        "tile_flags": np.where(silent, TileFlag.NO_ANSWER, 0),
     }
     return make_frames(len(forces), forces.shape[1], **reading | columns)
 
@@ -123,7 +123,7 @@ def laid_out(batch: FrameBatch, how: str) -> FrameBatch:
 def cut_up(batch: FrameBatch, cuts: Iterable[int], how: str = "as it is") -> list[FrameBatch]:
     """The frames in pieces, each laid out for itself; cuts beyond the last frame do not count."""
     edges = sorted(cut for cut in cuts if 0 < cut < len(batch))
-    return [laid_out(batch.rows(a, b), how) for a, b in pairwise((0, *edges, len(batch)))]
+    return [laid_out(batch.slice_rows(a, b), how) for a, b in pairwise((0, *edges, len(batch)))]
 
 
 def assert_same_bits(one: Any, other: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from devices.scene.file import Scene
+from devices.scene.scene_file import Scene
 
 ONE_TILE_FILE = """
 name = "one"

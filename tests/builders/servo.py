@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from devices.chips.dynamixel.packets import Packet
-from devices.chips.dynamixel.protocol1 import Error
+from devices.chips.dynamixel.protocol import Packet
+from devices.chips.dynamixel.protocol1 import ErrorFlag
 from devices.clock import Clock
 from devices.emulation.chips.dynamixel import EmulatedServo
 
@@ -27,7 +27,7 @@ class FaultyServo(EmulatedServo):
 
     def write_table(self, address: int, data: bytes) -> None:
         """Set registers, as with the maker's own tool."""
-        self._firmware.table[address : address + len(data)] = data
+        self._firmware.control_table[address : address + len(data)] = data
 
     def silent(self) -> contextlib.AbstractContextManager[None]:
         """Answer nothing, as without power or with the plug pulled; but its state survives."""
@@ -59,9 +59,9 @@ class FaultyServo(EmulatedServo):
 
     def _complain(self, of_voltage: bool) -> None:
         if self._firmware.version == 1:
-            self._firmware.alerts = Error.VOLTAGE if of_voltage else Error(0)
+            self._firmware.error_bits = ErrorFlag.VOLTAGE if of_voltage else ErrorFlag(0)
         else:
-            self._firmware.table[HARDWARE_ERROR] = int(of_voltage)
+            self._firmware.control_table[HARDWARE_ERROR] = int(of_voltage)
 
     @contextlib.contextmanager
     def _with(self, name: str, value: object) -> Iterator[None]:

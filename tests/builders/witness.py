@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
 from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import SAMPLE_PART_OF_CONVERSION, Coefficients, compensate_kpa
+from devices.chips.mpl115a2 import SAMPLE_DELAY_DIVISOR, Coefficients, compensate_kpa
 from devices.emulation.world import World
-from devices.frames import NOT_READ, FrameBatch, TileInfo, TileStatus
-from devices.temperature import hold_temperature
+from devices.frames import NOT_READ, FrameBatch, TileFlag, TileInfo
+from devices.temperature_hold import hold_temperature
 
 _ROUNDING_NS = 2_000  # offsets are whole microseconds
 _NEIGHBOURS = 5
@@ -52,10 +52,10 @@ class Witness:
     """Listens to all parts of a world from now on."""
 
     def __init__(self, world: World) -> None:
-        self._stops_ns: list[list[int]] = [[] for _ in world.parts]
-        self._words: list[list[tuple[int, int]]] = [[] for _ in world.parts]
-        self._chips: list[list[tuple[int, int, int, int]]] = [[] for _ in world.parts]
-        for i, part in enumerate(world.parts):
+        self._stops_ns: list[list[int]] = [[] for _ in world.chips]
+        self._words: list[list[tuple[int, int]]] = [[] for _ in world.chips]
+        self._chips: list[list[tuple[int, int, int, int]]] = [[] for _ in world.chips]
+        for i, part in enumerate(world.chips):
             part.on_conversion = partial(self._note, i)
 
     def _note(
@@ -69,40 +69,44 @@ class Witness:
         """Compare frames with what their conversions gave."""
         held, _ = hold_temperature(frames)
         compensation = Compensation(tiles)
-        kpa = compensation.readable_kpa(held)
-        true_kpa, true_padc, true_tadc, own = self._truth(frames, tiles, held.tadc)
-        given = ((frames.status & np.uint8(TileStatus.UNUSABLE)) == 0) & (frames.padc != NOT_READ)
-        same_tadc = (frames.tadc == NOT_READ) | (frames.tadc == true_tadc)
-        same = (frames.padc == true_padc) & same_tadc
+        kpa = compensation.compute_usable_kpa(held)
+        true_kpa, true_padc, true_tadc, own = self._truth(frames, tiles, held.temperature_raw)
+        given = ((frames.tile_flags & np.uint8(TileFlag.UNUSABLE)) == 0) & (
+            frames.pressure_raw != NOT_READ
+        )
+        same_temperature_raw = (frames.temperature_raw == NOT_READ) | (
+            frames.temperature_raw == true_tadc
+        )
+        same = (frames.pressure_raw == true_padc) & same_temperature_raw
         error_kpa = np.where(given, np.abs(kpa - true_kpa), np.nan)
         # Given, and no pressure can be made of it: that is wrong too, by an error without a number.
         right = given & same & own & np.isfinite(kpa)
         return Verdict(given, same, right, error_kpa)
 
     def _truth(
-        self, frames: FrameBatch, tiles: tuple[TileInfo, ...], held_tadc: Counts
+        self, frames: FrameBatch, tiles: tuple[TileInfo, ...], held_temperature_raw: Counts
     ) -> tuple[Floats, Floats, Floats, Bools]:
         """Pressure and words of the conversions that the frames claim to be, (n, tiles).
 
         By the coefficients of the part that converted; and whether these are those described.
         """
-        shape = frames.padc.shape
+        shape = frames.pressure_raw.shape
         kpa = np.full(shape, np.nan)
-        padc, tadc = np.zeros(shape), np.zeros(shape)
+        pressure_raw, temperature_raw = np.zeros(shape), np.zeros(shape)
         own = np.zeros(shape, dtype=np.bool_)
         for i, tile in enumerate(tiles):
-            delay_ns = round(tile.conversion_ms * 1e6) // SAMPLE_PART_OF_CONVERSION
+            delay_ns = round(tile.conversion_ms * 1e6) // SAMPLE_DELAY_DIVISOR
             asked_ns = frames.t_mono_ns + frames.sample_offset_us[:, i] * 1000 - delay_ns
             stops_ns, words, chips = self._stops_ns[i], self._words[i], self._chips[i]
             for row, stop_ns in enumerate(asked_ns.tolist()):
                 at = bisect_left(stops_ns, stop_ns - _ROUNDING_NS)
                 if at < len(stops_ns) and stops_ns[at] <= stop_ns + _ROUNDING_NS:
                     true_padc, true_tadc = words[at]
-                    padc[row, i], tadc[row, i] = words[at]
+                    pressure_raw[row, i], temperature_raw[row, i] = words[at]
                     own[row, i] = chips[at] == tile.coefficient_words
                     # Without a temperature of its own the held one is as good as it gets.
-                    if frames.tadc[row, i] == NOT_READ:
-                        true_tadc = int(held_tadc[row, i])
+                    if frames.temperature_raw[row, i] == NOT_READ:
+                        true_tadc = int(held_temperature_raw[row, i])
                 elif words:
                     around = words[max(0, at - _NEIGHBOURS) : at + _NEIGHBOURS] or words[-1:]
                     true_padc, true_tadc = np.median(np.array(around), axis=0)
@@ -110,8 +114,8 @@ class Witness:
                     continue
                 chip = Coefficients.from_words(chips[min(at, len(chips) - 1)])
                 kpa[row, i] = _kpa(true_padc, true_tadc, chip)
-        return kpa, padc, tadc, own
+        return kpa, pressure_raw, temperature_raw, own
 
 
-def _kpa(padc: float, tadc: float, chip: Coefficients) -> float:
-    return float(compensate_kpa(padc, tadc, chip.a0, chip.b1, chip.b2, chip.c12))
+def _kpa(pressure_raw: float, temperature_raw: float, chip: Coefficients) -> float:
+    return float(compensate_kpa(pressure_raw, temperature_raw, chip.a0, chip.b1, chip.b2, chip.c12))

@@ -8,20 +8,25 @@ from typing import Any, get_args
 
 from smbus2 import i2c_msg
 
-from devices.array.array import TileArray
-from devices.array.budget import BusTiming
-from devices.array.ports import Scan
+from devices.array.tile_array import TileArray
+from devices.array.tile_io import Scan
+from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import I2cBus
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter, Line
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
+from devices.emulation.buses.i2c import EmulatedI2cAdapter, FaultyWires
+from devices.emulation.chips.mpl115a2 import (
+    EmulatedMpl115a2,
+    EmulatedPart,
+    PartFaults,
+    SampleFunction,
+)
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
-from devices.emulation.faults import Faults
-from devices.emulation.parts import random_of
+from devices.emulation.fault_timing import SceneFaults
+from devices.emulation.parts import make_rng
 from devices.frames import TileInfo
-from devices.recovery.recovery import BusRecovery
-from devices.scene.emulated import BUS, FaultKind, PartFault, ReadDuringConversion
-from devices.scene.hardware import ScheduleName
+from devices.recovery.bus_recovery import BusRecovery
+from devices.scene.emulation_sections import BUS_TARGET, FaultKind, PartFault, ReadDuringConversion
+from devices.scene.hardware_sections import ScheduleName
 from tests.builders.arrays import DATA_SHEET_CHIP, make_tile
 
 # SCL periods per transaction, hardware.md 4
@@ -49,7 +54,7 @@ def full(tiles: int) -> Plugs:
     return tuple((0x70 + i // 8, i % 8) for i in range(tiles))
 
 
-def counting(first: int) -> Sense:
+def counting(first: int) -> SampleFunction:
     """A sense in which no two conversions are alike; its tile is told by the hundreds."""
     results: Iterator[int] = iter(range(first, first + 10_000_000))
     return lambda _: (1 + next(results) % 1000, 500)
@@ -77,10 +82,10 @@ class Wires:
         self.words = [(words or {}).get(i, DATA_SHEET_CHIP) for i in range(len(plugs))]
         self.tc_ns = [tc_ns] * len(plugs) if isinstance(tc_ns, int) else list(tc_ns)
         self.clock = VirtualClock(7_000_000_000)
-        self._faults = Faults(())
+        self._faults = SceneFaults(())
         self.tiles = [
             EmulatedMpl115a2(
-                Silicon(self.words[i], self.tc_ns[i], counting(100 * i)),
+                EmulatedPart(self.words[i], self.tc_ns[i], counting(100 * i)),
                 mode,
                 self._part_faults(f"T{i + 1:02d}"),
             )
@@ -90,24 +95,24 @@ class Wires:
             EmulatedTca9548a(
                 address,
                 {c: tile for (m, c), tile in zip(plugs, self.tiles, strict=True) if m == address},
-                self._faults.of("brown_out", f"0x{address:02x}"),
-                self._faults.of("mux_reset", f"0x{address:02x}"),
+                self._faults.get_fault("brown_out", f"0x{address:02x}"),
+                self._faults.get_fault("mux_reset", f"0x{address:02x}"),
             )
             for address in sorted({mux for mux, _ in plugs})
         ]
-        line = Line(self._faults, "test")
+        line = FaultyWires(self._faults, "test")
         self.adapter = EmulatedI2cAdapter(self.muxes, self.clock, scl_hz, line)
         self.log: list[str] = []
         self.on_transaction: Callable[[int, tuple[i2c_msg, ...]], None] = lambda _, __: None
         self.after_transaction: Callable[[], None] = lambda: None
 
     def _part_faults(self, serial: str) -> PartFaults:
-        own = {kind: self._faults.of(kind, serial) for kind in get_args(PartFault)}
+        own = {kind: self._faults.get_fault(kind, serial) for kind in get_args(PartFault)}
         return PartFaults(**own, scene=self._faults)
 
-    def fault(self, kind: FaultKind, target: str = BUS) -> AbstractContextManager[None]:
+    def fault(self, kind: FaultKind, target: str = BUS_TARGET) -> AbstractContextManager[None]:
         """Something fails while the block runs: a tile ("T01"), a mux ("0x70") or the bus."""
-        return self._faults.injected(kind, target)
+        return self._faults.inject(kind, target)
 
     @property
     def bus(self) -> I2cBus:
@@ -160,7 +165,7 @@ def array_on(
         wires.scl_hz,
         tuple(wait_ns * 1e-9 for wait_ns in waits_ns or wires.tc_ns),
         tuple(mux for mux, _ in wires.plugs),
-        bytes_read=2.0 + 2.0 / temperature_every,
+        bytes_per_read=2.0 + 2.0 / temperature_every,
     )
     return TileArray(
         wires.bus,
@@ -171,7 +176,7 @@ def array_on(
         temperature_every=temperature_every,
         broadcast_channels=broadcast_channels,
         recovery=recovery,
-        reference_n=reference_n,
+        read_reference_n=reference_n,
     )
 
 
@@ -193,19 +198,19 @@ def settled_on(
 def scanned(array: TileArray, frames: int) -> Scan:
     """The last of so many frames."""
     for _ in range(frames - 1):
-        array.scan()
-    return array.scan()
+        array.scan_frame()
+    return array.scan_frame()
 
 
 def timed_scan(array: TileArray, wires: Wires) -> tuple[Scan, int]:
     """One frame, and how long it took in ns."""
     begin_ns = wires.clock.now_ns()
-    return array.scan(), wires.clock.now_ns() - begin_ns
+    return array.scan_frame(), wires.clock.now_ns() - begin_ns
 
 
 def hesitating(wires: Wires, seed: int, least_ns: int = 500_000) -> None:
     """Now and then the machine hesitates before a transfer, by so much or up to 5 ms."""
-    rng = random_of(f"machine {seed}")
+    rng = make_rng(f"machine {seed}")
 
     def hesitate(_: int, __: tuple[i2c_msg, ...]) -> None:
         if rng.random() < 0.05:

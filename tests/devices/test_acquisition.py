@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from devices.acquisition import Acquisition
-from devices.array.array import TileArray
-from devices.array.budget import BusTiming
+from devices.array.tile_array import TileArray
+from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import I2cBus
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, FrameBatch, FrameStatus
-from devices.scene.file import Scene
-from devices.scene.hardware import ScheduleName
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, FrameBatch, FrameFlag
+from devices.scene.hardware_sections import ScheduleName
+from devices.scene.scene_file import Scene
 from tests.builders.scenes import make_scene
 from tests.devices.feet import (
     ANCHOR,
@@ -82,7 +82,7 @@ def test_an_unpaced_stream_runs_at_the_rate_of_the_bus(
     one = foot(make_scene(array=TYPICAL, emulation=LIVELY), schedule=schedule)
     batch = one.take(50)
     assert at_the_pace_of_the_bus(batch, frame_ns, looks=4)
-    assert (batch.frame_status == 0).all()
+    assert (batch.frame_flags == 0).all()
     assert one.stream.missed_slots == 0
 
 
@@ -92,7 +92,7 @@ def test_a_paced_stream_keeps_its_rate_exactly(rate_hz: float) -> None:
     batch = one.run_for(0.9)  # up to the first audit, which has a test of its own
     assert at_its_own_pace(batch, rate_hz)
     assert len(batch) == pytest.approx(0.9 * rate_hz, abs=1)
-    assert (batch.frame_status == 0).all()
+    assert (batch.frame_flags == 0).all()
     assert one.stream.missed_slots == 0
 
 
@@ -122,7 +122,7 @@ def test_a_rate_that_the_bus_does_not_give_shows_as_missed_slots(rate_hz: float)
     assert (np.diff(slot) >= (1 if rate_hz > 800 else 0)).all()
     assert abs(one.stream.missed_slots - (slot[-1] + 1 - len(batch))) <= 1
     assert one.stream.missed_slots > 0
-    overrun = (batch.frame_status & FrameStatus.OVERRUN) != 0
+    overrun = (batch.frame_flags & FrameFlag.OVERRUN) != 0
     assert not overrun[0]
     known = sure[1:] & sure[:-1]
     assert known.mean() > 0.3 or rate_hz > 800
@@ -133,15 +133,15 @@ def test_a_rate_that_the_bus_does_not_give_shows_as_missed_slots(rate_hz: float)
 
 def test_a_consumer_that_dawdles_is_counted_and_not_waited_for() -> None:
     one = foot(make_scene(array=TYPICAL, emulation=LIVELY), rate_hz=100.0)
-    frames = one.stream.run(lambda: False)
+    frames = one.stream.acquire_batches(lambda: False)
     first = next(frames)
     one.clock.sleep_until_ns(one.clock.now_ns() + 200_000_000)
     second = next(frames)
     gap_ns = int(second.t_mono_ns[0] - first.t_mono_ns[-1])
     assert one.stream.missed_slots == gap_ns // 10_000_000 - 1
     assert 18 <= one.stream.missed_slots <= 20
-    assert second.frame_status[0] == FrameStatus.OVERRUN
-    assert (second.frame_status[1:] == 0).all()
+    assert second.frame_flags[0] == FrameFlag.OVERRUN
+    assert (second.frame_flags[1:] == 0).all()
     assert second.seq[0] == first.seq[-1] + 1, "a missed slot never had a number"
 
 
@@ -161,29 +161,29 @@ def test_frames_that_are_further_apart_than_a_batch_come_one_by_one() -> None:
 def test_a_batch_is_contiguous_and_never_empty() -> None:
     for batch in foot(make_scene(array=TYPICAL, emulation=LIVELY)).batches(0.2):
         assert len(batch) > 0
-        assert batch.padc.flags.c_contiguous
-        assert batch.status.flags.c_contiguous
+        assert batch.pressure_raw.flags.c_contiguous
+        assert batch.tile_flags.flags.c_contiguous
 
 
 def test_a_batch_is_not_touched_by_the_next_one() -> None:
-    frames = foot(make_scene(array=TYPICAL, emulation=LIVELY)).stream.run(lambda: False)
+    frames = foot(make_scene(array=TYPICAL, emulation=LIVELY)).stream.acquire_batches(lambda: False)
     first = next(frames)
-    kept = first.padc.copy(), first.seq.copy()
+    kept = first.pressure_raw.copy(), first.seq.copy()
     next(frames)
-    np.testing.assert_array_equal(first.padc, kept[0])
+    np.testing.assert_array_equal(first.pressure_raw, kept[0])
     np.testing.assert_array_equal(first.seq, kept[1])
 
 
 def test_nothing_is_taken_when_the_end_has_come_already() -> None:
     one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
-    assert list(one.stream.run(lambda: True)) == []
+    assert list(one.stream.acquire_batches(lambda: True)) == []
 
 
 def test_the_end_is_looked_for_before_every_frame() -> None:
     one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     begin_ns = one.clock.now_ns()
     end_ns = begin_ns + 3 * FRAME_NS + 1  # in the middle of a batch
-    batches = list(one.stream.run(lambda: one.clock.now_ns() >= end_ns))
+    batches = list(one.stream.acquire_batches(lambda: one.clock.now_ns() >= end_ns))
     assert [len(batch) for batch in batches] == [4]
 
 
@@ -199,7 +199,7 @@ class Servo:
         self.stale_after_ns = 30_000_000
         self.is_turn_known = True
 
-    def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
+    def find_latest_position(self, t_mono_ns: int) -> tuple[int, int] | None:
         self.asked_ns.append(t_mono_ns)
         return self.reading
 
@@ -214,14 +214,14 @@ def test_without_a_servo_position_and_age_say_so() -> None:
     batch = foot(make_scene(array=TYPICAL, emulation=LIVELY)).take(3)
     assert set(batch.servo_counts.tolist()) == {NO_SERVO_COUNTS}
     assert set(batch.servo_age_us.tolist()) == {NO_SERVO_AGE}
-    assert (batch.frame_status == 0).all()
+    assert (batch.frame_flags == 0).all()
 
 
 def test_a_servo_that_has_not_answered_yet_is_stale() -> None:
     batch = with_servo(make_scene(array=TYPICAL, emulation=LIVELY), Servo(None)).take(3)
     assert set(batch.servo_counts.tolist()) == {NO_SERVO_COUNTS}
     assert set(batch.servo_age_us.tolist()) == {NO_SERVO_AGE}
-    assert (batch.frame_status == FrameStatus.SERVO_STALE).all()
+    assert (batch.frame_flags == FrameFlag.SERVO_STALE).all()
 
 
 def test_the_newest_position_goes_with_a_frame_and_ages() -> None:
@@ -231,7 +231,7 @@ def test_the_newest_position_goes_with_a_frame_and_ages() -> None:
     age_ns = batch.t_mono_ns - 1_000
     assert batch.servo_age_us.tolist() == (age_ns // 1000).tolist()
     assert servo.asked_ns == batch.t_mono_ns.tolist()
-    stale = (batch.frame_status & FrameStatus.SERVO_STALE) != 0
+    stale = (batch.frame_flags & FrameFlag.SERVO_STALE) != 0
     assert stale.tolist() == (age_ns > 30_000_000).tolist()
     assert stale.any()
     assert not stale.all()
@@ -243,9 +243,9 @@ def test_a_position_whose_turn_is_not_known_says_so() -> None:
     servo.is_turn_known = False
     batch = one.take(3)
     assert (batch.servo_counts == 2048).all(), "counts are kept as they were read"
-    assert ((batch.frame_status & FrameStatus.SERVO_TURN_UNKNOWN) != 0).all()
+    assert ((batch.frame_flags & FrameFlag.SERVO_TURN_UNKNOWN) != 0).all()
     servo.is_turn_known = True
-    assert ((one.take(3).frame_status & FrameStatus.SERVO_TURN_UNKNOWN) == 0).all()
+    assert ((one.take(3).frame_flags & FrameFlag.SERVO_TURN_UNKNOWN) == 0).all()
 
 
 def test_a_servo_that_died_an_hour_ago_does_not_stop_the_stream() -> None:
@@ -254,7 +254,7 @@ def test_a_servo_that_died_an_hour_ago_does_not_stop_the_stream() -> None:
     one = with_servo(make_scene(array=TYPICAL, emulation=LIVELY), servo, start_ns=3_600_000_000_000)
     batch = one.take(3)
     assert (batch.servo_counts == 2048).all()
-    assert (batch.frame_status & FrameStatus.SERVO_STALE).all()
+    assert (batch.frame_flags & FrameFlag.SERVO_STALE).all()
     assert (batch.servo_age_us > 30_000_000).all(), "old, however it is told"
 
 
@@ -269,7 +269,7 @@ def test_the_force_beside_the_array_goes_with_the_frame() -> None:
         one.clock,
         schedule="simultaneous",
         timing=timing,
-        reference_n=lambda: one.clock.now_ns() * 1e-9,
+        read_reference_n=lambda: one.clock.now_ns() * 1e-9,
     )
     one.stream = Acquisition(array, array.tiles, one.clock, ANCHOR)
     batch = one.take(3)
@@ -283,10 +283,10 @@ def test_the_force_beside_the_array_goes_with_the_frame() -> None:
 def test_the_same_scene_gives_the_same_frames_to_the_bit() -> None:
     scene = make_scene(array=TYPICAL, emulation={"noise_kpa": 0.165})
     first, second = foot(scene).take(50), foot(scene).take(50)
-    np.testing.assert_array_equal(first.padc, second.padc)
-    np.testing.assert_array_equal(first.tadc, second.tadc)
+    np.testing.assert_array_equal(first.pressure_raw, second.pressure_raw)
+    np.testing.assert_array_equal(first.temperature_raw, second.temperature_raw)
     np.testing.assert_array_equal(first.t_mono_ns, second.t_mono_ns)
-    assert len(set(first.padc[:, 0].tolist())) > 3, "noise and all"
+    assert len(set(first.pressure_raw[:, 0].tolist())) > 3, "noise and all"
 
 
 # A loop without a rate of its own
@@ -294,25 +294,29 @@ def test_the_same_scene_gives_the_same_frames_to_the_bit() -> None:
 
 def test_a_loop_that_was_stalled_says_how_many_frames_it_missed() -> None:
     one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
-    stream = Acquisition(one.array, one.array.tiles, one.clock, ANCHOR, expected_hz=1e9 / FRAME_NS)
-    batches = stream.run(lambda: False)
+    stream = Acquisition(
+        one.array, one.array.tiles, one.clock, ANCHOR, expected_rate_hz=1e9 / FRAME_NS
+    )
+    batches = stream.acquire_batches(lambda: False)
     before = next(batches)
     assert stream.missed_slots == 0
     one.clock.sleep_until_ns(one.clock.now_ns() + 100 * FRAME_NS)
     after = next(batches)
     assert stream.missed_slots == 100
-    assert after.frame_status[0] & FrameStatus.OVERRUN
-    assert not (after.frame_status[1:] & FrameStatus.OVERRUN).any()
+    assert after.frame_flags[0] & FrameFlag.OVERRUN
+    assert not (after.frame_flags[1:] & FrameFlag.OVERRUN).any()
     assert after.seq[0] == before.seq[-1] + 1  # what was not taken never had a number
 
 
 def test_a_loop_that_is_a_little_slow_misses_slots_without_a_stall() -> None:
     one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     expected_hz = 1.03e9 / FRAME_NS
-    one.stream = Acquisition(one.array, one.array.tiles, one.clock, ANCHOR, expected_hz=expected_hz)
+    one.stream = Acquisition(
+        one.array, one.array.tiles, one.clock, ANCHOR, expected_rate_hz=expected_hz
+    )
     begin_ns = one.clock.now_ns()
     batch = one.run_for(0.9)
     slots = (one.clock.now_ns() - begin_ns) * 1e-9 * expected_hz
     assert one.stream.missed_slots == pytest.approx(slots - len(batch), abs=1)
     assert one.stream.missed_slots > 5
-    assert not (batch.frame_status & FrameStatus.OVERRUN).any()
+    assert not (batch.frame_flags & FrameFlag.OVERRUN).any()

@@ -74,12 +74,12 @@ def test_the_system_clock_is_the_monotonic_one(impatient: ImpatientTime) -> None
 
 @given(t_mono_ns=st.integers(0, 2**62), t_ns=st.integers(0, 2**62))
 def test_an_anchor_carries_one_clock_over_to_the_other(t_mono_ns: int, t_ns: int) -> None:
-    anchor = UtcAnchor.of(t_mono_ns, t_ns, clock_set=False)
+    anchor = UtcAnchor.from_readings(t_mono_ns, t_ns, clock_set=False)
     assert t_mono_ns + anchor.offset_ns == t_ns
     assert not anchor.clock_set
 
 
 def test_an_anchor_cannot_be_moved() -> None:
-    anchor = UtcAnchor.of(0, 1, clock_set=True)
+    anchor = UtcAnchor.from_readings(0, 1, clock_set=True)
     with pytest.raises(dataclasses.FrozenInstanceError):
         anchor.offset_ns = 2  # type: ignore[misc]  # it is frozen

@@ -72,7 +72,7 @@ def test_the_errno_of_the_adapter_survives_pickling(kind: type[I2cError]) -> Non
     again = travelled(kind("no acknowledge", where="bus", errno=121))
     assert isinstance(again, kind)
     assert again.errno == 121
-    assert again.facts()["errno"] == 121
+    assert again.to_dict()["errno"] == 121
     assert str(again) == "bus: no acknowledge"
 
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from devices.errors import MissingExtraError, needs_extra
+from devices.errors import MissingExtraError, require_extra
 
 
 def test_a_missing_package_is_named_with_the_extra_that_brings_it(
@@ -15,11 +15,11 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(
     monkeypatch.setitem(sys.modules, "scipy", None)
     with (
         pytest.raises(MissingExtraError, match=r"an emulated array needs scipy.*'foottile\[emul"),
-        needs_extra("emulation", "an emulated array"),
+        require_extra("emulation", "an emulated array"),
     ):
         import scipy.signal  # noqa: F401  # that it cannot be is the test
 
 
 def test_a_mistake_of_ours_is_no_missing_package() -> None:
-    with pytest.raises(ModuleNotFoundError), needs_extra("server", "a server"):
+    with pytest.raises(ModuleNotFoundError), require_extra("server", "a server"):
         raise ModuleNotFoundError("no such module", name="service.no_such_module")

@@ -18,8 +18,8 @@ from devices.frames import (
     NOT_READ,
     ArrayInfo,
     FrameBatch,
-    FrameStatus,
-    TileStatus,
+    FrameFlag,
+    TileFlag,
 )
 from tests.builders.arrays import NEWTON_CHIP, UTC_NS, make_array, make_servo
 
@@ -28,13 +28,13 @@ DESIGN = {
     "seq": ("uint64", False),
     "t_mono_ns": ("int64", False),
     "t_ns": ("int64", False),
-    "padc": ("uint16", True),
-    "tadc": ("uint16", True),
+    "pressure_raw": ("uint16", True),
+    "temperature_raw": ("uint16", True),
     "sample_offset_us": ("int32", True),
     "servo_counts": ("int32", False),
     "servo_age_us": ("int32", False),
-    "status": ("uint8", True),
-    "frame_status": ("uint8", False),
+    "tile_flags": ("uint8", True),
+    "frame_flags": ("uint8", False),
     "reference_force_n": ("float32", False),
 }
 
@@ -61,7 +61,7 @@ def test_the_marks_of_what_was_not_read_are_those_of_the_design() -> None:
 
 
 def test_the_status_bits_are_those_of_the_design() -> None:
-    assert {bit.name: bit.value for bit in TileStatus} == {
+    assert {bit.name: bit.value for bit in TileFlag} == {
         "NO_ANSWER": 1,
         "STALE": 2,
         "RETRIED": 4,
@@ -69,7 +69,7 @@ def test_the_status_bits_are_those_of_the_design() -> None:
         "OVER_RANGE": 16,
         "NOT_CONVERTED": 32,
     }
-    assert {bit.name: bit.value for bit in FrameStatus} == {
+    assert {bit.name: bit.value for bit in FrameFlag} == {
         "OVERRUN": 1,
         "SERVO_STALE": 2,
         "BUS_FAULT": 4,
@@ -80,7 +80,7 @@ def test_the_status_bits_are_those_of_the_design() -> None:
 
 
 def test_a_retried_or_over_ranged_tile_is_still_usable() -> None:
-    usable = [bit.name for bit in TileStatus if not bit & TileStatus.UNUSABLE]
+    usable = [bit.name for bit in TileFlag if not bit & TileFlag.UNUSABLE]
     assert usable == ["RETRIED", "OVER_RANGE"]
 
 
@@ -92,7 +92,7 @@ def test_a_column_of_another_type_is_refused_by_name(name: str) -> None:
         replace(good, **{name: wrong})
 
 
-@pytest.mark.parametrize("name", [name for name in DESIGN if name != "padc"])
+@pytest.mark.parametrize("name", [name for name in DESIGN if name != "pressure_raw"])
 def test_a_column_of_another_length_is_refused_by_name(name: str) -> None:
     good = batch()
     with pytest.raises(ValueError, match=rf"FrameBatch\.{name}\b"):
@@ -122,19 +122,21 @@ def test_rows_and_concatenation_undo_each_other(
 ) -> None:
     whole = batch(n=sum(sizes), tiles=tiles)
     ends = np.cumsum(sizes).tolist()
-    pieces = [whole.rows(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    pieces = [whole.slice_rows(end - size, end) for end, size in zip(ends, sizes, strict=True)]
     assert [len(piece) for piece in pieces] == sizes
     again = FrameBatch.concatenate(pieces)
     for name in DESIGN:
         np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
         assert getattr(again, name).dtype == getattr(whole, name).dtype
     row = data.draw(st.integers(0, max(0, sum(sizes) - 1)))
-    np.testing.assert_array_equal(whole.rows(row, row + 1).padc, whole.padc[row : row + 1])
+    np.testing.assert_array_equal(
+        whole.slice_rows(row, row + 1).pressure_raw, whole.pressure_raw[row : row + 1]
+    )
 
 
 def test_rows_copy_nothing() -> None:
     whole = batch()
-    part = whole.rows(1, 3)
+    part = whole.slice_rows(1, 3)
     for name in DESIGN:
         assert np.shares_memory(getattr(part, name), getattr(whole, name))
 
@@ -152,7 +154,7 @@ def test_no_batch_at_all_does_not_join() -> None:
 def described() -> ArrayInfo:
     """An array with a servo, nothing in it a default."""
     servo = make_servo(sign=-1, ratio=0.1, ankle_travel_m_per_rad=None)
-    return make_array(servo=servo, nominal_rate_hz=394.87, boot_id="00ff")
+    return make_array(servo=servo, nominal_rate_hz=394.87, stream_id="00ff")
 
 
 def test_array_info_travels_as_json_without_loss() -> None:

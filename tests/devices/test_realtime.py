@@ -29,7 +29,7 @@ def in_a_thread(body: Callable[[], object]) -> object:
 
 def test_timers_are_as_sharp_as_asked_for() -> None:
     def slack_ns() -> int:
-        assert realtime.sharpen_timers(2_000)
+        assert realtime.set_timer_slack(2_000)
         return int(ctypes.CDLL(None).prctl(PR_GET_TIMERSLACK, 0, 0, 0, 0))
 
     assert in_a_thread(slack_ns) == 2_000
@@ -40,7 +40,7 @@ def test_a_priority_that_is_not_permitted_is_done_without(monkeypatch: pytest.Mo
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert in_a_thread(realtime.run_before_others) is False
+    assert in_a_thread(realtime.use_realtime_priority) is False
 
 
 @pytest.mark.parametrize(("state", "is_set"), [(0, True), (1, True), (5, False), (-1, False)])
@@ -53,21 +53,21 @@ def test_the_clock_is_set_unless_the_kernel_says_otherwise(
             return state
 
     monkeypatch.setattr(realtime, "_libc", Libc)
-    assert realtime.clock_is_set() is is_set
+    assert realtime.is_clock_set() is is_set
 
 
 @pytest.mark.process
 def test_what_is_loaded_is_not_looked_at_again_and_what_comes_later_is() -> None:
     code = """
 import gc, weakref
-from devices.realtime import spare_what_is_loaded
+from devices.realtime import freeze_garbage_collector
 
 class Ring:
     def __init__(self):
         self.me = self
 
 Ring()
-spare_what_is_loaded()
+freeze_garbage_collector()
 assert not any(isinstance(each, Ring) for each in gc.get_objects())
 loaded = gc.get_freeze_count()
 assert loaded > 1000 and len(gc.get_objects()) < 100, (loaded, len(gc.get_objects()))
@@ -81,8 +81,8 @@ assert later() is None
 @pytest.mark.process
 def test_a_process_ends_with_its_parent_even_if_that_is_killed() -> None:
     child = (
-        "import sys, time; from devices.realtime import end_with_parent; end_with_parent(); "
-        "print(1, flush=True); time.sleep(60)"
+        "import sys, time; from devices.realtime import terminate_with_parent; "
+        "terminate_with_parent(); print(1, flush=True); time.sleep(60)"
     )
     parent = (
         "import subprocess, sys, time; "

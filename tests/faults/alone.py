@@ -66,23 +66,23 @@ class Alone(Stage):
             if not self.node.is_alive:
                 raise RoundError(f"the node has ended: {self.node.said.read_text()[-2000:]}")
             # A power cut touches old folders, too: what counts is a name that was not there.
-            for boot_id in self._boot_ids() - self._known:
-                columns = journal_of(self.node.root, boot_id).get(boot_id)
+            for stream_id in self._stream_ids() - self._known:
+                columns = journal_of(self.node.root, stream_id).get(stream_id)
                 if columns is not None and len(columns["seq"]) >= _FRAMES:
                     return True
             return False
 
         wait_for("the node journals", back, _BACK_S)
-        self._known = self._boot_ids()
+        self._known = self._stream_ids()
 
     def _set_up(self, small: Mapping[str, Path | None]) -> None:
         self._set_up_node(None, None, small.get("node"))
 
-    def _boot_ids(self) -> frozenset[str]:
+    def _stream_ids(self) -> frozenset[str]:
         folder = self.node.root / "journal" / NODE
         return frozenset(path.name for path in folder.glob("*") if path.is_dir())
 
-    def _boot_id(self) -> str | None:
+    def _stream_id(self) -> str | None:
         folders = [path for path in (self.node.root / "journal" / NODE).glob("*") if path.is_dir()]
         with suppress(OSError):
             return max(folders, key=lambda path: path.stat().st_ctime_ns).name if folders else None
@@ -98,7 +98,7 @@ class Alone(Stage):
         sessions = [json.loads((folder / "session.json").read_text()) for folder in folders]
         if not sessions:
             raise RoundError("the node has no session")
-        named = [{part["boot_id"] for part in session["parts"]} for session in sessions]
+        named = [{part["stream_id"] for part in session["parts"]} for session in sessions]
         for folder, session, streams in zip(folders, sessions, named, strict=True):
             path = folder / "frames.parquet"
             yield replace(

@@ -49,9 +49,9 @@ def findings(facts: Facts, product: Product) -> list[str]:
     return found
 
 
-def bound_frames(facts: Facts, boot_id: str) -> int:
+def bound_frames(facts: Facts, stream_id: str) -> int:
     """What a power cut may cost of a stream: half a second and a batch."""
-    end = facts.ends.get(boot_id)
+    end = facts.ends.get(stream_id)
     # An fsync that takes a second leaves that second unsynced, and one more may be waiting.
     unsynced_s = _SYNC_S + (2 * end.slow_s if end is not None else 0.0)
     return math.ceil(facts.rate_hz * (unsynced_s + _BATCH_S))
@@ -97,8 +97,8 @@ def sessions_are_whole(tree: Tree, expected: str) -> list[str]:
 
 def _ledger_sums(facts: Facts) -> Iterator[str]:
     parts = facts.ledger["parts"]
-    named = [(p["boot_id"], p["seq_first"], p["seq_last"]) for p in facts.session["parts"]]
-    if named != [(p["boot_id"], p["seq_first"], p["seq_last"]) for p in parts]:
+    named = [(p["stream_id"], p["seq_first"], p["seq_last"]) for p in facts.session["parts"]]
+    if named != [(p["stream_id"], p["seq_first"], p["seq_last"]) for p in parts]:
         yield f"the ledger's parts are not the session's {named}"
     for number, part in enumerate(parts):
         length = part["seq_last"] - part["seq_first"] + 1
@@ -107,14 +107,14 @@ def _ledger_sums(facts: Facts) -> Iterator[str]:
             yield f"part {number} does not sum up: {part}"
         if part["pending"]:
             yield f"part {number} is sealed with {part['pending']} frames pending"
-    lossy = any(part["lost"] or part["unsynced_tail_max"] for part in parts)
+    lossy = any(part["lost"] or part["max_lost_tail_frames"] for part in parts)
     if facts.ledger["lossy"] != lossy or facts.ledger["complete"] == lossy:
         yield f"complete={facts.ledger['complete']}, lossy={facts.ledger['lossy']} is not so"
     seen: set[tuple[str, int]] = set()
     for part in parts:
-        span = {(part["boot_id"], seq) for seq in range(part["seq_first"], part["seq_last"] + 1)}
+        span = {(part["stream_id"], seq) for seq in range(part["seq_first"], part["seq_last"] + 1)}
         if span & seen:
-            yield f"parts overlap in stream {part['boot_id']}"
+            yield f"parts overlap in stream {part['stream_id']}"
         seen |= span
 
 
@@ -132,12 +132,12 @@ def _rows_by_part(facts: Facts, table: pa.Table | None) -> list[Columns]:
     if table is None:
         return [{"seq": np.array([], dtype=np.uint64)} for _ in facts.ledger["parts"]]
     columns: Columns = {}
-    for name in ("seq", "t_mono_ns", "t_ns", "frame_status", "part"):
+    for name in ("seq", "t_mono_ns", "t_ns", "frame_flags", "part"):
         columns[name] = table.column(name).to_numpy()
-    tiles = sum(1 for name in table.column_names if name.startswith("padc_"))
-    for name in ("padc", "tadc", "sample_offset_us", "status"):
+    tiles = sum(1 for name in table.column_names if name.startswith("pressure_raw_"))
+    for name in ("pressure_raw", "temperature_raw", "sample_offset_us", "tile_flags"):
         each = [table.column(f"{name}_{i}") for i in range(tiles)]
-        if name in ("padc", "tadc"):
+        if name in ("pressure_raw", "temperature_raw"):
             not_read = pa.scalar(_NOT_READ_COUNTS, pa.uint16())
             each = [column.fill_null(not_read) for column in each]
         columns[name] = np.stack([column.to_numpy() for column in each], axis=1)
@@ -160,7 +160,7 @@ def _file_is_the_one_it_says(facts: Facts) -> Iterator[str]:
         yield "the file's SHA-256 is not the one in session.json"
     if (folder / "frames.parquet").read_bytes() != facts.file:
         yield "what was downloaded is not what is on the disk"
-    for name in ("events.parquet", "clock.parquet"):
+    for name in ("markers.parquet", "clock.parquet"):
         try:
             pq.read_table(folder / name, page_checksum_verification=True)
         except (pa.ArrowException, OSError) as error:
@@ -197,24 +197,24 @@ def _safely_before_stop_s(facts: Facts) -> float:
 def _nothing_promised_is_missing(facts: Facts, rows: list[Columns]) -> Iterator[str]:
     parts = facts.ledger["parts"]
     before_s = _safely_before_stop_s(facts)
-    for boot_id, promised in facts.witness.acknowledged().items():
-        taken = facts.witness.frames(boot_id, before_s)
+    for stream_id, promised in facts.witness.acknowledged().items():
+        taken = facts.witness.frames(stream_id, before_s)
         if taken is None:
             continue
-        mine = [number for number, part in enumerate(parts) if part["boot_id"] == boot_id]
+        mine = [number for number, part in enumerate(parts) if part["stream_id"] == stream_id]
         wanted = np.intersect1d(promised, taken["seq"])
         if mine:
             if mine[0] == 0:  # before that it was not recorded
                 wanted = wanted[wanted >= parts[0]["seq_first"]]
         else:
-            earlier = facts.witness.last_seq(boot_id, facts.started_s)
+            earlier = facts.witness.last_seq(stream_id, facts.started_s)
             wanted = wanted if earlier is None else wanted[wanted > earlier]
         here = [rows[number]["seq"] for number in mine]
         missing = np.setdiff1d(wanted, np.concatenate([np.array([], np.uint64), *here]))
         if len(missing):
             yield (
                 f"{len(missing)} acknowledged frames are lost, {missing[0]} to {missing[-1]} of "
-                f"stream {boot_id}"
+                f"stream {stream_id}"
             )
 
 
@@ -223,8 +223,8 @@ def _content_is_what_was_taken(facts: Facts, rows: list[Columns]) -> Iterator[st
         if not len(sealed["seq"]):
             continue
         for whose, taken in (
-            ("what went over the link", facts.witness.frames(part["boot_id"])),
-            ("the node's journal", facts.kept_by_node.get(part["boot_id"])),
+            ("what went over the link", facts.witness.frames(part["stream_id"])),
+            ("the node's journal", facts.kept_by_node.get(part["stream_id"])),
         ):
             if taken is None:
                 continue
@@ -241,18 +241,18 @@ def _losses_are_allowed(facts: Facts, product: Product) -> Iterator[str]:
         return
     full = facts.story.small_disk_of == "node"
     for number, part in enumerate(facts.ledger["parts"]):
-        boot_id, lost = part["boot_id"], dict(part["lost"])
+        stream_id, lost = part["stream_id"], dict(part["lost"])
         if full:
             lost.pop("disk_full", None)
-        end, tail = facts.ends.get(boot_id), part["unsynced_tail_max"]
-        bound = bound_frames(facts, boot_id)
+        end, tail = facts.ends.get(stream_id), part["max_lost_tail_frames"]
+        bound = bound_frames(facts, stream_id)
         allowed = bound if end is not None and end.how == "power" else 0
         if sum(lost.values()) > allowed:
             yield f"part {number} lost {lost}, where {allowed} may be: {end}"
         if tail > allowed:
-            yield f"part {number}: unsynced_tail_max {tail} is more than {allowed}: {end}"
-        seen = facts.witness.last_seq(boot_id, _safely_before_stop_s(facts))
-        known = [seq for seq in (seen, _taken_by_node(facts, boot_id)) if seq is not None]
+            yield f"part {number}: max_lost_tail_frames {tail} is more than {allowed}: {end}"
+        seen = facts.witness.last_seq(stream_id, _safely_before_stop_s(facts))
+        known = [seq for seq in (seen, _taken_by_node(facts, stream_id)) if seq is not None]
         if known and not full and part["seq_last"] + tail < max(known):
             yield (
                 f"part {number} ends with {part['seq_last']} and at most {tail} more, but "
@@ -260,9 +260,9 @@ def _losses_are_allowed(facts: Facts, product: Product) -> Iterator[str]:
             )
 
 
-def _taken_by_node(facts: Facts, boot_id: str) -> int | None:
+def _taken_by_node(facts: Facts, stream_id: str) -> int | None:
     """The last frame of a stream that ended before the session was stopped, if it is known."""
-    end = facts.ends.get(boot_id)
+    end = facts.ends.get(stream_id)
     return end.last_seq if end is not None and end.at_s < facts.stopped_s else None
 
 
@@ -270,24 +270,24 @@ def _streams_are_all_there(facts: Facts, product: Product) -> Iterator[str]:
     """Each stream of which frames were taken while it was recorded is a part."""
     if not product.node_journal:
         return
-    named = {part["boot_id"] for part in facts.ledger["parts"]} | facts.elsewhere
-    first = facts.ledger["parts"][0]["boot_id"] if facts.ledger["parts"] else None
+    named = {part["stream_id"] for part in facts.ledger["parts"]} | facts.elsewhere
+    first = facts.ledger["parts"][0]["stream_id"] if facts.ledger["parts"] else None
     order = [*facts.witness.infos]
     before = set(order[: order.index(first)]) if first in order else set()
     promised = facts.witness.acknowledged()
-    for boot_id in sorted({*order, *facts.kept_by_node} - named - before):
-        seen = facts.witness.last_seq(boot_id, _safely_before_stop_s(facts))
-        known = [seq for seq in (seen, _taken_by_node(facts, boot_id)) if seq is not None]
-        end = facts.ends.get(boot_id)
+    for stream_id in sorted({*order, *facts.kept_by_node} - named - before):
+        seen = facts.witness.last_seq(stream_id, _safely_before_stop_s(facts))
+        known = [seq for seq in (seen, _taken_by_node(facts, stream_id)) if seq is not None]
+        end = facts.ends.get(stream_id)
         if not known or (
             # Nobody may know of what began less than half a second before the power failed.
             end is not None
             and end.how == "power"
-            and boot_id not in promised
+            and stream_id not in promised
             and max(known) < facts.rate_hz * (_SYNC_S + _BATCH_S)
         ):
             continue
-        yield f"stream {boot_id} was taken while it was recorded, and is no part of it: {end}"
+        yield f"stream {stream_id} was taken while it was recorded, and is no part of it: {end}"
 
 
 def _begins_with_the_start(facts: Facts) -> Iterator[str]:
@@ -295,7 +295,7 @@ def _begins_with_the_start(facts: Facts) -> Iterator[str]:
     if not parts:
         yield "the session has no part"
         return
-    before = facts.witness.last_seq(parts[0]["boot_id"], facts.started_s)
+    before = facts.witness.last_seq(parts[0]["stream_id"], facts.started_s)
     if before is not None and parts[0]["seq_first"] > before + 1:
         yield f"it begins with {parts[0]['seq_first']}; when it was started {before} was there"
     if facts.story.alone and parts[0]["seq_first"] != 0:
@@ -315,6 +315,6 @@ def summary_of(ledger: dict[str, Any]) -> str:
     """Recorded/lost/pending/tail of each part."""
     return "  ".join(
         f"{part['recorded']}/{sum(part['lost'].values())}/{part['pending']}"
-        f"/{part['unsynced_tail_max']}"
+        f"/{part['max_lost_tail_frames']}"
         for part in ledger.get("parts", ())
     )

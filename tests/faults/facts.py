@@ -49,9 +49,9 @@ class Facts:
     stop_sigma_s: float = 0.0
     """How well the server knew the node's clock then."""
     ends: dict[str, End] = field(default_factory=dict)
-    """Streams that were ended by a fault, by boot_id."""
+    """Streams that were ended by a fault, by stream_id."""
     kept_by_node: dict[str, Columns] = field(default_factory=dict)
-    """What was in the node's journal whenever it was looked at, by boot_id."""
+    """What was in the node's journal whenever it was looked at, by stream_id."""
     elsewhere: frozenset[str] = frozenset()
     """Streams that are parts of another session."""
     lossy_elsewhere: bool = False
@@ -65,21 +65,21 @@ class Facts:
     verify_said: str = ""
 
     def look_into_journal(self) -> dict[str, Columns]:
-        """What the node's journal holds now, by boot_id; it is remembered, too."""
+        """What the node's journal holds now, by stream_id; it is remembered, too."""
         found = journal_of(self.node_root)
-        for boot_id, columns in found.items():
-            before = self.kept_by_node.get(boot_id)
+        for stream_id, columns in found.items():
+            before = self.kept_by_node.get(stream_id)
             pieces = [piece for piece in (before, columns) if piece is not None]
             both = joined(pieces)
             assert both is not None
-            self.kept_by_node[boot_id] = both
+            self.kept_by_node[stream_id] = both
         return found
 
 
-def journal_of(root: Path, boot_id: str = "*") -> dict[str, Columns]:
-    """All whole batches of a data folder's journal, by boot_id, read with plain Arrow."""
+def journal_of(root: Path, stream_id: str = "*") -> dict[str, Columns]:
+    """All whole batches of a data folder's journal, by stream_id, read with plain Arrow."""
     found: dict[str, list[Columns]] = {}
-    for path in sorted((root / "journal" / NODE).glob(f"{boot_id}/*.arrows")):
+    for path in sorted((root / "journal" / NODE).glob(f"{stream_id}/*.arrows")):
         pieces = found.setdefault(path.parent.name, [])
         try:
             with pa.OSFile(str(path), "rb") as file, pa.ipc.open_stream(file) as stream:

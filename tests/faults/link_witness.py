@@ -30,7 +30,7 @@ Columns = dict[str, npt.NDArray[Any]]
 class Sent:
     """A batch as it left its node."""
 
-    boot_id: str
+    stream_id: str
     payload: bytes
     at_s: float
     """When it was seen, by `time.monotonic`."""
@@ -40,7 +40,7 @@ class Sent:
 class Ack:
     """A promise of the server."""
 
-    boot_id: str
+    stream_id: str
     seq_first: int
     seq_last: int
     at_s: float
@@ -51,7 +51,7 @@ class Witness:
     """What was seen of one node, over all its connections."""
 
     infos: dict[str, ArrayInfo] = field(default_factory=dict)
-    """Streams that were announced, in order, by boot_id."""
+    """Streams that were announced, in order, by stream_id."""
     sent: list[Sent] = field(default_factory=list)
     acks: list[Ack] = field(default_factory=list)
     odd: list[str] = field(default_factory=list)
@@ -63,29 +63,29 @@ class Witness:
         return _Connection(self)
 
     def acknowledged(self, until_s: float = float("inf")) -> dict[str, npt.NDArray[np.uint64]]:
-        """Numbers that were promised, rising, by boot_id."""
+        """Numbers that were promised, rising, by stream_id."""
         found: dict[str, list[npt.NDArray[np.uint64]]] = defaultdict(list)
         for ack in [ack for ack in list(self.acks) if ack.at_s <= until_s]:
-            found[ack.boot_id].append(np.arange(ack.seq_first, ack.seq_last + 1, dtype=np.uint64))
-        return {boot_id: np.unique(np.concatenate(pieces)) for boot_id, pieces in found.items()}
+            found[ack.stream_id].append(np.arange(ack.seq_first, ack.seq_last + 1, dtype=np.uint64))
+        return {stream_id: np.unique(np.concatenate(pieces)) for stream_id, pieces in found.items()}
 
-    def frames(self, boot_id: str, until_s: float = float("inf")) -> Columns | None:
+    def frames(self, stream_id: str, until_s: float = float("inf")) -> Columns | None:
         """All frames of a stream that were seen, each once, in order; None: not one."""
-        info = self.infos.get(boot_id)
+        info = self.infos.get(stream_id)
         if info is None:
             return None
         schema = wire_schema(info)
         pieces = []
         for sent in list(self.sent):
-            if sent.boot_id == boot_id and sent.at_s <= until_s:
+            if sent.stream_id == stream_id and sent.at_s <= until_s:
                 pieces.append(
                     columns_of(pa.ipc.read_record_batch(pa.py_buffer(sent.payload), schema))
                 )
         return joined(pieces)
 
-    def last_seq(self, boot_id: str, until_s: float = float("inf")) -> int | None:
+    def last_seq(self, stream_id: str, until_s: float = float("inf")) -> int | None:
         """The highest number that was seen of a stream."""
-        found = self.frames(boot_id, until_s)
+        found = self.frames(stream_id, until_s)
         return None if found is None else int(found["seq"][-1])
 
 
@@ -95,13 +95,13 @@ class _Connection:
     def __init__(self, witness: Witness) -> None:
         self._witness = witness
         self._node, self._server = Messages(), Messages()
-        self._boot_id = ""
+        self._stream_id = ""
 
     def to_server(self, data: bytes) -> None:
         with self._witness.lock:
             for kind, payload in self._node.feed(data):
                 if kind == _BINARY:
-                    sent = Sent(self._boot_id, payload, time.monotonic())
+                    sent = Sent(self._stream_id, payload, time.monotonic())
                     self._witness.sent.append(sent)
                 elif kind == _TEXT:
                     self._node_said(json.loads(payload))
@@ -113,8 +113,8 @@ class _Connection:
                     continue
                 said = json.loads(payload)
                 if said["type"] == "ack":
-                    boot_id = said.get("boot_id", self._boot_id)
-                    ack = Ack(boot_id, said["seq_first"], said["seq_last"], time.monotonic())
+                    stream_id = said.get("stream_id", self._stream_id)
+                    ack = Ack(stream_id, said["seq_first"], said["seq_last"], time.monotonic())
                     self._witness.acks.append(ack)
 
     def _node_said(self, said: dict[str, Any]) -> None:
@@ -122,10 +122,10 @@ class _Connection:
             earlier = [stream["array_info"] for stream in said.get("earlier", ())]
             for content in (*earlier, said["array_info"]):
                 info = ArrayInfo.model_validate(content)
-                self._witness.infos.setdefault(info.boot_id, info)
-                self._boot_id = info.boot_id
+                self._witness.infos.setdefault(info.stream_id, info)
+                self._stream_id = info.stream_id
         elif said["type"] == "stream":
-            self._boot_id = said["boot_id"]
+            self._stream_id = said["stream_id"]
 
 
 class Messages:

@@ -111,7 +111,7 @@ class Players:
                 node is not None
                 and node["connected"]
                 and node["last_seq"] is not None
-                and node["boot_id"] != boot_before
+                and node["stream_id"] != boot_before
             )
 
         wait_for("the node sends", back, _BACK_S)
@@ -131,11 +131,11 @@ class Players:
             wait_for("the node is killed", lambda: not self.node.is_alive, 20.0)
             self.node.kill()
 
-        boot_id = self._end_node(how, dies)
+        stream_id = self._end_node(how, dies)
         if how == "power":
             self.note(f"power of the node: {self.node.cut_power(rng)}")
         self.node.start()
-        self.wait_back(boot_id)
+        self.wait_back(stream_id)
 
     def _start_session(self) -> None:
         def begun() -> dict[str, Any] | None:
@@ -197,7 +197,7 @@ class Players:
     def _machines(self) -> tuple[Machine, ...]:
         return self.node, self.server
 
-    def _boot_id(self) -> str | None:
+    def _stream_id(self) -> str | None:
         """The newest stream that was announced."""
         return list(self.witness.infos)[-1] if self.witness.infos else None
 
@@ -210,35 +210,35 @@ class Players:
         slow_s: float = 0.0,
     ) -> str | None:
         """End the node and note what its streams had then; the newest stream's name."""
-        newest = self._boot_id()
+        newest = self._stream_id()
         at_s = time.monotonic()
         end()
         held = self.facts.look_into_journal()
-        known = [*self.witness.infos, *(boot_id for boot_id in held)]
-        for boot_id in known:
-            if boot_id not in self.facts.ends and only in (None, boot_id):
-                columns = held.get(boot_id)
+        known = [*self.witness.infos, *(stream_id for stream_id in held)]
+        for stream_id in known:
+            if stream_id not in self.facts.ends and only in (None, stream_id):
+                columns = held.get(stream_id)
                 last_seq = None if columns is None else int(columns["seq"][-1])
-                self.facts.ends[boot_id] = End(how, last_seq, at_s, slow_s)
+                self.facts.ends[stream_id] = End(how, last_seq, at_s, slow_s)
         return newest
 
     def _cut(self, machine: Machine) -> None:
         self.note(f"power of the {machine.name}: {machine.cut_power(self._rng)}")
 
-    def _node_again(self, boot_id: str | None) -> None:
+    def _node_again(self, stream_id: str | None) -> None:
         self.node.start()
-        self.wait_back(boot_id)
+        self.wait_back(stream_id)
 
     def _server_again(self) -> None:
         self.server.start()
         self.server.wait_ready()
         self.wait_back()
 
-    def _both_again(self, boot_id: str | None) -> None:
+    def _both_again(self, stream_id: str | None) -> None:
         self.server.start()
         self.node.start()
         self.server.wait_ready()
-        self.wait_back(boot_id)
+        self.wait_back(stream_id)
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:

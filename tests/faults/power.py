@@ -48,7 +48,7 @@ class Disk:
         self.root = root
         self.log = beside / "calls.jsonl"
         self.graveyard = beside / "graveyard"
-        self._boot_id = beside / "boot_id"
+        self._stream_id = beside / "stream_id"
         root.mkdir(parents=True, exist_ok=True)
         self.graveyard.mkdir(parents=True, exist_ok=True)
         self.begin()
@@ -62,7 +62,7 @@ class Disk:
             "FAULTS_ROOT": str(self.root),
             "FAULTS_LOG": str(self.log),
             "FAULTS_GRAVEYARD": str(self.graveyard),
-            "FAULTS_BOOT_ID": str(self._boot_id),
+            "FAULTS_BOOT_ID": str(self._stream_id),
         }
 
     def calls(self) -> list[dict[str, Any]]:
@@ -112,7 +112,7 @@ class Disk:
                 found = os.stat(os.path.join(path, name), follow_symlinks=False)
                 files[found.st_ino] = found.st_size
         self.log.write_text(json.dumps({"e": "base", "folders": folders, "files": files}) + "\n")
-        self._boot_id.write_text(f"{uuid.uuid4()}\n")
+        self._stream_id.write_text(f"{uuid.uuid4()}\n")
 
 
 def read_tree(folder: Path) -> Tree:

@@ -239,7 +239,7 @@ def _summary(results: list[Result], what: Product, seconds: float) -> Iterator[s
         f"{sum(part['recorded'] for part in parts)} sealed, "
         f"{sum(sum(part['lost'].values()) for part in parts)} named as lost, "
         f"{sum(part['pending'] for part in parts)} pending; "
-        f"longest stated tail {max((part['unsynced_tail_max'] for part in parts), default=0)}"
+        f"longest stated tail {max((part['max_lost_tail_frames'] for part in parts), default=0)}"
     )
     yield f"sessions: {len(results) - lossy} complete, {lossy} lossy"
     yield "faults: " + ", ".join(f"{kind} {number}" for kind, number in sorted(kinds.items()))

@@ -78,27 +78,27 @@ class Stage(Players):
         self._kill_node_by(self.node.kill_first, fault)
 
     def _kill_node_by(self, kill: Callable[[], None], fault: Fault) -> None:
-        boot_id = self._end_node("killed", kill)
+        stream_id = self._end_node("killed", kill)
         time.sleep(fault.length_s)
-        self._node_again(boot_id)
+        self._node_again(stream_id)
 
     def _kill_acquisition(self, fault: Fault) -> None:
         children = self.node.children()
         if not children:
             raise RoundError("the node has no acquisition process to kill")
-        boot_id = self._boot_id()
+        stream_id = self._stream_id()
         os.kill(children[-1], signal.SIGKILL)
 
         def noticed() -> bool:
-            return not self.node.is_alive or self._boot_id() != boot_id
+            return not self.node.is_alive or self._stream_id() != stream_id
 
         wait_for("the node notices that its acquisition is dead", noticed, 20.0)
-        self._end_node("killed", lambda: None, only=boot_id)
+        self._end_node("killed", lambda: None, only=stream_id)
         if not self.node.is_alive:
             self.node.kill()
             time.sleep(fault.length_s)
             self.node.start()
-        self.wait_back(boot_id)
+        self.wait_back(stream_id)
 
     def _kill_server(self, fault: Fault) -> None:
         self.server.kill()
@@ -106,24 +106,24 @@ class Stage(Players):
         self._server_again()
 
     def _kill_both(self, fault: Fault) -> None:
-        boot_id = self._end_node("killed", self.node.kill)
+        stream_id = self._end_node("killed", self.node.kill)
         self.server.kill()
         time.sleep(fault.length_s)
-        self._both_again(boot_id)
+        self._both_again(stream_id)
 
     def _restart_node_twice(self, fault: Fault) -> None:
-        boot_id = self._end_node("killed", self.node.kill)
+        stream_id = self._end_node("killed", self.node.kill)
         self.node.start()
         time.sleep(0.3 + 2.5 * fault.amount)
-        self._node_again(self._end_node("killed", self.node.kill) or boot_id)
+        self._node_again(self._end_node("killed", self.node.kill) or stream_id)
 
     # --- power ------------------------------------------------------------------------------------
 
     def _power_node(self, fault: Fault) -> None:
-        boot_id = self._end_node("power", self.node.kill)
+        stream_id = self._end_node("power", self.node.kill)
         self._cut(self.node)
         time.sleep(fault.length_s)
-        self._node_again(boot_id)
+        self._node_again(stream_id)
 
     def _power_server(self, fault: Fault) -> None:
         self._cut(self.server)
@@ -131,11 +131,11 @@ class Stage(Players):
         self._server_again()
 
     def _power_both(self, fault: Fault) -> None:
-        boot_id = self._end_node("power", self.node.kill)
+        stream_id = self._end_node("power", self.node.kill)
         self._cut(self.server)
         self._cut(self.node)
         time.sleep(fault.length_s)
-        self._both_again(boot_id)
+        self._both_again(stream_id)
 
     # --- the link ---------------------------------------------------------------------------------
 
@@ -180,10 +180,10 @@ class Stage(Players):
         time.sleep(1.0 + fault.length_s)
         if self._rng.random() < 0.5:
             if machine is self.node:
-                boot_id = self._end_node("power", self.node.kill, slow_s=slow_s)
+                stream_id = self._end_node("power", self.node.kill, slow_s=slow_s)
                 self._cut(self.node)
                 machine.slow.set_s(0.0)
-                self._node_again(boot_id)
+                self._node_again(stream_id)
             else:
                 self._cut(self.server)
                 machine.slow.set_s(0.0)
@@ -229,9 +229,9 @@ class Stage(Players):
         time.sleep(fault.length_s)
         self.stop()
         time.sleep(0.2)
-        boot_id = self._end_node("killed", self.node.kill)
+        stream_id = self._end_node("killed", self.node.kill)
         self.proxy.mend()
-        self._node_again(boot_id)
+        self._node_again(stream_id)
 
     def _kill_while_sealing(self, fault: Fault) -> None:
         self._die_while_sealing(fault, self.server.kill)

@@ -16,7 +16,7 @@ import pytest
 
 from devices.frames import FrameBatch
 from storage.schema import wire_schema
-from storage.wire import encode
+from storage.wire import encode_frames
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 from tests.faults.checks import findings, sessions_are_whole
@@ -40,11 +40,11 @@ def parquet(parts: list[np.ndarray[Any, Any]], *, padc_off: int = 0) -> bytes:
         taken = batch(0, int(seqs.max()) + 1 if len(seqs) else 1)
         rows = seqs.astype(np.int64)
         columns = {name: getattr(taken, name)[rows] for name in ("seq", "t_mono_ns", "t_ns")}
-        columns["frame_status"] = taken.frame_status[rows]
+        columns["frame_flags"] = taken.frame_flags[rows]
         columns["part"] = np.full(len(rows), number, np.uint16)
-        for name in ("padc", "tadc", "sample_offset_us", "status"):
+        for name in ("pressure_raw", "temperature_raw", "sample_offset_us", "tile_flags"):
             columns[f"{name}_0"] = getattr(taken, name)[rows, 0]
-        columns["padc_0"] = columns["padc_0"] + np.uint16(padc_off)
+        columns["pressure_raw_0"] = columns["pressure_raw_0"] + np.uint16(padc_off)
         tables.append(pa.table(columns))
     sink = io.BytesIO()
     pq.write_table(pa.concat_tables(tables), sink, write_page_checksum=True)
@@ -59,7 +59,7 @@ def seal(facts: Facts, content: bytes) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "session.json").write_text(json.dumps(facts.session))
     (folder / "frames.parquet").write_bytes(content)
-    for name in ("events.parquet", "clock.parquet"):
+    for name in ("markers.parquet", "clock.parquet"):
         pq.write_table(pa.table({"t_ns": pa.array([], pa.int64())}), folder / name)
 
 
@@ -72,10 +72,10 @@ def batch(first: int, count: int) -> FrameBatch:
         1,
         period_ns=10_000_000,
         utc_offset_ns=0,
-        padc=counts,
-        tadc=counts,
+        pressure_raw=counts,
+        temperature_raw=counts,
         sample_offset_us=counts,
-        status=counts % 256,
+        tile_flags=counts % 256,
     )
 
 
@@ -84,18 +84,18 @@ def facts(tmp_path: Path) -> Facts:
     """A node that was killed after 200 frames and took 200 more in another stream, all of them
     acknowledged; the session begins with frame 50."""
     witness = Witness()
-    for number, boot_id in enumerate(STREAMS):
-        info = make_array(1, boot_id=boot_id)
-        witness.infos[boot_id] = info
+    for number, stream_id in enumerate(STREAMS):
+        info = make_array(1, stream_id=stream_id)
+        witness.infos[stream_id] = info
         for first in range(0, FRAMES, 10):
             at_s = 10.0 * number + first * 0.01
-            payload = encode(batch(first, 10), wire_schema(info))
-            witness.sent.append(Sent(boot_id, payload, at_s))
-            witness.acks.append(Ack(boot_id, first, first + 9, at_s + 0.2))
+            payload = encode_frames(batch(first, 10), wire_schema(info))
+            witness.sent.append(Sent(stream_id, payload, at_s))
+            witness.acks.append(Ack(stream_id, first, first + 9, at_s + 0.2))
     firsts = (50, 0)
     parts: list[dict[str, Any]] = [
-        {"boot_id": boot_id, "seq_first": first, "seq_last": FRAMES - 1}
-        for boot_id, first in zip(STREAMS, firsts, strict=True)
+        {"stream_id": stream_id, "seq_first": first, "seq_last": FRAMES - 1}
+        for stream_id, first in zip(STREAMS, firsts, strict=True)
     ]
     made = Facts(
         Story(1, ()),
@@ -118,7 +118,7 @@ def facts(tmp_path: Path) -> Facts:
                 "recorded": FRAMES - part["seq_first"],
                 "lost": {},
                 "pending": 0,
-                "unsynced_tail_max": 0,
+                "max_lost_tail_frames": 0,
             }
             for part in parts
         ],
@@ -143,9 +143,9 @@ def shorter(facts: Facts, by: int, tail: int) -> None:
     """The first part ends earlier, and its tail is open; the server had acknowledged no more."""
     last = FRAMES - 1 - by
     entry = facts.ledger["parts"][0]
-    entry |= {"seq_last": last, "recorded": entry["recorded"] - by, "unsynced_tail_max": tail}
+    entry |= {"seq_last": last, "recorded": entry["recorded"] - by, "max_lost_tail_frames": tail}
     facts.session["parts"][0]["seq_last"] = last
-    facts.witness.acks = [a for a in facts.witness.acks if a.boot_id != STREAMS[0]]
+    facts.witness.acks = [a for a in facts.witness.acks if a.stream_id != STREAMS[0]]
     if tail:
         lossy(facts)
     seal(facts, parquet([np.arange(50, last + 1), np.arange(FRAMES)]))
@@ -200,12 +200,12 @@ def test_a_tail_that_is_shorter_than_what_is_missing_is_found(facts: Facts) -> N
 def test_a_tail_that_is_longer_than_half_a_second_is_found(facts: Facts) -> None:
     power(facts)
     shorter(facts, by=30, tail=80)
-    only(facts, "unsynced_tail_max 80 is more than 5")
+    only(facts, "max_lost_tail_frames 80 is more than 5")
 
 
 def test_a_process_that_was_killed_may_neither_lose_nor_state_a_tail(facts: Facts) -> None:
     shorter(facts, by=0, tail=1)
-    only(facts, "unsynced_tail_max 1 is more than 0")
+    only(facts, "max_lost_tail_frames 1 is more than 0")
 
 
 def test_what_a_killed_process_had_sent_is_missed(facts: Facts) -> None:
@@ -215,7 +215,7 @@ def test_what_a_killed_process_had_sent_is_missed(facts: Facts) -> None:
 
 def test_another_content_than_was_taken_is_found(facts: Facts) -> None:
     seal(facts, parquet([np.arange(50, FRAMES), np.arange(FRAMES)], padc_off=1))
-    only(facts, "padc of 150 frames is not that of what went over the link")
+    only(facts, "pressure_raw of 150 frames is not that of what went over the link")
 
 
 def test_a_frame_that_is_there_twice_is_found(facts: Facts) -> None:
@@ -235,7 +235,7 @@ def test_a_session_that_begins_too_late_is_found(facts: Facts) -> None:
         ({"recorded": 149}, "does not sum up"),
         ({"recorded": 140, "pending": 10}, "10 frames pending"),
         ({"lost": {"corrupt": 1}}, "does not sum up"),
-        ({"unsynced_tail_max": 5}, "lossy=False is not so"),
+        ({"max_lost_tail_frames": 5}, "lossy=False is not so"),
         ({"seq_first": 49}, "are not the session's"),
     ],
 )

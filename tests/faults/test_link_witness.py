@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
 from storage.schema import wire_schema
-from storage.wire import encode
+from storage.wire import encode_frames
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 from tests.faults.link_witness import Messages, Witness
@@ -52,18 +52,19 @@ def test_a_message_in_pieces_with_a_ping_between_them_is_one() -> None:
     assert list(Messages().feed(data)) == [(TEXT, b"hello")]
 
 
-def frames(first: int, count: int, boot_id: str) -> bytes:
+def frames(first: int, count: int, stream_id: str) -> bytes:
     """A message of frames with their number as the first tile's count."""
     seq = np.arange(first, first + count)
-    payload = encode(
-        make_frames(seq, 1, padc=seq[:, None]), wire_schema(make_array(1, boot_id=boot_id))
+    payload = encode_frames(
+        make_frames(seq, 1, pressure_raw=seq[:, None]),
+        wire_schema(make_array(1, stream_id=stream_id)),
     )
     return frame(Opcode.BINARY, payload)
 
 
-def connected(witness: Witness, *boot_ids: str) -> tuple[bytes, bytes]:
+def connected(witness: Witness, *stream_ids: str) -> tuple[bytes, bytes]:
     """What a node says first, of its last stream, and a server's answer."""
-    arrays = [make_array(1, boot_id=boot_id) for boot_id in boot_ids]
+    arrays = [make_array(1, stream_id=stream_id) for stream_id in stream_ids]
     *earlier, present = [array.model_dump(mode="json") for array in arrays]
     hello = {
         "type": "hello",
@@ -80,13 +81,13 @@ def test_frames_belong_to_the_stream_that_was_named_last_and_count_once() -> Non
     tap.to_server(node)
     for first in (0, 10, 5):
         tap.to_server(frames(first, 10, "new"))
-    tap.to_server(frame(Opcode.TEXT, json.dumps({"type": "stream", "boot_id": "old"}).encode()))
+    tap.to_server(frame(Opcode.TEXT, json.dumps({"type": "stream", "stream_id": "old"}).encode()))
     tap.to_server(frames(70, 3, "old"))
     new, old = witness.frames("new"), witness.frames("old")
     assert new is not None
     assert old is not None
     np.testing.assert_array_equal(new["seq"], np.arange(20))
-    np.testing.assert_array_equal(new["padc"][:, 0], np.arange(20))
+    np.testing.assert_array_equal(new["pressure_raw"][:, 0], np.arange(20))
     np.testing.assert_array_equal(old["seq"], [70, 71, 72])
     assert (witness.last_seq("new"), witness.last_seq("unknown")) == (19, None)
 
@@ -100,7 +101,7 @@ def test_an_acknowledgement_is_of_the_stream_it_names_or_else_of_the_present_one
         {"type": "welcome"},
         {"type": "ack", "seq_first": 0, "seq_last": 4},
         {"type": "ack", "seq_first": 3, "seq_last": 6},
-        {"type": "ack", "boot_id": "old", "seq_first": 70, "seq_last": 70},
+        {"type": "ack", "stream_id": "old", "seq_first": 70, "seq_last": 70},
     ]
     said = [frame(Opcode.TEXT, json.dumps(ack).encode(), masked=False) for ack in acks]
     tap.to_node(server + b"".join(said))

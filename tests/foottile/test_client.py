@@ -84,7 +84,7 @@ def test_frames_are_read_however_small_the_pieces_are_that_they_come_in(
 ) -> None:
     session = recorded(server, tared)
     whole = pq.read_table(session.download(tmp_path / "trial.parquet"))
-    monkeypatch.setattr(foottile.data, "_CHUNK", 100)
+    monkeypatch.setattr(foottile.data, "_CHUNK_BYTES", 100)
     table = session.open(whole.column_names).arrow()
     assert table.num_rows == session.frames
     assert table["seq"].equals(whole["seq"])
@@ -229,6 +229,6 @@ def test_all_of_it_is_there_for_asyncio(running: Running, tared: FakeNode, tmp_p
                     await asyncio.sleep(0.01)
                 batch = await first
                 assert batch.schema.names == ["seq", "t_ns", "grf_n", "recomputed"]
-                assert live.position == (tared.boot_id, batch["seq"][-1].as_py() + 1)
+                assert live.position == (tared.stream_id, batch["seq"][-1].as_py() + 1)
 
     asyncio.run(run())

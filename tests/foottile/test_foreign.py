@@ -175,7 +175,7 @@ def test_a_stream_that_has_begun_goes_on_when_a_login_page_is_over() -> None:
     )
     for status, headers in answers:
         assert protocol.refused(status, headers, b"") is not None
-    protocol.take('{"type": "stream", "boot_id": "b", "from_seq": 0}')
+    protocol.take('{"type": "stream", "stream_id": "b", "from_seq": 0}')
     for status, headers in answers:
         assert protocol.refused(status, headers, b"") is None
     assert isinstance(protocol.refused(401, {}, b"{}"), foottile.RefusedError)

@@ -80,13 +80,13 @@ class Sending:
 def test_from_a_position_on_it_has_all_that_came_since(running: Running, tared: FakeNode) -> None:
     tared.deliver(100, 20.0)
     with foottile.connect(running.url) as server:
-        with server.live("bench", boot_id=tared.boot_id, from_seq=20) as live:
+        with server.live("bench", stream_id=tared.stream_id, from_seq=20) as live:
             seqs = taken(live, 150)
             position = live.position
-        assert position == (tared.boot_id, seqs[-1] + 1)
-        boot_id, seq = position
+        assert position == (tared.stream_id, seqs[-1] + 1)
+        stream_id, seq = position
         tared.deliver(20, 20.0)
-        with server.live("bench", boot_id=boot_id, from_seq=seq) as live:
+        with server.live("bench", stream_id=stream_id, from_seq=seq) as live:
             seqs += taken(live, 175)
     assert seqs == list(range(20, seqs[-1] + 1))
 
@@ -97,7 +97,7 @@ def test_frames_that_are_lost_are_told(running: Running, tared: FakeNode) -> Non
     tared.say_lost(disk_full=[[first, tared.seq - 1]])
     tared.deliver(50, 20.0)
     told: list[foottile.Loss] = []
-    loss = foottile.Loss(tared.boot_id, first, first + 29, "disk_full")
+    loss = foottile.Loss(tared.stream_id, first, first + 29, "disk_full")
     with foottile.connect(running.url) as server:
         with server.live("bench", from_seq=0, on_loss=told.append) as live:
             taken(live, tared.seq - 10)
@@ -116,7 +116,7 @@ def test_frames_that_are_lost_are_told(running: Running, tared: FakeNode) -> Non
         ({"node": "nobody"}, "no node 'nobody'"),
         ({"columns": ["colour"]}, "no column 'colour'"),
         ({"policy": "all"}, "policy='all'"),
-        ({"boot_id": "0" * 32, "from_seq": 1}, "no stream"),
+        ({"stream_id": "0" * 32, "from_seq": 1}, "no stream"),
     ],
 )
 def test_what_is_not_there_is_said_and_not_tried_again(
@@ -170,11 +170,11 @@ def protocol(**asked: object) -> LiveProtocol:
 
 def test_a_stream_that_is_gone_is_a_loss_and_the_next_one_is_begun() -> None:
     live = protocol()
-    live.take(json.dumps({"type": "stream", "boot_id": "a" * 32, "from_seq": 5}))
-    assert f"boot_id={'a' * 32}&from_seq=5" in live.address()
+    live.take(json.dumps({"type": "stream", "stream_id": "a" * 32, "from_seq": 5}))
+    assert f"stream_id={'a' * 32}&from_seq=5" in live.address()
     with pytest.warns(foottile.FramesLostWarning, match="from 5 on"):
         live.closed(4011, "no stream")
-    assert "boot_id" not in live.address()
+    assert "stream_id" not in live.address()
     assert "from_seq=0" in live.address()  # nothing of the next one is left out
     assert live.losses[0].reason == "no_stream"
 
@@ -182,7 +182,7 @@ def test_a_stream_that_is_gone_is_a_loss_and_the_next_one_is_begun() -> None:
 def begun(seq: int, policy: str = "lossless") -> LiveProtocol:
     """A live stream whose next frame is this one."""
     live = protocol(policy=policy)
-    live.take(json.dumps({"type": "stream", "boot_id": "a" * 32, "from_seq": seq}))
+    live.take(json.dumps({"type": "stream", "stream_id": "a" * 32, "from_seq": seq}))
     live.take(SCHEMA.serialize().to_pybytes())
     return live
 
@@ -200,7 +200,9 @@ def frames(*seqs: int) -> bytes:
     [
         frames(6, 7),
         frames(5, 7),
-        json.dumps({"type": "lost", "boot_id": "a" * 32, "from_seq": 6, "to_seq": 9, "reason": ""}),
+        json.dumps(
+            {"type": "lost", "stream_id": "a" * 32, "from_seq": 6, "to_seq": 9, "reason": ""}
+        ),
     ],
     ids=["frames before it", "a frame among them", "a loss that leaves some out"],
 )

@@ -11,13 +11,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from devices.frames import FrameBatch
-from storage.clock.bounds import Rows
-from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import content_of
-from storage.formats.marks import BETWEEN, TIMES, Marks, place
+from storage.clock.bounds import OffsetRows
+from storage.clock.table import ClockTable, StreamClockFacts
+from storage.formats.export import make_frame_source
+from storage.formats.markers import LABEL_SEPARATOR, PLACEMENT_COLUMNS, PlacedMarkers, place_markers
 from storage.formats.slice import Slice
 from storage.schema import Array
-from storage.sessions.folder import Event
+from storage.sessions.folder import Marker
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 from tests.hostile.attack import Outcome, Play, attack
@@ -89,37 +89,40 @@ def _session(random: Random) -> tuple[FrameBatch, dict[str, Array]]:
     return frames, {"force_n": force_n, "phase": phase}
 
 
-def _placed(labels: list[str], frames: FrameBatch, random: Random) -> Marks:
+def _placed(labels: list[str], frames: FrameBatch, random: Random) -> PlacedMarkers:
     end_ns = ROWS * PERIOD_NS
     events = [
-        Event(id=f"{i:012x}", label=label, t_ns=int(frames.t_ns[0]) + random.randrange(end_ns))
+        Marker(id=f"{i:012x}", label=label, t_ns=int(frames.t_ns[0]) + random.randrange(end_ns))
         for i, label in enumerate(labels)
     ]
-    no_offset = Rows(np.array([0]), np.array([0]), np.array([1]))
-    clock = ClockTable({"a": no_offset}, [StreamFacts("a", 0, True)], ["a"])
-    times = {name: getattr(frames, name) for name in TIMES}
-    return place(events, [times], clock, Slice())
+    no_offset = OffsetRows(np.array([0]), np.array([0]), np.array([1]))
+    clock = ClockTable({"a": no_offset}, [StreamClockFacts("a", 0, True)], ["a"])
+    times = {name: getattr(frames, name) for name in PLACEMENT_COLUMNS}
+    return place_markers(events, [times], clock, Slice())
 
 
-def _written(to: str, frames: FrameBatch, extra: dict[str, Array], marks: Marks) -> bytes:
+def _written(to: str, frames: FrameBatch, extra: dict[str, Array], marks: PlacedMarkers) -> bytes:
     half = ROWS // 2
     pieces = [
-        (frames.rows(a, a + half), {name: values[a : a + half] for name, values in extra.items()})
+        (
+            frames.slice_rows(a, a + half),
+            {name: values[a : a + half] for name, values in extra.items()},
+        )
         for a in (0, half)
     ]
-    return b"".join(export(content_of(pieces), make_array(), {}, to, Slice(), None, marks))
+    return b"".join(export(make_frame_source(pieces), make_array(), {}, to, Slice(), None, marks))
 
 
-def _wrong(written: dict[str, bytes], marks: Marks, frames: FrameBatch) -> str | None:
+def _wrong(written: dict[str, bytes], marks: PlacedMarkers, frames: FrameBatch) -> str | None:
     arrow = pa.ipc.open_file(written["arrow"]).read_all()
     if not pq.read_table(io.BytesIO(written["parquet"])).equals(arrow):
         return "Parquet and Arrow differ"
     at: dict[int, list[str]] = {}
-    for mark in marks.all:
+    for mark in marks.markers:
         if mark.frame is not None:
-            at.setdefault(mark.frame[1], []).append(mark.event.label)
-    expected = [BETWEEN.join(at[seq]) if seq in at else None for seq in frames.seq.tolist()]
-    if arrow["event"].to_pylist() != expected:
+            at.setdefault(mark.frame[1], []).append(mark.marker.label)
+    expected = [LABEL_SEPARATOR.join(at[seq]) if seq in at else None for seq in frames.seq.tolist()]
+    if arrow["marker"].to_pylist() != expected:
         return f"Arrow has {arrow['event'].to_pylist()!r}"
     head, *rows = csv.reader(io.StringIO(written["csv"].decode(), newline=""))
     if len(rows) != ROWS or head != [*arrow.column_names, "about"]:

@@ -10,7 +10,7 @@ import time
 from contextlib import ExitStack, suppress
 from random import Random
 
-from service.link import LIVE_PATH, Close
+from service.protocol import LIVE_PATH, LinkCloseCode
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.stage import Served, asked, recording, traces
 from tests.waiting import until
@@ -148,7 +148,11 @@ def _answer_to(connection: socket.socket) -> str:
     head, _, frame = said.partition(b"\r\n\r\n")
     if b" 101 " in head and frame[:1] == _TEXT:  # hello
         return "admitted"
-    if b" 101 " in head and frame[:1] == _CLOSE and frame[2:4] == Close.TRY_LATER.to_bytes(2):
+    if (
+        b" 101 " in head
+        and frame[:1] == _CLOSE
+        and frame[2:4] == LinkCloseCode.TRY_LATER.to_bytes(2)
+    ):
         return "refused"
     return f"answered with {said[:200]!r}"
 

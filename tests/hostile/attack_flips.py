@@ -10,7 +10,7 @@ from pathlib import Path
 
 from storage.journal.segment import SUFFIX
 from storage.journal.segment_format import INDEX_SUFFIX
-from storage.verify.data import FolderReport, Report, verify
+from storage.verify.data_folder import DataFolderReport, Report, verify_path
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.folders import (
     DELETED,
@@ -121,7 +121,7 @@ def _server_readings(copy: Path, name: str) -> Readings:
 def _all_readings(root: Root, copy: Path) -> Readings:
     shutil.copytree(root.path, copy)
     try:
-        problems = verify(copy).as_dict()["problems"]
+        problems = verify_path(copy).to_json_dict()["problems"]
         if problems:
             raise AssertionError(f"{root.path.name} is not whole: {problems}")
         found = root.read(copy, "")
@@ -141,8 +141,8 @@ def _try(
     (copy / name).write_bytes(changed_to)
     where = f"{root.path.name}/{name}, byte {at}: {changed_to[at : at + 1]!r}"
     try:
-        report = verify(copy)
-        said, unproven = _said(report), "\n".join(report.as_dict().get("unproven", ()))
+        report = verify_path(copy)
+        said, unproven = _said(report), "\n".join(report.to_json_dict().get("unproven", ()))
         # Of a segment and its index either may be named.
         named = name.stem if name.suffix in (SUFFIX, INDEX_SUFFIX) else name.name
         is_named, is_unproven = named in said, name.name in unproven
@@ -171,10 +171,10 @@ def _try(
 
 def _said(report: Report) -> str:
     """All that verify says of what is not as it should be."""
-    found = report.as_dict()
+    found = report.to_json_dict()
     remarks = [
         remark
-        for stream in (report.streams if isinstance(report, FolderReport) else [])
+        for stream in (report.streams if isinstance(report, DataFolderReport) else [])
         for remark in stream.remarks
     ]
     return "\n".join([*found["problems"], *found.get("unproven", ()), *remarks])

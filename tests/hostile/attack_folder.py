@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from devices.errors import FootTileError
-from service.server.screens.views import SessionView
+from service.server.broadcast.views import SessionView
 from service.server.server import Server
 from storage.server_id import SERVER_ID_NAME
 from tests.hostile.attack import Outcome, Play, attack
@@ -27,19 +27,19 @@ def served(server: Server) -> Served:
     """What a server gives away, by what it is of."""
     found: Served = {}
     for node in server.nodes:
-        found[f"node {node.name}"] = server.view_node(node).model_dump_json()
-        for boot_id, stream in node.streams.items():
-            numbers = list(stream.held)
+        found[f"node {node.name}"] = server.make_node_view(node).model_dump_json()
+        for stream_id, stream in node.streams.items():
+            numbers = list(stream.stored)
             try:
                 journal = stream.journal
                 assert journal is not None
-                frames = [digest(b) for n in numbers for b in journal.read(*n)]
+                frames = [digest(b) for n in numbers for b in journal.read_frames(*n)]
             except FootTileError as error:
                 frames = [f"damaged: {error}"]
-            found[f"stream {boot_id}"] = (node.name, numbers, frames)
-    for session in server.sessions.newest_first():
-        view = SessionView.of(session, server.recorder).model_dump_json()
-        folder = server.sessions.folder.path(session.id)
+            found[f"stream {stream_id}"] = (node.name, numbers, frames)
+    for session in server.sessions.iterate_newest_first():
+        view = SessionView.from_session(session, server.recorder).model_dump_json()
+        folder = server.sessions.folder.get_path(session.id)
         files = {p.name: sha(p) for p in sorted(folder.iterdir()) if p.suffix == ".parquet"}
         found[f"session {session.id}"] = (view, files)
     return found
@@ -73,8 +73,8 @@ def _may_change(path: Path, whole: Served) -> set[str]:
             return {f"node {name}"} | streams | pending
         case ("nodes", _, _):
             return {f"node {name}"}
-        case ("journal", _, boot_id, *_):
-            return {f"node {name}", f"stream {boot_id}"} | pending
+        case ("journal", _, stream_id, *_):
+            return {f"node {name}", f"stream {stream_id}"} | pending
         case ("sessions", session_id, *_):
             return {f"session {session_id}", *(f"node {node}" for node in NODES)}
         case _:

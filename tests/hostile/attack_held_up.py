@@ -63,12 +63,12 @@ def held_up(play: Play) -> Outcome:
             went_on = _grows(running, during["last_seq"] + 20)
             longest_s = max(longest_s, time.monotonic() - begun_s)
             after = running.node("leg")
-            said = stopped_s < _SAID_S or any("held up" in text for text in during["troubles"])
+            said = stopped_s < _SAID_S or any("held up" in text for text in during["warnings"])
             too_fast = (after["rate_hz"] or 0.0) > after["nominal_rate_hz"]
             if not went_on or node.process.poll() is not None:
                 outcome.failed(f"after {stopped_s:g} s: no frames, {node.err[-3:]}")
                 return outcome
-            if after["boot_id"] != before["boot_id"] or not during["connected"]:
+            if after["stream_id"] != before["stream_id"] or not during["connected"]:
                 outcome.failed(f"after {stopped_s:g} s: another stream, or away")
             elif not said or too_fast:
                 outcome.failed(f"after {stopped_s:g} s: {during['troubles']}, {after['rate_hz']}")

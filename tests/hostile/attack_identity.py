@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from websockets.exceptions import ConnectionClosed
 
-from service.identity import make_secret
-from service.link import Challenge, Proof
+from service.node_identity import generate_secret
+from service.protocol import Challenge, Proof
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.stage import Served, recording, traces
 from tests.service.fake_node import Earlier, FakeNode
@@ -57,14 +57,14 @@ class _Stranger(FakeNode):
 def _take_over(served: Served, victim: FakeNode, random: Random) -> str:
     stranger = _Stranger(served, victim.name)
     stranger.answer = random.choice(
-        [Proof(), Proof(secret=make_secret()), Proof(proof=make_secret())]
+        [Proof(), Proof(secret=generate_secret()), Proof(proof=generate_secret())]
     )
     running = Earlier(victim.info, victim.seq, victim.sent[-1:])
     changes: dict[str, Any] = {"earlier": (running.said(),)}
     if random.random() < 0.5:
-        stranger.boot_id, stranger.utc_offset_ns = victim.boot_id, victim.utc_offset_ns
+        stranger.stream_id, stranger.utc_offset_ns = victim.stream_id, victim.utc_offset_ns
         stranger.seq = victim.seq + 50
-        changes = {"held": ((0, stranger.seq - 1),)}
+        changes = {"stored": ((0, stranger.seq - 1),)}
     try:
         stranger.open_with_hello(**changes)
         stranger.receive("welcome", _ANSWER_S)
@@ -97,7 +97,7 @@ def frames_ahead(play: Play) -> Outcome:
         time.sleep(0.5)
         if not served.node()["connected"]:
             outcome.failures.append("the node is no longer connected")
-        if "ahead" not in " ".join(served.node()["troubles"]):
+        if "ahead" not in " ".join(served.node()["warnings"]):
             outcome.failures.append("no warning counts the frames that were refused")
         outcome.failures += traces(served)[:5]
         outcome.failures += _find_forged(served, node)
@@ -107,7 +107,11 @@ def frames_ahead(play: Play) -> Outcome:
 def _send_ahead(node: FakeNode, random: Random) -> str:
     # Apart from what the thread of the node sends: a copy, that does not move its numbers.
     forger = FakeNode(node.running, node.name)
-    forger.boot_id, forger.utc_offset_ns, forger.seq = node.boot_id, node.utc_offset_ns, node.seq
+    forger.stream_id, forger.utc_offset_ns, forger.seq = (
+        node.stream_id,
+        node.utc_offset_ns,
+        node.seq,
+    )
     forger.next_t_mono_ns = time.monotonic_ns()
     kind = random.choice(["dated ahead", "numbered ahead"])
     if kind == "dated ahead":
@@ -121,7 +125,7 @@ def _send_ahead(node: FakeNode, random: Random) -> str:
 
 def _find_forged(served: Served, node: FakeNode) -> list[str]:
     """Return what is wrong with what the server's journal holds of the stream."""
-    held, sent = served.held(node.boot_id, node.name), node.all_sent()
+    held, sent = served.held(node.stream_id, node.name), node.all_sent()
     if not np.array_equal(held.seq, sent.seq[: len(held)]):
         return [f"the journal holds {len(held)} frames, of {len(sent)} that were taken"]
     if not np.array_equal(held.t_mono_ns, sent.t_mono_ns[: len(held)]):

@@ -21,13 +21,13 @@ _GROWN_MAX_MB = 100.0
 class Program(threading.Thread):
     """Takes every frame from a number on, over as many connections as that takes."""
 
-    def __init__(self, url: str, boot_id: str, from_seq: int) -> None:
+    def __init__(self, url: str, stream_id: str, from_seq: int) -> None:
         super().__init__(name="program")
         self.seqs: list[int] = []
         self.grf_n: dict[int, float | None] = {}
         self.problem: BaseException | None = None
         self._server = foottile.connect(url)
-        self._live = self._server.live("bench", "grf_n", boot_id=boot_id, from_seq=from_seq)
+        self._live = self._server.live("bench", "grf_n", stream_id=stream_id, from_seq=from_seq)
         self.start()
 
     def run(self) -> None:
@@ -76,7 +76,7 @@ def killed(play: Play) -> Outcome:
         node.connect()
         node.tared()
         first = node.seq
-        taking = Program(served.url, node.boot_id, first)
+        taking = Program(served.url, node.stream_id, first)
         stack.callback(taking.close)
         for _ in range(play.tries):
             rss_mb = served.rss_mb
@@ -98,10 +98,10 @@ def killed(play: Play) -> Outcome:
             server.enter_context(served)
             node.connect()
             rows = node.all_sent()
-            for a, b in node.lacks[node.boot_id]:
-                node.send_again(rows.rows(a, node.seq if b is None else b + 1))
+            for a, b in node.lacks[node.stream_id]:
+                node.send_again(rows.slice_rows(a, node.seq if b is None else b + 1))
             node.send(50, 20.0, alive=True)
-            old = [Program(served.url, node.boot_id, 0) for _ in range(2)]
+            old = [Program(served.url, node.stream_id, 0) for _ in range(2)]
             programs = (taking, *old)
             for each in programs:
                 until(partial(each.has_or_failed, node.seq - 20))

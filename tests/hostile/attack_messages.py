@@ -18,28 +18,28 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from devices.frames import ArrayInfo
-from service.api.protocols import SAID_ON_LIVE_BYTES_MAX
-from service.identity import make_proof
-from service.link import (
+from service.api.protocols import CLIENT_MESSAGE_BYTES_MAX
+from service.node_identity import make_proof
+from service.protocol import (
     INGEST_PATH,
     LIVE_PATH,
     MESSAGE_BYTES_MAX,
     PROTOCOL,
     SUBPROTOCOL,
     Challenge,
-    ClockRow,
+    ClockProbe,
+    ClockSample,
     EarlierStream,
-    FramesOf,
     Hello,
     Identify,
-    Lost,
-    Probe,
+    LossReport,
+    NodeStatus,
     Proof,
-    Status,
-    heard,
-    with_check,
+    StreamSelect,
+    append_crc,
+    strip_text_crc,
 )
-from storage.wire import messages_of
+from storage.wire import encode_as_messages
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.calibrations import make_calibration, make_effects, newton_tile
 from tests.builders.frames import make_frames, with_columns
@@ -206,7 +206,7 @@ class _Node(_Foreign):
         self._info = make_array(
             2,
             node=self._name,
-            boot_id=uuid.UUID(int=random.getrandbits(128)).hex,
+            stream_id=uuid.UUID(int=random.getrandbits(128)).hex,
             utc_offset_ns=time.time_ns() - time.monotonic_ns(),
         )
         self._begins_wrong = random.random() < 0.7
@@ -257,7 +257,7 @@ class _Node(_Foreign):
     async def heard(self, kind: str) -> str:
         assert self.socket is not None
         while True:
-            text = heard(await self.socket.recv())
+            text = strip_text_crc(await self.socket.recv())
             if json.loads(text)["type"] == kind:
                 return text
 
@@ -278,21 +278,21 @@ class _Node(_Foreign):
         return wrong_text(random, right)
 
     def _said(self) -> list[Any]:
-        boot_id = self._info.boot_id
+        stream_id = self._info.stream_id
         return [
-            FramesOf(boot_id=boot_id),
-            Probe(id=3),
-            ClockRow(t_mono_ns=time.monotonic_ns(), server_minus_node_ns=0, uncertainty_ns=9),
-            Lost(boot_id=boot_id, lost={"node_busy": ((0, 0), (5, 6))}),
-            Status(missed_slots=3, troubles=("T01: silent",), counts={"T01": {"stale": 4}}),
+            StreamSelect(stream_id=stream_id),
+            ClockProbe(id=3),
+            ClockSample(t_mono_ns=time.monotonic_ns(), server_minus_node_ns=0, uncertainty_ns=9),
+            LossReport(stream_id=stream_id, lost={"node_busy": ((0, 0), (5, 6))}),
+            NodeStatus(missed_slots=3, warnings=("T01: silent",), counts={"T01": {"stale": 4}}),
             _hello(self._info),
         ]
 
     async def _send_right(self) -> None:
         frames = make_frames(10, 2, utc_offset_ns=self._info.utc_offset_ns)
         frames = with_columns(frames, t_mono_ns=frames.t_mono_ns + self._t_mono_ns)
-        for message in messages_of(frames, self._info):
-            await self.say(with_check(message.payload))
+        for message in encode_as_messages(frames, self._info):
+            await self.say(append_crc(message.payload))
         self._seq, self._t_mono_ns = 10, self._t_mono_ns + 10 * PERIOD_NS
 
 
@@ -300,7 +300,7 @@ class _Viewer(_Foreign):
     """A screen that says more than `ping`."""
 
     path = LIVE_PATH
-    most_bytes = SAID_ON_LIVE_BYTES_MAX
+    most_bytes = CLIENT_MESSAGE_BYTES_MAX
 
     async def opened(self) -> ClientConnection:
         odd = ("", "", "", "?rate_hz=nan", "?rate_hz=1e999", "?node=%00", "?format=x", "?a=%ff%fe")
@@ -335,11 +335,11 @@ def _identify(name: str) -> dict[str, Any]:
 
 
 def _hello(info: ArrayInfo) -> Hello:
-    earlier = info.model_copy(update={"boot_id": info.boot_id[::-1]})
+    earlier = info.model_copy(update={"stream_id": info.stream_id[::-1]})
     return Hello(
         protocol=PROTOCOL,
         array_info=info,
-        held=((0, 99), (200, 299)),
+        stored=((0, 99), (200, 299)),
         next_seq=300,
         t_mono_ns=time.monotonic_ns(),
         lost={"evicted": ((100, 199),)},
@@ -347,7 +347,7 @@ def _hello(info: ArrayInfo) -> Hello:
         emulated=False,
         calibration=make_calibration(newton_tile("T01", effects=make_effects()), "T02"),
         calibration_problem=None,
-        earlier=(EarlierStream(array_info=earlier, held=((0, 9),), next_seq=10),),
+        earlier=(EarlierStream(array_info=earlier, stored=((0, 9),), next_seq=10),),
     )
 
 

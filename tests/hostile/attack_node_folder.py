@@ -13,11 +13,11 @@ from devices.acquisition import FrameRow
 from devices.errors import FootTileError
 from devices.frames import FrameBatch
 from storage.intervals import Intervals, OpenPairs
-from storage.journal.node.in_flight import InFlight
+from storage.journal.node.in_flight import InFlightWriter
 from storage.journal.node.journal import NodeJournal
+from storage.journal.node.retention_requests import RetentionRequest
 from storage.journal.node.stream import NodeStream
-from storage.journal.node.wanted import ServerWants
-from storage.wire import messages_of
+from storage.wire import encode_as_messages
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 from tests.hostile.attack import Outcome, Play, attack
@@ -33,19 +33,21 @@ def node_folder(folder: Path) -> Path:
     """The state of a node that was killed: a stream that ended, one in flight, what is wanted."""
     live = folder.with_name(f"{folder.name}-live")
     journal = NodeJournal(live, "leg")
-    journal.start()
+    journal.start_writer()
     wants: dict[str, OpenPairs] = {BOOTS[0]: ((0, 49),), BOOTS[1]: ((100, None),)}
-    journal.want("laptop", ServerWants(streams=wants, recording=True, known=BOOTS))
-    for boot_id in BOOTS:
-        info = make_array(node="leg", boot_id=boot_id)
-        stream = journal.begin(info)
-        in_flight = InFlight(stream.folder, info)
+    journal.update_retention_request(
+        "laptop", RetentionRequest(streams=wants, recording=True, known=BOOTS)
+    )
+    for stream_id in BOOTS:
+        info = make_array(node="leg", stream_id=stream_id)
+        stream = journal.begin_stream(info)
+        in_flight = InFlightWriter(stream.folder, info)
         for first in range(0, 200, 10):
             frames = make_frames(np.arange(first, first + 10))
             for row in rows_of(frames):
-                in_flight.put(row)
-            for message in messages_of(frames, info):
-                journal.put(stream, message)
+                in_flight.write_frame(row)
+            for message in encode_as_messages(frames, info):
+                journal.queue_batch(stream, message)
         in_flight.close()
         until(partial(_is_stored, stream))
     until((live / "journal" / "leg" / "wanted.json").exists)
@@ -94,30 +96,30 @@ def folder_of_a_node(play: Play) -> Outcome:
 def _goes_on(root: Path, undamaged: Sequence[str]) -> tuple[str, list[str]]:
     """What is wrong with a node's journal that is opened now, and what it says."""
     journal = NodeJournal(root, "leg")
-    journal.start()
+    journal.start_writer()
     try:
-        info = make_array(node="leg", boot_id="c" * 32)
-        stream = journal.begin(info)
-        for message in messages_of(make_frames(np.arange(10)), info):
-            journal.put(stream, message)
+        info = make_array(node="leg", stream_id="c" * 32)
+        stream = journal.begin_stream(info)
+        for message in encode_as_messages(make_frames(np.arange(10)), info):
+            journal.queue_batch(stream, message)
         until(lambda: stream.stored.last == 9)
-        known = {each.boot_id: each for each in journal.streams}
-        for boot_id in undamaged:
-            if boot_id not in known or known[boot_id].held != Intervals([(0, 199)]):
-                return f"stream {boot_id} is not whole", journal.problems
+        known = {each.stream_id: each for each in journal.streams}
+        for stream_id in undamaged:
+            if stream_id not in known or known[stream_id].available != Intervals([(0, 199)]):
+                return f"stream {stream_id} is not whole", journal.problems
         for each in known.values():
             read = 0
             try:
-                for batch in each.journal.read(0, 199) if each.journal else ():
+                for batch in each.journal.read_frames(0, 199) if each.journal else ():
                     taken = make_frames(batch.seq.astype(np.int64))
                     if digest(batch) != digest(taken):
                         return "other frames", journal.problems
                     read += len(batch)
             except FootTileError as error:
-                if each.boot_id in undamaged:
-                    return f"stream {each.boot_id}: {error}", journal.problems
-            if each.boot_id in undamaged and read != 200:
-                return f"of stream {each.boot_id} only {read} are read", journal.problems
+                if each.stream_id in undamaged:
+                    return f"stream {each.stream_id}: {error}", journal.problems
+            if each.stream_id in undamaged and read != 200:
+                return f"of stream {each.stream_id} only {read} are read", journal.problems
         return "", list(journal.problems)
     finally:
         journal.close()

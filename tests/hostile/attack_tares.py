@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from service.estimation.estimates import EstimateStatus
-from service.link import Hello
-from service.server.following import sources_now
+from service.estimation.estimates import EstimateFlag
+from service.protocol import Hello
 from service.server.node import ServerNode
-from service.server.nodes import ServerNodes
+from service.server.nodes import NodeRegistry
+from service.server.session_parts import current_inputs
 from service.sessions.frames import SessionFrames
-from storage.sessions.folder import SessionFolder
+from storage.sessions.folder import SessionsFolder
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.data_folders import data_folder
 
@@ -27,13 +27,13 @@ def flipped_tares(play: Play) -> Outcome:
     """A bit is flipped at every byte in turn; then forces are computed live, and a session sealed.
 
     Failures: a number that is neither bit for bit the one without the flip, nor NaN with bit 512 of
-    `estimate_status`; a flip that is not said.
+    `estimate_flags`; a flip that is not said.
     """
     outcome = Outcome()
     data = data_folder(play.folder / "data")
     path = data / "nodes" / "left" / "tares.json"
     text = path.read_bytes()
-    hello = ServerNodes(data).get("left").hello
+    hello = NodeRegistry(data).get("left").hello
     whole, _ = _estimated(data, hello)
     places = list(range(len(text)))
     play.random.shuffle(places)
@@ -47,8 +47,7 @@ def flipped_tares(play: Play) -> Outcome:
         if wrong or not said:
             outcome.failed(f"byte {at} bit {bit}: {wrong or 'nothing is said'}")
         elif any(
-            (columns["estimate_status"] & EstimateStatus.TARE_LOST).any()
-            for columns in now.values()
+            (columns["estimate_flags"] & EstimateFlag.TARE_LOST).any() for columns in now.values()
         ):
             outcome.saw("said, and forces are NaN")
         else:
@@ -62,10 +61,10 @@ def _estimated(data: Path, hello: Hello) -> tuple[dict[str, Numbers], bool]:
     node = ServerNode(data / "nodes" / "left", data / "journal" / "left", hello)
     found: dict[str, Numbers] = {"live": _live(node)}
     for path in sorted((data / "sessions").iterdir()):
-        session = SessionFolder(data / "sessions").load(path.name)
+        session = SessionsFolder(data / "sessions").load(path.name)
         if session.node == "left":
             session = session.model_copy(update={"state": "pending"})
-            pieces = [columns for _, columns in SessionFrames(sources_now(session, node))]
+            pieces = [columns for _, columns in SessionFrames(current_inputs(session, node))]
             found[path.name] = _joined(pieces)
     return found, bool(node.problems)
 
@@ -73,17 +72,21 @@ def _estimated(data: Path, hello: Hello) -> tuple[dict[str, Numbers], bool]:
 def _live(node: ServerNode) -> Numbers:
     journal = node.journal
     assert journal is not None
-    due = [c for batch in journal.read(0, 2**61) for _, c in node.estimates.live.feed(batch)]
+    due = [
+        c
+        for batch in journal.read_frames(0, 2**61)
+        for _, c in node.estimator.live.feed_frames(batch)
+    ]
     return _joined(due)
 
 
 def _joined(pieces: list[Any]) -> Numbers:
-    names = (*_NUMBERS, "estimate_status")
+    names = (*_NUMBERS, "estimate_flags")
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
 
 def _is_right_or_lost(whole: Numbers, now: Numbers) -> bool:
-    lost = (now["estimate_status"] & EstimateStatus.TARE_LOST) != 0
+    lost = (now["estimate_flags"] & EstimateFlag.TARE_LOST) != 0
     for name in _NUMBERS:
         rows = whole[name].reshape(len(whole[name]), -1), now[name].reshape(len(now[name]), -1)
         if rows[0].shape != rows[1].shape or rows[0][~lost].tobytes() != rows[1][~lost].tobytes():

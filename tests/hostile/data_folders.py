@@ -24,8 +24,8 @@ def data_folder(folder: Path) -> Path:
     """
     with (
         patch("service.server.server.TICK_S", 0.02),
-        patch("service.server.recorder.BEHIND_S", 1e9),  # its frames are long ago
-        patch("service.api.routes.recordings.sessions.SETTLE_S", 0.02),
+        patch("service.server.recorder.MAX_DELAY_S", 1e9),  # its frames are long ago
+        patch("service.api.routes.recordings.sessions.SEAL_TIMEOUT_S", 0.02),
     ):
         _record(folder)
     (folder / "token").write_text("a-token-of-an-earlier-start\n")
@@ -46,7 +46,7 @@ def _record(folder: Path) -> None:
             session = node.record(name="walk", tags=["a"])
             node.deliver(100, 5.0)
             event = {"label": "step"}
-            assert running.http.post(f"{session.url}/events", json=event).status_code == 201
+            assert running.http.post(f"{session.url}/markers", json=event).status_code == 201
             node.finish(session)
             if node is nodes[0]:
                 pending = node.record(name="pending")

@@ -11,19 +11,19 @@ import numpy as np
 
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo
-from service.link import PROTOCOL, Hello
-from service.offline.calibrations import read_calibration
+from service.offline.calibration_lookup import read_calibration
+from service.protocol import PROTOCOL, Hello
 from service.sessions.calibration_file import write_calibration
-from service.sessions.recover import recover
+from service.sessions.recovery import recover_folder
 from service.sessions.tares import TareHistory
-from storage.checked_json import write_checked
+from storage.checksummed_json import write_checksummed_json
 from storage.clock.log import ClockLog, ClockOffset
-from storage.journal.node.wanted import ServerWants, Wanted
+from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
 from storage.secret_file import SECRETS_NAME, write_secrets
 from storage.server_id import SERVER_ID_NAME, write_server_id
-from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
-from storage.sessions.folder import FRAMES_NAME, Event, Part, SessionFolder
-from storage.sessions.reader import SessionReader
+from storage.sessions.folder import FRAMES_NAME, Marker, Part, SessionsFolder
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.sidecars import MARKERS_NAME, load_clock_table, read_markers
 from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.service.sessions.crashed import BOOT, session, stream, t_ns
@@ -42,12 +42,12 @@ Readings = dict[str, str]
 
 def make_server(data: Path) -> None:
     """A server's: a sealed session, one in the trash, one that waits, journal, clock, tares."""
-    info, node = make_array(boot_id=BOOT), data / "nodes" / "bench"
-    TareHistory(node / "tares.json").add(make_tare(t_ns=t_ns(0)), info)
+    info, node = make_array(stream_id=BOOT), data / "nodes" / "bench"
+    TareHistory(node / "tares.json").add_tare(make_tare(t_ns=t_ns(0)), info)
     hello = Hello(
         protocol=PROTOCOL,
         array_info=info,
-        held=((0, FRAMES - 1),),
+        stored=((0, FRAMES - 1),),
         next_seq=FRAMES,
         t_mono_ns=0,
         scene={"name": "test"},
@@ -55,7 +55,7 @@ def make_server(data: Path) -> None:
         calibration=make_calibration("T01", "T02"),
         calibration_problem=None,
     )
-    write_checked(node / "hello.json", hello.model_dump_json().encode())
+    write_checksummed_json(node / "hello.json", hello.model_dump_json().encode())
     write_secrets(node / SECRETS_NAME, {"bench": SECRET})
     write_server_id(data / SERVER_ID_NAME, SERVER_ID)
     (data / "token").write_text("a token that nobody has\n")
@@ -64,26 +64,28 @@ def make_server(data: Path) -> None:
     for row in range(6):
         log.append(
             ClockOffset(
-                boot_id=BOOT,
+                stream_id=BOOT,
                 t_mono_ns=row * 30_000_000,
                 server_minus_node_ns=1_000_000 + row,
                 uncertainty_ns=300_000 - row,
             )
         )
     _session(data, SEALED, 5, 60)
-    recover(data, give_up=True)
+    recover_folder(data, abandon_missing=True)
     _session(data, DELETED, 20, 40)
-    sessions = SessionFolder(data / "sessions")
-    sessions.move(DELETED, SessionFolder(data / "trash"))
+    sessions = SessionsFolder(data / "sessions")
+    sessions.move_to(DELETED, SessionsFolder(data / "trash"))
     _session(data, PENDING, 50, FRAMES - 1)
 
 
 def make_node(root: Path) -> None:
     """A node's that recorded by itself and was killed."""
-    folder = _journal(root, make_array(boot_id=BOOT))
-    wanted = Wanted(folder.parent / "wanted.json")
+    folder = _journal(root, make_array(stream_id=BOOT))
+    wanted = RetentionRequests(folder.parent / "wanted.json")
     write_secrets(folder.parent / SECRETS_NAME, {SERVER_ID: SECRET})
-    wanted.say(SERVER_ID, ServerWants(streams={BOOT: ((0, None),)}, known=(BOOT,)))
+    wanted.update_server_request(
+        SERVER_ID, RetentionRequest(streams={BOOT: ((0, None),)}, known=(BOOT,))
+    )
     wanted.save()
     _session(root, PENDING, 0, FRAMES - 1)
 
@@ -104,8 +106,8 @@ def _session(data: Path, session_id: str, first: int, last: int) -> None:
         session_id,
         state="pending",
         stopped_t_ns=t_ns(last),
-        parts=(Part(boot_id=BOOT, seq_first=first, seq_last=last),),
-        events=(Event(id="e1", label="slip", t_ns=t_ns(first + 3)),),
+        parts=(Part(stream_id=BOOT, seq_first=first, seq_last=last),),
+        events=(Marker(id="e1", label="slip", t_ns=t_ns(first + 3)),),
         calibration=make_calibration("T01", "T02").model_dump(mode="json"),
     )
 
@@ -114,10 +116,10 @@ def session_readings(folder: Path) -> Readings:
     """What a session's files give, each by itself; of one that is not sealed there is only one."""
     readers: Mapping[str, Callable[[], bytes]] = {
         "session": lambda: (
-            SessionFolder(folder.parent).load(folder.name).model_dump_json().encode()
+            SessionsFolder(folder.parent).load(folder.name).model_dump_json().encode()
         ),
         "frames": lambda: _frames(folder / FRAMES_NAME),
-        "events": lambda: repr(read_events(folder / EVENTS_NAME).events).encode(),
+        "markers": lambda: repr(read_markers(folder / MARKERS_NAME).markers).encode(),
         "clock": lambda: _clock(folder / FRAMES_NAME),
     }
     wanted = readers if folder.name == SEALED else {"session"}
@@ -133,8 +135,8 @@ def recovered_readings(data: Path) -> Readings:
     """
 
     def sealed() -> bytes:
-        recover(data, give_up=True)
-        done = SessionFolder(data / "sessions").load(PENDING)
+        recover_folder(data, abandon_missing=True)
+        done = SessionsFolder(data / "sessions").load(PENDING)
         ledger = done.ledger
         if ledger is None or ledger.lossy or done.problem:
             raise FootTileError(done.problem or f"the ledger says {ledger}")
@@ -155,9 +157,9 @@ def _calibration(path: Path) -> bytes:
 def _frames(path: Path) -> bytes:
     """Every column of every frame, whatever the file says beside them."""
     digest = hashlib.sha256()
-    with SessionReader(path) as reader:
+    with SealedFileReader(path) as reader:
         digest.update(reader.info.model_dump_json(exclude={"software"}).encode())
-        for table in reader.tables():
+        for table in reader.read_tables():
             for name in table.column_names:
                 digest.update(name.encode())
                 values = table.column(name).to_numpy()
@@ -166,14 +168,14 @@ def _frames(path: Path) -> bytes:
 
 
 def _clock(path: Path) -> bytes:
-    with SessionReader(path) as reader:
-        table = clock_beside(reader)
+    with SealedFileReader(path) as reader:
+        table = load_clock_table(reader)
         columns = [
-            table.columns(frames.t_mono_ns, frames.t_ns, extra["part"])
-            for frames, extra in reader.batches("part")
+            table.compute_server_time(frames.t_mono_ns, frames.t_ns, extra["part"])
+            for frames, extra in reader.read_batches("part")
         ]
     values = [values.tobytes() for each in columns for values in each.values()]
-    return b"".join([table.summary().model_dump_json().encode(), *values])
+    return b"".join([table.summarize().model_dump_json().encode(), *values])
 
 
 def _read(reader: Callable[[], bytes]) -> str:

@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow as pa
 
 from devices.frames import ArrayInfo, FrameBatch
-from service.link import with_check
-from storage.schema import to_record_batch, wire_schema
+from service.protocol import append_crc
+from storage.schema import frames_to_record_batch, wire_schema
 from tests.builders.frames import make_frames, with_columns
 from tests.builders.odd_values import ODD_VALUES, places, with_value
 
@@ -62,11 +62,11 @@ def wrong_batch(random: Random, info: ArrayInfo, seq: int, t_mono_ns: int) -> by
         np.arange(seq, seq + 10), len(info.tiles), utc_offset_ns=info.utc_offset_ns
     )
     frames = with_columns(frames, t_mono_ns=frames.t_mono_ns - frames.t_mono_ns[0] + t_mono_ns)
-    return with_check(random.choice(_BATCHES)(random, info, frames))
+    return append_crc(random.choice(_BATCHES)(random, info, frames))
 
 
 def _encoded(info: ArrayInfo, frames: FrameBatch) -> bytes:
-    return to_record_batch(frames, wire_schema(info)).serialize().to_pybytes()
+    return frames_to_record_batch(frames, wire_schema(info)).serialize().to_pybytes()
 
 
 def _odd_column(random: Random, info: ArrayInfo, frames: FrameBatch) -> bytes:
@@ -129,7 +129,7 @@ def _compressed(random: Random, info: ArrayInfo, frames: FrameBatch) -> bytes:
     zeros = make_frames(np.zeros(rows), len(info.tiles), utc_offset_ns=info.utc_offset_ns)
     codec = random.choice(["zstd", "lz4"])
     options = pa.ipc.IpcWriteOptions(compression=codec)  # type: ignore[arg-type]  # both it knows
-    return _stream_of(to_record_batch(zeros, wire_schema(info)), options)
+    return _stream_of(frames_to_record_batch(zeros, wire_schema(info)), options)
 
 
 def _other_schema(random: Random, info: ArrayInfo, frames: FrameBatch) -> bytes:

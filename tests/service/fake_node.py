@@ -19,28 +19,28 @@ from websockets.sync.client import ClientConnection
 from devices.frames import (
     ArrayInfo,
     FrameBatch,
-    FrameStatus,
+    FrameFlag,
 )
 from service.estimation.calibration import Calibration
-from service.identity import make_proof, make_secret
-from service.link import (
+from service.node_identity import generate_secret, make_proof
+from service.protocol import (
     INGEST_PATH,
     PROTOCOL,
+    SERVER_MESSAGES,
     Challenge,
-    ClockRow,
+    ClockSample,
     EarlierStream,
-    FramesOf,
-    FromServer,
     Hello,
     Identify,
     Proof,
-    Wanted,
-    heard,
-    with_check,
+    RetentionMessage,
+    StreamSelect,
+    append_crc,
+    strip_text_crc,
 )
 from storage.intervals import Intervals
 from storage.schema import wire_schema
-from storage.wire import encode
+from storage.wire import encode_frames
 from tests.builders.arrays import PERIOD_NS, UNLOADED_COUNTS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
@@ -61,14 +61,14 @@ class Earlier:
     sent: list[FrameBatch]
 
     @property
-    def boot_id(self) -> str:
-        return self.info.boot_id
+    def stream_id(self) -> str:
+        return self.info.stream_id
 
     def said(self, **changes: Any) -> EarlierStream:
         """As a hello mentions it: the node has all of it."""
         content: dict[str, Any] = {
             "array_info": self.info,
-            "held": ((0, self.next_seq - 1),) if self.next_seq else (),
+            "stored": ((0, self.next_seq - 1),) if self.next_seq else (),
             "next_seq": self.next_seq,
             "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
         }
@@ -87,7 +87,7 @@ class Spoken:
     def send(self, message: str | bytes) -> None:
         """Send something, with the checksum that fits it."""
         if isinstance(message, bytes):
-            self.send_raw(with_check(message))
+            self.send_raw(append_crc(message))
         elif message.endswith("}"):
             body = message[:-1]
             self.send_raw(f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}')
@@ -100,7 +100,7 @@ class Spoken:
 
     def recv(self, timeout: float | None = None) -> str:
         """The next message, without its checksum, which has to be right."""
-        return heard(self._socket.recv(timeout=timeout))
+        return strip_text_crc(self._socket.recv(timeout=timeout))
 
 
 class FakeNode:
@@ -118,7 +118,7 @@ class FakeNode:
         secret: str | None = None,
     ) -> None:
         self.running = running
-        self.secret: str | None = secret or make_secret()
+        self.secret: str | None = secret or generate_secret()
         """Shared with every server; None: its disk keeps none."""
         self.is_emulated = is_emulated
         self.name = name
@@ -131,8 +131,8 @@ class FakeNode:
         self.acked_of: dict[str, Intervals] = {}
         self.lacks: dict[str, list[tuple[int, int | None]]] = {}
         """What the server asked for at the last connection, by stream."""
-        self.wanted: Wanted
-        self.boot_id = ""
+        self.wanted: RetentionMessage
+        self.stream_id = ""
         self.seq = 0
         self.sent: list[FrameBatch] = []
         self.before: list[Earlier] = []
@@ -143,9 +143,9 @@ class FakeNode:
 
     def reboot(self) -> None:
         """Begin a new stream, with the clock where it was before or long ago."""
-        if self.boot_id:
+        if self.stream_id:
             self.before.append(Earlier(self.info, self.seq, self.sent))
-        self.boot_id = uuid.uuid4().hex
+        self.stream_id = uuid.uuid4().hex
         self.utc_offset_ns = time.time_ns() - time.monotonic_ns()
         self.next_t_mono_ns = time.monotonic_ns() - LONG_AGO_NS
         self.seq = 0
@@ -157,7 +157,7 @@ class FakeNode:
         return make_array(
             self.tiles,
             node=self.name,
-            boot_id=self.boot_id,
+            stream_id=self.stream_id,
             utc_offset_ns=self.utc_offset_ns,
             nominal_rate_hz=self.nominal_rate_hz,
         )
@@ -169,7 +169,7 @@ class FakeNode:
         content: dict[str, Any] = {
             "protocol": PROTOCOL,
             "array_info": self.info,
-            "held": ((0, self.seq - 1),) if self.seq else (),
+            "stored": ((0, self.seq - 1),) if self.seq else (),
             "next_seq": self.seq,
             "t_mono_ns": time.monotonic_ns(),
             "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
@@ -190,15 +190,15 @@ class FakeNode:
         """As `connect`, without a word about clocks."""
         self.open_with_hello(**changes)
         welcome = self.receive("welcome")
-        self.wanted = welcome.wanted
-        self.lacks = {each.boot_id: [*each.numbers] for each in welcome.lacks}
-        return self.lacks[self.boot_id]
+        self.wanted = welcome.retention
+        self.lacks = {each.stream_id: [*each.numbers] for each in welcome.missing}
+        return self.lacks[self.stream_id]
 
     def say_clock(
         self, server_minus_node_ns: int, *, uncertainty_ns: int = 7, t_mono_ns: int | None = None
     ) -> None:
         """Tell how the clocks differed at this instant, or at the newest frame."""
-        row = ClockRow(
+        row = ClockSample(
             t_mono_ns=self.next_t_mono_ns if t_mono_ns is None else t_mono_ns,
             server_minus_node_ns=server_minus_node_ns,
             uncertainty_ns=uncertainty_ns,
@@ -207,7 +207,7 @@ class FakeNode:
 
     def say_lost(self, **lost: list[list[int]]) -> None:
         """Tell which numbers of the present stream are lost, by reason."""
-        self.socket.send(json.dumps({"type": "lost", "boot_id": self.boot_id, "lost": lost}))
+        self.socket.send(json.dumps({"type": "lost", "stream_id": self.stream_id, "lost": lost}))
 
     def open(self) -> Spoken:
         """Connect and say nothing."""
@@ -247,13 +247,13 @@ class FakeNode:
         """The next message of a kind; acknowledgements on the way are noted."""
         end_s = time.monotonic() + timeout_s
         while True:
-            message = FromServer.validate_json(
+            message = SERVER_MESSAGES.validate_json(
                 self.socket.recv(timeout=max(0.0, end_s - time.monotonic()))
             )
             if message.type == "ack":
-                acked = self.acked_of.setdefault(message.boot_id, Intervals())
+                acked = self.acked_of.setdefault(message.stream_id, Intervals())
                 acked.add(message.seq_first, message.seq_last)
-                if message.boot_id == self.boot_id:
+                if message.stream_id == self.stream_id:
                     self.acked.add(message.seq_first, message.seq_last)
             if message.type == "wanted":
                 self.wanted = message
@@ -262,7 +262,7 @@ class FakeNode:
 
     def acknowledged(self, last: int, first: int = 0) -> None:
         """Wait until all of this was acknowledged."""
-        while self.acked.missing(first, last):
+        while self.acked.missing_in(first, last):
             self.receive("ack")
 
     def frames(
@@ -297,9 +297,9 @@ class FakeNode:
             self.tiles,
             utc_offset_ns=self.utc_offset_ns,
             t_mono_ns=t_mono_ns,
-            padc=counts,
+            pressure_raw=counts,
             sample_offset_us=np.arange(self.tiles),
-            frame_status=FrameStatus.LEAD if lead else 0,
+            frame_flags=FrameFlag.LEAD if lead else 0,
         )
         self.seq += n
         self.next_t_mono_ns += n * PERIOD_NS
@@ -315,7 +315,7 @@ class FakeNode:
     def send_again(self, batch: FrameBatch) -> None:
         """Send frames, perhaps for the second time."""
         for begin in range(0, len(batch), 10):
-            self.socket.send(self.payload(batch.rows(begin, begin + 10)))
+            self.socket.send(self.payload(batch.slice_rows(begin, begin + 10)))
 
     def come_back(self) -> list[Earlier]:
         """Connect, mention every earlier stream, and send what the server lacks of them."""
@@ -326,20 +326,20 @@ class FakeNode:
     def send_lacking(self) -> None:
         """Send what the server asked for of streams before this one."""
         for earlier in self.before:
-            for first, last in self.lacks.get(earlier.boot_id, []):
+            for first, last in self.lacks.get(earlier.stream_id, []):
                 self.send_earlier(earlier, first, earlier.next_seq - 1 if last is None else last)
 
     def send_earlier(self, stream: Earlier, seq_first: int, seq_last: int) -> None:
         """Send frames of a stream before this one, then go on with this one."""
-        self.socket.send(FramesOf(boot_id=stream.info.boot_id).model_dump_json())
-        rows = FrameBatch.concatenate(stream.sent).rows(seq_first, seq_last + 1)
+        self.socket.send(StreamSelect(stream_id=stream.info.stream_id).model_dump_json())
+        rows = FrameBatch.concatenate(stream.sent).slice_rows(seq_first, seq_last + 1)
         for begin in range(0, len(rows), 10):
-            batch = rows.rows(begin, begin + 10)
-            self.socket.send(encode(batch, wire_schema(stream.info)))
-        self.socket.send(FramesOf(boot_id=self.boot_id).model_dump_json())
+            batch = rows.slice_rows(begin, begin + 10)
+            self.socket.send(encode_frames(batch, wire_schema(stream.info)))
+        self.socket.send(StreamSelect(stream_id=self.stream_id).model_dump_json())
 
     def payload(self, batch: FrameBatch) -> bytes:
-        return encode(batch, wire_schema(self.info))
+        return encode_frames(batch, wire_schema(self.info))
 
     def all_sent(self) -> FrameBatch:
         """Every frame of this stream, in order."""

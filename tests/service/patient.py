@@ -19,9 +19,9 @@ def be_patient(
     patch: pytest.MonkeyPatch, *, settle_s: float = 0.1, silence_s: float = PATIENCE_S
 ) -> None:
     """Servers of this process listen in vain for so long, and take frames of long ago."""
-    patch.setattr(service.server.recorder, "BEHIND_S", 1e9)
-    patch.setattr(service.api.routes.recordings.sessions, "SETTLE_S", settle_s)
-    patch.setattr(service.api.routes.sockets.ingest, "SILENCE_S", silence_s)
+    patch.setattr(service.server.recorder, "MAX_DELAY_S", 1e9)
+    patch.setattr(service.api.routes.recordings.sessions, "SEAL_TIMEOUT_S", settle_s)
+    patch.setattr(service.api.routes.sockets.ingest, "LINK_TIMEOUT_S", silence_s)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from devices.frames import FrameBatch
-from storage.sessions.reader import SessionReader
+from storage.sessions.reader import SealedFileReader
 from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
@@ -56,12 +56,12 @@ class Recording:
         until(lambda: self.now()["state"] == "sealed", timeout_s)
         return self.now()
 
-    def reader(self) -> SessionReader:
-        return SessionReader(self.folder / "frames.parquet")
+    def reader(self) -> SealedFileReader:
+        return SealedFileReader(self.folder / "frames.parquet")
 
     def frames(self) -> FrameBatch:
         with self.reader() as file:
-            return FrameBatch.concatenate([batch for batch, _ in file.batches()])
+            return FrameBatch.concatenate([batch for batch, _ in file.read_batches()])
 
     def column(self, name: str) -> np.ndarray:
         path = self.folder / "frames.parquet"
@@ -85,7 +85,7 @@ class Recording:
 
 def parts_of(session: dict[str, Any]) -> list[tuple[str, int, int | None]]:
     """Stream, first and last number of every part."""
-    return [(part["boot_id"], part["seq_first"], part["seq_last"]) for part in session["parts"]]
+    return [(part["stream_id"], part["seq_first"], part["seq_last"]) for part in session["parts"]]
 
 
 def whole_parts_of(session: dict[str, Any]) -> list[tuple[str, int, int | None]]:

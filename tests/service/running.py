@@ -17,13 +17,13 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from devices.frames import FrameBatch
-from service.api.address import listen, urls_of
+from service.api.address import list_urls, open_listening_socket
 from service.api.app import make_app
-from service.api.doors import Bounds
-from service.api.logins import Logins, Right
-from service.api.routes.login import with_ticket
-from service.api.serve import serving
-from service.link import SUBPROTOCOL
+from service.api.connection_limits import LimitSettings
+from service.api.logins import Logins, Role
+from service.api.routes.login import add_ticket
+from service.api.runner import serve_app
+from service.protocol import SUBPROTOCOL
 from service.server.server import Server
 from storage.journal.journal import Journal
 from tests.service.recording import Recording
@@ -54,7 +54,7 @@ class Running:
         token: str | None = None,
         is_private: bool = False,
         hosts: Sequence[str] = (),
-        bounds: Bounds | None = None,
+        bounds: LimitSettings | None = None,
         exact: bool = False,
     ) -> None:
         self.data = data
@@ -126,8 +126,8 @@ class Running:
 
     def link(self) -> str:
         """An address of the live page that logs a browser in, once."""
-        ticket = self.call(lambda: self.logins.tickets.new(Right.PRESS))
-        return with_ticket(self.url, ticket)
+        ticket = self.call(lambda: self.logins.tickets.create(Role.OPERATOR))
+        return add_ticket(self.url, ticket)
 
     def socket(self, path: str, *, small: bool = False, **options: Any) -> ClientConnection:
         """A websocket to the server."""
@@ -173,15 +173,15 @@ class Running:
         items: list[dict[str, Any]] = self.http.get("/sessions").json()["items"]
         return items
 
-    def journal(self, boot_id: str, name: str = "bench") -> Journal:
+    def journal(self, stream_id: str, name: str = "bench") -> Journal:
         """A journal as another process would find it now: opened from a copy of its files."""
         copy = self.data.with_name(f"copy-{uuid.uuid4().hex}")
-        shutil.copytree(self.data / "journal" / name / boot_id, copy)
+        shutil.copytree(self.data / "journal" / name / stream_id, copy)
         return Journal.open(copy)
 
-    def held(self, boot_id: str, name: str = "bench") -> FrameBatch:
+    def held(self, stream_id: str, name: str = "bench") -> FrameBatch:
         """All that its journal holds, in order."""
-        return FrameBatch.concatenate(list(self.journal(boot_id, name).read(0, 2**61)))
+        return FrameBatch.concatenate(list(self.journal(stream_id, name).read_frames(0, 2**61)))
 
     def _run(self, ready: threading.Event) -> None:
         try:
@@ -194,20 +194,20 @@ class Running:
     async def _serve(self, ready: threading.Event) -> None:
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
-        with listen("127.0.0.1", self.port) as listening:
+        with open_listening_socket("127.0.0.1", self.port) as listening:
             self.server = Server(self.data, exact=self._exact)
             if not self.shown or not hasattr(self, "logins"):
                 # Where a test is about something else, its pages stay logged in over a restart.
                 self.logins = Logins(self._token, is_private=self._is_private)
             app = make_app(self.server, logins=self.logins, hosts=self._hosts)
-            async with serving(app, listening, self._bounds):
-                self.port = int(urls_of(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])
+            async with serve_app(app, listening, self._bounds):
+                self.port = int(list_urls(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])
                 ready.set()
                 await self._stop.wait()
         self.open_journals = []
         for node in self.server.nodes:
             for journal in node.journals.values():
-                if journal.is_open:
+                if journal.has_open_segment:
                     self.open_journals.append(journal.folder)
                     journal.close()
         self._left_over = await _left_over()

@@ -15,8 +15,8 @@ from tests.service.running import Running
 
 def frames_of_long_ago(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let sessions have them, though they began later."""
-    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)
-    monkeypatch.setattr(service.api.routes.recordings.sessions, "SETTLE_S", 0.2)
+    monkeypatch.setattr(service.server.recorder, "MAX_DELAY_S", 1e9)
+    monkeypatch.setattr(service.api.routes.recordings.sessions, "SEAL_TIMEOUT_S", 0.2)
 
 
 class Take:

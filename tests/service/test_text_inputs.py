@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.inputs import decode_text
-from devices.scene.file import load_scene
+from devices.input_files import decode_text
+from devices.scene.scene_file import load_scene
 from service.api.settings import load_settings
-from service.sessions.calibration_file import calibration_of, content_of
+from service.sessions.calibration_file import encode_calibration, parse_calibration
 from tests.builders.calibrations import make_calibration
 
 ENCODINGS = ("utf-8", "utf-8-sig", "utf-16")
@@ -34,5 +34,5 @@ def test_scenes_settings_and_calibrations_may_come_from_any_editor(
     (tmp_path / "server.toml").write_text("port = 8123\n", encoding)
     assert load_settings(tmp_path / "server.toml").port == 8123
     calibration = make_calibration()
-    content = content_of(calibration).decode().encode(encoding)
-    assert calibration_of(content, where="here") == calibration
+    content = encode_calibration(calibration).decode().encode(encoding)
+    assert parse_calibration(content, where="here") == calibration

@@ -9,12 +9,12 @@ from typing import Any, get_args
 
 import pytest
 
-from devices.compiled import compiled
 from devices.errors import UsageError
+from devices.jit import jit_cached
 from service.api.settings import load_settings
-from service.user_folders import Kind, user_folder
+from service.user_folders import FolderKind, resolve_user_folder
 
-KINDS = get_args(Kind)
+KINDS = get_args(FolderKind)
 
 
 @pytest.fixture
@@ -33,15 +33,15 @@ def no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.usefixtures("no_home")
 def test_without_a_home_the_error_says_which_option_names_a_folder(
-    kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: FolderKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(UsageError, match=f"with --where, or in XDG_{kind.upper()}_HOME"):
-        user_folder(kind, None, "--where")
+        resolve_user_folder(kind, None, "--where")
     with pytest.raises(UsageError, match="Write the whole path"):
-        user_folder(kind, Path("~/walks"), "--where")
-    assert user_folder(kind, tmp_path / "walks", "--where") == tmp_path / "walks"
+        resolve_user_folder(kind, Path("~/walks"), "--where")
+    assert resolve_user_folder(kind, tmp_path / "walks", "--where") == tmp_path / "walks"
     monkeypatch.setenv(f"XDG_{kind.upper()}_HOME", str(tmp_path / "xdg"))
-    assert user_folder(kind, None, "--where") == tmp_path / "xdg" / "foottile"
+    assert resolve_user_folder(kind, None, "--where") == tmp_path / "xdg" / "foottile"
 
 
 @pytest.mark.usefixtures("no_home")
@@ -51,10 +51,10 @@ def test_a_home_in_which_nothing_can_be_written_is_named_with_the_option(
     monkeypatch.setenv("HOME", str(tmp_path / "root"))
     monkeypatch.setattr(os, "access", lambda *_: False)  # as `/` is to user 12345
     with pytest.raises(UsageError, match=r"cannot write in .*root.* with --where"):
-        user_folder("data", None, "--where")
-    user_folder("state", None, "--where")  # a node goes on without a disk
+        resolve_user_folder("data", None, "--where")
+    resolve_user_folder("state", None, "--where")  # a node goes on without a disk
     (tmp_path / "root" / ".local" / "share" / "foottile").mkdir(parents=True)
-    assert user_folder("data", None, "--where").is_dir()  # one that is there may be read
+    assert resolve_user_folder("data", None, "--where").is_dir()  # one that is there may be read
 
 
 @pytest.mark.usefixtures("no_home")
@@ -71,7 +71,7 @@ def test_a_tilde_that_no_shell_has_replaced_is_the_home_and_no_folder_of_that_na
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert user_folder("data", Path("~/walks"), "--data") == tmp_path / "walks"
+    assert resolve_user_folder("data", Path("~/walks"), "--data") == tmp_path / "walks"
     monkeypatch.setenv("FOOTTILE_DATA", "~/walks")
     assert load_settings(None).data == tmp_path / "walks"
 
@@ -85,10 +85,10 @@ def test_machine_code_is_kept_where_there_is_a_folder_for_it_and_nowhere_else(
 
     in_tree = Path(__file__).parent / "__pycache__"
     monkeypatch.setattr("numba.core.caching.os.makedirs", _refuses(in_tree, os.makedirs))
-    assert compiled(double)(2.0) == 4.0
+    assert jit_cached(double)(2.0) == 4.0
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert compiled(double)(2.0) == 4.0
+    assert jit_cached(double)(2.0) == 4.0
     assert list((tmp_path / "cache" / "numba").rglob("*.nbi"))
 
 

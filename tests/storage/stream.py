@@ -8,9 +8,9 @@ import numpy as np
 
 from devices.acquisition import FrameRow
 from devices.frames import ArrayInfo, FrameBatch
-from storage.journal.node.in_flight import InFlight
+from storage.journal.node.in_flight import InFlightWriter
 from storage.schema import wire_schema
-from storage.wire import EncodedBatch, encode
+from storage.wire import EncodedBatch, encode_frames
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 
@@ -19,18 +19,22 @@ def frames(first: int, last: int) -> FrameBatch:
     """Frames `first` to `last`; the first of all is taken a period after the clock began."""
     seq = np.arange(first, last + 1)
     counts = 500 + (seq[:, None] * 7 + np.arange(2)) % 97
-    return make_frames(seq, t_mono_ns=PERIOD_NS * (seq + 1), padc=counts)
+    return make_frames(seq, t_mono_ns=PERIOD_NS * (seq + 1), pressure_raw=counts)
 
 
 def message(first: int, last: int) -> EncodedBatch:
     """The same frames as a node's message."""
     batch = frames(first, last)
-    return EncodedBatch.of(batch, encode(batch, wire_schema(make_array())))
+    return EncodedBatch.from_frames_and_payload(
+        batch, encode_frames(batch, wire_schema(make_array()))
+    )
 
 
 def take_in_flight(folder: Path, batch: FrameBatch, info: ArrayInfo | None = None) -> None:
     """Take these frames as acquisition does, whose process then ends."""
-    keeper = InFlight(folder, info or make_array())
+    keeper = InFlightWriter(folder, info or make_array())
     for row in range(len(batch)):
-        keeper.put(FrameRow(*(getattr(batch, name)[row].tolist() for name in FrameRow._fields)))
+        keeper.write_frame(
+            FrameRow(*(getattr(batch, name)[row].tolist() for name in FrameRow._fields))
+        )
     keeper.close()

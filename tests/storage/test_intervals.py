@@ -45,7 +45,7 @@ def test_within_missing_and_without_are_those_of_sets(
     added: list[tuple[int, int]], first: int, last: int
 ) -> None:
     held, asked = Intervals(added), set(range(first, last + 1))
-    within, missing = held.within(first, last), held.missing(first, last)
+    within, missing = held.restricted_to(first, last), held.missing_in(first, last)
     assert members(within) == members(added) & asked
     assert members(missing) == asked - members(added)
     assert_tidy(within)
@@ -82,7 +82,7 @@ def test_a_stream_that_came_in_any_order_is_one_interval(order: list[int]) -> No
 
 def test_numbers_may_be_as_large_as_a_stream_can_count() -> None:
     held = Intervals([(0, 0), (2**62, 2**64)])
-    assert list(held.missing(0, 2**64)) == [(1, 2**62 - 1)]
+    assert list(held.missing_in(0, 2**64)) == [(1, 2**62 - 1)]
     assert held.count == 2**64 - 2**62 + 2
 
 

@@ -18,17 +18,17 @@ from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from service.estimation.estimates import Estimates
 from storage.schema import (
     ARRAY_INFO_KEY,
-    ESTIMATES,
-    FRAMES,
-    KNOWN,
-    MARKS,
-    MILL,
-    SERVER_TIME,
-    TRUTH,
-    array_info,
-    flat_columns,
-    from_record_batch,
-    to_record_batch,
+    COLUMNS_BY_NAME,
+    ESTIMATE_COLUMNS,
+    INDENTER_COLUMNS,
+    MARKER_COLUMNS,
+    MEASURED_COLUMNS,
+    SERVER_TIME_COLUMNS,
+    TRUTH_COLUMNS,
+    frames_from_record_batch,
+    frames_to_record_batch,
+    read_array_info,
+    to_flat_columns,
     wire_schema,
 )
 from tests.builders.arrays import make_array, make_servo, make_tile
@@ -65,7 +65,7 @@ def message(record: pa.RecordBatch) -> pa.Buffer:
 
 
 def record_of(batch: FrameBatch) -> pa.RecordBatch:
-    return to_record_batch(batch, wire_schema(array(batch.tile_count)))
+    return frames_to_record_batch(batch, wire_schema(array(batch.tile_count)))
 
 
 def lies_in(values: np.ndarray, buffer: pa.Buffer) -> bool:
@@ -82,7 +82,7 @@ sizes = {"rows": st.integers(1, 40), "tiles": st.integers(1, 9), "seed": st.inte
 @given(**sizes)
 def test_frames_survive_a_record_batch_bit_by_bit(rows: int, tiles: int, seed: int) -> None:
     batch = any_frames(rows, tiles, seed)
-    assert_same_bits(from_record_batch(record_of(batch)), batch)
+    assert_same_bits(frames_from_record_batch(record_of(batch)), batch)
 
 
 @settings(deadline=None)
@@ -92,32 +92,32 @@ def test_frames_survive_an_arrow_stream_bit_by_bit_with_the_array_beside_them(
 ) -> None:
     batch = any_frames(rows, tiles, seed)
     with pa.ipc.open_stream(message(record_of(batch))) as reader:
-        assert array_info(reader.schema, where="stream") == array(tiles)
-        assert_same_bits(from_record_batch(reader.read_next_batch()), batch)
+        assert read_array_info(reader.schema, where="stream") == array(tiles)
+        assert_same_bits(frames_from_record_batch(reader.read_next_batch()), batch)
 
 
 def test_a_batch_of_no_frames_survives_too() -> None:
     batch = any_frames(0, 4)
-    assert_same_bits(from_record_batch(record_of(batch)), batch)
+    assert_same_bits(frames_from_record_batch(record_of(batch)), batch)
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, 5), (3, 17), (19, 20)])
 def test_a_slice_of_a_message_gives_its_own_rows(start: int, stop: int) -> None:
     batch = any_frames(20, 4)
     part = record_of(batch).slice(start, stop - start)
-    assert_same_bits(from_record_batch(part), batch.rows(start, stop))
+    assert_same_bits(frames_from_record_batch(part), batch.slice_rows(start, stop))
 
 
 @pytest.mark.parametrize("how", LAYOUTS)
 def test_frames_that_lie_in_memory_some_other_way_are_sent_right(how: str) -> None:
     batch = any_frames(20, 4)
-    assert_same_bits(from_record_batch(record_of(laid_out(batch, how))), batch)
+    assert_same_bits(frames_from_record_batch(record_of(laid_out(batch, how))), batch)
 
 
 def test_sending_copies_nothing() -> None:
     batch = any_frames(20, 4)
     record = record_of(batch)
-    for column in FRAMES:
+    for column in MEASURED_COLUMNS:
         sent = record.column(column.name)
         values = sent.values if isinstance(sent, pa.FixedSizeListArray) else sent
         buffer = values.buffers()[1]
@@ -128,8 +128,8 @@ def test_sending_copies_nothing() -> None:
 def test_receiving_copies_nothing() -> None:
     received = message(record_of(any_frames(20, 4)))
     with pa.ipc.open_stream(received) as reader:
-        batch = from_record_batch(reader.read_next_batch())
-    for column in FRAMES:
+        batch = frames_from_record_batch(reader.read_next_batch())
+    for column in MEASURED_COLUMNS:
         values = getattr(batch, column.name)
         assert lies_in(values, received), column.name
         assert values.flags.c_contiguous, column.name
@@ -138,7 +138,7 @@ def test_receiving_copies_nothing() -> None:
 def test_what_was_received_outlives_its_reader() -> None:
     batch = any_frames(20, 4)
     with pa.ipc.open_stream(message(record_of(batch))) as reader:
-        received = from_record_batch(reader.read_next_batch())
+        received = frames_from_record_batch(reader.read_next_batch())
     del reader
     assert_same_bits(received, batch)
 
@@ -173,59 +173,72 @@ def test_every_column_on_the_wire_says_its_unit() -> None:
 
 def test_every_column_on_disk_says_its_unit() -> None:
     batch = any_frames(3, 2)
-    values = {column.name: getattr(batch, column.name) for column in FRAMES}
-    for column in (*ESTIMATES, *TRUTH):
+    values = {column.name: getattr(batch, column.name) for column in MEASURED_COLUMNS}
+    for column in (*ESTIMATE_COLUMNS, *TRUTH_COLUMNS):
         shape = (3, 2) if column.per_tile else (3,)
         values[column.name] = np.zeros(shape, dtype=column.type.to_pandas_dtype())
-    for column in (*MILL, *MARKS):
+    for column in (*INDENTER_COLUMNS, *MARKER_COLUMNS):
         values[column.name] = np.array(["a", "b", "c"])
     values["part"] = np.zeros(3, dtype=np.uint16)
-    for column in SERVER_TIME:
+    for column in SERVER_TIME_COLUMNS:
         values[column.name] = np.zeros(3, dtype=np.int64)
     values["time_s"] = np.zeros(3)
     values["time_utc"] = np.zeros(3, dtype="datetime64[ns]")
-    fields_made = [field for field, _ in flat_columns(tuple(KNOWN.values()), values)]
-    assert len(fields_made) == len(KNOWN) + sum(c.per_tile for c in KNOWN.values())
+    fields_made = [field for field, _ in to_flat_columns(tuple(COLUMNS_BY_NAME.values()), values)]
+    assert len(fields_made) == len(COLUMNS_BY_NAME) + sum(
+        c.per_tile for c in COLUMNS_BY_NAME.values()
+    )
     for field in fields_made:
         assert_described(field)
 
 
 def test_a_number_with_a_unit_carries_it_as_a_suffix() -> None:
-    for column in KNOWN.values():
-        if column.unit not in ("1", "bits") and column.name not in ("padc", "tadc"):
+    for column in COLUMNS_BY_NAME.values():
+        if column.unit not in ("1", "bits") and column.name not in (
+            "pressure_raw",
+            "temperature_raw",
+        ):
             assert SUFFIXES[column.name.rsplit("_", 1)[-1]] == column.unit
 
 
 def test_a_column_per_tile_is_flat_on_disk_and_a_list_on_the_wire() -> None:
     batch = any_frames(3, 2)
-    values = {column.name: getattr(batch, column.name) for column in FRAMES}
-    names = [field.name for field, _ in flat_columns(FRAMES, values)]
-    assert names[3:7] == ["padc_0", "padc_1", "tadc_0", "tadc_1"]
-    assert wire_schema(array(2)).field("padc").type == pa.list_(
+    values = {column.name: getattr(batch, column.name) for column in MEASURED_COLUMNS}
+    names = [field.name for field, _ in to_flat_columns(MEASURED_COLUMNS, values)]
+    assert names[3:7] == [
+        "pressure_raw_0",
+        "pressure_raw_1",
+        "temperature_raw_0",
+        "temperature_raw_1",
+    ]
+    assert wire_schema(array(2)).field("pressure_raw").type == pa.list_(
         pa.field("item", pa.uint16(), nullable=False), 2
     )
 
 
 def test_the_tables_hold_just_the_columns_of_the_contract() -> None:
     # design section 4
-    assert [column.name for column in FRAMES] == [f.name for f in fields(FrameBatch)]
-    assert [c.name for c in ESTIMATES] == [
+    assert [column.name for column in MEASURED_COLUMNS] == [f.name for f in fields(FrameBatch)]
+    assert [c.name for c in ESTIMATE_COLUMNS] == [
         f.name for f in fields(Estimates) if f.name not in ("seq", "t_ns")
     ]
-    raw = "seq t_mono_ns t_ns padc tadc sample_offset_us servo_counts servo_age_us status"
-    assert [c.name for c in FRAMES] == [*raw.split(), "frame_status", "reference_force_n"]
-    made = (
-        "gauge_kpa force_n force_sigma_n grf_n grf_sigma_n grf_at_least_n cop_x_m cop_y_m "
-        "cop_sigma_x_m cop_sigma_y_m cop_index_x cop_index_y cop_ground_x_m cop_ground_y_m "
-        "angle_rad contact estimate_status"
+    raw = (
+        "seq t_mono_ns t_ns pressure_raw temperature_raw sample_offset_us servo_counts "
+        "servo_age_us tile_flags"
     )
-    assert [c.name for c in ESTIMATES] == made.split()
+    assert [c.name for c in MEASURED_COLUMNS] == [*raw.split(), "frame_flags", "reference_force_n"]
+    made = (
+        "gauge_kpa force_n force_sigma_n grf_n grf_sigma_n grf_lower_bound_n cop_x_m cop_y_m "
+        "cop_sigma_x_m cop_sigma_y_m cop_index_x cop_index_y cop_ground_x_m cop_ground_y_m "
+        "angle_rad contact estimate_flags"
+    )
+    assert [c.name for c in ESTIMATE_COLUMNS] == made.split()
     truth = "true_force_n true_grf_n true_plate_n true_cop_x_m true_cop_y_m true_angle_rad"
-    assert [c.name for c in TRUTH] == truth.split()
-    assert [c.name for c in MILL] == ["pressed_tile", "phase"]
-    per_tile = {column.name for column in KNOWN.values() if column.per_tile}
+    assert [c.name for c in TRUTH_COLUMNS] == truth.split()
+    assert [c.name for c in INDENTER_COLUMNS] == ["pressed_tile", "phase"]
+    per_tile = {column.name for column in COLUMNS_BY_NAME.values() if column.per_tile}
     assert per_tile == {
-        *("padc", "tadc", "sample_offset_us", "status"),
+        *("pressure_raw", "temperature_raw", "sample_offset_us", "tile_flags"),
         *("gauge_kpa", "force_n", "force_sigma_n", "true_force_n"),
     }
 
@@ -243,7 +256,7 @@ def test_the_array_travels_as_json_that_others_can_read() -> None:
 
 def refused(record: pa.RecordBatch) -> None:
     with pytest.raises(FileFormatError, match="holds no frames"):
-        from_record_batch(record)
+        frames_from_record_batch(record)
 
 
 @pytest.mark.parametrize("missing", list(FRAME_COLUMNS))
@@ -267,8 +280,8 @@ def test_a_message_with_a_column_of_another_type_is_refused(name: str) -> None:
 
 def test_a_message_whose_tiles_differ_in_number_is_refused() -> None:
     record, three = record_of(any_frames(6, 4)), record_of(any_frames(6, 3))
-    at = record.schema.get_field_index("tadc")
-    refused(record.set_column(at, "tadc", three.column("tadc")))
+    at = record.schema.get_field_index("temperature_raw")
+    refused(record.set_column(at, "temperature_raw", three.column("temperature_raw")))
 
 
 @pytest.mark.parametrize("name", ["seq", "servo_counts", "reference_force_n"])
@@ -295,9 +308,9 @@ def test_a_message_with_an_empty_row_of_tiles_is_refused(rows: int, tiles: int) 
 
 def test_a_message_with_an_empty_value_of_one_tile_is_refused() -> None:
     record = record_of(any_frames(2, 2))
-    at = record.schema.get_field_index("padc")
+    at = record.schema.get_field_index("pressure_raw")
     lists = pa.array([[1, 2], [None, 4]], pa.list_(pa.uint16(), 2))
-    refused(record.set_column(at, "padc", lists))
+    refused(record.set_column(at, "pressure_raw", lists))
 
 
 def test_a_message_with_a_column_twice_is_refused() -> None:
@@ -309,24 +322,26 @@ def test_a_message_with_a_column_twice_is_refused() -> None:
 def test_a_schema_without_an_array_is_refused_by_name() -> None:
     for schema in (pa.schema([("a", pa.int32())]), pa.schema([], metadata={"other": "x"})):
         with pytest.raises(FileFormatError, match=r"thing\.arrows: no description"):
-            array_info(schema, where="thing.arrows")
+            read_array_info(schema, where="thing.arrows")
 
 
 @pytest.mark.parametrize("text", [b"", b"{}", b"null", b"\xff\xfe", b'{"node": 3}'])
 def test_an_array_that_cannot_be_read_is_refused_by_name(text: bytes) -> None:
     schema = pa.schema([], metadata={ARRAY_INFO_KEY: text})
     with pytest.raises(FileFormatError, match=r"thing\.arrows: .*not readable"):
-        array_info(schema, where="thing.arrows")
+        read_array_info(schema, where="thing.arrows")
 
 
 def test_an_array_with_an_unknown_fact_is_refused() -> None:
     content = json.loads(array(2).model_dump_json()) | {"colour": "red"}
     schema = pa.schema([], metadata={ARRAY_INFO_KEY: json.dumps(content)})
     with pytest.raises(FileFormatError, match="colour"):
-        array_info(schema, where="thing.arrows")
+        read_array_info(schema, where="thing.arrows")
 
 
 def test_frames_of_the_wrong_type_never_become_a_batch() -> None:
     batch = any_frames(3, 2)
-    with pytest.raises(ValueError, match=r"FrameBatch\.padc: expected uint16\(3, 2\), got int64"):
-        replace(batch, padc=batch.padc.astype(np.int64))
+    with pytest.raises(
+        ValueError, match=r"FrameBatch\.pressure_raw: expected uint16\(3, 2\), got int64"
+    ):
+        replace(batch, pressure_raw=batch.pressure_raw.astype(np.int64))

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
-from storage.layout import FRAMES_MAX
-from storage.schema import to_record_batch, wire_schema
-from storage.wire import decode, encode
+from storage.message_layout import MAX_MESSAGE_FRAMES
+from storage.schema import frames_to_record_batch, wire_schema
+from storage.wire import decode_message, encode_frames
 from tests.builders.arrays import make_array
 from tests.builders.frames import any_frames, assert_same_bits
 
@@ -40,7 +40,7 @@ def frames(rows: int, tiles: int = 2, seed: int = 0, *, first: int = 0) -> Frame
 def refused(batch: FrameBatch, match: str) -> None:
     schema = schema_of(batch.tile_count)
     with pytest.raises(FileFormatError, match=match):
-        decode(encode(batch, schema), schema)
+        decode_message(encode_frames(batch, schema), schema)
 
 
 # --- the same at both ends ------------------------------------------------------------------------
@@ -55,39 +55,43 @@ def refused(batch: FrameBatch, match: str) -> None:
 )
 def test_frames_survive_the_wire_bit_by_bit(rows: int, tiles: int, seed: int, first: int) -> None:
     batch, schema = frames(rows, tiles, seed, first=first), schema_of(tiles)
-    payload = encode(batch, schema)
-    assert_same_bits(decode(payload, schema), batch)
-    assert_same_bits(decode(memoryview(bytearray(payload)), schema), batch)
+    payload = encode_frames(batch, schema)
+    assert_same_bits(decode_message(payload, schema), batch)
+    assert_same_bits(decode_message(memoryview(bytearray(payload)), schema), batch)
 
 
 @given(start=st.integers(0, 19), stop=st.integers(1, 20))
 def test_some_rows_of_a_message_are_a_message_again(start: int, stop: int) -> None:
     schema, stop = schema_of(2), max(stop, start + 1)
-    received = decode(encode(frames(20), schema), schema)
-    part = received.rows(start, stop)
-    assert_same_bits(decode(encode(part, schema), schema), frames(20).rows(start, stop))
+    received = decode_message(encode_frames(frames(20), schema), schema)
+    part = received.slice_rows(start, stop)
+    assert_same_bits(
+        decode_message(encode_frames(part, schema), schema), frames(20).slice_rows(start, stop)
+    )
 
 
 def test_the_same_frames_are_the_same_bytes_and_know_nothing_of_their_neighbours() -> None:
     schema, batch = schema_of(2), frames(20)
-    alone = replace(batch.rows(5, 9), seq=np.arange(5, 9, dtype=np.uint64))
-    assert encode(batch.rows(5, 9), schema) == encode(alone, schema)
+    alone = replace(batch.slice_rows(5, 9), seq=np.arange(5, 9, dtype=np.uint64))
+    assert encode_frames(batch.slice_rows(5, 9), schema) == encode_frames(alone, schema)
 
 
 def test_messages_behind_the_schema_are_a_stream_that_arrow_reads_alone() -> None:
     schema, batch = schema_of(3), frames(20, 3)
     stream = schema.serialize().to_pybytes() + b"".join(
-        encode(batch.rows(a, a + 5), schema) for a in range(0, 20, 5)
+        encode_frames(batch.slice_rows(a, a + 5), schema) for a in range(0, 20, 5)
     )
     table = pa.ipc.open_stream(stream).read_all()
     assert table.column("seq").to_pylist() == list(range(20))
-    assert table.column("padc").to_pylist() == batch.padc.tolist()
+    assert table.column("pressure_raw").to_pylist() == batch.pressure_raw.tolist()
 
 
 def test_frames_of_one_instant_and_the_longest_message_are_taken() -> None:
     schema = schema_of(1)
-    batch = replace(frames(FRAMES_MAX, 1), t_mono_ns=np.full(FRAMES_MAX, 7, dtype=np.int64))
-    assert_same_bits(decode(encode(batch, schema), schema), batch)
+    batch = replace(
+        frames(MAX_MESSAGE_FRAMES, 1), t_mono_ns=np.full(MAX_MESSAGE_FRAMES, 7, dtype=np.int64)
+    )
+    assert_same_bits(decode_message(encode_frames(batch, schema), schema), batch)
 
 
 # --- refused --------------------------------------------------------------------------------------
@@ -95,16 +99,16 @@ def test_frames_of_one_instant_and_the_longest_message_are_taken() -> None:
 
 def test_a_message_that_is_cut_off_anywhere_is_refused() -> None:
     schema = schema_of(2)
-    payload = encode(frames(3), schema)
+    payload = encode_frames(frames(3), schema)
     for length in range(len(payload)):
         with pytest.raises(FileFormatError):
-            decode(payload[:length], schema)
+            decode_message(payload[:length], schema)
 
 
 def test_no_damage_does_more_than_be_refused() -> None:
     """Flipped, overwritten, removed and repeated bytes, most of them where Arrow keeps lengths."""
     rng, schema = np.random.default_rng(1), schema_of(2)
-    payload = encode(frames(5), schema)
+    payload = encode_frames(frames(5), schema)
     refusals = 0
     for _ in range(4000):
         damaged = bytearray(payload)
@@ -123,13 +127,13 @@ def test_no_damage_does_more_than_be_refused() -> None:
             else:
                 damaged[at:at] = damaged[at : at + int(rng.integers(1, 9))]
         try:
-            batch = decode(bytes(damaged), schema)
+            batch = decode_message(bytes(damaged), schema)
         except FileFormatError:
             refusals += 1
         else:  # what is taken can be used: every row is there and its numbers rise
-            assert batch.padc.shape == batch.status.shape == (len(batch), 2)
+            assert batch.pressure_raw.shape == batch.tile_flags.shape == (len(batch), 2)
             assert (np.diff(batch.seq) == 1).all()
-            assert int(batch.padc.sum()) >= 0
+            assert int(batch.pressure_raw.sum()) >= 0
     assert refusals > 1000
 
 
@@ -137,21 +141,21 @@ def test_no_damage_does_more_than_be_refused() -> None:
 @given(st.binary(max_size=400))
 def test_bytes_of_anything_else_are_refused(content: bytes) -> None:
     with pytest.raises(FileFormatError):
-        decode(content, schema_of(2))
+        decode_message(content, schema_of(2))
 
 
 def test_a_message_that_is_no_batch_of_records_is_refused() -> None:
     schema = schema_of(2)
     for payload in (schema.serialize().to_pybytes(), b"\xff\xff\xff\xff\0\0\0\0", b"PAR1" * 50):
         with pytest.raises(FileFormatError, match="no Arrow message of frames"):
-            decode(payload, schema)
+            decode_message(payload, schema)
 
 
 @pytest.mark.parametrize(("sent", "known"), [(1, 2), (2, 1), (3, 4), (9, 2)])
 def test_frames_of_another_number_of_tiles_are_refused(sent: int, known: int) -> None:
-    payload = encode(frames(20, sent), schema_of(sent))
+    payload = encode_frames(frames(20, sent), schema_of(sent))
     with pytest.raises(FileFormatError):
-        decode(payload, schema_of(known))
+        decode_message(payload, schema_of(known))
 
 
 def test_a_message_without_frames_is_refused() -> None:
@@ -159,7 +163,10 @@ def test_a_message_without_frames_is_refused() -> None:
 
 
 def test_a_message_of_too_many_frames_is_refused() -> None:
-    refused(frames(FRAMES_MAX + 1, 1), f"a message of {FRAMES_MAX + 1} frames.*{FRAMES_MAX}")
+    refused(
+        frames(MAX_MESSAGE_FRAMES + 1, 1),
+        f"a message of {MAX_MESSAGE_FRAMES + 1} frames.*{MAX_MESSAGE_FRAMES}",
+    )
 
 
 @pytest.mark.parametrize(
@@ -194,10 +201,10 @@ def test_compressed_buffers_are_refused_before_they_are_unpacked(
 ) -> None:
     schema, batch = schema_of(64), frames(4096, 64)
     options = pa.ipc.IpcWriteOptions(compression=codec)
-    payload = _written(to_record_batch(batch, schema), options)
+    payload = _written(frames_to_record_batch(batch, schema), options)
     before = pa.total_allocated_bytes()
     with pytest.raises(FileFormatError, match="compressed"):
-        decode(payload, schema)
+        decode_message(payload, schema)
     assert pa.total_allocated_bytes() - before < 1 << 20
 
 
@@ -205,7 +212,7 @@ def test_compressed_buffers_are_refused_before_they_are_unpacked(
 def test_whatever_a_header_says_of_lengths_little_memory_is_taken(data: st.DataObject) -> None:
     """Any 64 bits of the header as any number: rows, nulls, offsets, lengths."""
     schema = schema_of(2)
-    payload = bytearray(encode(frames(5), schema))
+    payload = bytearray(encode_frames(frames(5), schema))
     header_bytes = int.from_bytes(payload[4:8], "little")
     for _ in range(data.draw(st.integers(1, 3))):
         at = 8 + 8 * data.draw(st.integers(0, header_bytes // 8 - 1))
@@ -213,7 +220,7 @@ def test_whatever_a_header_says_of_lengths_little_memory_is_taken(data: st.DataO
         payload[at : at + 8] = number.to_bytes(8, "little", signed=True)
     before = pa.total_allocated_bytes()
     try:
-        batch = decode(bytes(payload), schema)
+        batch = decode_message(bytes(payload), schema)
     except FileFormatError:
         pass
     else:
@@ -225,16 +232,16 @@ def test_a_message_with_bytes_behind_it_is_refused() -> None:
     """In a journal they would stand where the next message has to begin."""
     schema = schema_of(2)
     with pytest.raises(FileFormatError, match="not those its header states"):
-        decode(encode(frames(5), schema) + bytes(8), schema)
+        decode_message(encode_frames(frames(5), schema) + bytes(8), schema)
 
 
 def test_a_message_in_the_form_of_arrow_before_015_is_refused() -> None:
     """Its columns lie four bytes before the places by which runs of messages are read."""
     schema = schema_of(2)
     options = pa.ipc.IpcWriteOptions(use_legacy_format=True)
-    payload = _written(to_record_batch(frames(1), schema), options) + bytes(4)
+    payload = _written(frames_to_record_batch(frames(1), schema), options) + bytes(4)
     with pytest.raises(FileFormatError, match="does not begin as messages do"):
-        decode(payload, schema)
+        decode_message(payload, schema)
 
 
 def test_a_dictionary_is_refused() -> None:
@@ -247,19 +254,19 @@ def test_a_dictionary_is_refused() -> None:
     begin = len(record.schema.serialize())
     payload = stream.slice(begin, stream.size - begin - 8).to_pybytes()
     with pytest.raises(FileFormatError, match="no Arrow message of frames"):
-        decode(payload, schema_of(2))
+        decode_message(payload, schema_of(2))
 
 
 def test_a_column_with_empty_values_is_refused() -> None:
     schema = schema_of(2)
-    record = to_record_batch(frames(5), schema)
+    record = frames_to_record_batch(frames(5), schema)
     at = schema.get_field_index("servo_counts")
     columns = [*record.columns]
     columns[at] = pa.array([1, None, 3, 4, 5], pa.int32())
     loose = pa.schema([field.with_nullable(True) for field in schema])
     payload = pa.RecordBatch.from_arrays(columns, schema=loose).serialize().to_pybytes()
     with pytest.raises(FileFormatError, match="without empty values"):
-        decode(payload, schema)
+        decode_message(payload, schema)
 
 
 @given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=2, max_size=6))
@@ -267,6 +274,6 @@ def test_time_that_runs_backwards_is_refused_however_far(times: list[int]) -> No
     batch = replace(frames(len(times)), t_mono_ns=np.array(times, dtype=np.int64))
     if times == sorted(times):
         schema = schema_of(2)
-        assert_same_bits(decode(encode(batch, schema), schema), batch)
+        assert_same_bits(decode_message(encode_frames(batch, schema), schema), batch)
     else:
         refused(batch, "time runs backwards")

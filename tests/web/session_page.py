@@ -35,7 +35,7 @@ def recorded_walk(server: Running) -> Recording:
     node.deliver(200, [0.0, 0.0], alive=True)
     node.finish(session)
     t_ns = int(session.column("t_ns")[700])
-    answer = server.http.post(f"{session.url}/events", json={"label": LABEL, "t_ns": t_ns})
+    answer = server.http.post(f"{session.url}/markers", json={"label": LABEL, "t_ns": t_ns})
     assert answer.status_code == 201
     node.close()
     return session

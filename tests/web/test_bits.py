@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from devices.frames import FrameStatus, TileStatus
-from service.estimation.estimates import EstimateStatus
+from devices.frames import FrameFlag, TileFlag
+from service.estimation.estimates import EstimateFlag
 
 BITS_JS = Path(__file__).resolve().parents[2] / "web" / "common" / "bits.js"
 
 
 @pytest.mark.parametrize(
-    ("name", "bits"), [("TILE", TileStatus), ("ESTIMATE", EstimateStatus), ("FRAME", FrameStatus)]
+    ("name", "bits"), [("TILE", TileFlag), ("ESTIMATE", EstimateFlag), ("FRAME", FrameFlag)]
 )
 def test_the_page_names_every_status_bit_as_python_does(name: str, bits: type[IntFlag]) -> None:
     found = re.search(rf"export const {name} = \{{([^}}]*)\}}", BITS_JS.read_text("utf-8"))

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from service.estimation.calibration import Calibration
-from service.sessions.calibration_file import content_of
+from service.sessions.calibration_file import encode_calibration
 from tests.builders.calibrations import make_calibration
 from tests.service.fake_node import Play
 from tests.web.login import log_in
@@ -28,7 +28,7 @@ JSON = {"Content-Type": "application/json"}
 def kept(scripted: Scripted, *serials: str, name: str) -> Calibration:
     calibration = make_calibration(*serials, name=name)
     answer = scripted.running.http.post(
-        "/calibrations", content=content_of(calibration), headers=JSON
+        "/calibrations", content=encode_calibration(calibration), headers=JSON
     )
     assert answer.status_code == 201, answer.text
     return calibration
@@ -81,8 +81,8 @@ def test_a_file_is_uploaded_as_it_is_and_what_is_none_is_refused_in_the_servers_
 ) -> None:
     calibration = make_calibration("T01", "T02", name="from the bench")
     good, bad = tmp_path / "cal.json", tmp_path / "bad.json"
-    good.write_bytes(content_of(calibration))
-    bad.write_bytes(content_of(calibration).replace(b"from the bench", b"from the bencH"))
+    good.write_bytes(encode_calibration(calibration))
+    bad.write_bytes(encode_calibration(calibration).replace(b"from the bench", b"from the bencH"))
     page = open_page(f"{scripted.url}/nodes")
     page.get_by_role("button", name="Calibration of bench").click()
     expect(page.locator("#calibration-dialog")).to_contain_text("None on the server yet")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from service.api.app import page_folder
+from service.api.app import find_page_folder
 from tests.builders.arrays import make_array, make_tile
 from tests.service.fake_node import FakeNode, Play
 from tests.web.scripted import Scripted
@@ -130,7 +130,7 @@ def test_a_grid_is_a_heat_map_with_readable_numbers_on_a_phone(
     class Grid(FakeNode):
         @property
         def info(self) -> Any:
-            facts = {"node": self.name, "boot_id": self.boot_id}
+            facts = {"node": self.name, "stream_id": self.stream_id}
             return make_array(tiles, **facts, utc_offset_ns=self.utc_offset_ns)
 
     scripted.node.close()
@@ -178,7 +178,7 @@ def test_a_row_of_tiles_draws_the_cop_on_the_row_and_gives_no_number_across_it(
     class Row(FakeNode):
         @property
         def info(self) -> Any:
-            facts = {"node": self.name, "boot_id": self.boot_id}
+            facts = {"node": self.name, "stream_id": self.stream_id}
             return make_array(tiles, **facts, utc_offset_ns=self.utc_offset_ns)
 
     scripted.node.close()
@@ -315,5 +315,7 @@ def test_nothing_is_wider_than_the_screen(
 
 
 def test_the_colours_of_forces_are_said_once() -> None:
-    said = [p.name for p in page_folder().rglob("*.css") if "--heat-0:" in p.read_text("utf-8")]
+    said = [
+        p.name for p in find_page_folder().rglob("*.css") if "--heat-0:" in p.read_text("utf-8")
+    ]
     assert said == ["style.css"]

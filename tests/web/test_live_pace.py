@@ -20,7 +20,7 @@ WRITTEN = """async () => {
   const pace = new TextPace();
   const node = {};
   const of = (status, force_n) =>
-    ({ status, force_n, saturated: [false], frame_status: 0, estimate_status: 0 });
+    ({ status, force_n, saturated: [false], frame_flags: 0, estimate_flags: 0 });
   const steady = of([0], [1]);
   return {
     first: pace.isDue(node, steady, 1000),

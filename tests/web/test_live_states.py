@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 import service.api.routes.sockets.ingest
-from service.link import SILENCE_S
+from service.protocol import LINK_TIMEOUT_S
 from tests.service.fake_node import Play
 from tests.service.recording import Recording
 from tests.waiting import until
@@ -91,7 +91,7 @@ def test_a_page_opened_after_the_node_died_tells_one_story(
 def test_a_node_out_of_reach_is_silent_on_the_page_and_then_away(
     scripted: Scripted, open_page: OpenPage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service.api.routes.sockets.ingest, "SILENCE_S", SILENCE_S)
+    monkeypatch.setattr(service.api.routes.sockets.ingest, "LINK_TIMEOUT_S", LINK_TIMEOUT_S)
     with Play(scripted.node):
         page = open_page(scripted.url)
         expect(page.locator(LIVE)).to_have_count(1)
@@ -115,7 +115,7 @@ def test_what_follows_a_labelled_marker_is_a_shortcut_again(
         expect(page.locator("#recordings")).to_be_hidden()
         assert page.input_value("#marker-label") == ""
         session.sealed()
-    events = scripted.running.http.get(f"{session.url}/events").json()["items"]
+    events = scripted.running.http.get(f"{session.url}/markers").json()["items"]
     assert [event["label"] for event in events] == ["a stone"]
 
 
@@ -145,7 +145,7 @@ def test_a_session_whose_end_alone_is_open_says_so_and_completes_when_the_node_i
 ) -> None:
     session = ends_open(scripted)
     now = session.now()
-    assert (now["pending_frames"], now["waits_for"]) == (0, "end")
+    assert (now["pending_frames"], now["pending_reason"]) == (0, "end")
     page = open_page(f"{scripted.url}/sessions")
     row = row_of(page, session)
     expect(row).to_contain_text("Waiting for the last frames before stop")
@@ -156,7 +156,7 @@ def test_a_session_whose_end_alone_is_open_says_so_and_completes_when_the_node_i
     scripted.node.connect()
     scripted.node.send(10, now=True)
     expect(row.locator(".state")).to_have_text("complete")
-    assert session.now()["waits_for"] is None
+    assert session.now()["pending_reason"] is None
 
 
 def test_a_session_whose_node_never_comes_back_is_sealed_with_what_is_here(

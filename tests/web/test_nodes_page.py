@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from service.identity import fingerprint_of
+from service.node_identity import compute_fingerprint
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import closed
 from tests.waiting import until
@@ -86,7 +86,7 @@ def test_two_feet_are_recorded_marked_and_stopped_together_and_one_is_lost_in_be
     assert (left["node"], right["node"]) == ("left", "right")
     assert left["name"] == right["name"] == "both feet"
     assert left["take"] == right["take"] is not None
-    markers = [two.get(f"/sessions/{session['id']}/events")["items"] for session in (left, right)]
+    markers = [two.get(f"/sessions/{session['id']}/markers")["items"] for session in (left, right)]
     assert markers[0] == markers[1]
     assert [marker["label"] for marker in markers[0]] == ["a stone", "one is lost"]
 
@@ -267,7 +267,7 @@ def test_another_machine_that_asks_for_a_name_is_accepted_with_a_button(
 ) -> None:
     stranger = FakeNode(scripted.running, scripted.node.name)
     assert stranger.secret is not None
-    fingerprint = fingerprint_of(stranger.secret)
+    fingerprint = compute_fingerprint(stranger.secret)
 
     def ask() -> int:
         stranger.prove(secret=stranger.secret, proof=None)

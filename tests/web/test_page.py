@@ -113,7 +113,7 @@ def test_record_marker_stop_download(known: Field, open_page: OpenPage, tmp_path
     assert len(seq) == session["frames"] > 300
     assert (np.diff(seq) == 1).all()
     assert (table.schema.field("grf_n").metadata or {})[b"unit"] == b"N"
-    events = known.get(f"/sessions/{session['id']}/events")["items"]
+    events = known.get(f"/sessions/{session['id']}/markers")["items"]
     assert [event["label"] for event in events] == ["a stone"]
 
 

@@ -40,7 +40,7 @@ def test_hostile_names_are_spelt_out_wherever_they_are_shown(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.recorded("walk")
-    answer = scripted.running.http.post(f"{session.url}/events", json={"label": "walk"})
+    answer = scripted.running.http.post(f"{session.url}/markers", json={"label": "walk"})
     assert answer.status_code == 201
     fields = {"subject": "walk", "tags": ["walk"], "notes": "walk"}
     assert scripted.running.http.patch(session.url, json=fields).status_code == 200

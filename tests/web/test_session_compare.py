@@ -29,7 +29,9 @@ STONE = "a stone"
 def add_marker(session: Recording, frame: int) -> int:
     """Set a marker at a frame; return its time."""
     t_ns = int(session.column("t_ns")[frame])
-    answer = session.running.http.post(f"{session.url}/events", json={"label": STONE, "t_ns": t_ns})
+    answer = session.running.http.post(
+        f"{session.url}/markers", json={"label": STONE, "t_ns": t_ns}
+    )
     assert answer.status_code == 201
     return t_ns
 

@@ -33,14 +33,14 @@ def with_marker(scripted: Scripted) -> Recording:
     clock = session.clock()["streams"][0]["stretches"][0]
     middle = int(t_ns[len(t_ns) // 2]) + clock["offset_ns"]
     answer = session.running.http.post(
-        f"{session.url}/events", json={"label": "a stone", "t_ns": middle}
+        f"{session.url}/markers", json={"label": "a stone", "t_ns": middle}
     )
     assert answer.status_code == 201
     return session
 
 
 def markers(session: Recording) -> list[dict[str, Any]]:
-    items: list[dict[str, Any]] = session.running.http.get(f"{session.url}/events").json()["items"]
+    items: list[dict[str, Any]] = session.running.http.get(f"{session.url}/markers").json()["items"]
     return items
 
 
@@ -125,7 +125,7 @@ def test_what_people_say_is_changed_and_the_second_of_two_is_told(
 
     marker = markers(session)[0]
     one.click("#markers-list [aria-label='Edit marker a stone']")
-    url = f"{session.url}/events/{marker['id']}"
+    url = f"{session.url}/markers/{marker['id']}"
     assert session.running.http.patch(url, json={"label": "water"}).status_code == 200
     one.fill("#marker-label", "sand")
     one.press("#marker-label", "Enter")

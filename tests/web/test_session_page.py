@@ -159,7 +159,7 @@ def test_a_session_is_shown_while_it_is_recorded_and_as_it_was_sealed_afterwards
         wait_until(lambda: summary(page, "frames") > before, "more of them")
         expect(page.locator("#replay-lag")).to_contain_text("Provisional forces")
         expect(page.locator("#download-parquet")).to_be_hidden()
-        scripted.running.http.post(f"{session.url}/events", json={"label": "a stone"})
+        scripted.running.http.post(f"{session.url}/markers", json={"label": "a stone"})
         expect(page.locator("#markers-list")).to_contain_text("a stone")
         page.keyboard.press("ArrowRight")
         expect(page.locator("#grf")).not_to_have_attribute("data-value", "")
@@ -249,7 +249,7 @@ def test_of_tiles_in_one_row_the_page_says_that_y_is_not_measured(
         const said = (y) => {
           const columns = {
             t_first_s: [0, 1], t_last_s: [0, 1], frames: [1, 1], missing: [0, 0], part: [0, 0],
-            contact: [2, 2], grf_at_least_n_max: [0, 0],
+            contact: [2, 2], grf_lower_bound_n_max: [0, 0],
           };
           for (const name of ["grf_n", "angle_rad", "cop_x_m"]) {
             for (const end of ["min", "max"]) columns[`${name}_${end}`] = [1, 2];

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.registry import FORMATS
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.web.session_page import grf, recorded_walk, seen, settled, summary, url_of
@@ -164,7 +164,7 @@ def test_a_marker_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
     page.fill("#new-marker-label", "here")
     page.press("#new-marker-label", "Enter")
     expect(page.locator("#notices")).to_contain_text("Marker “here” set")
-    events = walk.running.http.get(f"{walk.url}/events").json()["items"]
+    events = walk.running.http.get(f"{walk.url}/markers").json()["items"]
     t_ns = next(event["t_ns"] for event in events if event["label"] == "here")
     since_s = (t_ns - int(walk.column("t_ns")[0])) * 1e-9
     assert since_s == pytest.approx(float(at_s or "nan"), abs=1e-5)

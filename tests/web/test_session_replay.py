@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Page, expect
 
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileFlag
 from tests.builders.arrays import make_servo
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -32,18 +32,18 @@ class Rolling(FakeNode):
         return super().info.model_copy(update={"servo": make_servo()})
 
     def frames(self, n: int, *arguments: Any, **how: Any) -> FrameBatch:
-        status = how.pop("status", 0)
+        flags = how.pop("tile_flags", 0)
         batch = super().frames(n, *arguments, **how)
-        statuses = np.zeros_like(batch.status)
-        statuses[:, 1] = status
+        tile_flags = np.zeros_like(batch.tile_flags)
+        tile_flags[:, 1] = flags
         counts = (batch.seq % 400).astype(np.int32) + 1848
         batch = replace(
-            batch, status=statuses, servo_counts=counts, servo_age_us=np.zeros_like(counts)
+            batch, tile_flags=tile_flags, servo_counts=counts, servo_age_us=np.zeros_like(counts)
         )
         if status:
-            padc = batch.padc.copy()
-            padc[:, 1] = NOT_READ
-            batch = replace(batch, padc=padc)
+            pressure_raw = batch.pressure_raw.copy()
+            pressure_raw[:, 1] = NOT_READ
+            batch = replace(batch, pressure_raw=pressure_raw)
         self.sent[-1] = batch
         return batch
 
@@ -59,7 +59,7 @@ def session(server: Running) -> Recording:
     node.send(200, [0.0, 0.0], alive=True)
     node.send(ROLLED, over)
     node.send(SATURATED, [20.0, 200.0], alive=True)
-    node.send(UNREAD, [20.0, 0.0], alive=True, status=TileStatus.NO_ANSWER)
+    node.send(UNREAD, [20.0, 0.0], alive=True, status=TileFlag.NO_ANSWER)
     node.send(200, [0.0, 0.0], alive=True)
     first = node.seq
     node.frames(LOST)
@@ -77,7 +77,7 @@ def stored(session: Recording) -> dict[str, np.ndarray]:
     columns = {
         name: table[name].to_numpy(zero_copy_only=False)
         for name in table.column_names
-        if name != "event"
+        if name != "marker"
     }
     return columns | {"since_s": (columns["t_ns"] - columns["t_ns"][0]) * 1e-9}
 

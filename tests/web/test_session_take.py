@@ -8,11 +8,11 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
 
-from storage.formats.written.registry import SEVERAL
+from storage.formats.writers.registry import MULTI_SESSION_FORMATS
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
 from tests.service.takes import Take, frames_of_long_ago
-from tests.storage.formats.written.readers import said_in
+from tests.storage.formats.writers.readers import said_in
 
 OpenPage = Callable[..., Page]
 
@@ -36,7 +36,7 @@ def test_the_others_of_a_take_come_in_the_same_file(take: Take, open_page: OpenP
     everything = offered.count()
     together.check()
     names = offered.evaluate_all("items => items.map((item) => item.dataset.format)")
-    assert set(names) == set(SEVERAL)
+    assert set(names) == set(MULTI_SESSION_FORMATS)
     assert everything == len(names)  # the others stand in the page, and are of this session only
     assert not Axe().run(page).response["violations"]
     with page.expect_download() as download:

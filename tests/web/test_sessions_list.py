@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from storage.checked_json import write_checked
-from storage.sessions.folder import SessionFolder
+from storage.checksummed_json import write_checksummed_json
+from storage.sessions.folder import SessionsFolder
 from tests.service.fake_node import FakeNode
 from tests.service.patient import be_patient
 from tests.service.running import Running
@@ -44,7 +44,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         node.finish(session)
         node.close()
         running.stop()
-        original = SessionFolder(data / "sessions").load(session.id)
+        original = SessionsFolder(data / "sessions").load(session.id)
         for i in range(1, MANY):
             copy = original.model_copy(
                 update={
@@ -56,7 +56,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
             folder = data / "sessions" / copy.id
             shutil.copytree(session.folder, folder, copy_function=os.link)
             (folder / "session.json").unlink()
-            write_checked(folder / "session.json", copy.model_dump_json().encode())
+            write_checksummed_json(folder / "session.json", copy.model_dump_json().encode())
         running.start()
         yield running
         running.stop()

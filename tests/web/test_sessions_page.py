@@ -43,8 +43,8 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
         sessions = scripted.running.sessions
         wait_until(lambda: {s["state"] for s in sessions()} == {"sealed"}, "both sealed")
     for session in sessions():
-        events = scripted.running.http.get(f"/sessions/{session['id']}/events").json()["items"]
-        assert [event["label"] for event in events] == ["a stone"]
+        markers = scripted.running.http.get(f"/sessions/{session['id']}/markers").json()["items"]
+        assert [event["label"] for event in markers] == ["a stone"]
 
 
 def test_a_marker_that_is_set_while_the_server_is_away_has_the_instant_of_the_press(
@@ -67,7 +67,7 @@ def test_a_marker_that_is_set_while_the_server_is_away_has_the_instant_of_the_pr
     time.sleep(1.5)
     scripted.running.start()
     expect(page.locator("#waiting-markers")).to_be_hidden(timeout=15_000)
-    [event] = scripted.running.http.get(f"{session.url}/events").json()["items"]
+    [event] = scripted.running.http.get(f"{session.url}/markers").json()["items"]
     assert event["label"] == "a stone"
     assert abs(event["t_ns"] - pressed_ns) < 1_000_000_000
 
@@ -124,7 +124,7 @@ def test_losses_troubles_and_what_is_behind_are_said_in_words(
     node.frames(1000)
     with Play(node):
         node.say_lost(disk_full=[[first, first + 1]], evicted=[[first + 2, first + 101]])
-        status = {"type": "status", "missed_slots": 3, "troubles": ["the node's disk is full"]}
+        status = {"type": "status", "missed_slots": 3, "warnings": ["the node's disk is full"]}
         node.socket.send(json.dumps(status))
         page = open_page(scripted.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
@@ -178,7 +178,7 @@ def test_a_session_shows_how_many_markers_it_has_and_its_downloads_have_them(
     expect(markers).to_have_text("0")
     t_ns = int(session.column("t_ns")[3])
     body = {"label": "a stone", "t_ns": t_ns}
-    assert scripted.running.http.post(f"{session.url}/events", json=body).status_code == 201
+    assert scripted.running.http.post(f"{session.url}/markers", json=body).status_code == 201
     expect(markers).to_have_text("1")
     for kind in ("parquet", "arrow", "csv"):
         with page.expect_download() as download:

@@ -40,10 +40,10 @@ export const acceptReplacement = (node, fingerprint) => call("POST", `/nodes/${i
 export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
 /** @type {(node: string) => Promise<NodeCalibration>} */
 export const calibrationOf = (node) => call("GET", `/nodes/${id(node)}/calibration`);
-/** @type {(node: string, calibration: string, said: string) => Promise<NodeCalibration>} */
+/** @type {(node: string, calibration: string, revision: string) => Promise<NodeCalibration>} */
 export const assignCalibration = (node, calibration, said) =>
   call("PUT", `/nodes/${id(node)}/calibration`, { body: { id: calibration }, said });
-/** @type {(node: string, said: string) => Promise<NodeCalibration>} */
+/** @type {(node: string, revision: string) => Promise<NodeCalibration>} */
 export const unassignCalibration = (node, said) => call("DELETE", `/nodes/${id(node)}/calibration`, { said });
 /** @type {() => Promise<{items: Calibration[]}>} */
 export const listCalibrations = () => call("GET", "/calibrations");
@@ -54,7 +54,7 @@ export const deleteCalibration = (calibration) => call("DELETE", `/calibrations/
 export const weighingOf = (node) => call("GET", `/nodes/${id(node)}/weighing`);
 /** @type {(node: string, plan: WeighingPlan) => Promise<Weighing>} */
 export const startWeighing = (node, plan) => call("POST", `/nodes/${id(node)}/weighing`, { body: plan });
-/** @type {(node: string, said: string) => Promise<Weighing>} */
+/** @type {(node: string, revision: string) => Promise<Weighing>} */
 export const repeatWeight = (node, said) => call("POST", `/nodes/${id(node)}/weighing/repeat`, { said });
 export const endWeighing = (node, said) => call("DELETE", `/nodes/${id(node)}/weighing`, { said });
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
@@ -63,7 +63,7 @@ export const startSession = (node, name) => call("POST", "/sessions", { body: { 
 /** @type {(session: string) => Promise<Session>} */
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
 /** @type {(session: string, marker: object) => Promise<Marker>} */
-export const addMarker = (session, marker) => call("POST", `/sessions/${id(session)}/events`, { body: marker });
+export const addMarker = (session, marker) => call("POST", `/sessions/${id(session)}/markers`, { body: marker });
 /** @type {(name: string) => Promise<Take>} */
 export const startTake = (name) => call("POST", "/takes", { body: { name } });
 /** @type {(take: string) => Promise<Take>} */
@@ -71,11 +71,11 @@ export const getTake = (take) => call("GET", `/takes/${id(take)}`);
 /** @type {(take: string) => Promise<Take>} */
 export const stopTake = (take) => call("POST", `/takes/${id(take)}/stop`);
 /** @type {(take: string, marker: object) => Promise<Take>} */
-export const addTakeMarker = (take, marker) => call("POST", `/takes/${id(take)}/events`, { body: marker });
+export const addTakeMarker = (take, marker) => call("POST", `/takes/${id(take)}/markers`, { body: marker });
 /** @type {(session: string) => Promise<Session>} */
 export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
 /** @type {(session: string) => Promise<{items: Marker[]}>} */
-export const listMarkers = (session) => call("GET", `/sessions/${id(session)}/events`);
+export const listMarkers = (session) => call("GET", `/sessions/${id(session)}/markers`);
 export const listStances = (session) => call("GET", `/sessions/${id(session)}/stances`);
 export const stancesOverlay = (session) => call("GET", `/sessions/${id(session)}/stances/overlay`);
 export const listComparisons = (session) => call("GET", `/sessions/${id(session)}/comparisons`);
@@ -99,11 +99,11 @@ export const samples = (session, query) =>
 /** @type {(session: string, changes: object, said?: string | null) => Promise<Session>} */
 export const changeSession = (session, changes, said = null) =>
   call("PATCH", `/sessions/${id(session)}`, { body: changes, said });
-/** @type {(session: string, marker: string, changes: object, said: string) => Promise<Marker>} */
+/** @type {(session: string, marker: string, changes: object, revision: string) => Promise<Marker>} */
 export const changeMarker = (session, marker, changes, said) =>
-  call("PATCH", `/sessions/${id(session)}/events/${id(marker)}`, { body: changes, said });
+  call("PATCH", `/sessions/${id(session)}/markers/${id(marker)}`, { body: changes, said });
 export const removeMarker = (session, marker, said) =>
-  call("DELETE", `/sessions/${id(session)}/events/${id(marker)}`, { said });
+  call("DELETE", `/sessions/${id(session)}/markers/${id(marker)}`, { said });
 /** @type {(session: string) => Promise<Session>} */
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);

@@ -132,7 +132,7 @@ const hairs = (x, y, rx, ry) => `M${x} ${y}h.1M${x - rx - 14} ${y}h10M${x + rx +
 /** Return the reason for no COP. */
 function whyNoCop(node, frame, { row }) {
   if (!frame) return "no data";
-  const bits = frame.estimate_status ?? 0;
+  const bits = frame.estimate_flags ?? 0;
   if (!node.tare || node.tare.undone) return "not tared";
   if (!node.calibration) return "no calibration";
   if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);

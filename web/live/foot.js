@@ -158,9 +158,9 @@ export class Foot {
     const label = byId("angle");
     label.hidden = !node.servo;
     const angle = frame?.angle_rad ?? null;
-    const stale = Boolean((frame?.frame_status ?? 0) & FRAME.SERVO_STALE);
+    const stale = Boolean((frame?.frame_flags ?? 0) & FRAME.SERVO_STALE);
     const degrees = angle === null ? "unknown" : `${angle > 0 ? "+" : ""}${number((angle * 180) / Math.PI)}°`;
-    const turnless = Boolean((frame?.frame_status ?? 0) & FRAME.SERVO_TURN_UNKNOWN);
+    const turnless = Boolean((frame?.frame_flags ?? 0) & FRAME.SERVO_TURN_UNKNOWN);
     setText(label, `Foot angle ${degrees}${stale ? ", servo stale" : turnless ? ", servo turn unknown" : ""}`);
     setData(label, "stale", String(stale));
     setData(label, "known", String(angle !== null));

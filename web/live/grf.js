@@ -7,8 +7,8 @@ import { byId, number, plain, setData, setText } from "../common/text.js";
 export function drawGrf(node, frame) {
   const value = Number.isFinite(frame?.grf_n) ? frame.grf_n : null;
   // A foot does not pull: the bound is never below zero.
-  const atLeast = value === null && Number.isFinite(frame?.grf_at_least_n) ? Math.max(0, Math.floor(frame.grf_at_least_n * 10) / 10) : null;
-  const bits = frame?.estimate_status ?? 0;
+  const atLeast = value === null && Number.isFinite(frame?.grf_lower_bound_n) ? Math.max(0, Math.floor(frame.grf_lower_bound_n * 10) / 10) : null;
+  const bits = frame?.estimate_flags ?? 0;
   const assumed = node.calibration?.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE;
   setText(byId("grf"), number(value ?? atLeast ?? NaN));
   setData(byId("grf"), "value", plain(value));

@@ -7,7 +7,7 @@ import * as api from "../common/api.js";
 
 /** Requests history when the trace has a hole. */
 export class History {
-  /** `currentStream()` returns the boot_id of the stream on display. */
+  /** `currentStream()` returns the stream_id of the stream on display. */
   constructor(points, currentStream) {
     this.points = points;
     this.currentStream = currentStream;
@@ -28,7 +28,7 @@ export class History {
     this.tiles = tiles;
     try {
       const recent = await api.recent(node.node, seconds, frame?.seq_first, tiles);
-      if (recent.boot_id !== this.currentStream()) return;
+      if (recent.stream_id !== this.currentStream()) return;
       this.points.addHistory(recent, frame?.seq_first, nowMs);
       if (recent.tiles) this.points.addTileHistory(recent.tiles, tiles, frame?.seq_first);
     } catch (error) {

@@ -43,15 +43,15 @@ export class Warnings {
   /** Collect the flags of a message, also of those between two drawings. */
   addFrame(node, frame, nowMs) {
     const flag = (key, text, id = key) => this.flagged.set(id, { key, id, text, seenMs: nowMs });
-    const below = frame.estimate_status & ESTIMATE.EXTRAPOLATED ? 1 : 0;
+    const below = frame.estimate_flags & ESTIMATE.EXTRAPOLATED ? 1 : 0;
     this.belowShare += (below - this.belowShare) / SETTLE_MESSAGES;
     if (this.belowShare > 0.5) flag("below_range", BELOW_RANGE);
-    for (const [bit, key, text] of FROM_ESTIMATE) if (frame.estimate_status & bit) flag(key, text);
-    for (const [bit, key, text] of FROM_FRAME) if (frame.frame_status & bit) flag(key, text);
+    for (const [bit, key, text] of FROM_ESTIMATE) if (frame.estimate_flags & bit) flag(key, text);
+    for (const [bit, key, text] of FROM_FRAME) if (frame.frame_flags & bit) flag(key, text);
     node.tiles.forEach((tile, i) => {
-      const isOverRange = frame.status?.[i] & TILE.OVER_RANGE;
+      const isOverRange = frame.tile_flags?.[i] & TILE.OVER_RANGE;
       if (isOverRange && !frame.saturated?.[i]) flag("over_range", `${tile.serial} is outside the chip's range of 50 to 115 kPa.`, `over_range ${tile.serial}`);
-      if (frame.estimate_status & ESTIMATE.CLIPPED && frame.saturated?.[i] && !isOverRange) flag("clipped", clippedText(tile, frame.gauge_kpa?.[i]), `clipped ${tile.serial}`);
+      if (frame.estimate_flags & ESTIMATE.CLIPPED && frame.saturated?.[i] && !isOverRange) flag("clipped", clippedText(tile, frame.gauge_kpa?.[i]), `clipped ${tile.serial}`);
     });
   }
 
@@ -142,7 +142,7 @@ function makeItem({ key, text }, mayBeOlder) {
 function nodeWarnings(node, frame, serverNowMs) {
   const notes = [];
   const add = (key, text, id = key) => notes.push(makeNote(key, text, id));
-  const bits = frame?.estimate_status ?? 0;
+  const bits = frame?.estimate_flags ?? 0;
   const tare = node.tare && !node.tare.undone ? node.tare : null;
   if (!node.calibration) add("no_calibration", withReason("No calibration", node.calibration_problem || "pressures only."));
   else if (node.calibration.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE) {
@@ -157,7 +157,7 @@ function nodeWarnings(node, frame, serverNowMs) {
     doubts.forEach((doubt, i) => add("tare_doubt", `Tare in doubt: ${doubt}.`, `tare_doubt ${i}`));
     if (!doubts.length && bits & ESTIMATE.TARE_OLD) add("tare_doubt", `Tare in doubt (${tareAge(tare, serverNowMs)} old): lift the foot, press Tare.`);
   }
-  for (const warning of node.troubles ?? []) add(keyOf(warning), sentence(warning), warning);
+  for (const warning of node.warnings ?? []) add(keyOf(warning), sentence(warning), warning);
   for (const [reason, text] of lossTexts(node.lost)) add("lost", `Lost ${text}.`, `lost ${reason}`);
   if (node.storage_problem) add("storage", `The server cannot record: ${node.storage_problem}`);
   // An emulated node has the clock of this machine.
@@ -188,6 +188,6 @@ function facts(node, frame, serverNowMs) {
   if (FOLLOWS[node.auto_tare]) parts.push(FOLLOWS[node.auto_tare]);
   if (node.calibration) parts.push(node.calibration.absolute_scale === "measured" ? "calibrated in newtons" : "scale assumed");
   if (!node.clock) parts.push("clock offset unknown");
-  if (frame && frame.frame_status & FRAME.LEAD) parts.push("unloaded lead-in");
+  if (frame && frame.frame_flags & FRAME.LEAD) parts.push("unloaded lead-in");
   return parts.join(" · ");
 }

@@ -57,9 +57,9 @@ function stateOf(frame) {
   const known = (value) => (Number.isFinite(value) ? 1 : 0);
   const list = (name, of) => frame[name]?.map(of).join("") ?? "";
   return [
-    frame.status?.join(), list("saturated", Number), list("force_n", known), list("gauge_kpa", known), list("force_sigma_n", known),
-    known(frame.grf_n), known(frame.grf_at_least_n), known(frame.grf_sigma_n), frame.contact, known(frame.cop_x_m),
+    frame.tile_flags?.join(), list("saturated", Number), list("force_n", known), list("gauge_kpa", known), list("force_sigma_n", known),
+    known(frame.grf_n), known(frame.grf_lower_bound_n), known(frame.grf_sigma_n), frame.contact, known(frame.cop_x_m),
     known(frame.cop_y_m), known(frame.angle_rad),
-    frame.frame_status, frame.estimate_status,
+    frame.frame_flags, frame.estimate_flags,
   ].join(" ");
 }

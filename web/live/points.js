@@ -7,7 +7,7 @@ const STORED_S = 61;
 const POINTS_MAX = 4000; // a minute at 30 Hz: 1800
 const LATE_S = 0.1; // pause without a missing number that counts as a gap
 
-const FIELDS = ["seq_first", "seq", "n", "t_ns", "grf_n", "grf_min_n", "grf_max_n", "grf_at_least_max_n"];
+const FIELDS = ["seq_first", "seq", "n", "t_ns", "grf_n", "grf_min_n", "grf_max_n", "grf_lower_bound_max_n"];
 
 /** Points of the GRF trace, and of each tile. */
 export class Points {
@@ -94,5 +94,5 @@ const pointOf = (span) => ({
   seqFirst: span.seq_first, seq: span.seq, n: span.n, timeS: span.t_ns / 1e9, gap: true,
   grf: span.grf_n, low: span.grf_min_n, high: span.grf_max_n,
   // Lower bound where there is no force. A foot does not pull: never below zero.
-  bound: Number.isFinite(span.grf_at_least_max_n) ? Math.max(0, span.grf_at_least_max_n) : null,
+  bound: Number.isFinite(span.grf_lower_bound_max_n) ? Math.max(0, span.grf_lower_bound_max_n) : null,
 });

@@ -33,9 +33,9 @@ export function readTile(node, i, frame, unitChosen) {
   const tile = node.tiles[i];
   const unit = unitOf(tile, unitChosen);
   const none = (state, text, bound = "") => ({ state, text, bound, value: null, low: null, high: null, sigma: null, unit });
-  if (!frame || !Number.isFinite(frame.status?.[i])) return none("waiting", "no data");
+  if (!frame || !Number.isFinite(frame.tile_flags?.[i])) return none("waiting", "no data");
 
-  for (const [bit, state, text] of FAULTS) if (frame.status[i] & bit) return none(state, text);
+  for (const [bit, state, text] of FAULTS) if (frame.tile_flags[i] & bit) return none(state, text);
 
   const value = unit === "kPa" ? at(frame.gauge_kpa, i) : at(frame.force_n, i);
   if (frame.saturated?.[i]) return none("saturated", "saturated", lowerBound(tile, unit, value));

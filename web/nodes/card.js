@@ -41,7 +41,7 @@ export class Card {
     const canvas = el("canvas", { cls: "node-foot", role: "img", "aria-label": `Tiles of ${name} shaded by force, and the centre of pressure` });
     this.foot = new SmallFoot(canvas);
     const strip = el("canvas", { cls: "node-trace", role: "img", "aria-label": `Ground reaction force of ${name} over the last 10 seconds` });
-    this.trace = new SmallTrace(strip, () => this.node.boot_id);
+    this.trace = new SmallTrace(strip, () => this.node.stream_id);
     const facts = el("dl", { cls: "node-facts" });
     this.facts = Object.fromEntries(["Frames/s", "Losses", "Backlog"].map((title) => {
       const value = el("dd");
@@ -65,7 +65,7 @@ export class Card {
 
   /** Store the node's description. */
   update(node) {
-    if (this.node && this.node.boot_id !== node.boot_id) { // new stream
+    if (this.node && this.node.stream_id !== node.stream_id) { // new stream
       this.frame = this.frameMs = this.heartbeat = null;
       this.warnings.clear();
       this.trace.clear();
@@ -110,7 +110,7 @@ export class Card {
     if (this.state.className !== `state ${cls}`) this.state.className = `state ${cls}`;
 
     const grf = Number.isFinite(frame?.grf_n) ? frame.grf_n : null;
-    const atLeast = grf === null && Number.isFinite(frame?.grf_at_least_n) ? Math.max(0, Math.floor(frame.grf_at_least_n * 10) / 10) : null;
+    const atLeast = grf === null && Number.isFinite(frame?.grf_lower_bound_n) ? Math.max(0, Math.floor(frame.grf_lower_bound_n * 10) / 10) : null;
     setText(this.bound, atLeast === null ? "" : "at least ");
     setText(this.value, number(grf ?? atLeast ?? NaN));
     setData(this.value, "value", plain(grf));

@@ -10,7 +10,7 @@ const [LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX] = [46, 4, 8, 6];
 
 /** GRF strip of a card. */
 export class SmallTrace {
-  /** @param {HTMLCanvasElement} canvas @param {() => string} stream boot_id on display */
+  /** @param {HTMLCanvasElement} canvas @param {() => string} stream stream_id on display */
   constructor(canvas, stream) {
     this.canvas = canvas;
     this.points = new Points();

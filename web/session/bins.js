@@ -30,7 +30,7 @@ export class Bins {
     this.axis = overview.time_axis;
     this.serials = overview.serials;
     this.provisional = Boolean(overview.provisional); // not sealed
-    this.behind = Boolean(overview.behind); // estimation is not complete
+    this.catching_up = Boolean(overview.catching_up); // estimation is not complete
     this.covers = covers;
     this.estimated = "grf_n_min" in overview.columns;
   }

@@ -8,8 +8,8 @@ const UNKNOWN = ESTIMATE.TILE_MISSING | ESTIMATE.STUCK | ESTIMATE.TARE_LOST;
 const DOUBT = ESTIMATE.EXTRAPOLATED | ESTIMATE.TARE_OLD | ESTIMATE.OVER_RATED
   | ESTIMATE.AFTER_SATURATION | ESTIMATE.BASELINE_LOST;
 
-const anyTile = (bins, i, bits) => bins.serials.some((_, tile) => bins.columns[`status_${tile}`][i] & bits);
-const estimate = (bins, i) => bins.columns.estimate_status?.[i] ?? 0;
+const anyTile = (bins, i, bits) => bins.serials.some((_, tile) => bins.columns[`tile_flags_${tile}`][i] & bits);
+const estimate = (bins, i) => bins.columns.estimate_flags?.[i] ?? 0;
 
 /**
  * Kinds of faults: `label` in the legend, hatching `way` or "line" for a strip below the plot, plots it
@@ -21,11 +21,11 @@ export const KINDS = [
   { key: "restarted", label: "node restarted", colour: "text", way: "\\", over: "all", before: true,
     is: (bins, i) => i > 0 && bins.columns.part[i] !== bins.columns.part[i - 1] },
   { key: "late", label: "not sampled (node late)", colour: "edge", way: "x", over: "foot", before: true,
-    is: (bins, i) => Boolean(bins.columns.frame_status[i] & FRAME.OVERRUN) },
+    is: (bins, i) => Boolean(bins.columns.frame_flags[i] & FRAME.OVERRUN) },
   { key: "saturated", label: "tile saturated: lower bound", colour: "warn-line", way: "/", over: "force",
     is: (bins, i) => Boolean(estimate(bins, i) & SATURATED) || (!bins.estimated && anyTile(bins, i, TILE.OVER_RANGE)) },
   { key: "unread", label: "no reading from a tile", colour: "bad-line", way: "x", over: "force",
-    is: (bins, i) => anyTile(bins, i, UNREAD) || Boolean(bins.columns.frame_status[i] & FRAME.BUS_FAULT) },
+    is: (bins, i) => anyTile(bins, i, UNREAD) || Boolean(bins.columns.frame_flags[i] & FRAME.BUS_FAULT) },
   { key: "unknown", label: "force unknown", colour: "bad-line", way: "/", over: "force",
     is: (bins, i) => Boolean(estimate(bins, i) & UNKNOWN) },
   { key: "doubt", label: "force less certain", colour: "warn-line", way: "line", over: "foot",
@@ -79,9 +79,9 @@ export const estimateTexts = (bits) => ESTIMATE_TEXTS.filter(([bit]) => bits & b
 export function flagTexts(bins, i) {
   const texts = [
     ...estimateTexts(estimate(bins, i)),
-    ...FRAME_TEXTS.filter(([bit]) => bins.columns.frame_status[i] & bit).map(([, text]) => text),
+    ...FRAME_TEXTS.filter(([bit]) => bins.columns.frame_flags[i] & bit).map(([, text]) => text),
   ];
-  const unread = bins.serials.filter((_, tile) => bins.columns[`status_${tile}`][i] & UNREAD);
+  const unread = bins.serials.filter((_, tile) => bins.columns[`tile_flags_${tile}`][i] & UNREAD);
   if (unread.length) texts.push(`no reading from ${unread.slice(0, 4).join(", ")}${unread.length > 4 ? " and others" : ""}`);
   const missing = bins.columns.missing[i];
   if (missing) texts.push(`${missing.toLocaleString("en-GB")} frame${missing === 1 ? "" : "s"} lost ${bins.framesInBin === 1 ? "before it" : "here"}`);

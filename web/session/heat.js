@@ -11,7 +11,7 @@ export function drawTiles(plots, context, panel, box, view, x) {
   const { colours, whole } = plots;
   const counts = !whole.estimated;
   const serials = panel.besideOnly ? plots.beside.answer.serials : whole.serials;
-  const names = serials.map((_, i) => (counts ? `padc_${i}_min` : `force_n_${i}_max`));
+  const names = serials.map((_, i) => (counts ? `pressure_raw_${i}_min` : `force_n_${i}_max`));
   plots.heat ??= heatRange(whole, counts);
   const stops = STOPS.map((name) => colours[name]);
   const rows = names.length;
@@ -46,7 +46,7 @@ export function drawTiles(plots, context, panel, box, view, x) {
 function heatRange(bins, counts) {
   let [low, high] = [Infinity, -Infinity];
   bins.serials.forEach((_, i) => {
-    const stem = `${counts ? "padc" : "force_n"}_${i}`;
+    const stem = `${counts ? "pressure_raw" : "force_n"}_${i}`;
     const found = bins.extremes(`${stem}_min`, `${stem}_max`, 0, bins.count);
     if (!found) return;
     low = Math.min(low, found.low);

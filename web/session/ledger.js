@@ -12,7 +12,7 @@ export function ledgerTexts(ledger, session) {
   const pending = total("pending");
   if (pending) texts.push(`${frames(pending)} still on the node.`);
   for (const [, text] of lossTexts(session.lost)) texts.push(`Lost: ${text}.`);
-  if (session.tail_frames_max) texts.push(`Up to ${frames(session.tail_frames_max)} at the end may be lost (power failure).`);
+  if (session.max_lost_tail_frames) texts.push(`Up to ${frames(session.max_lost_tail_frames)} at the end may be lost (power failure).`);
   if (ledger.missed_slots) texts.push(`${ledger.missed_slots.toLocaleString("en-GB")} slot${ledger.missed_slots === 1 ? "" : "s"} not sampled (node late). They have no frame number and do not count as lost.`);
   if (ledger.parts.length > 1) texts.push(`Node restarted: ${ledger.parts.length} parts.`);
   if (ledger.complete) texts.push("Frame numbers are complete from first to last.");

@@ -37,7 +37,7 @@ export class Markers {
     const offset = this.offset(event.t_ns, true);
     if (offset === null) this.unmeasured = true;
     this.placed = this.placed.filter((marker) => marker.id !== event.id);
-    this.placed.push({ id: event.id, label: event.label, said: event.said, timeS: (event.t_ns - (offset ?? 0) - this.beginNs) * 1e-9 });
+    this.placed.push({ id: event.id, label: event.label, revision: event.revision, timeS: (event.t_ns - (offset ?? 0) - this.beginNs) * 1e-9 });
     this.placed.sort((a, b) => a.timeS - b.timeS);
   }
 
@@ -64,13 +64,13 @@ export class Markers {
     if (label && label !== marker.label) changes.label = label;
     if (Number.isFinite(timeS) && timeS !== marker.timeS) changes.t_ns = this.tNsOf(timeS);
     if (!Object.keys(changes).length) return;
-    await this.orReload(async () => this.place(await api.changeMarker(this.id, marker.id, changes, marker.said)));
+    await this.orReload(async () => this.place(await api.changeMarker(this.id, marker.id, changes, marker.revision)));
     this.draw();
   }
 
   async remove(marker) {
     await this.orReload(async () => {
-      await api.removeMarker(this.id, marker.id, marker.said);
+      await api.removeMarker(this.id, marker.id, marker.revision);
       this.placed = this.placed.filter(({ id }) => id !== marker.id);
       notice(`Removed marker “${marker.label}”.`);
     });

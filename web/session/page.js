@@ -44,7 +44,7 @@ async function refresh() {
     byId("message").dataset.small = "true";
     // Without frames there is nothing to plot.
     await unlessRefused(plotted.load(session));
-    if (plotted.plots.whole?.behind) setText(byId("message-text"), `${byId("message-text").textContent} Estimation is catching up; the rest follows.`);
+    if (plotted.plots.whole?.catching_up) setText(byId("message-text"), `${byId("message-text").textContent} Estimation is catching up; the rest follows.`);
     document.body.dataset.state = session.state;
     setTimeout(refresh, REFRESH_MS);
     return;
@@ -69,7 +69,7 @@ async function editSession() {
   const changes = await edit(before);
   if (!changes) return;
   try {
-    current = await api.changeSession(id, changes, before.said);
+    current = await api.changeSession(id, changes, before.revision);
   } catch (error) {
     if (!(error instanceof api.Refusal) || error.status !== 412) throw error;
     notice(error.message, { bad: true });

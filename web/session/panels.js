@@ -38,7 +38,7 @@ export function panelsOf(bins, asHeat, beside = null) {
   if (bins.estimated) {
     panels.push({
       key: "grf", title: "Ground reaction force", unit: "N", kind: "series", columns: ["grf_n_min", "grf_n_max"],
-      band: ["grf_low_n_min", "grf_high_n_max"], bound: "grf_at_least_n_max", force: true, zero: true, height: FORCE_PX, head: TITLE_PX,
+      band: ["grf_low_n_min", "grf_high_n_max"], bound: "grf_lower_bound_n_max", force: true, zero: true, height: FORCE_PX, head: TITLE_PX,
     });
   }
   if (bins.estimated && beside?.columns.difference) {
@@ -47,10 +47,10 @@ export function panelsOf(bins, asHeat, beside = null) {
       besideOnly: true, zero: true, height: PLACE_PX, head: TITLE_PX,
     });
   }
-  const [stem, unit] = bins.estimated ? ["force_n", "N"] : ["padc", "counts"];
+  const [stem, unit] = bins.estimated ? ["force_n", "N"] : ["pressure_raw", "counts"];
   const names = (i) => /** @type {[string, string]} */ ([`${stem}_${i}_min`, `${stem}_${i}_max`]);
   // Reference tiles have no force; failed tiles are shown.
-  const known = tiles.map((_, i) => i).filter((i) => bins.has(names(i)[1]) || bins.columns[`status_${i}`].some(Boolean));
+  const known = tiles.map((_, i) => i).filter((i) => bins.has(names(i)[1]) || bins.columns[`tile_flags_${i}`].some(Boolean));
   if (asHeat ?? tiles.length >= HEAT_FROM) {
     panels.push({
       key: "tiles", title: bins.estimated ? "Force per tile" : "Raw counts per tile (fall under load)",

@@ -16,7 +16,7 @@ function span(bins, i, [lowName, highName], factor = 1, decimals = 1) {
 
 function grfAt(bins, i) {
   const value = span(bins, i, ["grf_n_min", "grf_n_max"]);
-  const bound = bins.columns.grf_at_least_n_max[i];
+  const bound = bins.columns.grf_lower_bound_n_max[i];
   if (value === null) return bound > 0 ? `at least ${number(bound)} N` : "unknown";
   const [low, high] = [bins.columns.grf_low_n_min[i], bins.columns.grf_high_n_max[i]];
   if (low === null || high === null) return `${value} N`;
@@ -63,7 +63,7 @@ export function readingsOf(bins, i, panels) {
 
 /** @returns {[string, string, string][]} */
 function tilesAt(bins, i) {
-  const [stem, unit, decimals] = bins.estimated ? ["force_n", "N", 1] : ["padc", "counts", 0];
+  const [stem, unit, decimals] = bins.estimated ? ["force_n", "N", 1] : ["pressure_raw", "counts", 0];
   /** @returns {[string, string]} */
   const names = (tile) => [`${stem}_${tile}_min`, `${stem}_${tile}_max`];
   const order = bins.serials.map((_, tile) => tile);

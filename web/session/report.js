@@ -61,14 +61,14 @@ function alignmentText({ alignment, contact_n: contactN, trials_are: trialsAre, 
   return parts.join(" ");
 }
 
-/** Draw the report. @param {{name: string, is_of_these_frames: boolean | null, is_proven: boolean, missed: string[], report: ComparisonReport}} found */
+/** Draw the report. @param {{name: string, matches_current_data: boolean | null, is_proven: boolean, missed: string[], report: ComparisonReport}} found */
 export function drawReport(found) {
   const { report } = found;
   const limits = report.limits ?? {};
   byId("report-card").hidden = false;
   setText(byId("report-title"), `Comparison with ${report.reference}`);
   const doubts = [];
-  if (found.is_of_these_frames === false) doubts.push("The comparison used other frames: compare again.");
+  if (found.matches_current_data === false) doubts.push("The comparison used other frames: compare again.");
   if (!found.is_proven) doubts.push("The report has no checksum.");
   const judged = Object.keys(limits).length;
   if (judged) doubts.push(found.missed.length ? `${found.missed.length} of ${judged} limits missed.` : `All ${judged} limits met.`);

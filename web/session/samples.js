@@ -13,10 +13,10 @@ const APART_S = 0.1; // a frame further away does not belong to an instant
 
 const BY_TILE = ["status", "force_n", "force_sigma_n", "gauge_kpa"];
 const BY_FRAME = [
-  "seq", "frame_status", "estimate_status", "contact", "grf_n", "grf_sigma_n", "grf_at_least_n",
+  "seq", "frame_flags", "estimate_flags", "contact", "grf_n", "grf_sigma_n", "grf_lower_bound_n",
   "cop_x_m", "cop_y_m", "cop_sigma_x_m", "cop_sigma_y_m", "angle_rad",
 ];
-const RAW = ["seq", "frame_status", "status"];
+const RAW = ["seq", "frame_flags", "status"];
 
 /**
  * Parse the columns of CSV; unknown values are NaN.

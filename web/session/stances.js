@@ -19,7 +19,7 @@ export function withSeconds(stances, beginNs) {
 
 /** Return the faults of a stance as text. */
 function flagsOf(stance) {
-  const texts = estimateTexts(stance.estimate_status & ORDINARY);
+  const texts = estimateTexts(stance.estimate_flags & ORDINARY);
   if (!stance.begun) texts.push("start not recorded");
   if (!stance.ended) texts.push("end not recorded");
   if (stance.missing_frames) texts.push(`${stance.missing_frames} frames missing`);

@@ -19,7 +19,7 @@ export function moveStances(axis, stances) {
 export function moveClock(axis, parts, summary) {
   if (!summary) return summary;
   const streams = summary.streams.map((stream) => {
-    const shiftNs = shiftOf(axis, Math.max(0, parts.findIndex(({ boot_id: id }) => id === stream.boot_id)));
+    const shiftNs = shiftOf(axis, Math.max(0, parts.findIndex(({ stream_id: id }) => id === stream.stream_id)));
     const shift = (tNs) => (tNs === null ? null : tNs + shiftNs);
     return {
       ...stream,

@@ -210,7 +210,7 @@ export class Sessions {
       made.push(button);
     };
     add("edit", "Edit …", (now) => this.edit(now));
-    if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal now …" : "Abandon missing frames …", (now) => this.abandon(now));
+    if (session.state === "pending") add("seal", session.pending_reason === "end" ? "Seal now …" : "Abandon missing frames …", (now) => this.abandon(now));
     if (session.state === "sealed" || session.state === "pending") add("delete", "Delete", (now) => this.delete(now));
     return made;
   }
@@ -224,7 +224,7 @@ export class Sessions {
   /** @param {Session} session */
   async abandon(session) {
     const many = frames(session.pending_frames);
-    const [title, loss] = session.waits_for === "end"
+    const [title, loss] = session.pending_reason === "end"
       ? [`Seal “${session.name}” now?`, "Frames after the last received one are abandoned"]
       : [`Abandon missing frames of “${session.name}”?`, `${many[0].toUpperCase()}${many.slice(1)} will be lost for good`];
     const sure = await ask(title,

@@ -11,12 +11,12 @@ const WAITS = {
 export function stateText(session) {
   const why = session.problem ? ` ${session.problem}` : "";
   const losses = lossTexts(session.lost).map(([, text]) => `${text}.`);
-  if (session.tail_frames_max) losses.push(`Up to ${frames(session.tail_frames_max)} at the end may be lost (power failure).`);
+  if (session.max_lost_tail_frames) losses.push(`Up to ${frames(session.max_lost_tail_frames)} at the end may be lost (power failure).`);
   const missing = losses.length ? ` Missing: ${losses.join(" ")}` : "";
   switch (session.state) {
     case "recording": return ["recording", missing.trim(), "run"];
     case "pending": {
-      return ["pending", `${WAITS[session.waits_for]?.(session) ?? "All frames received; sealing."}${missing}${why}`, "warn"];
+      return ["pending", `${WAITS[session.pending_reason]?.(session) ?? "All frames received; sealing."}${missing}${why}`, "warn"];
     }
     case "sealing": return ["sealing", `Writing files.${missing}${why}`, "run"];
     case "sealed":

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from enum import IntFlag
 
-from devices.chips.dynamixel.packets import (
+from devices.chips.dynamixel.protocol import (
     BROADCAST_ID,
     DynamixelProtocol,
     Instruction,
     Packet,
-    Status,
+    ServoAnswer,
 )
 
 # Instruction or error to checksum. Longer than the whole control table of an MX, which ends at
@@ -24,7 +24,7 @@ from devices.chips.dynamixel.packets import (
 _MIN_LENGTH, _MAX_LENGTH = 2, 2 + 74
 
 
-class Error(IntFlag):
+class ErrorFlag(IntFlag):
     """Bits of an answer's error byte (e-manual protocol1.md, "Error")."""
 
     VOLTAGE = 0x01
@@ -42,14 +42,14 @@ class Error(IntFlag):
 
 
 _REFUSALS = {
-    Error.RANGE: "range",
-    Error.CHECKSUM: "checksum of the request",
-    Error.INSTRUCTION: "undefined instruction",
-    Error.UNDEFINED: "unknown",
+    ErrorFlag.RANGE: "range",
+    ErrorFlag.CHECKSUM: "checksum of the request",
+    ErrorFlag.INSTRUCTION: "undefined instruction",
+    ErrorFlag.UNDEFINED: "unknown",
 }
 
 
-def checksum(data: bytes) -> int:
+def compute_checksum(data: bytes) -> int:
     """Compute the inverted sum of `data`, all bytes from the id on (e-manual protocol1.md)."""
     return ~sum(data) & 0xFF
 
@@ -58,35 +58,35 @@ class _Protocol1(DynamixelProtocol):
     """`FF FF ID LEN INST parameters SUM`; an answer has its error byte in the place of INST."""
 
     version = 1
-    highest_id = 253
+    max_servo_id = 253
     header = b"\xff\xff"
     preamble_bytes = 4
     shortest_bytes = 4 + _MIN_LENGTH
 
-    def size(self, preamble: bytes) -> int:
+    def compute_packet_size(self, preamble: bytes) -> int:
         servo_id, length = preamble[2], preamble[3]
         # An id of FF is the header's second byte, after an FF of noise.
         plausible = servo_id <= BROADCAST_ID and _MIN_LENGTH <= length <= _MAX_LENGTH
         return self.preamble_bytes + length if plausible else 0
 
-    def pack(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    def encode_packet(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
         body = bytes([servo_id, len(parameters) + _MIN_LENGTH, instruction]) + parameters
-        return self.header + body + bytes([checksum(body)])
+        return self.header + body + bytes([compute_checksum(body)])
 
-    def unpack(self, wire: bytes) -> Packet:
-        intact = checksum(wire[2:-1]) == wire[-1]
-        return Packet(wire[2], wire[4], wire[5:-1], intact, wire)
+    def decode_packet(self, raw_bytes: bytes) -> Packet:
+        intact = compute_checksum(raw_bytes[2:-1]) == raw_bytes[-1]
+        return Packet(raw_bytes[2], raw_bytes[4], raw_bytes[5:-1], intact, raw_bytes)
 
-    def read_request(self, servo_id: int, address: int, length: int) -> bytes:
-        return self.pack(servo_id, Instruction.READ, bytes([address, length]))
+    def encode_read_request(self, servo_id: int, address: int, length: int) -> bytes:
+        return self.encode_packet(servo_id, Instruction.READ, bytes([address, length]))
 
-    def identity_request(self, servo_id: int) -> bytes:
-        return self.read_request(servo_id, 0, 3)
+    def encode_identity_request(self, servo_id: int) -> bytes:
+        return self.encode_read_request(servo_id, 0, 3)
 
-    def status(self, packet: Packet) -> Status | None:
-        error = Error(packet.instruction)
+    def decode_answer(self, packet: Packet) -> ServoAnswer | None:
+        error = ErrorFlag(packet.instruction)
         refusal = ", ".join(meaning for bit, meaning in _REFUSALS.items() if error & bit)
-        return Status(packet, packet.parameters, bool(error & Error.ALERT), refusal)
+        return ServoAnswer(packet, packet.parameters, bool(error & ErrorFlag.ALERT), refusal)
 
 
 PROTOCOL_1 = _Protocol1()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 
-from devices.chips.dynamixel.packets import DynamixelProtocol, Instruction, Packet, Status
+from devices.chips.dynamixel.protocol import DynamixelProtocol, Instruction, Packet, ServoAnswer
 
 ALERT = 0x80
 """Bit of the error byte: a hardware error (register at address 70); the answer is valid."""
@@ -41,7 +41,7 @@ def _crc_table() -> list[int]:
 _CRC_TABLE = _crc_table()
 
 
-def crc16(data: bytes) -> int:
+def compute_crc16(data: bytes) -> int:
     """Compute the CRC-16 of Protocol 2.0: polynomial 0x8005, initially 0 (e-manual crc.md)."""
     crc = 0
     for byte in data:
@@ -53,41 +53,41 @@ class _Protocol2(DynamixelProtocol):
     """`FF FF FD 00 ID LEN LEN INST parameters CRC CRC`; a status begins with its error."""
 
     version = 2
-    highest_id = 252
+    max_servo_id = 252
     header = b"\xff\xff\xfd\x00"
     preamble_bytes = 7
     shortest_bytes = 7 + _MIN_LENGTH
 
-    def size(self, preamble: bytes) -> int:
+    def compute_packet_size(self, preamble: bytes) -> int:
         length = int.from_bytes(preamble[5:7], "little")
         return self.preamble_bytes + length if _MIN_LENGTH <= length <= _MAX_LENGTH else 0
 
-    def pack(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    def encode_packet(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
         # Length and CRC are of the stuffed bytes.
         body = (bytes([instruction]) + parameters).replace(_PATTERN, _STUFFED)
         packet = self.header + struct.pack("<BH", servo_id, len(body) + _CRC) + body
-        return packet + struct.pack("<H", crc16(packet))
+        return packet + struct.pack("<H", compute_crc16(packet))
 
-    def unpack(self, wire: bytes) -> Packet:
-        intact = crc16(wire[:-_CRC]) == int.from_bytes(wire[-_CRC:], "little")
-        body = wire[self.preamble_bytes : -_CRC].replace(_STUFFED, _PATTERN)
-        return Packet(wire[4], body[0], body[1:], intact, wire)
+    def decode_packet(self, raw_bytes: bytes) -> Packet:
+        intact = compute_crc16(raw_bytes[:-_CRC]) == int.from_bytes(raw_bytes[-_CRC:], "little")
+        body = raw_bytes[self.preamble_bytes : -_CRC].replace(_STUFFED, _PATTERN)
+        return Packet(raw_bytes[4], body[0], body[1:], intact, raw_bytes)
 
-    def read_request(self, servo_id: int, address: int, length: int) -> bytes:
-        return self.pack(servo_id, Instruction.READ, struct.pack("<HH", address, length))
+    def encode_read_request(self, servo_id: int, address: int, length: int) -> bytes:
+        return self.encode_packet(servo_id, Instruction.READ, struct.pack("<HH", address, length))
 
-    def identity_request(self, servo_id: int) -> bytes:
-        return self.pack(servo_id, Instruction.PING)
+    def encode_identity_request(self, servo_id: int) -> bytes:
+        return self.encode_packet(servo_id, Instruction.PING)
 
-    def status(self, packet: Packet) -> Status | None:
-        if packet.intact and packet.instruction != Instruction.STATUS:
+    def decode_answer(self, packet: Packet) -> ServoAnswer | None:
+        if packet.is_intact and packet.instruction != Instruction.STATUS:
             return None
         error = packet.parameters[0] if packet.parameters else 0
         refusal, number = "", error & ~ALERT
         if number:
             meaning = ERRORS[number] if number < len(ERRORS) else "unknown"
             refusal = f"error {number}, {meaning}"
-        return Status(packet, packet.parameters[1:], bool(error & ALERT), refusal)
+        return ServoAnswer(packet, packet.parameters[1:], bool(error & ALERT), refusal)
 
 
 PROTOCOL_2 = _Protocol2()

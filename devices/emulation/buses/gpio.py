@@ -1,4 +1,4 @@
-"""Wires of an emulated bus as GPIO lines, for `devices.recovery.recovery`."""
+"""Wires of an emulated bus as GPIO lines, for `devices.recovery.bus_recovery`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from devices.clock import Clock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
-from devices.emulation.faults import Fault
+from devices.emulation.fault_timing import FaultTiming
 
 _CLOCKS_LEFT = 6
 """Clocks until a hanging slave has sent the rest of its byte and the acknowledge."""
@@ -16,19 +16,21 @@ _CLOCKS_LEFT = 6
 class EmulatedWire:
     """SCL or SDA as a GPIO line; low while driven low, or while a fault holds it."""
 
-    def __init__(self, adapter: EmulatedI2cAdapter, clock: Clock, held: Fault) -> None:
+    def __init__(
+        self, adapter: EmulatedI2cAdapter, clock: Clock, holding_fault: FaultTiming
+    ) -> None:
         self._adapter = adapter
         self._clock = clock
-        self._held = held
+        self._holding_fault = holding_fault
         self._low = False
 
     def drive(self, *, low: bool) -> None:
         """Pull the line low, or release it."""
         self._low = low
 
-    def high(self) -> bool:
+    def is_high(self) -> bool:
         """Return whether the line is high: no device pulls it low."""
-        return not self._low and not self._held(self._clock.now_ns())
+        return not self._low and not self._holding_fault(self._clock.now_ns())
 
 
 class EmulatedScl(EmulatedWire):
@@ -40,10 +42,10 @@ class EmulatedScl(EmulatedWire):
 
     def drive(self, *, low: bool) -> None:
         """Pull the line low, or release it; a rising edge is a clock."""
-        if self._low and not low and not self._held(self._clock.now_ns()):
+        if self._low and not low and not self._holding_fault(self._clock.now_ns()):
             self._clocks += 1
             if self._clocks >= _CLOCKS_LEFT:
-                self._adapter.line.sda_low.clear(self._clock.now_ns())
+                self._adapter.line.sda_low.end_at(self._clock.now_ns())
         super().drive(low=low)
 
 
@@ -58,12 +60,12 @@ class EmulatedReset:
         if low:
             self._adapter.reset_muxes()
 
-    def high(self) -> bool:
+    def is_high(self) -> bool:
         """Return True: no other device pulls the line."""
         return True
 
 
-class EmulatedLines:
+class EmulatedGpioLines:
     """GPIO lines of one emulated bus."""
 
     def __init__(self, adapter: EmulatedI2cAdapter, clock: Clock) -> None:
@@ -71,12 +73,12 @@ class EmulatedLines:
         self._clock = clock
 
     @contextmanager
-    def bus(self) -> Iterator[tuple[EmulatedScl, EmulatedWire]]:
+    def request_scl_sda(self) -> Iterator[tuple[EmulatedScl, EmulatedWire]]:
         """Request SCL and SDA while the block runs."""
         sda = EmulatedWire(self._adapter, self._clock, self._adapter.line.sda_low)
         yield EmulatedScl(self._adapter, self._clock), sda
 
     @contextmanager
-    def reset(self) -> Iterator[EmulatedReset]:
+    def request_reset(self) -> Iterator[EmulatedReset]:
         """Request RESET while the block runs."""
         yield EmulatedReset(self._adapter)

@@ -1,6 +1,6 @@
 """Emulated Dynamixel MX servo behind a pseudo-terminal, for the real driver.
 
-A thread answers any program that opens `port`: `devices.chips.dynamixel.reader`, or ROBOTIS's own
+A thread answers any program that opens `port`: `devices.chips.dynamixel.driver`, or ROBOTIS's own
 SDK. A pseudo-terminal has no wire, so the time on the wire and the return delay pass on the
 injected clock: with a `SystemClock` an answer takes as long as a servo's, with a `VirtualClock` it
 takes as long in virtual time, while the reader is blocked. The answers are in
@@ -21,10 +21,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-from devices.chips.dynamixel.packets import Packet, PacketDecoder, wire_time_ns
+from devices.chips.dynamixel.protocol import Packet, PacketDecoder, compute_wire_time_ns
 from devices.clock import Clock
 from devices.emulation.chips.dynamixel_firmware import EMULATED_FIRMWARES
-from devices.emulation.faults import Fault
+from devices.emulation.fault_timing import FaultTiming
 
 # Baud rates as termios constants.
 _SPEEDS = {
@@ -61,8 +61,8 @@ class EmulatedServo:
         return_delay_us: int = 500,
         status_return_level: int = 2,
         many_turns: bool = False,
-        unplugged: Fault | None = None,
-        unpowered: Fault | None = None,
+        unplugged: FaultTiming | None = None,
+        unpowered: FaultTiming | None = None,
     ) -> None:
         self._is_closed = False
         self._clock = clock
@@ -77,8 +77,8 @@ class EmulatedServo:
             many_turns=many_turns,
         )
         self._speed = _SPEEDS[baudrate]
-        self._unplugged = unplugged if unplugged is not None else Fault()
-        self._unpowered = unpowered if unpowered is not None else Fault()
+        self._unplugged = unplugged if unplugged is not None else FaultTiming()
+        self._unpowered = unpowered if unpowered is not None else FaultTiming()
         self._seen_ns = self._plugged_ns = clock.now_ns()
         self._is_hung_up = False
         self._folder = tempfile.TemporaryDirectory(prefix="foottile-servo-")
@@ -94,7 +94,7 @@ class EmulatedServo:
         now_ns = self._clock.now_ns()
         if self._is_hung_up and not self._unplugged(now_ns):
             self._plugged_ns = now_ns
-            self._end_thread()
+            self._stop_thread()
             self._plug_in()
         return str(self._link)
 
@@ -118,7 +118,7 @@ class EmulatedServo:
         for descriptor in (self._line, self._slave):
             os.close(descriptor)
 
-    def _end_thread(self) -> None:
+    def _stop_thread(self) -> None:
         os.close(self._wake_writer)
         self._thread.join()
         os.close(self._wake)
@@ -128,7 +128,7 @@ class EmulatedServo:
         if self._is_closed:
             return
         self._is_closed = True
-        self._end_thread()
+        self._stop_thread()
         if not self._is_hung_up:
             self._hang_up()
         self._folder.cleanup()
@@ -150,28 +150,28 @@ class EmulatedServo:
             data = os.read(self._line, 4096)
             received_ns = self._clock.now_ns()
             since_ns, self._seen_ns = self._seen_ns, received_ns
-            if self._unplugged.struck(self._plugged_ns, received_ns):
+            if self._unplugged.was_active_between(self._plugged_ns, received_ns):
                 self._hang_up()
                 return
-            if self._unpowered.struck(since_ns, received_ns):
+            if self._unpowered.was_active_between(since_ns, received_ns):
                 self._firmware.restart(received_ns)
             if self._unpowered(received_ns):
                 continue
             # A pseudo-terminal has a baud rate, but no wire. At another rate a servo gets noise.
             if termios.tcgetattr(self._slave)[5] != self._speed:
                 continue
-            for packet in decoder.feed(data):
+            for packet in decoder.decode_bytes(data):
                 if self._firmware.is_answered(packet):
                     self._answer(packet, received_ns)
 
     def _answer(self, packet: Packet, received_ns: int) -> None:
-        request_end_ns = received_ns + wire_time_ns(len(packet.wire), self._baudrate)
+        request_end_ns = received_ns + compute_wire_time_ns(len(packet.raw_bytes), self._baudrate)
         begin_ns = request_end_ns + self._firmware.return_delay_ns
         self._clock.sleep_until_ns(begin_ns)
         reply = self._reply(packet, begin_ns)
-        self._clock.sleep_until_ns(begin_ns + wire_time_ns(len(reply), self._baudrate))
+        self._clock.sleep_until_ns(begin_ns + compute_wire_time_ns(len(reply), self._baudrate))
         with contextlib.suppress(BlockingIOError):
             os.write(self._line, reply)
 
     def _reply(self, packet: Packet, t_ns: int) -> bytes:
-        return self._firmware.answer(packet, t_ns)
+        return self._firmware.execute_packet(packet, t_ns)

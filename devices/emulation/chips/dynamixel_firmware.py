@@ -16,18 +16,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from devices.chips.dynamixel.models import COUNTS_PER_TURN, FIRMWARES
-from devices.chips.dynamixel.packets import BROADCAST_ID, Instruction, Packet
-from devices.chips.dynamixel.protocol1 import Error
+from devices.chips.dynamixel.firmwares import COUNTS_PER_TURN, FIRMWARES
+from devices.chips.dynamixel.protocol import BROADCAST_ID, Instruction, Packet
+from devices.chips.dynamixel.protocol1 import ErrorFlag
 from devices.chips.dynamixel.protocol2 import ALERT
-from devices.chips.dynamixel.uptime import TICKS
+from devices.chips.dynamixel.restart_detection import TICK_PERIOD
 from devices.errors import UsageError
 
 FIRMWARE_VERSION = 42
-MULTI_TURN_COUNTS = 28_672
+MULTI_TURN_LIMIT_COUNTS = 28_672
 """Limit of the count in Protocol 1.0, either way: seven turns (hardware.md 5)."""
 
-_ON_BEFORE_NS = 5_000_000_000
+_UPTIME_AT_FIRST_ANSWER_NS = 5_000_000_000
 """Uptime at the first answer."""
 
 _ANSWERED_FROM: dict[int, int] = {Instruction.PING: 0, Instruction.READ: 1}
@@ -90,50 +90,50 @@ class EmulatedFirmware(ABC):
             )
         firmware = FIRMWARES[self.version]
         self.protocol = firmware.protocol
-        self.alerts = Error(0)
+        self.error_bits = ErrorFlag(0)
         """Error bits of every answer in 1.0; in 2.0 they are in the control table."""
         self._position = position
         self._register = firmware
-        self._uncounted = 0
+        self._turn_offset_counts = 0
         self._powered_ns: int | None = None
         layout = self._layout
-        self.table = bytearray(layout.size)
-        struct.pack_into("<H", self.table, 0, firmware.model_numbers[model])
-        self.table[layout.firmware] = FIRMWARE_VERSION
-        self.table[layout.servo_id] = servo_id
-        self.table[layout.baud] = self._baud_codes[baudrate]
-        self.table[layout.return_delay] = return_delay_us // 2
-        self.table[layout.status_return_level] = status_return_level
+        self.control_table = bytearray(layout.size)
+        struct.pack_into("<H", self.control_table, 0, firmware.model_numbers[model])
+        self.control_table[layout.firmware] = FIRMWARE_VERSION
+        self.control_table[layout.servo_id] = servo_id
+        self.control_table[layout.baud] = self._baud_codes[baudrate]
+        self.control_table[layout.return_delay] = return_delay_us // 2
+        self.control_table[layout.status_return_level] = status_return_level
         if layout.protocol_type is not None:
-            self.table[layout.protocol_type] = self.version
-        mode = firmware.mode
-        self.table[mode.address : mode.address + mode.size] = self._modes[many_turns]
+            self.control_table[layout.protocol_type] = self.version
+        mode = firmware.mode_register
+        self.control_table[mode.address : mode.address + mode.size] = self._modes[many_turns]
 
     @property
     def return_delay_ns(self) -> int:
         """Delay between the end of a request and the beginning of its answer."""
-        return self.table[self._layout.return_delay] * 2000
+        return self.control_table[self._layout.return_delay] * 2000
 
     def is_answered(self, packet: Packet) -> bool:
         """Return whether this servo answers `packet`."""
-        level = self.table[self._layout.status_return_level]
+        level = self.control_table[self._layout.status_return_level]
         if level < self._answered_from.get(packet.instruction, 2):
             return False
         if packet.servo_id == BROADCAST_ID:
-            called = packet.instruction == Instruction.PING or self._is_called_by(packet)
-            return packet.intact and called
+            called = packet.instruction == Instruction.PING or self._is_addressed_by(packet)
+            return packet.is_intact and called
         return packet.servo_id == self._id and not self._is_an_answer(packet)
 
     def restart(self, t_ns: int) -> None:
         """Restart at `t_ns` after a loss of power: reset uptime and turns."""
         self._powered_ns = t_ns
-        self._uncounted = self._position(t_ns) // COUNTS_PER_TURN * COUNTS_PER_TURN
+        self._turn_offset_counts = self._position(t_ns) // COUNTS_PER_TURN * COUNTS_PER_TURN
 
     @abstractmethod
-    def answer(self, packet: Packet, t_ns: int) -> bytes:
+    def execute_packet(self, packet: Packet, t_ns: int) -> bytes:
         """Execute `packet` at `t_ns` and return the status packet."""
 
-    def _is_called_by(self, packet: Packet) -> bool:
+    def _is_addressed_by(self, packet: Packet) -> bool:
         """Return whether a broadcast addresses this servo."""
         return False
 
@@ -143,19 +143,19 @@ class EmulatedFirmware(ABC):
 
     @property
     def _id(self) -> int:
-        return self.table[self._layout.servo_id]
+        return self.control_table[self._layout.servo_id]
 
     def _counts(self, t_ns: int) -> int:
-        return self._position(t_ns) - self._uncounted
+        return self._position(t_ns) - self._turn_offset_counts
 
-    def _store(self, counts: int, t_ns: int) -> None:
+    def _store_position(self, counts: int, t_ns: int) -> None:
         """Write the position and the Realtime Tick into the table."""
         if self._powered_ns is None:
-            self._powered_ns = t_ns - _ON_BEFORE_NS
-        tick = (t_ns - self._powered_ns) // 1_000_000 % TICKS
-        struct.pack_into("<H", self.table, self._register.tick.address, tick)
+            self._powered_ns = t_ns - _UPTIME_AT_FIRST_ANSWER_NS
+        tick = (t_ns - self._powered_ns) // 1_000_000 % TICK_PERIOD
+        struct.pack_into("<H", self.control_table, self._register.tick_register.address, tick)
         size, address = self._register.position_bytes, self._register.position_address
-        self.table[address : address + size] = counts.to_bytes(size, "little", signed=True)
+        self.control_table[address : address + size] = counts.to_bytes(size, "little", signed=True)
 
 
 class _Firmware1(EmulatedFirmware):
@@ -175,27 +175,27 @@ class _Firmware1(EmulatedFirmware):
         3_000_000: 252,
     }
 
-    def answer(self, packet: Packet, t_ns: int) -> bytes:
+    def execute_packet(self, packet: Packet, t_ns: int) -> bytes:
         error, data = self._execute(packet, t_ns)
-        return self.protocol.pack(self._id, self.alerts | error, data)
+        return self.protocol.encode_packet(self._id, self.error_bits | error, data)
 
-    def _execute(self, packet: Packet, t_ns: int) -> tuple[Error, bytes]:
-        if not packet.intact:
-            return Error.CHECKSUM, b""
+    def _execute(self, packet: Packet, t_ns: int) -> tuple[ErrorFlag, bytes]:
+        if not packet.is_intact:
+            return ErrorFlag.CHECKSUM, b""
         if packet.instruction == Instruction.PING:
-            return Error(0), b""
+            return ErrorFlag(0), b""
         if packet.instruction != Instruction.READ:
-            return Error.INSTRUCTION, b""
+            return ErrorFlag.INSTRUCTION, b""
         if len(packet.parameters) != 2:
-            return Error.RANGE, b""
+            return ErrorFlag.RANGE, b""
         address, length = packet.parameters
-        if length == 0 or address + length > len(self.table):
-            return Error.RANGE, b""
-        counts = max(-MULTI_TURN_COUNTS, min(self._counts(t_ns), MULTI_TURN_COUNTS))
-        if self.table[6:10] == bytes(4):  # both limits 0: wheel mode
+        if length == 0 or address + length > len(self.control_table):
+            return ErrorFlag.RANGE, b""
+        counts = max(-MULTI_TURN_LIMIT_COUNTS, min(self._counts(t_ns), MULTI_TURN_LIMIT_COUNTS))
+        if self.control_table[6:10] == bytes(4):  # both limits 0: wheel mode
             counts = self._position(t_ns) % COUNTS_PER_TURN
-        self._store(counts, t_ns)
-        return Error(0), bytes(self.table[address : address + length])
+        self._store_position(counts, t_ns)
+        return ErrorFlag(0), bytes(self.control_table[address : address + length])
 
 
 class _Firmware2(EmulatedFirmware):
@@ -223,12 +223,14 @@ class _Firmware2(EmulatedFirmware):
     }
     _answered_from: ClassVar = {**_ANSWERED_FROM, Instruction.SYNC_READ: 1}
 
-    def answer(self, packet: Packet, t_ns: int) -> bytes:
+    def execute_packet(self, packet: Packet, t_ns: int) -> bytes:
         error, data = self._execute(packet, t_ns)
-        alert = ALERT if self.table[_HARDWARE_ERROR] else 0
-        return self.protocol.pack(self._id, Instruction.STATUS, bytes([alert | error]) + data)
+        alert = ALERT if self.control_table[_HARDWARE_ERROR] else 0
+        return self.protocol.encode_packet(
+            self._id, Instruction.STATUS, bytes([alert | error]) + data
+        )
 
-    def _is_called_by(self, packet: Packet) -> bool:
+    def _is_addressed_by(self, packet: Packet) -> bool:
         return packet.instruction == Instruction.SYNC_READ and self._id in packet.parameters[4:]
 
     def _is_an_answer(self, packet: Packet) -> bool:
@@ -237,10 +239,12 @@ class _Firmware2(EmulatedFirmware):
     def _execute(self, packet: Packet, t_ns: int) -> tuple[int, bytes]:
         """Execute a packet; return error number and data."""
         broadcast = packet.servo_id == BROADCAST_ID
-        if not packet.intact:
+        if not packet.is_intact:
             return _CRC_ERROR, b""
         if packet.instruction == Instruction.PING:
-            return 0, bytes(self.table[0:2]) + bytes([self.table[self._layout.firmware]])
+            return 0, bytes(self.control_table[0:2]) + bytes(
+                [self.control_table[self._layout.firmware]]
+            )
         if packet.instruction == Instruction.READ:
             return self._read(packet.parameters, t_ns)
         if packet.instruction == Instruction.SYNC_READ and broadcast:
@@ -253,10 +257,10 @@ class _Firmware2(EmulatedFirmware):
         address, length = struct.unpack("<HH", parameters)
         if length == 0:
             return _DATA_LENGTH_ERROR, b""
-        if address + length > len(self.table):
+        if address + length > len(self.control_table):
             return _DATA_RANGE_ERROR, b""
-        self._store(self._counts(t_ns), t_ns)
-        return 0, bytes(self.table[address : address + length])
+        self._store_position(self._counts(t_ns), t_ns)
+        return 0, bytes(self.control_table[address : address + length])
 
 
 EMULATED_FIRMWARES: dict[int, type[EmulatedFirmware]] = {1: _Firmware1, 2: _Firmware2}

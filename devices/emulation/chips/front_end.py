@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
-from devices.emulation.faults import Fault
-from devices.emulation.parts import ChipPart, DomePart, random_of
+from devices.emulation.fault_timing import FaultTiming
+from devices.emulation.parts import ChipProperties, DomeProperties, make_rng
 from devices.emulation.puncture import Puncture
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulated import EmulationScene
+from devices.scene.emulation_sections import EmulationSection
 
 _KPA_PER_PCOMP = (PRESSURE_MAX_KPA - PRESSURE_MIN_KPA) / 1023
 _TADC_PER_KELVIN = -5.35
@@ -31,7 +31,7 @@ _FAR_OVER_RANGE_KPA = 45.0
 
 
 class FrontEnd:
-    """Sampler of one dome, or of the surroundings of a bare chip: a `Sense` of the emulated chip.
+    """Sampler of one dome, or of the surroundings of a bare chip: called by the emulated chip.
 
     Before `begin` the dome is at the scene's first instant. Fault `over_range`: pressure is 45 kPa
     higher, past the range; most parts wrap. `frozen`: the pressure word stays constant, the
@@ -40,14 +40,14 @@ class FrontEnd:
 
     def __init__(
         self,
-        chip: ChipPart,
-        dome: DomePart,
+        chip: ChipProperties,
+        dome: DomeProperties,
         pressure_kpa: Callable[[float], float],
         surroundings: Surroundings,
-        scene: EmulationScene,
+        scene: EmulationSection,
         label: str,
-        over_range: Fault | None = None,
-        frozen: Fault | None = None,
+        over_range: FaultTiming | None = None,
+        frozen: FaultTiming | None = None,
         puncture: Puncture | None = None,
     ) -> None:
         self._c = chip.coefficients
@@ -57,18 +57,18 @@ class FrontEnd:
         self._surroundings = surroundings
         self._clip_kpa = scene.clip_kpa or math.inf
         self._epoch_ns: int | None = None
-        self._over_range = over_range if over_range is not None else Fault()
-        self._frozen = frozen if frozen is not None else Fault()
+        self._over_range = over_range if over_range is not None else FaultTiming()
+        self._frozen = frozen if frozen is not None else FaultTiming()
         self._puncture = puncture
         self._padc = -1  # none so far
-        self._noise = _noise(scene, self._lsb_kpa(), random_of(label))
+        self._noise = _generate_noise(scene, self._lsb_kpa(), make_rng(label))
         self._correlated_s = scene.correlated_ms * 1e-3
         self._core_kpa = 0.0
         self._last_s = -math.inf
-        self._steady = surroundings.steady
-        self._steady_tadc = self._true_tadc(0.0)
+        self._is_temperature_constant = surroundings.is_temperature_constant
+        self._constant_tadc = self._true_tadc(0.0)
 
-    def begin(self, epoch_ns: int) -> None:
+    def begin_scene_time(self, epoch_ns: int) -> None:
         """Begin the scene's time at this instant of the clock."""
         self._epoch_ns = epoch_ns
 
@@ -79,13 +79,13 @@ class FrontEnd:
         core_kpa, outlier_kpa, tadc_noise = next(self._noise)
         kpa = self._pressure_kpa(t_s)
         if self._puncture is not None:
-            kpa = self._puncture.leaked_kpa(kpa, t_s, t_ns)
+            kpa = self._puncture.apply_leak(kpa, t_s, t_ns)
         kpa = min(kpa, self._clip_kpa)
         if self._over_range(t_ns):
             kpa += _FAR_OVER_RANGE_KPA
         kpa += self._correlate(core_kpa, t_ns * 1e-9) + outlier_kpa
         # The true temperature affects the pressure word; the temperature word itself is noisy.
-        tadc = self._steady_tadc if self._steady else self._true_tadc(t_s)
+        tadc = self._constant_tadc if self._is_temperature_constant else self._true_tadc(t_s)
         c = self._c
         pcomp = (kpa - PRESSURE_MIN_KPA) / _KPA_PER_PCOMP
         padc = (pcomp - c.a0 - c.b2 * tadc) / (c.b1 + c.c12 * tadc)
@@ -94,7 +94,7 @@ class FrontEnd:
         return self._padc, min(max(round(tadc + tadc_noise), 0), 1023)
 
     def _true_tadc(self, t_s: float) -> float:
-        degc = self._surroundings.chip_degc(t_s, *self._lags_s)
+        degc = self._surroundings.compute_chip_degc(t_s, *self._lags_s)
         return self._tadc_at_25 + (degc - 25.0) * _TADC_PER_KELVIN
 
     def _lsb_kpa(self) -> float:
@@ -110,8 +110,8 @@ class FrontEnd:
         return self._core_kpa
 
 
-def _noise(
-    scene: EmulationScene, lsb_kpa: float, rng: np.random.Generator
+def _generate_noise(
+    scene: EmulationSection, lsb_kpa: float, rng: np.random.Generator
 ) -> Iterator[tuple[float, float, float]]:
     """Yield core noise and outlier in kPa, and temperature noise in counts, per conversion."""
     scale = scene.noise_kpa / _MEASURED_NOISE_KPA

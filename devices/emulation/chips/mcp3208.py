@@ -12,9 +12,9 @@ from collections.abc import Callable
 from devices.buses.spi import MAX_SPEED_HZ
 from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF
 from devices.clock import Clock
-from devices.scene.hardware import ReferenceScene
+from devices.scene.hardware_sections import ReferenceSection
 
-Volts = Callable[[int, int], float]
+InputVoltages = Callable[[int, int], float]
 """Function of input and instant in ns that returns the voltage, with noise and non-linearity."""
 
 # Clocks after the start bit: SGL/DIFF, D2, D1, D0, then the clock that ends sampling.
@@ -29,7 +29,7 @@ class EmulatedMcp3208:
     begins half a count below its voltage.
 
     Args:
-        volts: voltages at the inputs.
+        input_voltages: voltages at the inputs.
         clock: virtual or real clock.
         vref_v: reference, in volts.
         max_speed_hz: SPI clock.
@@ -39,14 +39,14 @@ class EmulatedMcp3208:
 
     def __init__(
         self,
-        volts: Volts,
+        input_voltages: InputVoltages,
         clock: Clock,
         *,
         vref_v: float = 3.3,
         max_speed_hz: int = MAX_SPEED_HZ,
         floats_high: bool = True,
     ) -> None:
-        self._volts = volts
+        self._input_voltages = input_voltages
         self._clock = clock
         self._counts_per_v = COUNTS_PER_VREF / vref_v
         self._ns_per_bit = 1e9 / max_speed_hz
@@ -56,7 +56,7 @@ class EmulatedMcp3208:
         """Exchange bytes in one chip select; like spidev, it writes them into `data`."""
         begin_ns = self._clock.now_ns()
         sent = [byte >> shift & 1 for byte in data for shift in range(7, -1, -1)]
-        received = self._answer(sent, begin_ns)
+        received = self._compute_answer_bits(sent, begin_ns)
         for index in range(len(data)):
             byte = 0
             for bit in received[8 * index : 8 * index + 8]:
@@ -68,7 +68,7 @@ class EmulatedMcp3208:
     def close(self) -> None:
         """Close the device; it has no resources."""
 
-    def _answer(self, sent: list[int], begin_ns: int) -> list[int]:
+    def _compute_answer_bits(self, sent: list[int], begin_ns: int) -> list[int]:
         start = sent.index(1) if 1 in sent else len(sent)
         sampling = start + _SAMPLING
         if sampling >= len(sent):
@@ -83,18 +83,18 @@ class EmulatedMcp3208:
         return (answer + [0] * len(sent))[: len(sent)]
 
     def _convert(self, number: int, single_ended: bool, t_ns: int) -> int:
-        volts = self._volts(number, t_ns)
+        volts = self._input_voltages(number, t_ns)
         if not single_ended:  # the other input of the pair is the negative one (table 5-2)
-            volts -= self._volts(number ^ 1, t_ns)
+            volts -= self._input_voltages(number ^ 1, t_ns)
         return min(max(math.floor(volts * self._counts_per_v + 0.5), 0), COUNTS_MAX)
 
 
-def amplifier_volts(
+def make_amplifier(
     force_n: Callable[[int], float],
-    scene: ReferenceScene,
+    scene: ReferenceSection,
     *,
     noise_n: Callable[[], float] | None = None,
-) -> Volts:
+) -> InputVoltages:
     """Create the voltages of a load cell's amplifier at the scene's input; others are grounded.
 
     Args:

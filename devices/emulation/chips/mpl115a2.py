@@ -10,15 +10,15 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from devices.emulation.faults import Fault, Faults
-from devices.scene.emulated import ReadDuringConversion
+from devices.emulation.fault_timing import FaultTiming, SceneFaults
+from devices.scene.emulation_sections import ReadDuringConversion
 
 _CONVERT = 0x12
 _REGISTERS = 0x80
 _SAMPLE_QUARTER = 4  # as the driver assumes (hardware.md 1.4)
 _SLOW_NS = 2_900_000  # slower than any healthy part, within the data sheet's 3 ms
 
-Sense = Callable[[int], tuple[int, int]]
+SampleFunction = Callable[[int], tuple[int, int]]
 """Function of a conversion's sample instant in ns that returns the 10-bit words `padc`, `tadc`."""
 
 OnConversion = Callable[[int, tuple[int, int], tuple[int, int, int, int]], None]
@@ -36,24 +36,24 @@ class PartFaults:
     `all_ones`: the part is lost between address and data, so that the line floats high.
     """
 
-    no_answer: Fault = field(default_factory=Fault)
-    unplugged: Fault = field(default_factory=Fault)
-    replaced: Fault = field(default_factory=Fault)
-    stale: Fault = field(default_factory=Fault)
-    slow: Fault = field(default_factory=Fault)
-    all_ones: Fault = field(default_factory=Fault)
-    scene: Faults | None = None
+    no_answer: FaultTiming = field(default_factory=FaultTiming)
+    unplugged: FaultTiming = field(default_factory=FaultTiming)
+    replaced: FaultTiming = field(default_factory=FaultTiming)
+    stale: FaultTiming = field(default_factory=FaultTiming)
+    slow: FaultTiming = field(default_factory=FaultTiming)
+    all_ones: FaultTiming = field(default_factory=FaultTiming)
+    scene: SceneFaults | None = None
     """All faults of the scene; while none is possible, the others are not evaluated."""
 
 
 @dataclass(frozen=True)
-class Silicon:
+class EmulatedPart:
     """Fixed properties of one part."""
 
     coefficient_words: tuple[int, int, int, int]
     conversion_ns: int
-    sense: Sense
-    late_ns: int = 0
+    sample_counts: SampleFunction
+    sample_delay_ns: int = 0
     """Delay of the sample instant after a quarter of the conversion; negative: earlier."""
 
 
@@ -76,22 +76,22 @@ class EmulatedMpl115a2:
 
     def __init__(
         self,
-        silicon: Silicon,
+        silicon: EmulatedPart,
         read_during_conversion: ReadDuringConversion = "stale",
         faults: PartFaults | None = None,
-        spare: Callable[[], Silicon] | None = None,
+        make_replacement: Callable[[], EmulatedPart] | None = None,
     ) -> None:
         self.on_conversion: OnConversion | None = None
         self._silicon = silicon
         self._mode = read_during_conversion
         self._faults = faults if faults is not None else PartFaults()
-        self._spare = spare
+        self._make_replacement = make_replacement
         self._scene_faults = self._faults.scene
         self._seen_ns = 0
         self._t_ns = 0
-        self.lose_supply()
+        self.interrupt_supply()
 
-    def lose_supply(self) -> None:
+    def interrupt_supply(self) -> None:
         """Reset: all registers but the coefficients are zero, no conversion runs."""
         self._registers = bytearray(_REGISTERS)
         self._registers[0x04:0x0C] = struct.pack(">4H", *self._silicon.coefficient_words)
@@ -100,31 +100,33 @@ class EmulatedMpl115a2:
         self._convert_at_stop = False
         self._conversion: _Conversion | None = None
 
-    def start(self, reading: bool, t_ns: int) -> bool:
+    def on_address(self, reading: bool, t_ns: int) -> bool:
         """Handle the part's address; return the acknowledge, False if the part is silent."""
-        if (self._scene_faults is None or self._scene_faults.possible) and not self._lives(t_ns):
+        if (
+            self._scene_faults is None or self._scene_faults.is_any_possible
+        ) and not self._apply_faults(t_ns):
             return False
         self._t_ns = t_ns
         if self._conversion is not None:
-            self._settle(t_ns)
+            self._finish_conversion(t_ns)
             if reading:
-                self._disturb(t_ns)
+                self._apply_early_read(t_ns)
         self._expects_register = not reading
         return True
 
-    def _lives(self, t_ns: int) -> bool:
+    def _apply_faults(self, t_ns: int) -> bool:
         """Apply faults since the last call; return whether the part acknowledges."""
         since_ns, self._seen_ns = self._seen_ns, t_ns
         faults = self._faults
-        if faults.replaced.possible and faults.replaced.struck(since_ns, t_ns):
-            if self._spare is not None:
-                self._silicon, self._spare = self._spare(), None
-            self.lose_supply()
-        if faults.unplugged.possible and faults.unplugged.struck(since_ns, t_ns):
-            self.lose_supply()
+        if faults.replaced.is_possible and faults.replaced.was_active_between(since_ns, t_ns):
+            if self._make_replacement is not None:
+                self._silicon, self._make_replacement = self._make_replacement(), None
+            self.interrupt_supply()
+        if faults.unplugged.is_possible and faults.unplugged.was_active_between(since_ns, t_ns):
+            self.interrupt_supply()
         return not (faults.no_answer(t_ns) or faults.unplugged(t_ns) or faults.replaced(t_ns))
 
-    def write(self, value: int) -> bool:
+    def receive_byte(self, value: int) -> bool:
         """Receive the register address, then data, which matter for CONVERT only, in any value."""
         if self._expects_register:
             self._pointer = value & 0x7F  # the top bit is "don't care" (DS 8.4)
@@ -134,25 +136,25 @@ class EmulatedMpl115a2:
             self._pointer = (self._pointer + 1) % _REGISTERS
         return True
 
-    def read(self, count: int) -> bytes:
+    def send_bytes(self, count: int) -> bytes:
         """Send bytes from the pointer on, and advance it."""
         begin = self._pointer
         self._pointer = (begin + count) % _REGISTERS
-        if self._faults.all_ones.possible and self._faults.all_ones(self._t_ns):
+        if self._faults.all_ones.is_possible and self._faults.all_ones(self._t_ns):
             return b"\xff" * count
         if begin + count <= _REGISTERS:
             return bytes(self._registers[begin : begin + count])
         return bytes(self._registers[(begin + i) % _REGISTERS] for i in range(count))
 
-    def stop(self, t_ns: int) -> None:
+    def on_stop(self, t_ns: int) -> None:
         """Start a conversion if the transaction contained CONVERT."""
         if self._convert_at_stop:
             self._convert_at_stop = False
-            self._settle(t_ns)
+            self._finish_conversion(t_ns)
             self._conversion = None
             silicon = self._silicon
-            after_ns = silicon.conversion_ns // _SAMPLE_QUARTER + silicon.late_ns
-            words = silicon.sense(t_ns + after_ns)
+            after_ns = silicon.conversion_ns // _SAMPLE_QUARTER + silicon.sample_delay_ns
+            words = silicon.sample_counts(t_ns + after_ns)
             if self.on_conversion is not None:
                 self.on_conversion(t_ns, words, self._silicon.coefficient_words)
             if not self._faults.stale(t_ns):
@@ -162,13 +164,13 @@ class EmulatedMpl115a2:
                     p_ready_ns=t_ns + tc // 2, done_ns=t_ns + tc, words=words
                 )
 
-    def _settle(self, t_ns: int) -> None:
+    def _finish_conversion(self, t_ns: int) -> None:
         conversion = self._conversion
         if conversion is not None and t_ns >= conversion.done_ns:
-            self._load(*conversion.words)
+            self._load_result(*conversion.words)
             self._conversion = None
 
-    def _disturb(self, t_ns: int) -> None:
+    def _apply_early_read(self, t_ns: int) -> None:
         """Apply the effect of a read during a conversion: undocumented, so one of three modes."""
         conversion = self._conversion
         if conversion is None or self._mode == "stale":
@@ -178,5 +180,5 @@ class EmulatedMpl115a2:
         elif t_ns >= conversion.p_ready_ns:  # torn: the new pressure beside the old temperature
             self._registers[0:2] = struct.pack(">H", conversion.words[0] << 6)
 
-    def _load(self, padc: int, tadc: int) -> None:
+    def _load_result(self, padc: int, tadc: int) -> None:
         self._registers[0:4] = struct.pack(">2H", padc << 6, tadc << 6)

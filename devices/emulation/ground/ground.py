@@ -28,7 +28,7 @@ class Ground(ABC):
     def forces_n(self, t_s: Floats) -> Floats:
         """Compute the force on each dome along its axis, (len(t_s), tiles)."""
 
-    def rest_n(self, t_s: Floats) -> Floats:
+    def force_beside_domes_n(self, t_s: Floats) -> Floats:
         """Compute the vertical force on the foot beside the domes."""
         return np.zeros(len(t_s))
 
@@ -44,7 +44,7 @@ class Ground(ABC):
         return np.asarray(self.arc_rad - angle_rad[:, None])
 
 
-def in_round(t_s: Floats, lead_s: float, round_s: float) -> Floats:
+def map_to_first_round(t_s: Floats, lead_s: float, round_s: float) -> Floats:
     """Map times to the first round after the lead; `round_s` infinite: a single round."""
     t_s = np.asarray(t_s)
     if not math.isfinite(round_s):

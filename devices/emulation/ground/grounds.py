@@ -8,13 +8,18 @@ from __future__ import annotations
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from devices.emulation.ground.ground import Ground, in_round
+from devices.emulation.ground.ground import Ground, map_to_first_round
 from devices.emulation.ground.hopping import Hopping
-from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace, press
-from devices.emulation.ground.mill import Indentation
-from devices.emulation.parts import random_of
+from devices.emulation.ground.indenter import IndentationProgramme
+from devices.emulation.ground.load_trace import (
+    CopTransform,
+    LoadTrace,
+    TileLoad,
+    convert_to_tile_load,
+)
+from devices.emulation.parts import make_rng
 from devices.errors import SceneError, UsageError
-from devices.scene.emulated import (
+from devices.scene.emulation_sections import (
     IndentationGround,
     MudGround,
     NoGround,
@@ -23,8 +28,8 @@ from devices.scene.emulated import (
     RollingGround,
     TraceGround,
 )
-from devices.scene.file import Scene
-from devices.scene.hardware import TileScene
+from devices.scene.hardware_sections import TileSection
+from devices.scene.scene_file import Scene
 
 
 class NoLoad(Ground):
@@ -54,7 +59,7 @@ class Standing(Ground):
     ) -> None:
         self._load_n = ground.load_n
         self._lead_s = lead_s
-        self._phases = random_of(f"sway/{seed}").uniform(0, 2 * np.pi, len(self._SWAY_HZ))
+        self._phases = make_rng(f"sway/{seed}").uniform(0, 2 * np.pi, len(self._SWAY_HZ))
         x_m = positions_m[bears, 0] - positions_m[bears, 0].mean()
         spread = (x_m**2).sum()
         per_m = x_m / spread if spread > 0 else np.zeros(len(x_m))
@@ -140,35 +145,39 @@ class Rolling(Ground):
 
 
 class TraceLoad(Ground):
-    """Recorded load, linear between its samples, repeated endlessly if `looped`."""
+    """Recorded load, linear between its samples, repeated endlessly if `is_repeated`."""
 
     _PAUSE_S = 1.0
     """Pause in the air between two rounds, long enough for a tare."""
 
-    def __init__(self, pressed: PressedTrace, lead_s: float = 0.0, *, looped: bool = False) -> None:
-        self._pressed = pressed
+    def __init__(
+        self, tile_load: TileLoad, lead_s: float = 0.0, *, is_repeated: bool = False
+    ) -> None:
+        self._tile_load = tile_load
         self._lead_s = lead_s
-        self._round_s = float(pressed.time_s[-1]) - lead_s + self._PAUSE_S if looped else np.inf
+        self._round_s = (
+            float(tile_load.time_s[-1]) - lead_s + self._PAUSE_S if is_repeated else np.inf
+        )
 
     @property
     def duration_s(self) -> float | None:
         """End of the trace, after lifting the foot; None if looped."""
-        return None if np.isfinite(self._round_s) else float(self._pressed.time_s[-1])
+        return None if np.isfinite(self._round_s) else float(self._tile_load.time_s[-1])
 
     def forces_n(self, t_s: Floats) -> Floats:
         """Interpolate the trace's forces; zero before and after it."""
-        time_s, forces_n = self._pressed.time_s, self._pressed.forces_n
-        at_s = in_round(t_s, self._lead_s, self._round_s)
+        time_s, forces_n = self._tile_load.time_s, self._tile_load.forces_n
+        at_s = map_to_first_round(t_s, self._lead_s, self._round_s)
         return np.stack(
             [np.interp(at_s, time_s, f, left=0.0, right=0.0) for f in forces_n.T], axis=1
         )
 
     def angle_rad(self, t_s: Floats) -> Floats | None:
         """Interpolate the trace's angle; None without one."""
-        if self._pressed.angle_rad is None:
+        if self._tile_load.angle_rad is None:
             return None
-        at_s = in_round(t_s, self._lead_s, self._round_s)
-        return np.interp(at_s, self._pressed.time_s, self._pressed.angle_rad)
+        at_s = map_to_first_round(t_s, self._lead_s, self._round_s)
+        return np.interp(at_s, self._tile_load.time_s, self._tile_load.angle_rad)
 
 
 def make_ground(
@@ -176,21 +185,21 @@ def make_ground(
     *,
     seed: int,
     lead_s: float,
-    pressed: PressedTrace | None,
-    looped: bool = False,
+    tile_load: TileLoad | None,
+    is_repeated: bool = False,
 ) -> Ground:
     """Create the ground of a scene, or of a recorded load in its place.
 
-    With `looped` a finite load (a recorded one, or three hops) repeats endlessly.
+    With `is_repeated` a finite load (a recorded one, or three hops) repeats endlessly.
 
     Raises:
         UsageError: the scene needs a load trace and none was given.
         SceneError: the ground's keys are physically impossible.
     """
-    positions_m = tile_positions_m(scene.tile)
+    positions_m = get_tile_positions_m(scene.tile)
     bears = np.array([not tile.reference for tile in scene.tile])
-    if pressed is not None:
-        return TraceLoad(pressed, lead_s, looped=looped)
+    if tile_load is not None:
+        return TraceLoad(tile_load, lead_s, is_repeated=is_repeated)
     match scene.ground:
         case NoGround():
             return NoLoad(len(bears))
@@ -199,9 +208,9 @@ def make_ground(
         case RollingGround() as ground:
             return Rolling(ground, positions_m, bears, lead_s)
         case PoppyGround() | MudGround() as ground:
-            return Hopping(ground, positions_m, bears, seed, lead_s, looped=looped)
+            return Hopping(ground, positions_m, bears, seed, lead_s, is_repeated=is_repeated)
         case IndentationGround() as ground:
-            return Indentation(ground, scene.tile, lead_s)
+            return IndentationProgramme(ground, scene.tile, lead_s)
         case TraceGround():
             raise UsageError(
                 f"scene {scene.name!r} presses a recorded load, and none was given",
@@ -209,24 +218,24 @@ def make_ground(
             )
 
 
-def press_on(
-    scene: Scene, load: LoadTrace, *, load_scale: float, cop: CopTransform, lead_s: float
-) -> PressedTrace:
+def convert_load_for_scene(
+    scene: Scene, load: LoadTrace, *, load_scale: float, cop_transform: CopTransform, lead_s: float
+) -> TileLoad:
     """Convert a recorded load to forces on the scene's tiles (`load_trace.press`).
 
     Raises:
         LoadTraceError: the load does not fit the tiles.
     """
-    return press(
+    return convert_to_tile_load(
         load,
-        tile_positions_m(scene.tile)[:, :2],
+        get_tile_positions_m(scene.tile)[:, :2],
         np.array([not tile.reference for tile in scene.tile]),
         load_scale=load_scale,
-        cop=cop,
+        cop_transform=cop_transform,
         lead_s=lead_s,
     )
 
 
-def tile_positions_m(tiles: tuple[TileScene, ...]) -> Floats:
+def get_tile_positions_m(tiles: tuple[TileSection, ...]) -> Floats:
     """Return the positions of tiles in the foot frame, (tiles, 3)."""
     return np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in tiles])

@@ -16,12 +16,12 @@ from bisect import bisect_right
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from devices.emulation.ground.ground import Ground, in_round
-from devices.emulation.ground.hopping_leg import STEP_S, HoppingLeg, Leg, Strip
+from devices.emulation.ground.ground import Ground, map_to_first_round
+from devices.emulation.ground.hopping_leg import STEP_S, LegProperties, LegSimulation, Strip
 from devices.emulation.ground.soft_ground import SoftGround
-from devices.emulation.parts import random_of
+from devices.emulation.parts import make_rng
 from devices.errors import SceneError
-from devices.scene.emulated import MudGround, PoppyGround
+from devices.scene.emulation_sections import MudGround, PoppyGround
 
 HOPS = 3
 
@@ -45,7 +45,7 @@ class Hopping(Ground):
         bears: (tiles,), False for bare reference tiles, which are in no strip.
         seed: seed of the variation between hops.
         lead_s: time of the drop.
-        looped: repeat endlessly.
+        is_repeated: repeat endlessly.
 
     Raises:
         SceneError: the tiles are not on an arc below the ankle, or the leg gets stuck.
@@ -61,7 +61,7 @@ class Hopping(Ground):
         seed: int,
         lead_s: float,
         *,
-        looped: bool = False,
+        is_repeated: bool = False,
     ) -> None:
         self._positions_m = positions_m
         self._lead_s = lead_s
@@ -82,47 +82,49 @@ class Hopping(Ground):
             Strip(float(x_m), float(z_m), float(tile_m2 * n))
             for (x_m, z_m), n in zip(places_m, tiles_of, strict=True)
         )
-        leg = Leg(ground.mass_kg, ground.leg_n_per_m, strips)
+        leg = LegProperties(ground.mass_kg, ground.leg_n_per_m, strips)
         self._head_kpa_m = ground.head_kpa_per_m if isinstance(ground, MudGround) else 0.0
         # Turns of the segment: begin; duration, first and last angle.
         self._begins_s: list[float] = [0.0]
         self._turns: list[tuple[float, float, float]] = []
-        self.touch_s: list[float] = []
+        self.touch_down_s: list[float] = []
         """Touch-down time of each hop."""
-        self.leave_s: list[float] = []
+        self.lift_off_s: list[float] = []
         """Lift-off time of each hop."""
-        self.strokes_m: list[float] = []
+        self.push_off_strokes_m: list[float] = []
         """Stroke of each push-off."""
-        self._hop(ground, leg, random_of(f"hop/{seed}"))
-        self._round_s = self._end_s - lead_s if looped else math.inf
+        self._simulate_hops(ground, leg, make_rng(f"hop/{seed}"))
+        self._round_s = self._end_s - lead_s if is_repeated else math.inf
 
-    def _hop(self, ground: PoppyGround | MudGround, leg: Leg, rng: np.random.Generator) -> None:
+    def _simulate_hops(
+        self, ground: PoppyGround | MudGround, leg: LegProperties, rng: np.random.Generator
+    ) -> None:
         firmness = 1.0 + _FIRMNESS * rng.uniform(-1.0, 1.0, HOPS)
         heights_m = ground.drop_m * _HEIGHT * rng.uniform(-1.0, 1.0, HOPS)
         pitches_rad = ground.pitch_rad * (1.0 + _PITCH * rng.uniform(-1.0, 1.0, HOPS))
         self._turns.append((1.0, -pitches_rad[0], -pitches_rad[0]))
-        hopping = HoppingLeg(leg, ground.drop_m, self._lead_s)
+        hopping = LegSimulation(leg, ground.drop_m, self._lead_s)
         for hop in range(HOPS):
-            place = SoftGround.of(ground, float(firmness[hop]))
-            hopping.fall(place, self._angle)
+            place = SoftGround.from_scene(ground, float(firmness[hop]))
+            hopping.simulate_fall(place, self._angle)
             # The force has acted for a step, and rises from zero during the previous one.
-            self.touch_s.append(hopping.motion.t_s - 2.0 * STEP_S)
-            self._turn(hopping.motion.t_s, ground.stand_s + _STANCE_S, pitches_rad[hop])
-            hopping.stand(place, self._angle, hopping.motion.t_s + ground.stand_s)
-            height_m = hopping.release_m + heights_m[hop]
-            self.strokes_m.append(hopping.push_off(place, self._angle, height_m))
-            self.leave_s.append(hopping.motion.t_s)
+            self.touch_down_s.append(hopping.motion.t_s - 2.0 * STEP_S)
+            self._add_turn(hopping.motion.t_s, ground.stand_s + _STANCE_S, pitches_rad[hop])
+            hopping.simulate_stance(place, self._angle, hopping.motion.t_s + ground.stand_s)
+            height_m = hopping.drop_centre_m + heights_m[hop]
+            self.push_off_strokes_m.append(hopping.simulate_push_off(place, self._angle, height_m))
+            self.lift_off_s.append(hopping.motion.t_s)
             # After the last hop it turns as before the first, in case it is dropped again.
-            self._turn(hopping.motion.t_s, _SWING_S, -pitches_rad[(hop + 1) % HOPS])
-            hopping.rise(place, self._angle)
+            self._add_turn(hopping.motion.t_s, _SWING_S, -pitches_rad[(hop + 1) % HOPS])
+            hopping.simulate_flight_up(place, self._angle)
         self._end_s = hopping.motion.t_s + _AIR_S
-        self.recorded = hopping.recorded
-        self._time_s = np.array([step.t_s for step in self.recorded])
-        self._ankle_m = np.array([step.ankle_m for step in self.recorded])
-        self._stress_pa = np.array([step.stress_pa for step in self.recorded])
-        self._rest_n = np.array([step.rest_n for step in self.recorded])
+        self.recorded_steps = hopping.recorded_steps
+        self._time_s = np.array([step.t_s for step in self.recorded_steps])
+        self._ankle_m = np.array([step.ankle_m for step in self.recorded_steps])
+        self._stress_pa = np.array([step.stress_pa for step in self.recorded_steps])
+        self._rest_n = np.array([step.force_beside_strips_n for step in self.recorded_steps])
 
-    def _turn(self, begin_s: float, duration_s: float, to_rad: float) -> None:
+    def _add_turn(self, begin_s: float, duration_s: float, to_rad: float) -> None:
         from_rad = self._angle(begin_s)
         self._begins_s.append(begin_s)
         self._turns.append((duration_s, from_rad, float(to_rad)))
@@ -140,40 +142,40 @@ class Hopping(Ground):
 
     def forces_n(self, t_s: Floats) -> Floats:
         """Compute the force on each dome along its axis, (len(t_s), tiles)."""
-        return self._stresses_pa(self._in_round(t_s)) * self._dome_m2
+        return self._interpolate_stress_pa(self._map_to_first_round(t_s)) * self._dome_m2
 
     def angle_rad(self, t_s: Floats) -> Floats:
         """Compute the angle of the segment."""
-        at_s = self._in_round(t_s)
+        at_s = self._map_to_first_round(t_s)
         turn = np.maximum(np.searchsorted(self._begins_s, at_s, side="right") - 1, 0)
         duration_s, from_rad, to_rad = np.array(self._turns)[turn].T
         done = np.minimum((at_s - np.array(self._begins_s)[turn]) / duration_s, 1.0)
         return np.asarray(from_rad + (to_rad - from_rad) * done * done * (3.0 - 2.0 * done))
 
-    def rest_n(self, t_s: Floats) -> Floats:
+    def force_beside_domes_n(self, t_s: Floats) -> Floats:
         """Compute the vertical force on the foot beside the domes: rim, drag, suction, buoyancy."""
-        at_s = self._in_round(t_s)
+        at_s = self._map_to_first_round(t_s)
         upright = np.cos(self.arc_rad - self.angle_rad(t_s)[:, None])
-        rim_n = (self._stresses_pa(at_s) * self._rim_m2 * upright).sum(axis=1)
+        rim_n = (self._interpolate_stress_pa(at_s) * self._rim_m2 * upright).sum(axis=1)
         return np.asarray(rim_n + np.interp(at_s, self._time_s, self._rest_n, left=0.0, right=0.0))
 
-    def depth_m(self, t_s: Floats) -> Floats:
+    def compute_depth_m(self, t_s: Floats) -> Floats:
         """Compute the depth of each tile below the surface, (len(t_s), tiles); negative above."""
-        ankle_m = np.interp(self._in_round(t_s), self._time_s, self._ankle_m)[:, None]
+        ankle_m = np.interp(self._map_to_first_round(t_s), self._time_s, self._ankle_m)[:, None]
         angle_rad = self.angle_rad(t_s)[:, None]
         x_m, z_m = self._positions_m[:, 0], self._positions_m[:, 2]
         return np.asarray(np.sin(angle_rad) * x_m - np.cos(angle_rad) * z_m - ankle_m)
 
-    def head_kpa(self, t_s: Floats) -> Floats:
+    def compute_head_kpa(self, t_s: Floats) -> Floats:
         """Compute the hydrostatic pressure on each tile, (len(t_s), tiles)."""
-        return self._head_kpa_m * np.maximum(self.depth_m(t_s), 0.0)
+        return self._head_kpa_m * np.maximum(self.compute_depth_m(t_s), 0.0)
 
-    def _stresses_pa(self, at_s: Floats) -> Floats:
+    def _interpolate_stress_pa(self, at_s: Floats) -> Floats:
         """Interpolate the stress under each tile."""
         pa = [
             np.interp(at_s, self._time_s, strip, left=0.0, right=0.0) for strip in self._stress_pa.T
         ]
         return np.stack(pa, axis=1)[:, self._strip_of]
 
-    def _in_round(self, t_s: Floats) -> Floats:
-        return in_round(t_s, self._lead_s, self._round_s)
+    def _map_to_first_round(self, t_s: Floats) -> Floats:
+        return map_to_first_round(t_s, self._lead_s, self._round_s)

@@ -34,7 +34,7 @@ _LEFT_WITHIN_S = 0.6  # timeout of a push-off, after which the foot counts as st
 _HEIGHT_TOLERANCE_M = 0.001  # tolerance of the hop's height
 _TRIES = 12  # iterations of the regula falsi
 
-Angle = Callable[[float], float]
+AngleFunction = Callable[[float], float]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Strip:
 
 
 @dataclass(frozen=True)
-class Leg:
+class LegProperties:
     """Properties of a leg.
 
     Attributes:
@@ -82,13 +82,13 @@ class Leg:
         return self.mass_kg - self.foot_kg
 
     @property
-    def sole_m(self) -> float:
+    def sole_distance_m(self) -> float:
         """Distance from the ankle to the lowest point of the upright sole."""
         return max(-strip.z_m for strip in self.strips)
 
 
 @dataclass
-class Motion:
+class LegMotion:
     """State of a leg in motion.
 
     Attributes:
@@ -96,7 +96,7 @@ class Motion:
         ankle_m: height of the ankle above the ground's surface.
         body_m: height of the body.
         stroke_m: extension of the leg beyond its rest length.
-        set_m: plastic set under each strip, see `SoftGround.stress_pa`.
+        set_m: plastic set under each strip, see `SoftGround.compute_stress_pa`.
     """
 
     t_s: float
@@ -107,12 +107,12 @@ class Motion:
     stroke_m: float = 0.0
     set_m: list[float] = field(default_factory=list)
 
-    def copy(self) -> Motion:
+    def copy(self) -> LegMotion:
         """Return a deep copy, for trial motions."""
-        return Motion(**(vars(self) | {"set_m": list(self.set_m)}))
+        return LegMotion(**(vars(self) | {"set_m": list(self.set_m)}))
 
 
-class Step(NamedTuple):
+class RecordedStep(NamedTuple):
     """Recorded state and forces of one time step.
 
     Attributes:
@@ -122,7 +122,7 @@ class Step(NamedTuple):
         ankle_m_s: speed of the ankle upwards.
         body_m_s: speed of the body upwards.
         stress_pa: stress on each strip.
-        rest_n: vertical force of the ground beside the strips.
+        force_beside_strips_n: vertical force of the ground beside the strips.
     """
 
     t_s: float
@@ -131,10 +131,10 @@ class Step(NamedTuple):
     ankle_m_s: float
     body_m_s: float
     stress_pa: list[float]
-    rest_n: float
+    force_beside_strips_n: float
 
 
-class HoppingLeg:
+class LegSimulation:
     """Simulation of a hopping leg.
 
     Args:
@@ -143,45 +143,45 @@ class HoppingLeg:
         t_s: time of the drop.
     """
 
-    def __init__(self, leg: Leg, drop_m: float, t_s: float) -> None:
+    def __init__(self, leg: LegProperties, drop_m: float, t_s: float) -> None:
         self.leg = leg
-        ankle_m = drop_m + leg.sole_m
-        self.motion = Motion(t_s, ankle_m, ankle_m + LEG_M, set_m=[0.0] * len(leg.strips))
-        self.recorded: list[Step] = []
+        ankle_m = drop_m + leg.sole_distance_m
+        self.motion = LegMotion(t_s, ankle_m, ankle_m + LEG_M, set_m=[0.0] * len(leg.strips))
+        self.recorded_steps: list[RecordedStep] = []
         self._strips = [(p.x_m, p.z_m, p.area_m2, p.area_m2 / p.radius_m) for p in leg.strips]
         self._sole_m2 = sum(p.area_m2 for p in leg.strips)
         self._reach_m = max(p.radius_m for p in leg.strips)
         self._angle = (-1.0, 0.0)
         self._touches = False
         self._damping = _STANDING_DAMPING
-        self.release_m = self.centre_m(self.motion)
+        self.drop_centre_m = self.compute_centre_m(self.motion)
         """Height of the centre of mass at the drop."""
 
-    def centre_m(self, motion: Motion) -> float:
+    def compute_centre_m(self, motion: LegMotion) -> float:
         """Compute the height of the centre of mass."""
         leg = self.leg
         return (leg.foot_kg * motion.ankle_m + leg.body_kg * motion.body_m) / leg.mass_kg
 
-    def rising_m_s(self, motion: Motion) -> float:
+    def compute_rise_m_s(self, motion: LegMotion) -> float:
         """Compute the speed of the centre of mass, upwards."""
         leg = self.leg
         return (leg.foot_kg * motion.ankle_m_s + leg.body_kg * motion.body_m_s) / leg.mass_kg
 
-    def fall(self, ground: SoftGround, angle: Angle) -> None:
+    def simulate_fall(self, ground: SoftGround, angle: AngleFunction) -> None:
         """Simulate the fall until the sole touches fresh ground."""
         self.motion.set_m = [0.0] * len(self.leg.strips)
         self._touches = False
         while not self._touches:
             self._retract()
-            self._step(self.motion, ground, angle, self.recorded)
+            self._step(self.motion, ground, angle, self.recorded_steps)
 
-    def stand(self, ground: SoftGround, angle: Angle, until_s: float) -> None:
+    def simulate_stance(self, ground: SoftGround, angle: AngleFunction, until_s: float) -> None:
         """Simulate landing and standing until `until_s`."""
         self._damping = _STANDING_DAMPING
         while self.motion.t_s < until_s:
-            self._step(self.motion, ground, angle, self.recorded)
+            self._step(self.motion, ground, angle, self.recorded_steps)
 
-    def push_off(self, ground: SoftGround, angle: Angle, height_m: float) -> float:
+    def simulate_push_off(self, ground: SoftGround, angle: AngleFunction, height_m: float) -> float:
         """Simulate a push-off whose stroke lets the centre of mass rise to `height_m`.
 
         Returns:
@@ -192,15 +192,15 @@ class HoppingLeg:
         """
         begin = self.motion
         self._damping = _PUSHING_DAMPING
-        stuck_m = height_m - self.centre_m(begin)
+        stuck_m = height_m - self.compute_centre_m(begin)
 
         def missing_m(stroke_m: float) -> float:
             self.motion = begin.copy()
             self._push(ground, angle, stroke_m, None)
             if self._touches:  # the leg is fully extended and still in the ground
                 return stuck_m
-            v = max(self.rising_m_s(self.motion), 0.0)
-            return height_m - self.centre_m(self.motion) - v * v / (2 * GRAVITY_M_S2)
+            v = max(self.compute_rise_m_s(self.motion), 0.0)
+            return height_m - self.compute_centre_m(self.motion) - v * v / (2 * GRAVITY_M_S2)
 
         low_m, high_m = 0.0, _STROKE_MAX_M
         low, high = stuck_m, missing_m(high_m)
@@ -225,17 +225,21 @@ class HoppingLeg:
         else:
             stroke_m = high_m
         self.motion = begin
-        self._push(ground, angle, stroke_m, self.recorded)
+        self._push(ground, angle, stroke_m, self.recorded_steps)
         return stroke_m
 
-    def rise(self, ground: SoftGround, angle: Angle) -> None:
+    def simulate_flight_up(self, ground: SoftGround, angle: AngleFunction) -> None:
         """Simulate the flight to its highest point."""
-        while self.rising_m_s(self.motion) > 0.0:
+        while self.compute_rise_m_s(self.motion) > 0.0:
             self._retract()
-            self._step(self.motion, ground, angle, self.recorded)
+            self._step(self.motion, ground, angle, self.recorded_steps)
 
     def _push(
-        self, ground: SoftGround, angle: Angle, stroke_m: float, record: list[Step] | None
+        self,
+        ground: SoftGround,
+        angle: AngleFunction,
+        stroke_m: float,
+        record: list[RecordedStep] | None,
     ) -> None:
         motion = self.motion
         begin_s = motion.t_s
@@ -251,7 +255,11 @@ class HoppingLeg:
         motion.stroke_m = max(motion.stroke_m - _STROKE_MAX_M * STEP_S / _RETRACT_S, 0.0)
 
     def _step(
-        self, motion: Motion, ground: SoftGround, angle: Angle, record: list[Step] | None
+        self,
+        motion: LegMotion,
+        ground: SoftGround,
+        angle: AngleFunction,
+        record: list[RecordedStep] | None,
     ) -> None:
         """Integrate one step: forces, then speeds, then positions (semi-implicit Euler)."""
         known_s, angle_rad = self._angle
@@ -260,21 +268,25 @@ class HoppingLeg:
         ahead_rad = angle(motion.t_s + STEP_S)
         self._angle = (motion.t_s + STEP_S, ahead_rad)
         turn_rad = (ahead_rad - angle_rad) / STEP_S
-        stress_pa, press_n, rest_n = self._ground_n(motion, ground, angle_rad, turn_rad)
+        stress_pa, press_n, rest_n = self._compute_ground_forces(
+            motion, ground, angle_rad, turn_rad
+        )
         if record is not None:
             m = motion
-            step = Step(m.t_s, m.ankle_m, m.body_m, m.ankle_m_s, m.body_m_s, stress_pa, rest_n)
+            step = RecordedStep(
+                m.t_s, m.ankle_m, m.body_m, m.ankle_m_s, m.body_m_s, stress_pa, rest_n
+            )
             record.append(step)
         leg = self.leg
-        leg_n = self._leg_n(motion)
+        leg_n = self._compute_leg_force_n(motion)
         motion.ankle_m_s += ((press_n + rest_n - leg_n) / leg.foot_kg - GRAVITY_M_S2) * STEP_S
         motion.body_m_s += (leg_n / leg.body_kg - GRAVITY_M_S2) * STEP_S
         motion.ankle_m += motion.ankle_m_s * STEP_S
         motion.body_m += motion.body_m_s * STEP_S
         motion.t_s += STEP_S
 
-    def _ground_n(
-        self, motion: Motion, ground: SoftGround, angle_rad: float, turn_rad: float
+    def _compute_ground_forces(
+        self, motion: LegMotion, ground: SoftGround, angle_rad: float, turn_rad: float
     ) -> tuple[list[float], float, float]:
         """Compute the stress on each strip, their vertical force, and the rest of the foot's."""
         if motion.ankle_m >= self._reach_m:
@@ -289,7 +301,7 @@ class HoppingLeg:
             below_m = s * x_m - c * z_m
             depth_m = below_m - ankle_m
             sinking = turn_rad * (c * x_m + s * z_m) - ankle_m_s
-            pa, set_m[i] = ground.stress_pa(depth_m, sinking, set_m[i])
+            pa, set_m[i] = ground.compute_stress_pa(depth_m, sinking, set_m[i])
             stress_pa.append(pa)
             # The vertical component of the normal, cos(arc - angle), is below_m over the radius.
             press_n += pa * area_per_radius_m * below_m
@@ -297,12 +309,12 @@ class HoppingLeg:
             gap_m = min(gap_m, set_m[i] - depth_m)
             deepest_m = max(deepest_m, depth_m)
         self._touches = deepest_m > 0.0
-        rest_n = ground.on_the_foot_n(
+        rest_n = ground.compute_foot_force_n(
             mean_depth_m / self._sole_m2, -ankle_m_s, max(gap_m, 0.0), self._sole_m2
         )
         return stress_pa, press_n, rest_n
 
-    def _leg_n(self, motion: Motion) -> float:
+    def _compute_leg_force_n(self, motion: LegMotion) -> float:
         """Compute the leg's force: a damped spring, and in extension an end stop that pulls.
 
         Raises:

@@ -62,7 +62,7 @@ class CopTransform:
     offset_m: tuple[float, float] = (0.0, 0.0)
     axes: str = "xy"
 
-    def matrix(self) -> Floats:
+    def make_axes_matrix(self) -> Floats:
         """Return the matrix of the axes (rows: foot x and y; columns: trace x and y).
 
         Raises:
@@ -81,35 +81,35 @@ class CopTransform:
 
 
 @dataclass(frozen=True)
-class PressedTrace:
+class TileLoad:
     """Tile forces over time, converted from a trace, with counts of changed samples."""
 
     time_s: Floats
     forces_n: Floats
     angle_rad: Floats | None
-    moved_to_edge: int
+    moved_samples: int
     """Number of samples whose COP lay outside the tiles' hull and was moved to its edge."""
-    limited: int
+    limited_samples: int
     """Number of samples with a tile force above `FORCE_LIMIT_N`, which was limited."""
 
 
-def press(
+def convert_to_tile_load(
     trace: LoadTrace,
     positions_m: Floats,
-    bears: Bools,
+    bears_load: Bools,
     *,
     load_scale: float,
-    cop: CopTransform,
+    cop_transform: CopTransform,
     lead_s: float,
-) -> PressedTrace:
+) -> TileLoad:
     """Convert a trace to forces on tiles, beginning at `lead_s`.
 
     Args:
         trace: recorded load.
         positions_m: (tiles, 2), positions of the tiles.
-        bears: (tiles,), False for bare reference tiles, which get no force.
+        bears_load: (tiles,), False for bare reference tiles, which get no force.
         load_scale: factor on every force.
-        cop: transform of the trace's centre of pressure to the foot's.
+        cop_transform: transform of the trace's centre of pressure to the foot's.
         lead_s: seconds without load before it.
 
     Raises:
@@ -118,34 +118,36 @@ def press(
     """
     if trace.cells_n is not None:
         borne_n, moved = trace.cells_n * load_scale, 0
-        if borne_n.shape[1] != bears.sum():
+        if borne_n.shape[1] != bears_load.sum():
             raise LoadTraceError(
                 f"the trace has {borne_n.shape[1]} cell columns, the array has "
-                f"{bears.sum()} tiles that bear load",
+                f"{bears_load.sum()} tiles that bear load",
                 where=trace.where,
                 remedy="Choose a scene with as many tiles, or remove the cell columns",
             )
     else:
-        borne_n, moved = _share(trace, positions_m[bears], load_scale, cop)
+        borne_n, moved = _distribute_force(
+            trace, positions_m[bears_load], load_scale, cop_transform
+        )
     limited = int((borne_n > FORCE_LIMIT_N).any(axis=1).sum())
     forces_n = np.zeros((len(borne_n), len(positions_m)))
-    forces_n[:, bears] = np.clip(borne_n, 0.0, FORCE_LIMIT_N)
+    forces_n[:, bears_load] = np.clip(borne_n, 0.0, FORCE_LIMIT_N)
 
     begin_s = lead_s + TOUCH_S
     time_s = trace.time_s - trace.time_s[0] + begin_s
     rest = np.zeros((1, forces_n.shape[1]))
-    return PressedTrace(
+    return TileLoad(
         time_s=np.concatenate([[lead_s], time_s, [time_s[-1] + TOUCH_S]]),
         forces_n=np.concatenate([rest, forces_n, rest]),
         angle_rad=None
         if trace.angle_rad is None
         else np.pad(trace.angle_rad, 1, mode="edge").astype(np.float64),
-        moved_to_edge=moved,
-        limited=limited,
+        moved_samples=moved,
+        limited_samples=limited,
     )
 
 
-def _share(
+def _distribute_force(
     trace: LoadTrace, positions_m: Floats, load_scale: float, cop: CopTransform
 ) -> tuple[Floats, int]:
     if trace.fz_n is None or trace.cop_m is None:
@@ -172,19 +174,21 @@ def _share(
         0
     ) / weight.sum()
     cop_m = np.where(defined[:, None], trace.cop_m - centre_m, 0.0)
-    wanted_m = cop.scale * cop_m @ cop.matrix().T + np.array(cop.offset_m)
+    wanted_m = cop.scale * cop_m @ cop.make_axes_matrix().T + np.array(cop.offset_m)
 
     # A line array has one axis only; the other one is dropped.
     axes = np.ptp(positions_m, axis=0) > 1e-9
     shares = np.zeros((len(fz_n), len(positions_m)))
     moved = 0
     for row in np.flatnonzero(fz_n > 0.0).tolist():
-        shares[row], was_moved = _least_squares_shares(positions_m[:, axes], wanted_m[row, axes])
+        shares[row], was_moved = _compute_least_squares_shares(
+            positions_m[:, axes], wanted_m[row, axes]
+        )
         moved += was_moved
     return shares * (fz_n * load_scale)[:, None], moved
 
 
-def _least_squares_shares(positions_m: Floats, cop_m: Floats) -> tuple[Floats, bool]:
+def _compute_least_squares_shares(positions_m: Floats, cop_m: Floats) -> tuple[Floats, bool]:
     """Compute non-negative shares of sum one with their centroid nearest to `cop_m`.
 
     Returns:

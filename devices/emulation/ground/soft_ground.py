@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from devices.scene.emulated import MudGround, PoppyGround
+from devices.scene.emulation_sections import MudGround, PoppyGround
 
 GRAVITY_M_S2 = 9.81
 _PA_M_PER_N_CM3 = 1e6
@@ -35,8 +35,8 @@ _WETTED_M = 0.002
 1.4 ms at 1.4 m/s."""
 _FOOT_M = 0.02
 """Thickness of the foot, the depth of full buoyancy."""
-_SUCKS_M = 0.004
-_SUCKS_M_S = 0.05
+_SUCTION_GAP_M = 0.004
+_SUCTION_SPEED_M_S = 0.05
 """Speed of pulling below which mud mostly fills the gap as it opens."""
 
 
@@ -46,7 +46,7 @@ class SoftGround:
 
     Attributes:
         strength_pa_m: strength per metre of depth.
-        unloading: ratio of the stiffness in unloading to that in penetration.
+        unloading_stiffness_ratio: ratio of the stiffness in unloading to that in penetration.
         inertia_kg_m3: density of the displaced matter, times its drag coefficient.
         viscous_pa_s_m: stress under the sole per speed of sinking.
         side_n_s_m2: viscous drag on the sides of foot and leg per speed and depth.
@@ -55,7 +55,7 @@ class SoftGround:
     """
 
     strength_pa_m: float
-    unloading: float
+    unloading_stiffness_ratio: float
     inertia_kg_m3: float
     viscous_pa_s_m: float = 0.0
     side_n_s_m2: float = 0.0
@@ -63,17 +63,17 @@ class SoftGround:
     head_pa_m: float = 0.0
 
     @classmethod
-    def of(cls, ground: PoppyGround | MudGround, firmness: float = 1.0) -> SoftGround:
+    def from_scene(cls, ground: PoppyGround | MudGround, firmness: float = 1.0) -> SoftGround:
         """Derive a place of a scene's ground, `firmness` times as strong as in the scene."""
         strength_pa_m = firmness * ground.strength_n_per_cm3 * _PA_M_PER_N_CM3
         if isinstance(ground, PoppyGround):
             # Grains of 1.0 g/cm^3, 58 % of the volume when loosely packed; drag coefficient 1.5.
-            return cls(strength_pa_m, unloading=20.0, inertia_kg_m3=1.5 * 580.0)
+            return cls(strength_pa_m, unloading_stiffness_ratio=20.0, inertia_kg_m3=1.5 * 580.0)
         head_pa_m = ground.head_kpa_per_m * 1e3
         half_width_m = 0.5 * math.sqrt(ground.sole_m2)
         return cls(
             strength_pa_m,
-            unloading=10.0,
+            unloading_stiffness_ratio=10.0,
             inertia_kg_m3=1.0 * head_pa_m / GRAVITY_M_S2,
             # Drag of a disc in creeping flow: 16 eta r v over pi r^2, half of it in front.
             viscous_pa_s_m=8.0 / math.pi * ground.viscosity_pa_s / half_width_m,
@@ -83,7 +83,9 @@ class SoftGround:
             head_pa_m=head_pa_m,
         )
 
-    def stress_pa(self, depth_m: float, sinking_m_s: float, set_m: float) -> tuple[float, float]:
+    def compute_stress_pa(
+        self, depth_m: float, sinking_m_s: float, set_m: float
+    ) -> tuple[float, float]:
         """Compute the stress on a strip, never negative, and its new plastic set.
 
         Args:
@@ -95,7 +97,7 @@ class SoftGround:
         if depth_m <= 0.0:
             return 0.0, set_m
         strength_pa = self.strength_pa_m * depth_m
-        stiffness_pa_m = self.unloading * self.strength_pa_m
+        stiffness_pa_m = self.unloading_stiffness_ratio * self.strength_pa_m
         stress_pa = stiffness_pa_m * (depth_m - set_m)
         if stress_pa < strength_pa:  # elastic: unloading or reloading
             return max(stress_pa, 0.0), set_m
@@ -108,7 +110,7 @@ class SoftGround:
             stress_pa = strength_pa
         return stress_pa, depth_m - strength_pa / stiffness_pa_m
 
-    def on_the_foot_n(
+    def compute_foot_force_n(
         self, depth_m: float, sinking_m_s: float, gap_m: float, sole_m2: float
     ) -> float:
         """Compute the vertical force on the whole foot beside the strips; negative: downwards.
@@ -124,11 +126,11 @@ class SoftGround:
         force_n = self.side_n_s_m2 * depth_m * sinking_m_s
         force_n += self.head_pa_m * sole_m2 * min(depth_m, _FOOT_M)
         if sinking_m_s < 0.0 < gap_m:
-            force_n -= sole_m2 * self.suction_at_pa(gap_m, -sinking_m_s)
+            force_n -= sole_m2 * self.compute_suction_pa(gap_m, -sinking_m_s)
         return force_n
 
-    def suction_at_pa(self, gap_m: float, rising_m_s: float) -> float:
-        """Compute the suction on a rising sole: largest at `_SUCKS_M`, zero in a filled gap."""
-        part = gap_m / _SUCKS_M
-        flow = rising_m_s / (rising_m_s + _SUCKS_M_S)
+    def compute_suction_pa(self, gap_m: float, rising_m_s: float) -> float:
+        """Compute suction on a rising sole: largest at `_SUCTION_GAP_M`, zero in a filled gap."""
+        part = gap_m / _SUCTION_GAP_M
+        flow = rising_m_s / (rising_m_s + _SUCTION_SPEED_M_S)
         return self.suction_pa * part * math.exp(1.0 - part) * flow

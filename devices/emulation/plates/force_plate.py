@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats
-from devices.emulation.plates.clock import PlateClock
-from devices.emulation.plates.underfoot import FORCES, MOMENTS, VERTICAL
+from devices.emulation.plates.plate_clock import PlateClock
+from devices.emulation.plates.plate_load import FORCES, MOMENTS, VERTICAL
 
 CHANNELS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
 RATE_HZ = 1000.0
@@ -58,18 +58,18 @@ class ForcePlate:
 
     Attributes:
         clock: clock of the plate.
-        mixing: (6, 6), sensitivity of each channel to each load.
+        sensitivity: (6, 6), sensitivity of each channel to each load.
         offset: (6,), offset at the first sample.
         creep_per_s: (6,), drift of the offset.
     """
 
     clock: PlateClock
-    mixing: Floats
+    sensitivity: Floats
     offset: Floats
     creep_per_s: Floats
 
     @classmethod
-    def drawn(cls, plate: np.random.Generator, trial: np.random.Generator) -> ForcePlate:
+    def draw(cls, plate: np.random.Generator, trial: np.random.Generator) -> ForcePlate:
         """Draw a plate's properties and the set-up of a trial, each by its own generator."""
         mixing = np.eye(6) * (1.0 + GAIN * plate.uniform(-1.0, 1.0, 6))
         part = CROSSTALK * plate.uniform(-1.0, 1.0, (6, 6))
@@ -84,7 +84,7 @@ class ForcePlate:
                 start_s=trial.uniform(0.05, LATEST_S),
                 drift_ppm=plate.uniform(-DRIFT_PPM, DRIFT_PPM),
             ),
-            mixing=mixing,
+            sensitivity=mixing,
             offset=RANGE * OFFSET * trial.uniform(-1.0, 1.0, 6),
             creep_per_s=RANGE * CREEP_PER_S * trial.uniform(-1.0, 1.0, 6),
         )
@@ -94,7 +94,7 @@ class ForcePlate:
         """Delay of slow loads: the spring's and the filter's."""
         return DAMPING / (math.pi * NATURAL_HZ) + math.sqrt(0.5) / (math.pi * FILTER_HZ)
 
-    def record(
+    def simulate_recording(
         self, wrench: Callable[[Floats], Floats], end_s: float, noise: np.random.Generator
     ) -> tuple[Floats, Floats]:
         """Simulate a recording of a load until `end_s` of the scene.
@@ -107,15 +107,15 @@ class ForcePlate:
         Returns:
             Times by the plate's clock (n,), and its channels (n, 6).
         """
-        time_s, t_s = self.clock.samples(end_s)
-        shown = self._filtered(wrench, t_s) @ self.mixing.T
+        time_s, t_s = self.clock.compute_sample_times(end_s)
+        shown = self._filter_load(wrench, t_s) @ self.sensitivity.T
         shown += self.offset + time_s[:, None] * self.creep_per_s
         shown += RANGE * WHITE * noise.standard_normal(shown.shape)
-        shown += RANGE * SLOW * self._slow(len(time_s), noise)
+        shown += RANGE * SLOW * self._draw_slow_noise(len(time_s), noise)
         step = RANGE / 2 ** (BITS - 1)
         return time_s, np.asarray(np.clip(np.rint(shown / step) * step, -RANGE, RANGE - step))
 
-    def _filtered(self, wrench: Callable[[Floats], Floats], t_s: Floats) -> Floats:
+    def _filter_load(self, wrench: Callable[[Floats], Floats], t_s: Floats) -> Floats:
         """Apply spring and filter to the load, exactly, as both are linear."""
         if not len(t_s):
             return np.zeros((0, 6))
@@ -129,7 +129,7 @@ class ForcePlate:
         spectrum = np.fft.rfft(load, axis=0) * passed[:, None]
         return np.asarray(np.fft.irfft(spectrum, len(fine_s), axis=0)[before::_FINER])
 
-    def _slow(self, n: int, noise: np.random.Generator) -> Floats:
+    def _draw_slow_noise(self, n: int, noise: np.random.Generator) -> Floats:
         """Draw noise of unit variance with correlation time `SLOW_S`, linear between knots."""
         decay = math.exp(-0.1)
         knot_s = 0.1 * SLOW_S

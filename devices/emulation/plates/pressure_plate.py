@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from devices.emulation.plates.clock import PlateClock
-from devices.emulation.plates.underfoot import Underfoot
+from devices.emulation.plates.plate_clock import PlateClock
+from devices.emulation.plates.plate_load import PlateLoad
 
 RATE_HZ = 100.0
 PITCH_M = 0.005
@@ -60,7 +60,7 @@ class PressurePlate:
     turned_rad: float
 
     @classmethod
-    def drawn(
+    def draw(
         cls, places_m: Floats, plate: np.random.Generator, trial: np.random.Generator
     ) -> PressurePlate:
         """Draw a plate around places (tiles, 2), and the placement of the foot in a trial."""
@@ -78,30 +78,30 @@ class PressurePlate:
             turned_rad=TURNED_RAD * trial.standard_normal(),
         )
 
-    def record(
-        self, foot: Underfoot, end_s: float, noise: np.random.Generator
+    def simulate_recording(
+        self, plate_load: PlateLoad, end_s: float, noise: np.random.Generator
     ) -> tuple[Floats, Floats]:
         """Simulate a recording of a foot until `end_s` of the scene.
 
         Returns:
             Times by the plate's clock (n,), and forces (n, cells along x, cells along y).
         """
-        time_s, t_s = self.clock.samples(end_s)
+        time_s, t_s = self.clock.compute_sample_times(end_s)
         cosine, sine = math.cos(self.turned_rad), math.sin(self.turned_rad)
         turn = np.array([[cosine, sine], [-sine, cosine]])
-        places_m = foot.places_m @ turn + self.placed_m
-        bears = self._pressed_n(foot.vertical_n(t_s), places_m)
+        places_m = plate_load.dome_places_m @ turn + self.placed_m
+        bears = self._compute_cell_forces_n(plate_load.compute_vertical_n(t_s), places_m)
         n_per_kpa = 1e3 * PITCH_M**2
         kpa = bears * self.gains / n_per_kpa
         kpa += NOISE_KPA * noise.standard_normal(kpa.shape)
         kpa = np.rint(np.minimum(kpa, END_KPA) / STEP_KPA) * STEP_KPA
         return time_s, np.where(kpa < THRESHOLD_KPA, 0.0, kpa) * n_per_kpa
 
-    def _pressed_n(self, vertical_n: Floats, places_m: Floats) -> Floats:
+    def _compute_cell_forces_n(self, vertical_n: Floats, places_m: Floats) -> Floats:
         """Compute the load of each cell, (n, cells along x, cells along y); none off the plate."""
         shape = (len(vertical_n), *self.gains.shape)
         total = np.zeros(math.prod(shape))
-        radius_m = patch_radius_m(vertical_n)
+        radius_m = compute_patch_radius_m(vertical_n)
         frame = np.arange(len(vertical_n))[:, None]
         for dome, place_m in enumerate(places_m):
             at_m = place_m + radius_m[:, dome, None, None] * _SPREAD
@@ -113,13 +113,13 @@ class PressurePlate:
         return total.reshape(shape)
 
 
-def patch_radius_m(force_n: Floats) -> Floats:
+def compute_patch_radius_m(force_n: Floats) -> Floats:
     """Compute the radius of a dome's contact patch on a plane under a force."""
     cubed = 0.75 * np.maximum(force_n, 0.0) * _DOME_RADIUS_M / _MODULUS_PA
     return np.asarray(np.minimum(np.cbrt(cubed), _DOME_RADIUS_M))
 
 
-def _spread() -> Floats:
+def _compute_patch_points() -> Floats:
     """Compute points of a patch of radius 1 with equal forces, (points, 2).
 
     The part 1 - (1 - r^2)^(3/2) of the force is within a radius r (Hertz).
@@ -131,4 +131,4 @@ def _spread() -> Floats:
     return np.asarray(points - points.mean(axis=0))
 
 
-_SPREAD = _spread()
+_SPREAD = _compute_patch_points()

@@ -10,42 +10,48 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
 from devices.errors import CalibrationError, FootTileError, UsageError
-from devices.facts import check_new_name
-from service.api.routes.access import FULL, ServerState, has_it, problems, tag_of
+from devices.types import check_user_name
+from service.api.routes.common import (
+    FULL,
+    ServerState,
+    has_matching_etag,
+    parse_if_match,
+    problem_responses,
+)
 from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
-from service.private_paths import ShownText
-from service.server.book import expect
-from service.server.calibrations import Kept
-from service.server.fits import SESSIONS_MAX, Fit
-from service.server.node import ServerNode
-from service.server.screens.views import (
+from service.private_paths import PublicText
+from service.server.broadcast.views import (
     CalibrationSource,
     CalibrationView,
     Page,
     View,
-    scale_of,
+    absolute_scale,
 )
-from service.server_clock import utc_ns
-from service.sessions.calibration_file import calibration_of, content_of
+from service.server.calibration_jobs import SESSIONS_MAX, CalibrationJob
+from service.server.calibrations import CalibrationSummary
+from service.server.node import ServerNode
+from service.server.session_store import check_revision
+from service.server_clock import server_utc_ns
+from service.sessions.calibration_file import encode_calibration, parse_calibration
 from service.sessions.pipeline import EstimateOptions, EstimateStream
 
 router = APIRouter(tags=["calibrations"])
 
-_NONE = "none"
+_NO_CALIBRATION = "none"
 """Id for the absence of a calibration."""
-_UNKNOWN = problems(_404="No such calibration.", _409="Its file is damaged.")
-_NO_NODE = problems(_404="No such node.")
+_UNKNOWN = problem_responses(_404="No such calibration.", _409="Its file is damaged.")
+_NO_NODE = problem_responses(_404="No such node.")
 
 Line = Annotated[
     str,
     StringConstraints(strip_whitespace=True, min_length=1, max_length=200),
-    AfterValidator(check_new_name),
+    AfterValidator(check_user_name),
 ]
 SessionId = Annotated[str, StringConstraints(max_length=100)]
 
 
-class KeptView(View):
+class CalibrationSummaryView(View):
     """Summary of a calibration."""
 
     id: str = Field(description="Hash of its content.", examples=["983bbbe1624bad0b"])
@@ -60,17 +66,17 @@ class KeptView(View):
     mounted: bool = Field(description="True: a force plate has shown how its tiles are mounted.")
 
     @classmethod
-    def of(cls, kept: Kept) -> KeptView:
+    def from_summary(cls, summary: CalibrationSummary) -> CalibrationSummaryView:
         """Return the view of a summary."""
         return cls(
-            id=kept.id,
-            name=kept.name,
-            reference=kept.reference,
-            date=kept.date,
-            serials=list(kept.serials),
-            refused=list(kept.refused),
-            absolute_scale="assumed" if kept.is_assumed else "measured",
-            mounted=kept.is_mounted,
+            id=summary.id,
+            name=summary.name,
+            reference=summary.reference,
+            date=summary.date,
+            serials=list(summary.serials),
+            refused=list(summary.refused),
+            absolute_scale="assumed" if summary.has_assumed_scale else "measured",
+            mounted=summary.has_mount_gains,
         )
 
 
@@ -102,27 +108,27 @@ class FitView(View):
     state: Literal["running", "done", "failed", "cancelled"]
     started_t_ns: int = Field(description="Server's UTC.")
     ended_t_ns: int | None
-    said: list[ShownText] = Field(description="Log of the job, a line per tile.")
+    log: list[PublicText] = Field(description="Log of the job, a line per tile.")
     calibration_id: str | None = Field(description="Id of the calibration, once it is done.")
-    problem: ShownText | None = Field(description="Reason of a failure.")
+    problem: PublicText | None = Field(description="Reason of a failure.")
 
     @classmethod
-    def of(cls, fit: Fit) -> FitView:
+    def from_job(cls, job: CalibrationJob) -> FitView:
         """Return the present state of a job."""
         return cls(
-            id=fit.id,
-            name=fit.name,
-            sessions=list(fit.sessions),
-            state=fit.state,
-            started_t_ns=fit.started_t_ns,
-            ended_t_ns=fit.ended_t_ns,
-            said=list(fit.said),
-            calibration_id=fit.calibration_id,
-            problem=fit.problem,
+            id=job.id,
+            name=job.name,
+            sessions=list(job.sessions),
+            state=job.state,
+            started_t_ns=job.started_t_ns,
+            ended_t_ns=job.ended_t_ns,
+            log=list(job.log_lines),
+            calibration_id=job.calibration_id,
+            problem=job.problem,
         )
 
 
-class Assign(BaseModel):
+class AssignCalibration(BaseModel):
     """Request to assign a calibration to a node."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -141,20 +147,20 @@ class NodeCalibrationView(View):
     )
     assigned_t_ns: int | None = Field(description="Time of the assignment, server's UTC.")
     calibration: CalibrationView | None = Field(description="Calibration in use; null: none.")
-    problem: ShownText | None = Field(description="Reason why none is in use.")
+    problem: PublicText | None = Field(description="Reason why none is in use.")
     own_id: str | None = Field(description="Id of the node's own calibration.")
 
     @classmethod
-    def of(cls, node: ServerNode) -> NodeCalibrationView:
+    def from_node(cls, node: ServerNode) -> NodeCalibrationView:
         """Return the present calibration of a node."""
-        estimates, own_calibration = node.estimates, node.hello.calibration
-        live, assigned = estimates.live, estimates.assignment.present
+        estimates, own_calibration = node.estimator, node.hello.calibration
+        live, assigned = estimates.live, estimates.assignment.current
         used = None
         if live.calibration is not None and live.calibration_id and live.ranges is not None:
             used = CalibrationView(
                 id=live.calibration_id,
                 name=live.calibration.name,
-                absolute_scale=scale_of(live.ranges),
+                absolute_scale=absolute_scale(live.ranges),
             )
         return cls(
             node=node.name,
@@ -176,9 +182,14 @@ InUse = Annotated[
 
 
 @router.get("/calibrations", operation_id="listCalibrations", summary="Calibrations")
-async def list_calibrations(server: ServerState) -> Page[KeptView]:
+async def list_calibrations(server: ServerState) -> Page[CalibrationSummaryView]:
     """Return the calibrations on the server, the newest recordings first."""
-    return Page(items=[KeptView.of(summary) for summary in server.calibrations.all()])
+    return Page(
+        items=[
+            CalibrationSummaryView.from_summary(summary)
+            for summary in server.calibrations.list_all()
+        ]
+    )
 
 
 @router.post(
@@ -187,7 +198,7 @@ async def list_calibrations(server: ServerState) -> Page[KeptView]:
     summary="Upload a calibration",
     status_code=HTTPStatus.CREATED,
     responses={
-        **problems(
+        **problem_responses(
             _409="The limit of calibrations is reached.",
             _413="It is longer than 1 MiB.",
             _422="No calibration, an unknown field, or a wrong hash.",
@@ -202,21 +213,23 @@ async def list_calibrations(server: ServerState) -> Page[KeptView]:
         }
     },
 )
-async def upload(request: Request, server: ServerState, response: Response) -> KeptView:
+async def upload_calibration(
+    request: Request, server: ServerState, response: Response
+) -> CalibrationSummaryView:
     """Store a calibration file, checked as on every read; the same file twice is one calibration.
 
     A file without `id` and `check` was written by hand, and is marked as unproven.
     """
-    calibration = await run_in_threadpool(_understood, await request.body())
-    summary = server.calibrations.keep(calibration)
+    calibration = await run_in_threadpool(_parse_body, await request.body())
+    summary = server.calibrations.save(calibration)
     response.headers["Location"] = f"/api/v1/calibrations/{summary.id}"
-    return KeptView.of(summary)
+    return CalibrationSummaryView.from_summary(summary)
 
 
 @router.get("/calibrations/fits", operation_id="listFits", summary="Fits")
 async def list_fits(server: ServerState) -> Page[FitView]:
     """Return the last jobs since the server was started, newest first."""
-    return Page(items=[FitView.of(fit) for fit in server.fits.all()])
+    return Page(items=[FitView.from_job(fit) for fit in server.calibration_jobs.list_jobs()])
 
 
 @router.post(
@@ -224,7 +237,7 @@ async def list_fits(server: ServerState) -> Page[FitView]:
     operation_id="startFit",
     summary="Fit a calibration",
     status_code=HTTPStatus.ACCEPTED,
-    responses=problems(
+    responses=problem_responses(
         _404="No such session.",
         _409="Another job is running, or a session is not sealed.",
         _422="Invalid body, or the sessions are too long.",
@@ -239,31 +252,31 @@ async def start_fit(body: StartFit, server: ServerState, response: Response) -> 
     if body.reference_delay_ms is not None:
         options["reference_delay_ms"] = repr(body.reference_delay_ms)
         options["reference_delay_sigma_ms"] = repr(body.reference_delay_sigma_ms)
-    fit = server.fits.start(body.name, body.sessions, options)
+    fit = server.calibration_jobs.start_job(body.name, body.sessions, options)
     response.headers["Location"] = f"/api/v1/calibrations/fits/{fit.id}"
-    return FitView.of(fit)
+    return FitView.from_job(fit)
 
 
 @router.get(
     "/calibrations/fits/{fit_id}",
     operation_id="getFit",
     summary="Fit progress",
-    responses=problems(_404="No such fit."),
+    responses=problem_responses(_404="No such fit."),
 )
 async def get_fit(fit_id: str, server: ServerState) -> FitView:
     """Return a job's progress, and the id of the calibration once it is done."""
-    return FitView.of(server.fits.get(fit_id))
+    return FitView.from_job(server.calibration_jobs.get_job(fit_id))
 
 
 @router.delete(
     "/calibrations/fits/{fit_id}",
     operation_id="cancelFit",
     summary="Cancel a fit",
-    responses=problems(_404="No such fit."),
+    responses=problem_responses(_404="No such fit."),
 )
 async def cancel_fit(fit_id: str, server: ServerState) -> FitView:
     """Cancel a running job without a result; an ended one is unchanged."""
-    return FitView.of(await server.fits.cancel(fit_id))
+    return FitView.from_job(await server.calibration_jobs.cancel_job(fit_id))
 
 
 @router.get(
@@ -279,8 +292,8 @@ async def cancel_fit(fit_id: str, server: ServerState) -> FitView:
 )
 async def get_calibration(calibration_id: str, request: Request, server: ServerState) -> Response:
     """Return the file as every command of `foottile` reads it; its id is its entity tag."""
-    calibration = await run_in_threadpool(server.calibrations.get, calibration_id)
-    return _file(calibration, request)
+    calibration = await run_in_threadpool(server.calibrations.load, calibration_id)
+    return _file_response(calibration, request)
 
 
 @router.delete(
@@ -289,7 +302,7 @@ async def get_calibration(calibration_id: str, request: Request, server: ServerS
     summary="Delete a calibration",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
-    responses={**problems(_404="No such calibration."), **FULL},
+    responses={**problem_responses(_404="No such calibration."), **FULL},
 )
 async def delete_calibration(calibration_id: str, server: ServerState) -> None:
     """Delete a calibration; sessions and nodes that use it have a copy."""
@@ -302,9 +315,9 @@ async def delete_calibration(calibration_id: str, server: ServerState) -> None:
     summary="A node's calibration",
     responses=_NO_NODE,
 )
-async def node_calibration(node: str, server: ServerState) -> NodeCalibrationView:
+async def get_node_calibration(node: str, server: ServerState) -> NodeCalibrationView:
     """Return the calibration in use, and its origin."""
-    return NodeCalibrationView.of(server.nodes.get(node))
+    return NodeCalibrationView.from_node(server.nodes.get(node))
 
 
 @router.put(
@@ -312,7 +325,7 @@ async def node_calibration(node: str, server: ServerState) -> NodeCalibrationVie
     operation_id="assignCalibration",
     summary="Assign a calibration",
     responses={
-        **problems(
+        **problem_responses(
             _404="No such node or calibration.",
             _409="The calibration's file is damaged.",
             _412="Another calibration is in use than If-Match names.",
@@ -321,8 +334,8 @@ async def node_calibration(node: str, server: ServerState) -> NodeCalibrationVie
         **FULL,
     },
 )
-async def assign(
-    node: str, body: Assign, server: ServerState, if_match: InUse = None
+async def assign_calibration(
+    node: str, body: AssignCalibration, server: ServerState, if_match: InUse = None
 ) -> NodeCalibrationView:
     """Estimate a node's tiles with this calibration, until it is unassigned.
 
@@ -330,12 +343,12 @@ async def assign(
     theirs. The assignment outlives a restart of either side.
     """
     the_node = server.nodes.get(node)
-    calibration = await run_in_threadpool(server.calibrations.get, body.id)
-    _expect_in_use(the_node, if_match)
+    calibration = await run_in_threadpool(server.calibrations.load, body.id)
+    _check_calibration_in_use(the_node, if_match)
     check_fits(the_node, calibration)
-    the_node.estimates.use_calibration(calibration, utc_ns())
-    server.tell_node(the_node)
-    return NodeCalibrationView.of(the_node)
+    the_node.estimator.assign_calibration(calibration, server_utc_ns())
+    server.notify_node_changed(the_node)
+    return NodeCalibrationView.from_node(the_node)
 
 
 @router.delete(
@@ -344,37 +357,39 @@ async def assign(
     summary="Unassign a calibration",
     responses={
         **_NO_NODE,
-        **problems(_412="Another calibration is in use than If-Match names."),
+        **problem_responses(_412="Another calibration is in use than If-Match names."),
         **FULL,
     },
 )
-async def take_back(node: str, server: ServerState, if_match: InUse = None) -> NodeCalibrationView:
+async def unassign_calibration(
+    node: str, server: ServerState, if_match: InUse = None
+) -> NodeCalibrationView:
     """Use the node's own calibration again, if it has one."""
     the_node = server.nodes.get(node)
-    _expect_in_use(the_node, if_match)
-    if the_node.estimates.calibration_source == "server":
-        the_node.estimates.use_calibration(None, utc_ns())
-        server.tell_node(the_node)
-    return NodeCalibrationView.of(the_node)
+    _check_calibration_in_use(the_node, if_match)
+    if the_node.estimator.calibration_source == "server":
+        the_node.estimator.assign_calibration(None, server_utc_ns())
+        server.notify_node_changed(the_node)
+    return NodeCalibrationView.from_node(the_node)
 
 
-def _understood(content: bytes) -> Calibration:
+def _parse_body(content: bytes) -> Calibration:
     try:
-        return calibration_of(content, where="the body")
+        return parse_calibration(content, where="the body")
     except CalibrationError as error:
         raise UsageError(error.what, expected=error.expected, remedy=error.remedy) from error
 
 
-def _file(calibration: Calibration, request: Request) -> Response:
+def _file_response(calibration: Calibration, request: Request) -> Response:
     headers = {"ETag": f'"{calibration.id}"'}
-    if has_it(request, calibration.id):
+    if has_matching_etag(request, calibration.id):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    return Response(content_of(calibration), media_type="application/json", headers=headers)
+    return Response(encode_calibration(calibration), media_type="application/json", headers=headers)
 
 
-def _expect_in_use(node: ServerNode, if_match: str | None) -> None:
-    present = node.estimates.live.calibration_id or _NONE
-    expect(tag_of(if_match), present, f"the calibration of {node.name!r}")
+def _check_calibration_in_use(node: ServerNode, if_match: str | None) -> None:
+    present = node.estimator.live.calibration_id or _NO_CALIBRATION
+    check_revision(parse_if_match(if_match), present, f"the calibration of {node.name!r}")
 
 
 def check_fits(node: ServerNode, calibration: Calibration) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.registry import FORMATS
 
 router = APIRouter(prefix="/formats", tags=["data"])
 
@@ -34,7 +34,7 @@ class FormatsView(BaseModel):
 
 
 @router.get("", operation_id="listFormats", summary="Formats of downloads")
-def formats() -> FormatsView:
+def list_formats() -> FormatsView:
     """Return the formats in the order of menus."""
     formats_ = FORMATS.values()
     return FormatsView(items=[FormatView.model_validate(f, from_attributes=True) for f in formats_])

@@ -5,11 +5,11 @@ from __future__ import annotations
 from fastapi import APIRouter
 from pydantic import Field
 
-from service.api.routes.access import ServerState, problems
-from service.link import SUBPROTOCOL
-from service.private_paths import ShownText
-from service.server.screens.views import View
-from service.version import SOFTWARE
+from service.api.routes.common import ServerState, problem_responses
+from service.private_paths import PublicText
+from service.protocol import SUBPROTOCOL
+from service.server.broadcast.views import View
+from service.version import SOFTWARE_VERSION
 
 router = APIRouter(tags=["server"])
 
@@ -18,7 +18,7 @@ class Health(View):
     """State of the process."""
 
     status: str = Field(examples=["ok"])
-    problems: list[ShownText] = Field(
+    problems: list[PublicText] = Field(
         description="Damage found in the data folder at the start, and the consequence, as text. "
         "Everything else is served."
     )
@@ -41,7 +41,7 @@ class Version(View):
 
 
 @router.get("/health", operation_id="getHealth", summary="Liveness")
-async def health(server: ServerState) -> Health:
+async def get_health(server: ServerState) -> Health:
     """Return the state of the process, with the damage found at its start."""
     return Health(status="ok", problems=server.problems)
 
@@ -50,19 +50,19 @@ async def health(server: ServerState) -> Health:
     "/ready",
     operation_id="getReady",
     summary="Readiness",
-    responses=problems(_507="The data folder cannot be written."),
+    responses=problem_responses(_507="The data folder cannot be written."),
 )
-def ready(server: ServerState) -> Ready:
+def get_ready(server: ServerState) -> Ready:
     """Write a test file to the data folder, and count nodes and subscribers."""
-    server.check_storage()
+    server.check_writable()
     return Ready(
         ready=True,
         nodes_connected=len(server.links),
-        subscribers=server.hub.subscribers,
+        subscribers=server.broadcaster.subscriber_count,
     )
 
 
 @router.get("/version", operation_id="getVersion", summary="Version")
-async def version() -> Version:
+async def get_version() -> Version:
     """Return the versions of software, API and link protocol."""
-    return Version(software=SOFTWARE)
+    return Version(software=SOFTWARE_VERSION)

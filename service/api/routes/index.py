@@ -5,10 +5,10 @@ from __future__ import annotations
 from fastapi import Request
 from pydantic import Field
 
-from service.api.described import operations
-from service.link import INGEST_PATH, LIVE_PATH
-from service.server.screens.views import View
-from service.version import SOFTWARE
+from service.api.openapi import list_operations
+from service.protocol import INGEST_PATH, LIVE_PATH
+from service.server.broadcast.views import View
+from service.version import SOFTWARE_VERSION
 
 
 class RouteView(View):
@@ -36,11 +36,11 @@ class IndexView(View):
     routes: list[RouteView]
 
 
-async def index(request: Request) -> IndexView:
+async def get_index(request: Request) -> IndexView:
     """Return every route with its address and summary."""
     app = request.app
     return IndexView(
-        software=SOFTWARE,
+        software=SOFTWARE_VERSION,
         docs="/docs",
         openapi=str(app.openapi_url),
         live=LIVE_PATH,
@@ -52,6 +52,6 @@ async def index(request: Request) -> IndexView:
                 operation=operation["operationId"],
                 summary=operation["summary"],
             )
-            for path, method, operation in operations(app.openapi())
+            for path, method, operation in list_operations(app.openapi())
         ],
     )

@@ -9,27 +9,27 @@ from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from starlette.exceptions import HTTPException
 
-from service.api.logins import LOGIN_S, TICKET_S, Logins, Right, cookie_name
-from service.server.screens.views import View
-from service.server_clock import utc_ns
+from service.api.logins import LOGIN_S, TICKET_S, Logins, Role, cookie_name
+from service.server.broadcast.views import View
+from service.server_clock import server_utc_ns
 
 router = APIRouter(tags=["login"])
 
-_NOT_TAKEN = (
+_INVALID_TICKET = (
     "Invalid ticket: each is valid once and for five minutes, until the server ends. Get "
     "a new one with `foottile invite` on the computer on which `foottile serve` runs"
 )
-_NOTHING_SHOWN = "A login needs a ticket, or the token as Authorization: Bearer TOKEN"
+_NO_CREDENTIALS = "A login needs a ticket, or the token as Authorization: Bearer TOKEN"
 
-May = Literal["look", "press"]
-_RIGHTS: dict[str, Right] = {"look": Right.LOOK, "press": Right.PRESS}
+RoleName = Literal["look", "press"]
+_ROLES: dict[str, Role] = {"look": Role.VIEWER, "press": Role.OPERATOR}
 
 
 class LoginView(View):
     """Present permissions of the client."""
 
     private: bool = Field(description="True: reading needs a login, too.")
-    may: May | None = Field(
+    may: RoleName | None = Field(
         description="Role by the credentials of the request; null: none. Without any, reading is "
         "allowed unless the server is private."
     )
@@ -50,14 +50,14 @@ class NewTicket(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    may: May = Field(default="press", description="`look`: viewer; `press`: operator.")
+    may: RoleName = Field(default="press", description="`look`: viewer; `press`: operator.")
 
 
 class TicketView(View):
     """Ticket, a one-time login."""
 
     ticket: str
-    may: May
+    may: RoleName
     ends_t_ns: int = Field(description="End of its validity, server's UTC.")
     urls: list[str] = Field(
         description="URLs of the live page with the ticket; the first browser that opens one is "
@@ -77,8 +77,10 @@ LoginsState = Annotated[Logins, Depends(_logins)]
 @router.get("/login", operation_id="getLogin", summary="Current permissions")
 async def get_login(request: Request, logins: LoginsState) -> LoginView:
     """Return the permissions by the cookie or the token of this request."""
-    credentials = logins.shown_by(request)
-    return _view(logins, credentials.right, credentials.left_s, has_ended=credentials.has_ended)
+    credentials = logins.check_credentials(request)
+    return _make_view(
+        logins, credentials.role, credentials.cookie_remaining_s, has_ended=credentials.is_expired
+    )
 
 
 @router.post(
@@ -89,25 +91,25 @@ async def log_in(
 ) -> LoginView:
     """Set a cookie, HttpOnly and SameSite=Strict, valid for 12 hours or until the server ends."""
     if body.ticket is not None:
-        grant = logins.tickets.take(body.ticket)
-        right = None if grant is None else grant.right
+        grant = logins.tickets.redeem(body.ticket)
+        right = None if grant is None else grant.role
     else:
-        credentials = logins.shown_by(request)
+        credentials = logins.check_credentials(request)
         # A cookie cannot renew itself: it would never expire.
-        right = Right.PRESS if credentials.right is Right.OWN else None
+        right = Role.OPERATOR if credentials.role is Role.OWNER else None
     if right is None:
-        detail = _NOT_TAKEN if body.ticket is not None else _NOTHING_SHOWN
+        detail = _INVALID_TICKET if body.ticket is not None else _NO_CREDENTIALS
         headers = {"www-authenticate": "Bearer"}
         raise HTTPException(HTTPStatus.UNAUTHORIZED, detail, headers)
     response.set_cookie(
         cookie_name(request),
-        logins.cookies.new(right),
+        logins.cookies.create(right),
         max_age=int(LOGIN_S),
         httponly=True,
         samesite="strict",
         secure=request.url.scheme == "https",
     )
-    return _view(logins, right, LOGIN_S)
+    return _make_view(logins, right, LOGIN_S)
 
 
 @router.delete(
@@ -119,9 +121,9 @@ async def log_in(
 )
 async def log_out(request: Request, response: Response, logins: LoginsState) -> None:
     """Invalidate the cookie of this request."""
-    cookie = logins.cookie_of(request)
+    cookie = logins.read_cookie(request)
     if cookie is not None:
-        logins.cookies.take(cookie)
+        logins.cookies.redeem(cookie)
         response.delete_cookie(cookie_name(request), httponly=True, samesite="strict")
 
 
@@ -131,29 +133,29 @@ async def log_out(request: Request, response: Response, logins: LoginsState) -> 
     summary="Create a one-time login",
     status_code=HTTPStatus.CREATED,
 )
-async def give_ticket(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
+async def create_ticket(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
     """Create a ticket, valid once and for five minutes. Needs the token; a login is not enough."""
-    ticket = logins.tickets.new(_RIGHTS[body.may])
+    ticket = logins.tickets.create(_ROLES[body.may])
     urls = request.app.state.find_urls() or (str(request.base_url).rstrip("/"),)
     return TicketView(
         ticket=ticket,
         may=body.may,
-        ends_t_ns=utc_ns() + round(TICKET_S * 1e9),
-        urls=[with_ticket(url, ticket) for url in urls],
+        ends_t_ns=server_utc_ns() + round(TICKET_S * 1e9),
+        urls=[add_ticket(url, ticket) for url in urls],
     )
 
 
-def with_ticket(url: str, ticket: str) -> str:
+def add_ticket(url: str, ticket: str) -> str:
     """Return the page's URL with a ticket in the fragment, which no browser sends to a server."""
     return f"{url}/#ticket={ticket}"
 
 
-def _view(
-    logins: Logins, right: Right | None, left_s: float | None, *, has_ended: bool = False
+def _make_view(
+    logins: Logins, right: Role | None, left_s: float | None, *, has_ended: bool = False
 ) -> LoginView:
     return LoginView(
         private=logins.is_private,
-        may=None if right is None else "look" if right is Right.LOOK else "press",
+        may=None if right is None else "look" if right is Role.VIEWER else "press",
         ended=has_ended,
-        ends_t_ns=None if left_s is None else utc_ns() + round(left_s * 1e9),
+        ends_t_ns=None if left_s is None else server_utc_ns() + round(left_s * 1e9),
     )

@@ -9,15 +9,15 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from devices.facts import check_new_name
-from service.api.routes.access import ServerState, problems, tag_of
-from service.server.book import expect
+from devices.types import check_user_name
+from service.api.routes.common import ServerState, parse_if_match, problem_responses
+from service.server.broadcast.force_history import SECONDS_MAX
+from service.server.broadcast.force_span import ForceSpan
+from service.server.broadcast.summary import round_values
+from service.server.broadcast.views import DriftView, NodeView, Page, TaresPage, TareView, View
 from service.server.node import ServerNode
-from service.server.screens.picture import rounded
-from service.server.screens.recent import SECONDS_MAX
-from service.server.screens.spans import Span
-from service.server.screens.views import DriftView, NodeView, Page, TaresPage, TareView, View
 from service.server.server import Server
+from service.server.session_store import check_revision
 from service.sessions.tares import REASON_LENGTH_MAX
 
 router = APIRouter(prefix="/nodes", tags=["nodes"])
@@ -28,7 +28,7 @@ class TareRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    reason: Annotated[str, AfterValidator(check_new_name)] = Field(
+    reason: Annotated[str, AfterValidator(check_user_name)] = Field(
         default="",
         max_length=REASON_LENGTH_MAX,
         description='Reason for the history; default "by hand".',
@@ -79,7 +79,7 @@ class RecentView(View):
     """Spans of consecutive frames, oldest first; one value per span in each list."""
 
     node: str
-    boot_id: str = Field(description="Id of the present stream, of which all spans are.")
+    stream_id: str = Field(description="Id of the present stream, of which all spans are.")
     age_ms: float | None = Field(description="Age of the newest published frame; null if unknown.")
     seq_first: list[int]
     seq: list[int]
@@ -90,13 +90,13 @@ class RecentView(View):
     grf_n: list[float | None] = Field(description="GRF of its newest frame.")
     grf_min_n: list[float | None] = Field(description="Minimum over its frames.")
     grf_max_n: list[float | None] = Field(description="Maximum over its frames.")
-    grf_at_least_max_n: list[float | None] = Field(
+    grf_lower_bound_max_n: list[float | None] = Field(
         description="Greatest lower bound among its frames without a GRF."
     )
     tiles: RecentTilesView | None = Field(description="Null unless requested.")
 
 
-_UNKNOWN = problems(_404="No such node.")
+_UNKNOWN = problem_responses(_404="No such node.")
 
 InForce = Annotated[
     str | None,
@@ -107,22 +107,22 @@ InForce = Annotated[
 ]
 
 
-def _expect_in_force(node: ServerNode, if_match: str | None) -> None:
-    recorded = node.estimates.tares.in_force(node.info)
+def _check_tare_in_force(node: ServerNode, if_match: str | None) -> None:
+    recorded = node.estimator.tare_history.tare_in_force(node.info)
     in_force = "none" if recorded is None else recorded.id
-    expect(tag_of(if_match), in_force, f"the tare of {node.name!r}")
+    check_revision(parse_if_match(if_match), in_force, f"the tare of {node.name!r}")
 
 
 @router.get("", operation_id="listNodes", summary="All nodes")
 async def list_nodes(server: ServerState) -> Page[NodeView]:
     """Return connected and remembered nodes."""
-    return Page(items=[server.view_node(node) for node in server.nodes])
+    return Page(items=[server.make_node_view(node) for node in server.nodes])
 
 
 @router.get("/{node}", operation_id="getNode", summary="One node", responses=_UNKNOWN)
 async def get_node(node: str, server: ServerState) -> NodeView:
     """Return array, calibration, tare, clock and counts of a node."""
-    return server.view_node(server.nodes.get(node))
+    return server.make_node_view(server.nodes.get(node))
 
 
 @router.get(
@@ -148,30 +148,34 @@ async def get_recent(
     came since the server was started; where frames are missing, numbers are missing.
     """
     the_node = server.nodes.get(node)
-    rows = server.hub.recent(the_node).rows(query.seconds, query.before_seq)
-    age_ms = server.hub.age_ms(the_node)
+    rows = server.broadcaster.force_history(the_node).get_spans(query.seconds, query.before_seq)
+    age_ms = server.broadcaster.newest_frame_age_ms(the_node)
     numbers = {name: rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
-    forces = {name: rounded(rows[name], "n") for name in Span._fields if name.startswith("grf_")}
+    forces = {
+        name: round_values(rows[name], "n") for name in ForceSpan._fields if name.startswith("grf_")
+    }
     return RecentView(
         node=the_node.name,
-        boot_id=the_node.boot_id,
+        stream_id=the_node.stream_id,
         age_ms=None if age_ms is None else round(age_ms, 1),
-        tiles=None if query.tiles is None else _recent_tiles(the_node, query, query.tiles, server),
+        tiles=None
+        if query.tiles is None
+        else _make_tiles_view(the_node, query, query.tiles, server),
         **(numbers | forces),
     )
 
 
-def _recent_tiles(
+def _make_tiles_view(
     node: ServerNode, query: RecentQuery, unit: str, server: Server
 ) -> RecentTilesView:
-    recent = server.hub.recent_tiles(node)
-    rows, *extremes = recent.rows(query.seconds, unit, query.before_seq)
-    least, greatest = ([_four_digits(row) for row in values.tolist()] for values in extremes)
+    recent = server.broadcaster.tile_history(node)
+    rows, *extremes = recent.get_spans(query.seconds, unit, query.before_seq)
+    least, greatest = ([_round_four_digits(row) for row in values.tolist()] for values in extremes)
     numbers = {name: rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
     return RecentTilesView(min=least, max=greatest, **numbers)
 
 
-def _four_digits(values: list[float]) -> list[float | None]:
+def _round_four_digits(values: list[float]) -> list[float | None]:
     return [float(f"{value:.4g}") if isfinite(value) else None for value in values]
 
 
@@ -182,14 +186,14 @@ def _four_digits(values: list[float]) -> list[float | None]:
     status_code=HTTPStatus.CREATED,
     responses={
         **_UNKNOWN,
-        **problems(
+        **problem_responses(
             _409="The foot is loaded or moves, or the node is not connected.",
             _412="Another tare is in force than If-Match names.",
             _507="Disk full.",
         ),
     },
 )
-async def tare(
+async def tare_node(
     node: str,
     server: ServerState,
     request: TareRequest | None = None,
@@ -201,10 +205,10 @@ async def tare(
     one is undone.
     """
     the_node = server.nodes.get(node)
-    _expect_in_force(the_node, if_match)
-    recorded = the_node.take_tare(request.reason.strip() if request is not None else "")
-    server.tell_node(the_node)
-    return TareView.of(recorded)
+    _check_tare_in_force(the_node, if_match)
+    recorded = the_node.tare_now(request.reason.strip() if request is not None else "")
+    server.notify_node_changed(the_node)
+    return TareView.from_recorded(recorded)
 
 
 @router.get(
@@ -213,8 +217,8 @@ async def tare(
 async def list_tares(node: str, server: ServerState) -> TaresPage:
     """Return the tares, newest first; the first valid one of the present tiles is in force."""
     the_node = server.nodes.get(node)
-    items = [TareView.of(t) for t in reversed(the_node.estimates.tares.all)]
-    return TaresPage(items=items, drift=DriftView.of(the_node))
+    items = [TareView.from_recorded(t) for t in reversed(the_node.estimator.tare_history.tares)]
+    return TaresPage(items=items, drift=DriftView.from_node(the_node))
 
 
 @router.delete(
@@ -223,7 +227,7 @@ async def list_tares(node: str, server: ServerState) -> TaresPage:
     summary="Undo a tare",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
-    responses=problems(
+    responses=problem_responses(
         _404="No such node, or no such tare that is not undone.",
         _412="Another tare is in force than If-Match names.",
         _507="Disk full.",
@@ -235,9 +239,9 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
     After undoing an automatic tare, no other automatic one follows until a tare by hand.
     """
     the_node = server.nodes.get(node)
-    _expect_in_force(the_node, if_match)
-    the_node.estimates.tare_keeper.undo(tare_id)
-    server.tell_node(the_node)
+    _check_tare_in_force(the_node, if_match)
+    the_node.estimator.tare_controller.undo_tare(tare_id)
+    server.notify_node_changed(the_node)
 
 
 @router.post(
@@ -248,7 +252,7 @@ async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InFo
     response_model=None,
     responses={
         **_UNKNOWN,
-        **problems(
+        **problem_responses(
             _409="No machine was refused under this name.",
             _412="Another machine was refused last.",
             _507="Disk full.",

@@ -10,13 +10,13 @@ from fastapi import APIRouter, Header
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from devices.errors import UsageError
-from service.api.routes.access import FULL, ServerState, problems, tag_of
 from service.api.routes.calibrations import Line, check_fits
+from service.api.routes.common import FULL, ServerState, parse_if_match, problem_responses
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.weights import TOLERANCE_PERCENT, weight_labels
-from service.private_paths import ShownText
+from service.estimation.dead_weights import TOLERANCE_PERCENT, make_weight_labels
+from service.private_paths import PublicText
+from service.server.broadcast.views import View
 from service.server.node import ServerNode
-from service.server.screens.views import View
 from service.server.weighing import Method, Repeatability
 from service.server.weighings import NodeWeighing, WeighingPlan, WeighingState
 
@@ -28,8 +28,8 @@ _REFERENCES: dict[Method, str] = {
     "scale": "kitchen scale",
     "sensor": "force sensor",
 }
-_NONE = problems(_404="No such node, or no guided calibration on it.")
-_OTHER = problems(_412="Another guided calibration is there than If-Match names.")
+_NONE = problem_responses(_404="No such node, or no guided calibration on it.")
+_OTHER = problem_responses(_412="Another guided calibration is there than If-Match names.")
 
 ThisOne = Annotated[
     str | None, Header(description="`session_id` of the guided calibration: only if it is this.")
@@ -74,7 +74,7 @@ class StartWeighing(BaseModel):
         reference = self.reference or _REFERENCES[self.method]
         return WeighingPlan(
             tiles=self.tiles,
-            weights=weight_labels(self.weights, self.within_percent),
+            weights=make_weight_labels(self.weights, self.within_percent),
             method=self.method,
             reference=reference,
             name=self.name or f"{', '.join(self.tiles)}, {reference}"[:200],
@@ -90,7 +90,7 @@ class RepeatabilityView(View):
 
     @classmethod
     def of(cls, found: Repeatability) -> RepeatabilityView:
-        """Return the view of a step's repeatability."""
+        """Make the view of a measured step."""
         return cls(**vars(found))
 
 
@@ -137,7 +137,7 @@ class TileResultView(View):
             serial=tile.serial,
             weights=[
                 WeightResultView(
-                    **step.model_dump(), half_width_n=facts.half_width_n(step.gauge_kpa)
+                    **step.model_dump(), half_width_n=facts.interpolate_half_width_n(step.gauge_kpa)
                 )
                 for step in steps
                 if facts is not None
@@ -160,8 +160,8 @@ class WeighingResultView(View):
     name: str
     date: str
     tiles: list[TileResultView]
-    refused: dict[str, ShownText] = Field(description="Tiles without a curve, and why.")
-    misfit: ShownText | None = Field(
+    refused: dict[str, PublicText] = Field(description="Tiles without a curve, and why.")
+    misfit: PublicText | None = Field(
         description="Why the node cannot be estimated with it; null: it can."
     )
 
@@ -170,7 +170,7 @@ class WeighingResultView(View):
         """Return the result of a calibration for the tiles of a node."""
         misfit = None
         bearing = [tile.serial for tile in node.info.tiles if not tile.reference]
-        if lacking := [serial for serial in bearing if calibration.find(serial) is None]:
+        if lacking := [serial for serial in bearing if calibration.find_tile(serial) is None]:
             misfit = f"It has no curve of {', '.join(lacking)}: calibrate all tiles in one go"
         else:
             try:
@@ -202,7 +202,7 @@ class WeighingView(View):
     prompt: str = Field(description="Instruction for now.", examples=["Put 500 g on T02"])
     left_s: float | None = Field(description="Rest of the step; null between steps.")
     warning: str | None = Field(description="Why the last step is repeated.")
-    problem: ShownText | None = Field(description="Why it failed, and what to do.")
+    problem: PublicText | None = Field(description="Why it failed, and what to do.")
     pressure_kpa: float | None = Field(
         description="Mean of the newest quarter second, above the last rest; null before one."
     )
@@ -217,7 +217,7 @@ class WeighingView(View):
 
     @classmethod
     def of(cls, weighing: NodeWeighing, node: ServerNode) -> WeighingView:
-        """Return the present state of a weighing."""
+        """Make the view of a weighing in its present state."""
         now, plan, found = weighing.now, weighing.plan, weighing.calibration
         rest_kpa = now.rest_kpa if isfinite(now.rest_kpa) else None
         recent_kpa = [round(kpa, 3) for kpa in now.recent_kpa]
@@ -265,7 +265,7 @@ class NodeWeighingView(View):
     "",
     operation_id="getWeighing",
     summary="Guided calibration of a node",
-    responses=problems(_404="No such node."),
+    responses=problem_responses(_404="No such node."),
 )
 async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
     """Return the state of the guided calibration; poll it while one is under way."""
@@ -282,7 +282,7 @@ async def get_weighing(node: str, server: ServerState) -> NodeWeighingView:
     summary="Start a guided calibration",
     status_code=HTTPStatus.CREATED,
     responses={
-        **problems(
+        **problem_responses(
             _404="No such node.",
             _409="One is under way on this node, or the node cannot be recorded now.",
             _422="A weight is none, they are too few, or there is no such tile.",
@@ -304,12 +304,12 @@ async def start(node: str, body: StartWeighing, server: ServerState) -> Weighing
     "/repeat",
     operation_id="repeatWeight",
     summary="Repeat a weight",
-    responses={**_NONE, **problems(_409="It has ended."), **_OTHER, **FULL},
+    responses={**_NONE, **problem_responses(_409="It has ended."), **_OTHER, **FULL},
 )
 async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> WeighingView:
     """Go back to the weight that is held, or else to the last one on this tile."""
     the_node = server.nodes.get(node)
-    return WeighingView.of(server.weighings.repeat(the_node, tag_of(if_match)), the_node)
+    return WeighingView.of(server.weighings.repeat(the_node, parse_if_match(if_match)), the_node)
 
 
 @router.delete(
@@ -322,4 +322,4 @@ async def repeat(node: str, server: ServerState, if_match: ThisOne = None) -> We
 )
 async def end(node: str, server: ServerState, if_match: ThisOne = None) -> None:
     """Cancel a running calibration without a fit, or close an ended one; its recording stays."""
-    await server.weighings.end(node, tag_of(if_match))
+    await server.weighings.end(node, parse_if_match(if_match))

@@ -7,13 +7,13 @@ from urllib.parse import quote
 
 import typer
 
-from devices.errors import StateError, needs_extra
+from devices.errors import StateError, require_extra
 from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import CaOption, say
 from service.cli.tickets import TokenFolderOption, read_data_token
 
 
-@needs_extra("server", "`foottile accept-node`")
+@require_extra("server", "`foottile accept-node`")
 def accept_node_command(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
     fingerprint: Annotated[

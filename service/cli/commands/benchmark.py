@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from devices.errors import UsageError, needs_extra
-from devices.scene.file import load_scene
+from devices.errors import UsageError, require_extra
+from devices.scene.scene_file import load_scene
 from service.cli.commands.benchmark_broad import ARRAYS, QUICK_ARRAYS, benchmark_broad, is_broad
 from service.cli.options import (
     JsonOption,
@@ -21,7 +21,7 @@ from service.cli.options import (
     say_lines,
 )
 from service.cli.result_folder import result_folder
-from service.plain_json import json_text
+from service.json_output import to_json_text
 
 SCENES = ("rolling", "poppy", "mud")
 DRAWS, QUICK_DRAWS = 20, 3
@@ -35,7 +35,7 @@ JOBS_MAX = 1024
 REPETITIONS, QUICK_REPETITIONS = 5, 3
 
 
-@needs_extra("server", "`foottile benchmark`")
+@require_extra("server", "`foottile benchmark`")
 def benchmark_command(
     out: Annotated[
         Path,
@@ -138,11 +138,11 @@ def benchmark_command(
                 as_json=as_json,
             )
         return
-    from service.offline.benchmark.plot import plot_bench
-    from service.offline.benchmark.report import markdown
-    from service.offline.benchmark.run import BenchOptions, run_bench
-    from service.offline.plots import new_figure
-    from storage.durable import write_whole
+    from service.offline.benchmark.plot import plot_benchmark
+    from service.offline.benchmark.report import format_benchmark_report
+    from service.offline.benchmark.run import BenchmarkOptions, run_benchmark
+    from service.offline.figure_output import create_figure
+    from storage.durable_files import write_atomically
 
     scenes = tuple(load_scene(name) for name in scene or SCENES)
     names = [the_scene.name for the_scene in scenes]
@@ -152,27 +152,27 @@ def benchmark_command(
         check_emulated(the_scene)
     if seconds is not None and not 0.0 < seconds <= SECONDS_MAX:
         raise UsageError(f"--seconds {seconds:g}", expected=f"0 to {SECONDS_MAX:g}")
-    new_figure(1.0, 1.0)  # says what is missing before anything takes time
-    options = BenchOptions(
+    create_figure(1.0, 1.0)  # says what is missing before anything takes time
+    options = BenchmarkOptions(
         scenes=scenes,
         draws=draws or (QUICK_DRAWS if quick else DRAWS),
         seconds=seconds,
-        jobs=jobs or os.cpu_count() or 1,
+        process_count=jobs or os.cpu_count() or 1,
         offline_frames=frames or (QUICK_FRAMES if quick else FRAMES),
         live_frames=QUICK_LIVE_FRAMES if quick else LIVE_FRAMES,
         repetitions=QUICK_REPETITIONS if quick else REPETITIONS,
-        whole_only=whole_only,
+        full_only=whole_only,
         repeatability=repeatability,
         correlated_ms=correlated_ms,
     )
     with result_folder(out) as folder:
         with progress("starting") as tell:
-            bench = run_bench(options, tell)
-            text, png = markdown(bench), plot_bench(bench.scenes)
-        content = json_text(bench.as_dict())
-        write_whole(folder / "bench.json", content.encode())
-        write_whole(folder / "bench.md", text.encode())
-        write_whole(folder / "bench.png", png)
+            bench = run_benchmark(options, tell)
+            text, png = format_benchmark_report(bench), plot_benchmark(bench.scenes)
+        content = to_json_text(bench.as_dict())
+        write_atomically(folder / "bench.json", content.encode())
+        write_atomically(folder / "bench.md", text.encode())
+        write_atomically(folder / "bench.png", png)
     if as_json:
         print_json(bench.as_dict())
     else:
@@ -180,7 +180,9 @@ def benchmark_command(
         say(f"{folder}: bench.json, bench.md, bench.png")
     for name, failure in bench.failures:
         remark(f"not measured: {name}, {failure.what}: {failure.why}")
-    missed = [(name, goal) for name, goals in bench.goals.items() for goal in goals if not goal.met]
+    missed = [
+        (name, goal) for name, goals in bench.goals.items() for goal in goals if not goal.is_met
+    ]
     if check_goals:
         for name, goal in missed:
             remark(f"goal not met: {name}, {goal.mode}: {goal.figure}: {goal.value:.3g}")

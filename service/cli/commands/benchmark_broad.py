@@ -9,9 +9,9 @@ from typing import get_args
 import typer
 
 from devices.errors import UsageError
-from devices.scene.emulated import Family
+from devices.scene.emulation_sections import PartFamily
 from service.cli.options import print_json, remark, say, say_lines
-from service.plain_json import json_text
+from service.json_output import to_json_text
 
 ARRAYS, QUICK_ARRAYS = 200, 3
 
@@ -26,7 +26,7 @@ def is_broad(family: str, given: Mapping[str, object]) -> bool:
     Raises:
         UsageError: there is no such family, or an option does not go with it.
     """
-    known = get_args(Family)
+    known = get_args(PartFamily)
     if family not in known:
         raise UsageError(f"--family {family}", expected=" or ".join(known))
     asked = [option for option, value in given.items() if value is not None]
@@ -51,48 +51,54 @@ def benchmark_broad(
         UsageError: there are no such seeds.
         Exit: 3, if something gave no result, or with `check_goals` a goal is not met.
     """
-    from service.offline.benchmark.broad.figures import goals_of, models_of, rows_of
+    from service.offline.benchmark.broad.figures import (
+        compare_with_goals,
+        count_models,
+        summarize_cases,
+    )
     from service.offline.benchmark.broad.plot import plot_broad
-    from service.offline.benchmark.broad.report import markdown
+    from service.offline.benchmark.broad.report import format_broad_report
     from service.offline.benchmark.broad.results import Seeds
-    from service.offline.benchmark.broad.run import BroadOptions, run_broad
-    from service.offline.plots import new_figure
-    from storage.durable import write_whole
+    from service.offline.benchmark.broad.run import BroadOptions, run_broad_benchmark
+    from service.offline.figure_output import create_figure
+    from storage.durable_files import write_atomically
 
     known: dict[str, Seeds] = {name: name for name in get_args(Seeds)}
     if seeds not in known:
         raise UsageError(f"--seeds {seeds}", expected=" or ".join(known))
-    new_figure(1.0, 1.0)  # says what is missing before anything takes time
-    bench = run_broad(BroadOptions(arrays, known[seeds], jobs, folder, repeatability), remark)
-    text = markdown(bench)
-    goals = goals_of(bench.results)
+    create_figure(1.0, 1.0)  # says what is missing before anything takes time
+    bench = run_broad_benchmark(
+        BroadOptions(arrays, known[seeds], jobs, folder, repeatability), remark
+    )
+    text = format_broad_report(bench)
+    goals = compare_with_goals(bench.results)
     content = {
         "software": bench.software,
-        "code": bench.made_by,
-        "made": bench.made,
+        "code": bench.code_hash,
+        "made": bench.run_at,
         "machine": bench.machine,
         "seeds": seeds,
         "arrays": len(bench.results),
         "repeatability": repeatability,
         "goals": goals,
-        "rows": rows_of(bench.results),
-        "models": models_of(bench.results),
+        "rows": summarize_cases(bench.results),
+        "models": count_models(bench.results),
         "results": [result.model_dump() for result in bench.results],
     }
-    write_whole(folder / "broad.json", json_text(content).encode())
-    write_whole(folder / "broad.md", text.encode())
-    write_whole(folder / "broad.png", plot_broad(bench.results))
+    write_atomically(folder / "broad.json", to_json_text(content).encode())
+    write_atomically(folder / "broad.md", text.encode())
+    write_atomically(folder / "broad.png", plot_broad(bench.results))
     if as_json:
         print_json(content)
     else:
         say_lines(text)
         say(f"{folder}: broad.json, broad.md, broad.png")
     refused = [(f"array {r.number}, {f.what}", f.why) for r in bench.results for f in r.refusals]
-    for what, why in [*refused, *((f.what, f.why) for f in bench.lost)]:
+    for what, why in [*refused, *((f.what, f.why) for f in bench.lost_arrays)]:
         remark(f"no result: {what}: {why}")
-    missed = [goal for goal in goals if not goal.met]
+    missed = [goal for goal in goals if not goal.is_met]
     if check_goals:
         for goal in missed:
             remark(f"goal not met: {goal.mode}: {goal.figure}: {goal.value:.3g}")
-    if refused or bench.lost or (check_goals and missed):
+    if refused or bench.lost_arrays or (check_goals and missed):
         raise typer.Exit(3)

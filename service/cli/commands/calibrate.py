@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from devices.errors import UsageError, needs_extra
+from devices.errors import UsageError, require_extra
 from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import (
     CaOption,
@@ -38,7 +38,7 @@ DELAY_MAX_MS = 1000.0
 """No reference of use here is later."""
 
 
-@needs_extra("server", "`foottile calibrate`")
+@require_extra("server", "`foottile calibrate`")
 def calibrate_command(
     out: Annotated[Path, typer.Option(help="Calibration file to write (JSON).")],
     recordings: Annotated[
@@ -174,11 +174,11 @@ def calibrate_command(
                 "--reference goes with one session, and without --plot and --reference-delay-ms"
             )
         from service.cli.commands.calibrate_against import calibrate_mounted
-        from service.offline.against import AgainstOptions
-        from storage.formats.reference import Stated
+        from service.offline.mount_calibration import MountCalibrationOptions
+        from storage.formats.reference import ReferenceOptions
 
-        options = AgainstOptions(
-            stated=Stated(
+        options = MountCalibrationOptions(
+            stated=ReferenceOptions(
                 named_values(columns, "--map"),
                 named_values(units, "--units"),
                 sign,
@@ -207,13 +207,13 @@ def calibrate_command(
         )
     from service.cli.calibration_report import calibration_json, calibration_tables
     from service.estimation.effects import Parameter
-    from service.estimation.fitting.bench.weights import has_weights
-    from service.estimation.fitting.timing import UNKNOWN_DELAY
-    from service.offline.calibrate import calibrate_recordings, read_recordings
+    from service.estimation.fitting.rig.weight_holds import has_weights
+    from service.estimation.fitting.sample_delay import DEFAULT_REFERENCE_DELAY
+    from service.offline.calibration_fit import fit_calibration, read_indentations
     from service.sessions.calibration_file import write_calibration
-    from storage.durable import write_whole
+    from storage.durable_files import write_atomically
 
-    delay = UNKNOWN_DELAY
+    delay = DEFAULT_REFERENCE_DELAY
     if reference_delay_ms is not None:
         if not abs(reference_delay_ms) <= DELAY_MAX_MS:
             raise UsageError(
@@ -223,15 +223,19 @@ def calibrate_command(
     path = output_path(out, *recordings)
     plot_path = output_path(plot, out, *recordings) if plot is not None else None
     with progress("fitting"):
-        pressed = read_recordings(
+        pressed = read_indentations(
             [each / FRAMES_NAME if each.is_dir() else each for each in recordings]
         )
         if plot_path is not None and any(
             has_weights(one.indentation) for each in pressed.values() for one in each
         ):
             raise UsageError("--plot draws strokes of a mill, and these are dead weights")
-        calibration = calibrate_recordings(
-            pressed, name=name or path.stem, reference=sensor, delay=delay, progress=remark
+        calibration = fit_calibration(
+            pressed,
+            name=name or path.stem,
+            reference_name=sensor,
+            reference_delay=delay,
+            on_progress=remark,
         )
         png = None
         if plot_path is not None:
@@ -243,7 +247,7 @@ def calibrate_command(
             )
     write_calibration(path, calibration)
     if plot_path is not None and png is not None:
-        write_whole(plot_path, png)
+        write_atomically(plot_path, png)
     if as_json:
         print_json(calibration_json(calibration))
     else:

@@ -10,18 +10,22 @@ from rich.table import Table
 from service.cli.commands.sessions import sealed_file
 from service.cli.options import output_path, print_json, progress, remark, stdout
 from service.estimation.effects import Parameter
-from service.offline.against import Against, AgainstOptions, calibrate_against
+from service.offline.mount_calibration import (
+    MountCalibrationOptions,
+    MountCalibrationResult,
+    calibrate_mount,
+)
 from service.sessions.calibration_file import write_calibration
 
 
 def calibrate_mounted(
-    session: Path, against: Path, out: Path, options: AgainstOptions, *, as_json: bool
+    session: Path, against: Path, out: Path, options: MountCalibrationOptions, *, as_json: bool
 ) -> None:
     """See `foottile calibrate --help`."""
     source = sealed_file(str(session), None)
     path = output_path(out, source, against)
     with progress(f"calibrating {session.name} against {against.name}"):
-        found = calibrate_against(source, against, options, name=path.stem)
+        found = calibrate_mount(source, against, options, name=path.stem)
     write_calibration(path, found.calibration)
     if as_json:
         print_json(_content(found))
@@ -33,8 +37,8 @@ def calibrate_mounted(
         remark(note)
 
 
-def _content(found: Against) -> dict[str, object]:
-    mounted, mount = found.calibration.mounted, found.mount
+def _content(found: MountCalibrationResult) -> dict[str, object]:
+    mounted, mount = found.calibration.mounted, found.mount_fit
     return {
         "id": found.calibration.id,
         "against": None if mounted is None else mounted.against,
@@ -42,11 +46,11 @@ def _content(found: Against) -> dict[str, object]:
         if mounted is None
         else {serial: _parameter(gain) for serial, gain in mounted.gains.items()},
         "shear": None if mount.shear is None else _parameter(mount.shear),
-        "mae_before_n": mount.before_n,
-        "mae_after_n": mount.after_n,
-        "frames": mount.frames,
-        "blocks": mount.blocks,
-        "late_s": _parameter(mount.late_s),
+        "mae_before_n": mount.mae_before_n,
+        "mae_after_n": mount.mae_after_n,
+        "frames": mount.frame_count,
+        "blocks": mount.block_count,
+        "late_s": _parameter(mount.residual_lag_s),
     }
 
 
@@ -54,14 +58,14 @@ def _parameter(found: Parameter) -> dict[str, object]:
     return {"value": found.value, "sigma": found.sigma, "interval_95": found.interval_95}
 
 
-def _table(found: Against) -> Table:
-    mounted, mount = found.calibration.mounted, found.mount
+def _table(found: MountCalibrationResult) -> Table:
+    mounted, mount = found.calibration.mounted, found.mount_fit
     table = Table(
         title=f"Calibration {found.calibration.name} ({found.calibration.id}), as mounted",
         caption=(
-            f"GRF under load, mean absolute error: {mount.before_n:.3f} N before, "
-            f"{mount.after_n:.3f} N after,\neach stretch by a fit to the others; "
-            f"{mount.frames} frames"
+            f"GRF under load, mean absolute error: {mount.mae_before_n:.3f} N before, "
+            f"{mount.mae_after_n:.3f} N after,\neach stretch by a fit to the others; "
+            f"{mount.frame_count} frames"
         ),
         title_justify="left",
         caption_justify="left",

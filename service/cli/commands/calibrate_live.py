@@ -50,11 +50,11 @@ def calibrate_live(
     """
     import foottile
     from service.cli.calibration_report import calibration_json, calibration_tables
-    from service.estimation.weights import weight_labels
-    from service.sessions.calibration_file import calibration_of
-    from storage.durable import write_whole
+    from service.estimation.dead_weights import make_weight_labels
+    from service.sessions.calibration_file import parse_calibration
+    from storage.durable_files import write_atomically
 
-    weights = weight_labels(asked.weights.split(","), asked.within_percent)
+    weights = make_weight_labels(asked.weights.split(","), asked.within_percent)
     with foottile.connect(server, ca=ca) as source:
         node = _node_of(source, asked.node)
         _check_assignable(node, asked)
@@ -70,7 +70,7 @@ def calibrate_live(
             found = weighing["result"]["calibration_id"]
             with source.http.stream(f"/calibrations/{found}") as file:
                 content = file.read()
-            calibration = calibration_of(content, where=f"calibration {found}")
+            calibration = parse_calibration(content, where=f"calibration {found}")
             if not as_json:
                 for table in calibration_tables(calibration):
                     stdout.print(table)
@@ -81,7 +81,7 @@ def calibrate_live(
             if answer == "n":
                 remark(f"not accepted; its recording is session {weighing['session_id']}")
                 raise typer.Exit(_NOT_ACCEPTED)
-        write_whole(out, content)
+        write_atomically(out, content)
         if asked.assign:
             _assign(source, node, calibration)
     if as_json:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from devices.errors import UsageError, needs_extra
+from devices.errors import UsageError, require_extra
 from service.cli.commands.sessions import sealed_file
 from service.cli.compare_many import MISSED, compare_many, options_of
 from service.cli.many import NOT_ALL, JobsOption, ManifestOption, SchedulerOption
@@ -30,7 +30,7 @@ from service.cli.reference_options import (
 from service.cli.result_folder import result_folder
 
 
-@needs_extra("server", "`foottile compare`")
+@require_extra("server", "`foottile compare`")
 def compare_command(
     session: Annotated[
         str | None, typer.Argument(help="A sealed file, a session's folder, or an id in --data.")
@@ -107,12 +107,13 @@ def compare_command(
     Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but a limit is missed, or some of many
     sessions failed.
     """
-    from service.offline.compare.report import FIGURES
-    from service.offline.comparison_files import write_comparison
-    from service.offline.plots import new_figure
+    from service.offline.compare.report import FIGURE_TITLES
+    from service.offline.comparison_output import write_comparison
+    from service.offline.figure_output import create_figure
 
     asked = {
-        name: _limit(name, text, FIGURES) for name, text in named_values(limits, "--limits").items()
+        name: _limit(name, text, FIGURE_TITLES)
+        for name, text in named_values(limits, "--limits").items()
     }
     said: dict[str, str | float | None] = {
         "map": columns,
@@ -130,7 +131,7 @@ def compare_command(
         "reference_sigma_n": reference_sigma_n,
         "reference_cop_sigma_m": reference_cop_sigma_m,
     }
-    new_figure(1.0, 1.0)  # says what is missing before anything takes time
+    create_figure(1.0, 1.0)  # says what is missing before anything takes time
     if manifest is not None or session is None or reference is None:
         if manifest is None or session is not None or reference is not None or out is None:
             raise UsageError(
@@ -161,11 +162,11 @@ def compare_command(
     if as_json:
         print_json(done.content)
     else:
-        say_lines(done.text)
+        say_lines(done.report_text)
         say(f"{folder}: compare.json, compare.md, compare.png, series.parquet")
-    for line in done.missed:
+    for line in done.missed_limits:
         remark(f"limit missed: {line}")
-    if done.missed:
+    if done.missed_limits:
         raise typer.Exit(3)
 
 
@@ -175,15 +176,15 @@ def kept_with(source: Path, reference: Path) -> Path:
     Raises:
         UsageError: the session is a file by itself.
     """
-    from storage.sessions.claims import SESSION_NAME
-    from storage.sessions.comparisons import COMPARISONS
+    from storage.sessions.comparisons import COMPARISONS_FOLDER
+    from storage.sessions.metadata import SESSION_NAME
 
     if not (source.parent / SESSION_NAME).is_file():
         raise UsageError(
             f"{source.name} is a file by itself, with which nothing is kept",
             remedy="Add --out FOLDER, or name a session's folder or id",
         )
-    return source.parent / COMPARISONS / reference.stem
+    return source.parent / COMPARISONS_FOLDER / reference.stem
 
 
 def _limit(name: str, text: str, known: Collection[str]) -> float:

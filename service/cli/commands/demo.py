@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.errors import FootTileError, needs_extra
+from devices.errors import FootTileError, require_extra
 from service.cli.commands.node import calibration_of
 from service.cli.commands.serve import announce
 from service.cli.options import (
@@ -39,7 +39,7 @@ _SEAL_S = 20.0
 _END_S = 8.0
 
 
-@needs_extra("server", "`foottile demo`")
+@require_extra("server", "`foottile demo`")
 @with_foot_options
 def demo_command(
     options: FootOptions,
@@ -62,10 +62,10 @@ def demo_command(
     """
     import uvloop
 
-    from service.api.doors import raise_open_files
+    from service.api.connection_limits import raise_open_files_limit
     from service.rig.options import RigOptions
 
-    raise_open_files()
+    raise_open_files_limit()
     the_scene = scene_with(scene, bus=None, servo=None)
     check_emulated(the_scene)
     # The node finds it in the cache.
@@ -87,18 +87,23 @@ async def _demo(
     node_arguments: list[str],
 ) -> None:
     from foottile.environment import read_token
-    from service.api.address import listen, published, token_for, urls_of
+    from service.api.address import (
+        list_urls,
+        load_or_create_token,
+        open_listening_socket,
+        publish_token,
+    )
     from service.api.logins import Logins
-    from storage.private import keep_private
+    from storage.permissions import restrict_to_owner
 
     stop = stop_on_signals()
-    keep_private(data)
-    with listen(host, port) as listening, ExitStack() as stack:
+    restrict_to_owner(data)
+    with open_listening_socket(host, port) as listening, ExitStack() as stack:
         given = read_token()
-        token = token_for(given, data)
-        stack.enter_context(published(listening, token))
+        token = load_or_create_token(given, data)
+        stack.enter_context(publish_token(listening, token))
         logins = Logins(token)
-        find_urls = partial(urls_of, listening, host, advertise)
+        find_urls = partial(list_urls, listening, host, advertise)
         urls = find_urls()
         # First: while the server is imported and prepared, the tiles are found and measured.
         node = await _start_node(urls[-1], token, node_arguments)
@@ -131,17 +136,17 @@ async def _server(
     listening: socket.socket, data: Path, logins: Logins, find_urls: Callable[[], list[str]]
 ) -> AsyncIterator[Server]:
     """A server that answers, while the block runs."""
-    from devices.realtime import spare_what_is_loaded
-    from service.api.address import own_names
+    from devices.realtime import freeze_garbage_collector
+    from service.api.address import list_own_names
     from service.api.app import make_app
-    from service.api.serve import serving
+    from service.api.runner import serve_app
     from service.server.server import Server
 
     server = Server(data)
-    hosts = (*own_names(), host_of(find_urls()[0]))
+    hosts = (*list_own_names(), host_of(find_urls()[0]))
     app = make_app(server, hosts=hosts, logins=logins, find_urls=find_urls)
-    async with serving(app, listening):
-        spare_what_is_loaded()
+    async with serve_app(app, listening):
+        freeze_garbage_collector()
         yield server
 
 
@@ -159,9 +164,9 @@ async def _start_node(url: str, token: str, arguments: list[str]) -> asyncio.sub
 
 
 async def _stop_recording(server: Server) -> None:
-    for session in server.recorder.recording_on(NODE):
-        server.recorder.stop(session.id)
-        sealed = await server.settling.settled(session.id, _SEAL_S)
+    for session in server.recorder.list_recording(NODE):
+        server.recorder.stop_session(session.id)
+        sealed = await server.sealer.wait_until_sealed(session.id, _SEAL_S)
         remark(f"session {sealed.id} ({sealed.name}) is {sealed.state}")
 
 

@@ -12,19 +12,19 @@ from rich.table import Table
 
 from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import Clock, SystemClock, VirtualClock
-from devices.errors import UsageError, needs_extra
-from devices.scene.file import Scene, load_scene
-from devices.scene.hardware import EMULATED, ServoScene
+from devices.errors import UsageError, require_extra
+from devices.scene.hardware_sections import EMULATED, ServoSection
+from devices.scene.scene_file import Scene, load_scene
 from service.cli.options import JsonOption, print_json, progress, say, stdout
 
 if TYPE_CHECKING:
-    from service.offline.doctor import Diagnosis
+    from service.offline.doctor import BusDiagnosis
     from service.offline.servo_doctor import ServoDiagnosis
 
 _EMULATED_SCENE = "standing"
 
 
-@needs_extra("emulation", "an emulated bus or servo")
+@require_extra("emulation", "an emulated bus or servo")
 def doctor_command(
     scene: Annotated[
         str | None,
@@ -50,7 +50,7 @@ def doctor_command(
     virtual time. Exit codes: 0 all is well, 1 nothing works, 2 wrong usage, 3 something has to be
     changed.
     """
-    from service.offline.doctor import diagnose
+    from service.offline.doctor import diagnose_bus
     from service.offline.servo_doctor import diagnose_servo
 
     the_scene = load_scene(scene) if scene is not None else None
@@ -64,7 +64,7 @@ def doctor_command(
     with ExitStack() as stack, progress(f"examining {name}"):
         opened, clock = _open(name, the_scene)
         stack.callback(opened.close)
-        diagnosis = diagnose(opened, clock, the_scene, asked_hz=rate_hz)
+        diagnosis = diagnose_bus(opened, clock, the_scene, requested_hz=rate_hz)
     wanted = the_scene.servo if the_scene is not None else None
     port = servo or (wanted.port if wanted is not None else "none")
     found = None
@@ -82,12 +82,12 @@ def doctor_command(
             say(f"Servo at {port}: {found.verdict}")
     if diagnosis.scl_hz is None:
         raise typer.Exit(1)
-    if not diagnosis.holds or (found is not None and not found.is_well):
+    if not diagnosis.is_rate_reached or (found is not None and not found.is_well):
         raise typer.Exit(3)
 
 
 @contextmanager
-def _emulated_servo(scene: Scene | None, wanted: ServoScene | None) -> Iterator[str]:
+def _emulated_servo(scene: Scene | None, wanted: ServoSection | None) -> Iterator[str]:
     if scene is None or wanted is None:
         raise UsageError(
             "an emulated servo for a scene without servo", remedy="Add --scene rolling"
@@ -95,7 +95,7 @@ def _emulated_servo(scene: Scene | None, wanted: ServoScene | None) -> Iterator[
     from devices.emulation.world import World
 
     clock = SystemClock()
-    with World(scene, clock).servo(wanted, clock) as emulated:
+    with World(scene, clock).open_servo(wanted, clock) as emulated:
         yield emulated.port
 
 
@@ -107,28 +107,28 @@ def _open(name: str, scene: Scene | None) -> tuple[I2cBus, Clock]:
     clock = VirtualClock()
     if scene.ground.kind == "trace":  # examined unloaded, so the load does not matter
         scene = scene.model_copy(update={"ground": load_scene(_EMULATED_SCENE).ground})
-    world = World(scene, clock, begun=False)
+    world = World(scene, clock, begins_now=False)
     return open_bus(name, world.i2c_adapter), clock
 
 
 def _as_json(
-    name: str, diagnosis: Diagnosis, port: str, servo: ServoDiagnosis | None
+    name: str, diagnosis: BusDiagnosis, port: str, servo: ServoDiagnosis | None
 ) -> dict[str, object]:
     return {
         "bus": name,
         "tiles": [asdict(tile) for tile in diagnosis.tiles],
         "scl_hz": diagnosis.scl_hz,
-        "asked_scl_hz": diagnosis.asked_scl_hz,
-        "transaction_us": diagnosis.transaction_s * 1e6,
+        "asked_scl_hz": diagnosis.configured_scl_hz,
+        "transaction_us": diagnosis.transaction_overhead_s * 1e6,
         "rates_hz": dict(diagnosis.rates_hz),
-        "schedule": diagnosis.schedule,
-        "holds": diagnosis.holds,
+        "schedule": diagnosis.fastest_schedule,
+        "holds": diagnosis.is_rate_reached,
         "verdict": diagnosis.verdict,
         "servo": None if servo is None else {**asdict(servo), "port": port},
     }
 
 
-def _print(name: str, diagnosis: Diagnosis, scene: Scene | None) -> None:
+def _print(name: str, diagnosis: BusDiagnosis, scene: Scene | None) -> None:
     where = f"{name}, scene {scene.name}" if scene is not None else name
     if name == EMULATED:
         where += ", in virtual time"
@@ -147,15 +147,16 @@ def _print(name: str, diagnosis: Diagnosis, scene: Scene | None) -> None:
     stdout.print(tiles)
     if diagnosis.scl_hz is not None:
         say(
-            f"SCL {diagnosis.scl_hz / 1e3:.1f} kHz measured, {diagnosis.asked_scl_hz / 1e3:.0f} "
-            f"asked for; {diagnosis.transaction_s * 1e6:.0f} us per transaction beyond its bits"
+            f"SCL {diagnosis.scl_hz / 1e3:.1f} kHz measured, "
+            f"{diagnosis.configured_scl_hz / 1e3:.0f} asked for; "
+            f"{diagnosis.transaction_overhead_s * 1e6:.0f} us per transaction beyond its bits"
         )
         rates = Table("schedule", "frames/s predicted", "")
         for schedule, rate in diagnosis.rates_hz.items():
             rates.add_row(
                 schedule,
                 f"{rate:.1f}" if rate is not None else "too many channels at once",
-                "best" if schedule == diagnosis.schedule else "",
+                "best" if schedule == diagnosis.fastest_schedule else "",
             )
         stdout.print(rates)
     say(diagnosis.verdict)

@@ -10,7 +10,13 @@ from rich.table import Table
 
 from devices.errors import UsageError
 from service.cli.options import JsonOption, print_json, say, stdout
-from service.estimation.domes import DomeRange, dome_for, external_share, fast_share, ranges
+from service.estimation.domes import (
+    SaturationLoad,
+    compute_ambient_transmission,
+    compute_fast_load_ratio,
+    list_saturation_loads,
+    select_dome_for_load,
+)
 
 
 def domes_command(
@@ -27,15 +33,15 @@ def domes_command(
     """
     if load_n is not None and not 0.0 < load_n < float("inf"):
         raise UsageError(f"--load-n {load_n} is no load", expected="newtons above 0")
-    chosen = None if load_n is None else dome_for(load_n)
+    chosen = None if load_n is None else select_dome_for_load(load_n)
     if as_json:
         print_json(
             {
                 "load_n": load_n,
                 "dome": None if chosen is None else chosen.dome.name,
-                "verdict": None if chosen is None or load_n is None else chosen.verdict(load_n),
-                "basis": None if chosen is None else chosen.basis,
-                "fast_share": fast_share(),
+                "verdict": None if chosen is None or load_n is None else chosen.judge_load(load_n),
+                "basis": None if chosen is None else chosen.source,
+                "fast_share": compute_fast_load_ratio(),
                 "domes": [
                     {
                         "name": found.dome.name,
@@ -43,11 +49,11 @@ def domes_command(
                         "modulus_mpa": found.dome.material.modulus_mpa,
                         "diameter_mm": found.dome.diameter_mm,
                         "range_n": [found.low_n, found.high_n],
-                        "basis": found.basis,
-                        "external_share": external_share(found.dome),
-                        "verdict": None if load_n is None else found.verdict(load_n),
+                        "basis": found.source,
+                        "external_share": compute_ambient_transmission(found.dome),
+                        "verdict": None if load_n is None else found.judge_load(load_n),
                     }
-                    for found in ranges()
+                    for found in list_saturation_loads()
                 ],
             }
         )
@@ -62,19 +68,19 @@ def domes_command(
         headings = ["dome", "material", "mm", "MPa", "full scale N", "from", "outside"]
         for heading in [*headings, *([] if load_n is None else [f"{load_n:g} N"])]:
             table.add_column(heading, no_wrap=True)
-        for found in ranges():
+        for found in list_saturation_loads():
             table.add_row(
                 found.dome.name,
                 found.dome.material.name,
                 f"{found.dome.diameter_mm:.0f}",
                 f"{found.dome.material.modulus_mpa:.2f}",
                 f"{found.low_n:.0f} to {found.high_n:.0f}",
-                found.basis,
-                f"{100 * external_share(found.dome):.0f} %",
-                *([] if load_n is None else [found.verdict(load_n)]),
+                found.source,
+                f"{100 * compute_ambient_transmission(found.dome):.0f} %",
+                *([] if load_n is None else [found.judge_load(load_n)]),
             )
         stdout.print(table)
-        say(_NOTES.format(fast=100 * fast_share()))
+        say(_NOTES.format(fast=100 * compute_fast_load_ratio()))
         if load_n is not None:
             say(f"For {load_n:g} N: {_answer(chosen, load_n)}")
     if load_n is not None and chosen is None:
@@ -88,12 +94,12 @@ A load that comes within milliseconds reaches full scale at about {fast:.0f} % o
 Outside: estimated part of a change of air or water pressure that a tile reads."""
 
 
-def _answer(chosen: DomeRange | None, load_n: float) -> str:
+def _answer(chosen: SaturationLoad | None, load_n: float) -> str:
     if chosen is None:
         return "none of them; share the load between tiles."
-    if chosen.verdict(load_n) == "covers":
-        return f"{chosen.dome.name} ({chosen.basis})."
+    if chosen.judge_load(load_n) == "covers":
+        return f"{chosen.dome.name} ({chosen.source})."
     return (
         f"perhaps {chosen.dome.name}: it saturates somewhere between {chosen.low_n:.0f} and "
-        f"{chosen.high_n:.0f} N ({chosen.basis})."
+        f"{chosen.high_n:.0f} N ({chosen.source})."
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.errors import needs_extra
+from devices.errors import require_extra
 from service.cli.many import (
     NOT_ALL,
     JobsOption,
@@ -35,10 +35,10 @@ from storage.sessions.folder import FRAMES_NAME
 
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
-    from service.offline.estimate.changes import Change
+    from service.offline.estimate.estimate_change import EstimateChange
 
 
-@needs_extra("server", "`foottile estimate`")
+@require_extra("server", "`foottile estimate`")
 def estimate_command(
     out: Annotated[
         str,
@@ -93,12 +93,15 @@ def estimate_command(
 
     Exit codes: 0 good, 1 failed, 2 wrong usage, 3 some of many sessions failed.
     """
-    from devices.scene.file import load_scene
+    from devices.scene.scene_file import load_scene
     from service.cli.report import findings_json, tell_findings
-    from service.estimation.asked import SEEN
-    from service.offline.archive.places import is_remote
+    from service.estimation.model_sensitivity import REASONS_BY_MODEL
+    from service.offline.archive.locations import is_remote
     from service.offline.archive.tasks import EstimateTask
-    from service.offline.estimate.changes import change_between, read_stored
+    from service.offline.estimate.estimate_change import (
+        compute_estimate_change,
+        read_stored_estimates,
+    )
     from service.offline.estimate.session import estimate_session
     from storage.formats.slice import Slice
 
@@ -126,16 +129,16 @@ def estimate_command(
     )
     source = session / FRAMES_NAME if session.is_dir() else session
     with progress(f"estimating {session}"):
-        before = read_stored(source)
-        result = estimate_session(source, path, task, remark=remark)
-        after = None if before is None else read_stored(path)
-    change = None if before is None or after is None else change_between(before, after)
+        before = read_stored_estimates(source)
+        result = estimate_session(source, path, task, on_remark=remark)
+        after = None if before is None else read_stored_estimates(path)
+    change = None if before is None or after is None else compute_estimate_change(before, after)
     plan = result.plan
     if as_json:
         print_json(
             {
                 "out": path,
-                "frames": result.frames,
+                "frames": result.frame_count,
                 "calibration_id": plan.calibration.id,
                 "models": plan.models,
                 "lag_ms": lag_ms,
@@ -145,22 +148,22 @@ def estimate_command(
                     "begin_s": result.tare_s[0],
                     "end_s": result.tare_s[1],
                 },
-                "asks_for": result.asked,
+                "asks_for": result.omitted_effects_n,
                 **findings_json(result.findings),
             }
         )
         return
     say(
-        f"{path}: {result.frames} frames, calibration {plan.calibration.name} "
+        f"{path}: {result.frame_count} frames, calibration {plan.calibration.name} "
         f"({plan.calibration.id}), models {', '.join(plan.models)}, tare {plan.tare.source} "
         f"{result.tare_s[0]:.2f} to {result.tare_s[1]:.2f} s"
     )
     say(f"look-ahead {lag_ms:g} ms{_describe(change)}")
     tell_findings(result.findings)
-    for name, newtons in result.asked.items():
+    for name, newtons in result.omitted_effects_n.items():
         remark(
-            f"{SEEN[name]}: model {name!r} is not named, and is good for {newtons:.2f} N of the "
-            "GRF here; the calibration offers it"
+            f"{REASONS_BY_MODEL[name]}: model {name!r} is not named, and is good for "
+            f"{newtons:.2f} N of the GRF here; the calibration offers it"
         )
 
 
@@ -169,7 +172,7 @@ def _with_ending(out: Path) -> Path:
     return out if out.suffix or os.path.lexists(out) else out.with_name(f"{out.name}.parquet")
 
 
-def _describe(change: Change | None) -> str:
+def _describe(change: EstimateChange | None) -> str:
     if change is None:
         return ""
     before = f" (before: {change.lag_before_ms:g} ms)"
@@ -184,7 +187,7 @@ def _describe(change: Change | None) -> str:
 
 def _for_workers(named: str | None) -> Calibration | str | None:
     """A calibration's content, where a file is named: a worker elsewhere does not have it."""
-    from service.offline.calibrations import read_calibration
+    from service.offline.calibration_lookup import read_calibration
 
     if named is None or not Path(named).is_file():
         return named

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from devices.errors import needs_extra
+from devices.errors import require_extra
 from service.cli.commands.sessions import SERVER, ServerOption
 from service.cli.options import (
     CaOption,
@@ -16,7 +16,7 @@ from service.cli.options import (
 from service.cli.tickets import TokenFolderOption, read_data_token, say_ticket
 
 
-@needs_extra("server", "`foottile invite`")
+@require_extra("server", "`foottile invite`")
 def invite_command(
     read_only: Annotated[
         bool, typer.Option("--read-only", help="May look; may not tare or record.")

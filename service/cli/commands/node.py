@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import CalibrationError, MissingExtraError, StorageError, UsageError
-from devices.facts import check_new_name
+from devices.types import check_user_name
 from service.cli.options import (
     CaOption,
     FootOptions,
@@ -27,7 +27,7 @@ from service.cli.options import (
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
     from service.node.options import NodeOptions
-    from service.node.run import Outcome
+    from service.node.running_node import NodeOutcome
     from service.rig.options import RigOptions
 
 SERVER = "http://127.0.0.1:8000"
@@ -76,55 +76,58 @@ def node_command(
     """
     from foottile.environment import read_token
     from foottile.tls import make_context
-    from service.node.dial import ingest_url
     from service.node.options import NodeOptions
+    from service.node.tcp_connect import make_ingest_url
     from service.rig.options import RigOptions
-    from service.user_folders import user_folder
-    from storage.private import keep_private
+    from service.user_folders import resolve_user_folder
+    from storage.permissions import restrict_to_owner
 
     if end_with_parent:
         from devices import realtime
 
-        realtime.end_with_parent()
+        realtime.terminate_with_parent()
     if server is None and record is None:
         server = SERVER
     if server is not None:
-        ingest_url(server)  # refuse a wrong address before anything else
+        make_ingest_url(server)  # refuse a wrong address before anything else
     if ca is not None:
         if server is None or not server.startswith(("https:", "wss:")):
             raise UsageError("--ca is for a --server with https://")
         make_context(ca)  # and what is no certificate
-    folder = user_folder("state", journal, "--journal")
+    folder = resolve_user_folder("state", journal, "--journal")
     if os.path.lexists(folder) and not folder.is_dir():
         raise UsageError(f"--journal {str(folder)!r} is no folder", remedy="Choose another one")
     if record is not None and not record.strip():
         raise UsageError("--record without a name", expected="the name of the session")
     if record is not None:
         try:
-            check_new_name(record)
+            check_user_name(record)
         except ValueError as error:
             raise UsageError(f"--record {record!r} {error}", expected="one line of text") from error
     the_scene = scene_with(scene, bus=bus, servo=servo)
     rig = RigOptions(the_scene, _name(name), options.foot(the_scene))
     calibration, problem = calibration_of(rig)
     with suppress(StorageError):  # a card that takes nothing is said later, and stops nothing
-        keep_private(folder)
+        restrict_to_owner(folder)
     outcome = asyncio.run(
         _run(
             NodeOptions(
-                rig=rig,
-                journal=folder,
-                server=server,
-                record=record,
+                rig_options=rig,
+                node_folder=folder,
+                server_url=server,
+                session_name=record,
                 calibration=calibration,
                 calibration_problem=problem,
                 token=read_token(),
-                ca=ca,
+                ca_path=ca,
             )
         )
     )
-    if outcome.recorded is not None:
-        say(f"session {outcome.recorded}" + (" is lossy" if outcome.is_lossy else " is complete"))
+    if outcome.recorded_session_id is not None:
+        say(
+            f"session {outcome.recorded_session_id}"
+            + (" is lossy" if outcome.is_lossy else " is complete")
+        )
     if outcome.lost_frames:
         remark(f"{outcome.lost_frames} frames of sessions are lost")
     if outcome.undelivered_frames:
@@ -136,22 +139,22 @@ def node_command(
         raise typer.Exit(3)
 
 
-async def _run(options: NodeOptions) -> Outcome:
-    from devices.realtime import spare_what_is_loaded
-    from service.node.run import run_node
+async def _run(options: NodeOptions) -> NodeOutcome:
+    from devices.realtime import freeze_garbage_collector
+    from service.node.running_node import run_node
 
-    spare_what_is_loaded()
+    freeze_garbage_collector()
     return await run_node(options, stop=stop_on_signals(), report=remark)
 
 
 def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]:
     """The calibration that the scene names, or why there is none: raw frames are worth having."""
-    from service.offline.calibrations import EMULATED_RIG, find_calibration
+    from service.offline.calibration_lookup import EMULATED_RIG, find_calibration
 
     scene = options.scene
     if scene.calibration == "none":
         return None, "the scene names no calibration"
-    if scene.calibration == EMULATED_RIG and not options.emulated:
+    if scene.calibration == EMULATED_RIG and not options.is_emulated:
         # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
         problem = (
             "the emulated bench knows emulated tiles only: press the tiles on a real bench, run "
@@ -165,7 +168,7 @@ def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]
             [tile.serial for tile in scene.tile if not tile.reference],
             parts_seed=options.foot.parts_seed,
             family=scene.emulation.family,
-            progress=remark,
+            on_progress=remark,
         )
     except (CalibrationError, MissingExtraError) as error:
         remark(f"no calibration, so no forces: {error}")

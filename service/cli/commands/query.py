@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
-from devices.words import printable
+from devices.text import escape_control_chars
 from service.cli.options import (
     JsonOption,
     data_folder,
@@ -32,7 +32,7 @@ _LEFT_OUT = 3
 
 def query_command(
     sql: Annotated[
-        str, typer.Argument(help="One SELECT over sessions, stances, events and frames.")
+        str, typer.Argument(help="One SELECT over sessions, stances, markers and frames.")
     ],
     places: Annotated[
         list[str] | None,
@@ -52,10 +52,10 @@ def query_command(
     Columns and examples are in docs/query.md. No question changes a session. Sessions that are not
     sealed yet, or damaged, are left out and named on stderr; the exit code is 3 then.
     """
-    from service.offline.archive.finding import find_sessions
-    from service.offline.archive.places import is_data_folder, is_remote, no_session_in
-    from service.offline.archive.query import ask
-    from service.offline.archive.workspace import SYSTEM, workspace
+    from service.offline.archive.locations import is_data_folder, is_remote, make_no_session_error
+    from service.offline.archive.query import run_query
+    from service.offline.archive.session_search import find_sessions
+    from service.offline.archive.temporary_folders import SYSTEM_TEMP_FOLDER, create_workspace
 
     if data is not None and places:
         raise UsageError("--data and places are two ways to say where", remedy="Name one")
@@ -67,27 +67,27 @@ def query_command(
     asked = places or [str(data_folder(data))]
     with progress("looking for sessions"), ExitStack() as stack:
         needs_mirror = any(is_remote(place) for place in asked)
-        mirror = stack.enter_context(workspace(SYSTEM)) if needs_mirror else None
+        mirror = stack.enter_context(create_workspace(SYSTEM_TEMP_FOLDER)) if needs_mirror else None
         archive = find_sessions(asked, mirror)
-        is_empty = not archive.sessions and not archive.left_out
+        is_empty = not archive.sessions and not archive.left_out_reasons
         if is_empty and not any(is_data_folder(place) for place in asked):
-            raise no_session_in(asked)
-        answer = ask(archive, sql)
+            raise make_no_session_error(asked)
+        answer = run_query(archive, sql)
     if path is not None:
         _write(answer, path)
         say(f"{path}: {len(answer)} rows")
     elif as_json:
-        print_json({"rows": _rows(answer), "left_out": archive.left_out})
+        print_json({"rows": _rows(answer), "left_out": archive.left_out_reasons})
     elif as_csv:
-        from storage.formats.written.csv_text import write_csv
+        from storage.formats.writers.csv_text import write_csv_table
 
         with _unwritable("the answer"):
-            write_csv(sys.stdout.buffer, answer)
+            write_csv_table(sys.stdout.buffer, answer)
     else:
         _print(answer)
-    for place, reason in archive.left_out.items():
+    for place, reason in archive.left_out_reasons.items():
         remark(f"{place} is left out: {reason}")
-    if archive.left_out:
+    if archive.left_out_reasons:
         raise typer.Exit(_LEFT_OUT)
 
 
@@ -150,9 +150,9 @@ def _print(answer: pa.Table) -> None:
         is_number = all(isinstance(row[name], int | float | None) for row in rows)
         justify: Any = "right" if is_number else "left"
         # A row is one line: a text that goes on in the next could look like a line of ours.
-        table.add_column(escape(printable(name)), justify=justify, no_wrap=True)
+        table.add_column(escape(escape_control_chars(name)), justify=justify, no_wrap=True)
     for row in rows:
-        table.add_row(*(escape(printable(_text(value))) for value in row.values()))
+        table.add_row(*(escape(escape_control_chars(_text(value))) for value in row.values()))
     stdout.print(table)
 
 
@@ -165,7 +165,7 @@ def _text(value: Any) -> str:
 def _write(answer: pa.Table, path: Path) -> None:
     import pyarrow.parquet as pq
 
-    from storage.durable import whole_file
+    from storage.durable_files import open_for_atomic_write
 
-    with whole_file(path) as file, _unwritable("the answer"):
+    with open_for_atomic_write(path) as file, _unwritable("the answer"):
         pq.write_table(answer, file, compression="zstd")

@@ -11,7 +11,7 @@ from devices.errors import UsageError
 from service.cli.options import JsonOption, print_json, progress, remark, say
 
 if TYPE_CHECKING:
-    from service.sessions.recover import Recovered, Recovery
+    from service.sessions.recovery import RecoveredSession, RecoveryReport
 
 _FAILED, _NOT_ALL = 1, 3
 
@@ -37,18 +37,20 @@ def recover_command(
     node alone. It can be run again at any time. Exit codes: 0 good, 1 something could not be
     recovered, 2 wrong usage, 3 done, but a session is lossy, or waits for its node.
     """
-    from service.sessions.recover import recover
-    from storage.durable import locked
-    from storage.private import keep_private
+    from service.sessions.recovery import recover_folder
+    from storage.durable_files import lock_folder
+    from storage.permissions import restrict_to_owner
 
     if not any((folder / name).is_dir() for name in ("journal", "sessions")):
         raise UsageError(
             f"no data folder {str(folder)!r}",
             expected="a folder with `journal` and `sessions`, of a server or a node",
         )
-    keep_private(folder)
-    with locked(folder), progress("opening journals") as tell:
-        recovery = recover(folder, streams=streams, give_up=give_up, tell=tell)
+    restrict_to_owner(folder)
+    with lock_folder(folder), progress("opening journals") as tell:
+        recovery = recover_folder(
+            folder, make_sessions=streams, abandon_missing=give_up, report_step=tell
+        )
     if as_json:
         print_json(_as_dict(recovery))
     else:
@@ -59,7 +61,7 @@ def recover_command(
         raise typer.Exit(_NOT_ALL)
 
 
-def _as_dict(recovery: Recovery) -> dict[str, Any]:
+def _as_dict(recovery: RecoveryReport) -> dict[str, Any]:
     return {
         "sessions": [
             {
@@ -72,22 +74,22 @@ def _as_dict(recovery: Recovery) -> dict[str, Any]:
             }
             for found in recovery.sessions
         ],
-        "removed": [str(path) for path in recovery.removed],
-        "cut_bytes": recovery.cut,
-        "mended": recovery.mended,
-        "restored": recovery.restored,
+        "removed": [str(path) for path in recovery.removed_temporaries],
+        "cut_bytes": recovery.cut_bytes,
+        "mended": recovery.rewritten_markers,
+        "restored": recovery.rebuilt_sessions,
         "problems": recovery.problems,
     }
 
 
-def _tell(recovery: Recovery) -> None:
-    for name, cut_bytes in recovery.cut.items():
+def _tell(recovery: RecoveryReport) -> None:
+    for name, cut_bytes in recovery.cut_bytes.items():
         say(f"journal {name}: {cut_bytes} bytes behind the last whole batch were set aside")
-    if recovery.removed:
-        say(f"{len(recovery.removed)} half-written files were removed")
-    for session_id in recovery.mended:
-        say(f"session {session_id}: events.parquet was written again")
-    for session_id in recovery.restored:
+    if recovery.removed_temporaries:
+        say(f"{len(recovery.removed_temporaries)} half-written files were removed")
+    for session_id in recovery.rewritten_markers:
+        say(f"session {session_id}: markers.parquet was written again")
+    for session_id in recovery.rebuilt_sessions:
         say(f"session {session_id}: session.json was made again from the files beside it")
     for found in recovery.sessions:
         say(f"session {found.session.id} ({found.session.name}): {_outcome(found)}")
@@ -95,17 +97,17 @@ def _tell(recovery: Recovery) -> None:
             say(f"  {found.problem}")
     for problem in recovery.problems:
         say(f"not recovered: {problem}")
-    if recovery.is_nothing:
+    if recovery.is_empty:
         say("nothing to recover")
     if any(found.outcome == "waiting" for found in recovery.sessions):
         remark("what waits for its node is completed by the server, or sealed with --give-up")
 
 
-def _outcome(found: Recovered) -> str:
+def _outcome(found: RecoveredSession) -> str:
     ledger = found.ledger
     if found.outcome != "sealed" or ledger is None:
         return {"waiting": "waits for its node"}.get(found.outcome, "NOT recovered")
     lost = sum(ledger.lost.values())
     text = f"sealed and proven, {ledger.recorded} frames" + (f", {lost} lost" if lost else "")
-    tail = ledger.unsynced_tail_max
+    tail = ledger.max_lost_tail_frames
     return text + (f", at most {tail} more when it broke off" if tail else "")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from devices.errors import needs_extra
+from devices.errors import require_extra
 from service.cli.options import (
     SEED_MAX,
     JsonOption,
@@ -19,12 +19,12 @@ from service.cli.options import (
     say_lines,
 )
 from service.cli.result_folder import result_folder
-from service.plain_json import json_text
+from service.json_output import to_json_text
 
 TRIALS_MAX, JOBS_MAX = 100, 64
 
 
-@needs_extra("server", "`foottile reproduce`")
+@require_extra("server", "`foottile reproduce`")
 def reproduce_command(
     out: Annotated[
         Path,
@@ -55,13 +55,13 @@ def reproduce_command(
     good, 1 failed, 2 wrong usage, 3 written, but something could not be measured.
     """
     from service.cli.reproduction import QUICK_TRIALS, ReproduceOptions, reproduce
-    from service.offline.plots import new_figure
-    from service.offline.reproduce.figures import figures_of
-    from service.offline.reproduce.report import markdown
+    from service.offline.figure_output import create_figure
+    from service.offline.reproduce.figures import draw_figures
+    from service.offline.reproduce.report import format_reproduction_report
     from service.offline.reproduce.setups import TRIALS
-    from storage.durable import write_whole
+    from storage.durable_files import write_atomically
 
-    new_figure(1.0, 1.0)  # says what is missing before anything takes time
+    create_figure(1.0, 1.0)  # says what is missing before anything takes time
     options = ReproduceOptions(
         seed=seed,
         parts_seed=parts_seed,
@@ -72,12 +72,12 @@ def reproduce_command(
     with result_folder(out) as folder:
         with progress("starting") as tell:
             result = reproduce(options, folder, tell)
-            text, figures = markdown(result), figures_of(result)
-        content = json_text(result)
-        write_whole(folder / "reproduce.json", content.encode())
-        write_whole(folder / "reproduce.md", text.encode())
+            text, figures = format_reproduction_report(result), draw_figures(result)
+        content = to_json_text(result)
+        write_atomically(folder / "reproduce.json", content.encode())
+        write_atomically(folder / "reproduce.md", text.encode())
         for name, png in figures.items():
-            write_whole(folder / name, png)
+            write_atomically(folder / name, png)
     if as_json:
         print_json(result)
     else:

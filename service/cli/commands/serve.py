@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from devices.errors import needs_extra
+from devices.errors import require_extra
 from service.cli.options import remark, say, stop_on_signals
 from service.cli.tickets import AdvertiseOption, host_of, reaches_others, remark_reach, show_code
 
@@ -23,7 +23,7 @@ def _bound(text: str) -> Any:
     return typer.Option(help=text, rich_help_panel="Bounds for those without a key")
 
 
-@needs_extra("server", "`foottile serve`")
+@require_extra("server", "`foottile serve`")
 def serve_command(
     host: Annotated[
         str | None, typer.Option(help="Address to listen on; default 127.0.0.1: this machine only.")
@@ -81,7 +81,7 @@ def serve_command(
     """
     import uvloop
 
-    from service.api.doors import raise_open_files
+    from service.api.connection_limits import raise_open_files_limit
     from service.api.settings import load_settings
 
     settings = load_settings(
@@ -102,32 +102,38 @@ def serve_command(
         body_timeout_s=body_timeout_s,
         idle_timeout_s=idle_timeout_s,
     )
-    raise_open_files()
+    raise_open_files_limit()
     uvloop.run(_serve(settings))
 
 
 async def _serve(settings: Settings) -> None:
-    from devices.realtime import spare_what_is_loaded
-    from service.api.address import listen, own_names, published, token_for, urls_of
+    from devices.realtime import freeze_garbage_collector
+    from service.api.address import (
+        list_own_names,
+        list_urls,
+        load_or_create_token,
+        open_listening_socket,
+        publish_token,
+    )
     from service.api.app import make_app
     from service.api.logins import Logins
-    from service.api.serve import serving
+    from service.api.runner import serve_app
     from service.server.server import Server
-    from storage.private import keep_private
+    from storage.permissions import restrict_to_owner
 
     stop = stop_on_signals()
-    keep_private(settings.data)
-    with listen(settings.host, settings.port) as listening:
+    restrict_to_owner(settings.data)
+    with open_listening_socket(settings.host, settings.port) as listening:
         server = Server(settings.data, exact=settings.no_quantize)
-        token = token_for(settings.token, settings.data)
+        token = load_or_create_token(settings.token, settings.data)
         logins = Logins(token, is_private=settings.private)
-        find_urls = partial(urls_of, listening, settings.host, settings.advertise)
+        find_urls = partial(list_urls, listening, settings.host, settings.advertise)
         urls = find_urls()
-        hosts = (*settings.allow_host, *own_names(), host_of(urls[0]))
+        hosts = (*settings.allow_host, *list_own_names(), host_of(urls[0]))
         app = make_app(server, logins=logins, hosts=hosts, find_urls=find_urls)
-        with published(listening, token):
-            async with serving(app, listening, settings):
-                spare_what_is_loaded()
+        with publish_token(listening, token):
+            async with serve_app(app, listening, settings):
+                freeze_garbage_collector()
                 announce(urls, settings.data, logins, is_kept=not settings.token)
                 remark_reach(urls, settings.host)
                 await stop.wait()
@@ -148,26 +154,26 @@ def announce(
         is_kept: is its token the one that is kept in the data folder?
         is_demo: has every link to log a browser in?
     """
-    from service.api.address import KEPT_IN
-    from service.api.logins import Right
-    from service.api.routes.login import with_ticket
-    from service.estimation.warm import WARMING, is_warming
+    from service.api.address import TOKEN_NAME
+    from service.api.logins import Role
+    from service.api.routes.login import add_ticket
+    from service.estimation.compilation import COMPILING_NOTE, is_compiling
 
     token, has_screen = logins.token, sys.stdout.isatty()
     for url in urls:
         if has_screen:
             link = f"{url}/#token={token}"
         else:
-            link = with_ticket(url, logins.tickets.new(Right.PRESS)) if is_demo else f"{url}/"
+            link = add_ticket(url, logins.tickets.create(Role.OPERATOR)) if is_demo else f"{url}/"
         say(f"FootTile is at {link}")
     if has_screen and reaches_others(urls[0]):
-        show_code(with_ticket(urls[0], logins.tickets.new(Right.PRESS)))
+        show_code(add_ticket(urls[0], logins.tickets.create(Role.OPERATOR)))
     remark(f"data in {data}; Ctrl-C ends it")
-    if is_warming():
-        remark(WARMING)
-    where = f"$(cat {shlex.quote(str(data / KEPT_IN))})" if is_kept else '"$FOOTTILE_TOKEN"'
+    if is_compiling():
+        remark(COMPILING_NOTE)
+    where = f"$(cat {shlex.quote(str(data / TOKEN_NAME))})" if is_kept else '"$FOOTTILE_TOKEN"'
     if not has_screen:
-        place = f"in {data / KEPT_IN}" if is_kept else "the one that was given"
+        place = f"in {data / TOKEN_NAME}" if is_kept else "the one that was given"
         remark(f"its token is {place}; `foottile invite` prints a link that logs a browser in")
     shown = token if sys.stderr.isatty() else where
     remark(f"a node: FOOTTILE_TOKEN={shown} foottile node --scene FILE --server {urls[0]}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
-from devices.words import printable
+from devices.text import escape_control_chars
 from service.cli.format_options import FormatOption, with_format_options
 from service.cli.many import (
     NOT_ALL,
@@ -33,16 +33,16 @@ from service.cli.options import (
     stdout,
 )
 from storage.formats.options import FormatOptions
-from storage.formats.written.registry import SEVERAL
-from storage.sessions.beside import EVENTS_NAME
+from storage.formats.writers.registry import MULTI_SESSION_FORMATS
+from storage.sessions.sidecars import MARKERS_NAME
 
 if TYPE_CHECKING:
     from storage.formats.export import ClockName
-    from storage.sessions.choice import Choice
+    from storage.sessions.filters import SessionFilter
 
 SERVER = "http://127.0.0.1:8000"
 
-_LONG = {"ledger", "events", "clock", "calibration", "scene_content", "asked"}
+_LONG = {"ledger", "markers", "clock", "calibration", "scene_content", "asked"}
 """What a list of sessions leaves out."""
 
 ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
@@ -92,16 +92,16 @@ def sessions_command(
     from rich.markup import escape
     from rich.table import Table
 
-    from storage.sessions.choice import Choice, completeness_of, instant_ns
+    from storage.sessions.filters import SessionFilter, parse_completeness, parse_t_ns
 
-    choice = Choice(
+    choice = SessionFilter(
         nodes=tuple(node or ()),
         tags=tuple(tag or ()),
         take=take,
         q=search,
-        from_t_ns=None if since is None else instant_ns(since, where="--from"),
-        to_t_ns=None if until is None else instant_ns(until, where="--to"),
-        complete=None if complete is None else completeness_of(complete, where="--complete"),
+        from_t_ns=None if since is None else parse_t_ns(since, where="--from"),
+        to_t_ns=None if until is None else parse_t_ns(until, where="--to"),
+        complete=None if complete is None else parse_completeness(complete, where="--complete"),
     )
     if server is not None and data is not None:
         raise UsageError("--server and --data are two places to look in", remedy="Name one")
@@ -114,8 +114,8 @@ def sessions_command(
         print_json({"items": found})
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("session", "name", "node", "s", "frames", "marks", "state"):
-        right = heading in ("s", "frames", "marks")
+    for heading in ("session", "name", "node", "s", "frames", "markers", "state"):
+        right = heading in ("s", "frames", "markers")
         # A row is one line: a name that goes on in the next could look like a line of ours.
         table.add_column(heading, justify="right" if right else "left", no_wrap=True)
     for session in found:
@@ -123,11 +123,11 @@ def sessions_command(
         assumed = ", scale assumed" if session["absolute_scale"] == "assumed" else ""
         table.add_row(
             session["id"],
-            escape(printable(session["name"])),
-            escape(printable(session["node"])),
+            escape(escape_control_chars(session["name"])),
+            escape(escape_control_chars(session["node"])),
             f"{session['duration_s']:.1f}",
             str(session["frames"]),
-            str(session.get("marks", "")),
+            str(session.get("marker_count", "")),
             session["state"] + lossy + assumed,
         )
     stdout.print(table)
@@ -141,7 +141,7 @@ def pull_command(
         str | None,
         typer.Option(
             help="All sessions of this take, as one file on the server's axis of time: "
-            f"--format {', '.join(SEVERAL)}."
+            f"--format {', '.join(MULTI_SESSION_FORMATS)}."
         ),
     ] = None,
     server: ServerOption = None,
@@ -162,26 +162,31 @@ def pull_command(
     complete on disk, but lossy.
     """
     import foottile
-    from service.pull import pull, pull_made, pull_take
+    from service.pull import pull_export, pull_session, pull_take_export
     from storage.formats.slice import Slice
-    from storage.formats.written.parquet import PARQUET
-    from storage.formats.written.registry import format_named, together_named
+    from storage.formats.writers.parquet import PARQUET
+    from storage.formats.writers.registry import get_format, get_multi_session_format
 
     if (session is None) == (take is None):
         raise UsageError("what is to be pulled", expected="the id of a session, or --take")
     own_clock = _clock_named(clock)
-    chosen = format_named(to) if take is None else together_named(to)
+    chosen = get_format(to) if take is None else get_multi_session_format(to)
     part = Slice(start_s, end_s, _names(columns))
     with (
         foottile.connect(server or SERVER, ca=ca) as source,
         progress(f"pulling {session or take}"),
     ):
         if session is None:
-            pulled = pull_take(source, str(take), out, part, chosen, options)
-        elif part.is_all and chosen is PARQUET and not options.set_names and own_clock == "node":
-            pulled = pull(source, session, out)
+            pulled = pull_take_export(source, str(take), out, part, chosen, options)
+        elif (
+            part.is_whole_session
+            and chosen is PARQUET
+            and not options.specified_names
+            and own_clock == "node"
+        ):
+            pulled = pull_session(source, session, out)
         else:
-            pulled = pull_made(source, session, out, part, chosen, options, own_clock)
+            pulled = pull_export(source, session, out, part, chosen, options, own_clock)
     if as_json:
         print_json(pulled)
     elif "resumed_bytes" not in pulled:
@@ -214,7 +219,7 @@ def export_command(
     end_s: EndOption = None,
     columns: ColumnsOption = None,
     clock: ClockOption = "node",
-    marks: Annotated[
+    markers: Annotated[
         bool | None,
         typer.Option(
             "--marks/--no-marks",
@@ -227,7 +232,8 @@ def export_command(
         bool,
         typer.Option(
             "--merge",
-            help=f"All of them into one file, on the server's axis of time: {', '.join(SEVERAL)}.",
+            help="All of them into one file, on the server's axis of time: "
+            f"{', '.join(MULTI_SESSION_FORMATS)}.",
         ),
     ] = False,
     manifest: ManifestOption = None,
@@ -244,10 +250,10 @@ def export_command(
     Many sessions are written each into a folder of its id in --out; given again, the command goes
     on where it was broken off. Exit code 3: some of them failed.
     """
-    from service.offline.archive.places import is_remote
-    from service.offline.export import ExportOptions, export_session, export_together
+    from service.offline.archive.locations import is_remote
+    from service.offline.export import ExportOptions, export_merged, export_session
     from storage.formats.slice import Slice
-    from storage.formats.written.registry import format_named
+    from storage.formats.writers.registry import get_format
 
     own_clock = _clock_named(clock)
     if take is not None:
@@ -256,7 +262,7 @@ def export_command(
         sessions, together = _of_take(take, data), True
     part = Slice(start_s, end_s, _names(columns))
     wanted = ExportOptions(
-        format_named(to).name, part, "server" if together else own_clock, marks, options
+        get_format(to).name, part, "server" if together else own_clock, markers, options
     )
     if together and (manifest is not None or is_remote(out)):
         raise UsageError(
@@ -281,16 +287,16 @@ def export_command(
     path = output_path(Path(out), *sources)
     with progress(f"writing {path.name}"):
         if together:
-            done = export_together(sources, path, wanted)
+            done = export_merged(sources, path, wanted)
         else:
             done = export_session(sources[0], path, wanted)
     say(f"{path}: {done.size_bytes} bytes")
-    for mark in done.left_out:
-        remark(f"mark {mark.event.label!r} is not in it: {mark.left_out}")
+    for mark in done.left_out_markers:
+        remark(f"mark {mark.marker.label!r} is not in it: {mark.exclusion_reason}")
     for text in done.remarks:
         remark(text)
-    if done.lacks_marks:
-        remark(f"without marks: there is no {EVENTS_NAME} beside {sources[0].name}")
+    if done.is_markers_file_missing:
+        remark(f"without marks: there is no {MARKERS_NAME} beside {sources[0].name}")
 
 
 def _clock_named(clock: str) -> ClockName:
@@ -299,12 +305,12 @@ def _clock_named(clock: str) -> ClockName:
     Raises:
         UsageError: there is no such clock.
     """
-    from storage.formats.export import CLOCKS
+    from storage.formats.export import CLOCK_NAMES
 
-    for name in CLOCKS:
+    for name in CLOCK_NAMES:
         if name == clock:
             return name
-    raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
+    raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCK_NAMES))
 
 
 def _names(columns: str | None) -> tuple[str, ...]:
@@ -317,15 +323,15 @@ def _of_take(take: str, data: Path | None) -> list[str]:
     Raises:
         UsageError: there is none.
     """
-    from storage.sessions.choice import Choice
+    from storage.sessions.filters import SessionFilter
 
-    found = _in_folder(data_folder(data), Choice(take=take))
+    found = _in_folder(data_folder(data), SessionFilter(take=take))
     if not found:
         raise UsageError(f"no session of take {take!r}", where=str(data_folder(data)))
     return [each["id"] for each in sorted(found, key=lambda each: (each["node"], each["id"]))]
 
 
-def _of_server(url: str, ca: Path | None, choice: Choice) -> list[Mapping[str, Any]]:
+def _of_server(url: str, ca: Path | None, choice: SessionFilter) -> list[Mapping[str, Any]]:
     import foottile
 
     def instant(t_ns: int | None) -> str | None:
@@ -344,16 +350,16 @@ def _of_server(url: str, ca: Path | None, choice: Choice) -> list[Mapping[str, A
         return [session.facts for session in found]
 
 
-def _in_folder(data: Path, choice: Choice) -> list[Mapping[str, Any]]:
-    from storage.sessions.folder import Completeness, Session, SessionFolder
+def _in_folder(data: Path, choice: SessionFilter) -> list[Mapping[str, Any]]:
+    from storage.sessions.folder import Completeness, Session, SessionsFolder
 
     if not data.is_dir():
         raise UsageError(f"no data folder {str(data)!r}")
-    folder = SessionFolder(data / "sessions")
+    folder = SessionsFolder(data / "sessions")
     sessions, unreadable = folder.load_all()
     for session_id, error in unreadable.items():
         remark(f"session {session_id} is left out: {error}")
-    for stray in folder.strays():
+    for stray in folder.find_strays():
         remark(f"session folder {stray.name} is left out: {stray.error}")
 
     def complete(session: Session) -> Completeness:
@@ -363,10 +369,10 @@ def _in_folder(data: Path, choice: Choice) -> list[Mapping[str, Any]]:
         {
             **session.model_dump(mode="json", exclude=_LONG),
             "complete": complete(session),
-            "marks": len(session.events),
+            "marker_count": len(session.markers),
         }
         for session in sessions
-        if choice.takes(session, complete)
+        if choice.accepts(session, complete)
     ]
 
 
@@ -376,13 +382,13 @@ def sealed_file(session: str, data: Path | None) -> Path:
     Raises:
         UsageError: there is none.
     """
-    from storage.sessions.folder import FRAMES_NAME, SessionFolder
+    from storage.sessions.folder import FRAMES_NAME, SessionsFolder
 
     path = Path(session)
     if path.is_file():
         return path
     if not path.is_dir():
-        path = SessionFolder(data_folder(data) / "sessions").path(session)
+        path = SessionsFolder(data_folder(data) / "sessions").get_path(session)
     if not (path / FRAMES_NAME).is_file():
         raise UsageError(
             f"no sealed session {session!r}",

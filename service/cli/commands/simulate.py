@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
-from devices.errors import UsageError, needs_extra
-from devices.scene.file import load_scene
-from devices.scene.hardware import AnySchedule, ScheduleName
+from devices.errors import UsageError, require_extra
+from devices.scene.hardware_sections import AnySchedule, ScheduleName
+from devices.scene.scene_file import load_scene
 from service.cli.options import (
     ExactOption,
     FootOptions,
@@ -26,10 +26,10 @@ from service.cli.report import findings_json, tell_findings
 from service.estimation import OFFLINE_LAG_MS
 
 if TYPE_CHECKING:
-    from service.offline.simulate import Simulated
+    from service.offline.simulation import SimulationResult
 
 
-@needs_extra("server", "`foottile simulate`")
+@require_extra("server", "`foottile simulate`")
 @with_foot_options
 def simulate_command(
     options: FootOptions,
@@ -64,17 +64,17 @@ def simulate_command(
     the scene's frame rate.
     """
     # Imported here: the physics pulls in numba, which `--help` need not wait for.
-    from service.estimation.ladder.chosen import check_models
-    from service.offline.calibrations import find_calibration, with_tiles
-    from service.offline.simulate import SimulateOptions, simulate
-    from service.rig.plates import injected_beside
+    from service.estimation.pipeline.model_set import validate_model_names
+    from service.offline.calibration_lookup import find_calibration, replace_tiles
+    from service.offline.simulation import SimulationOptions, run_simulation
+    from service.rig.plate_files import make_injected_path
     from service.sessions.pipeline import EstimateOptions
 
     the_scene = load_scene(scene)
     if tiles is not None:
         if the_scene.ground.kind != "indentation":
             raise UsageError("--tiles chooses what the mill presses", expected="an indentation")
-        the_scene = with_tiles(the_scene, tiles.split(","))
+        the_scene = replace_tiles(the_scene, tiles.split(","))
     check_emulated(the_scene)
     if seconds is not None and not 0.0 < seconds < 1e9:
         raise UsageError(f"--seconds {seconds:g}", expected="a sensible positive number")
@@ -83,7 +83,7 @@ def simulate_command(
     path = output_path(out if out is not None else Path(f"{the_scene.name}.parquet"), *inputs)
     has_estimates = not no_estimates and the_scene.calibration != "none"
     if has_estimates:
-        check_models(the_scene.models)
+        validate_model_names(the_scene.models)
 
     def estimate() -> EstimateOptions:
         calibration = find_calibration(
@@ -91,74 +91,74 @@ def simulate_command(
             [tile.serial for tile in the_scene.tile if not tile.reference],
             parts_seed=foot.parts_seed,
             family=the_scene.emulation.family,
-            progress=remark,
+            on_progress=remark,
         )
         return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS, exact=exact)
 
     with progress(f"simulating {the_scene.name}"):
-        result = simulate(
-            SimulateOptions(
+        result = run_simulation(
+            SimulationOptions(
                 scene=the_scene,
                 seconds=seconds,
                 schedule=_schedule(schedule),
-                truth=truth,
+                with_truth=truth,
                 foot=foot,
             ),
             path,
             estimate if has_estimates else None,
         )
-    plates = foot.plates.by_name
+    plates = foot.plates.paths_by_instrument
     if as_json:
         print_json({**_as_json(result, path), "plates": list(plates.values())})
     else:
         _print(result, path)
         for name, file in plates.items():
-            say(f"{file}: the {name}; {injected_beside(file)}: what was injected into it")
+            say(f"{file}: the {name}; {make_injected_path(file)}: what was injected into it")
     if result.missed_slots:
         raise typer.Exit(3)
 
 
-def _as_json(result: Simulated, path: Path) -> dict[str, object]:
-    pressed = result.pressed
+def _as_json(result: SimulationResult, path: Path) -> dict[str, object]:
+    pressed = result.indentation_trace
     return {
         "out": path,
-        "frames": result.frames,
+        "frames": result.frame_count,
         "seconds": result.seconds,
         "rate_hz": result.rate_hz,
-        "schedule": result.choice.schedule,
-        "unmeasured": result.unmeasured,
-        "flags": result.flags,
+        "schedule": result.schedule_choice.schedule,
+        "unmeasured": result.unmeasured_serials,
+        "flags": result.flag_counts,
         "missed_slots": result.missed_slots,
         "bytes": path.stat().st_size,
-        "moved_to_edge": pressed.moved_to_edge if pressed else None,
-        "limited": pressed.limited if pressed else None,
+        "moved_to_edge": pressed.moved_samples if pressed else None,
+        "limited": pressed.limited_samples if pressed else None,
         **findings_json(result.findings),
     }
 
 
-def _print(result: Simulated, path: Path) -> None:
+def _print(result: SimulationResult, path: Path) -> None:
     size = path.stat().st_size
     say(
-        f"{path}: {result.frames} frames in {result.seconds:.3f} s of virtual time, "
-        f"{result.rate_hz:.1f} frames/s, {size} bytes ({size / result.frames:.1f} a frame)"
+        f"{path}: {result.frame_count} frames in {result.seconds:.3f} s of virtual time, "
+        f"{result.rate_hz:.1f} frames/s, {size} bytes ({size / result.frame_count:.1f} a frame)"
     )
     remark(
         f"{result.wall_s:.1f} s of wall time, {result.seconds / result.wall_s:.1f} times real time"
     )
-    remark(f"schedule {result.choice.schedule}: {result.choice.reason}")
-    for serial in result.unmeasured:
+    remark(f"schedule {result.schedule_choice.schedule}: {result.schedule_choice.reason}")
+    for serial in result.unmeasured_serials:
         say(f"tile {serial}: its conversion time could not be measured, so it was given 3 ms")
-    for serial, flags in result.flags.items():
+    for serial, flags in result.flag_counts.items():
         said = ", ".join(f"{n} {reason}" for reason, n in flags.items())
-        say(f"tile {serial}: of {result.frames} frames {said}")
-    for serial in result.replaced:
+        say(f"tile {serial}: of {result.frame_count} frames {said}")
+    for serial in result.replaced_serials:
         say(f"tile {serial} was replaced by another part: its readings are flagged from then on")
     if result.missed_slots:
         say(f"{result.missed_slots} slots were missed: the bus cannot keep this rate")
-    if result.pressed is not None:
+    if (trace := result.indentation_trace) is not None:
         say(
-            f"load: {result.pressed.moved_to_edge} samples had their COP moved to the hull's edge, "
-            f"{result.pressed.limited} had a tile's force limited"
+            f"load: {trace.moved_samples} samples had their COP moved to the hull's edge, "
+            f"{trace.limited_samples} had a tile's force limited"
         )
     tell_findings(result.findings)
 

@@ -20,8 +20,8 @@ from service.cli.options import JsonOption, data_folder, print_json, progress, s
 
 if TYPE_CHECKING:
     from storage.sessions.folder import Ledger
-    from storage.verify.data import Report, Verdict
-    from storage.verify.exported import ExportReport
+    from storage.verify.data_folder import Report, Verdict
+    from storage.verify.export import ExportReport
     from storage.verify.journal import StreamReport
     from storage.verify.session import SessionReport
 
@@ -67,17 +67,17 @@ def verify_command(
     session that it was made from. Of many sessions it is 1 if one is damaged, and 3 if one could
     not be read, too.
     """
-    from storage.verify.data import verdict_of, verify
+    from storage.verify.data_folder import find_verdict, verify_path
 
     if out is not None or _are_many(targets, manifest):
         _verify_many(targets, manifest, out, jobs, scheduler, as_json=as_json)
         return
     path = _path_of((targets or [""])[0], data)
     with progress(f"reading {path}"):
-        report = verify(path, data=data)
-    verdict = verdict_of(report)
+        report = verify_path(path, data_folder=data)
+    verdict = find_verdict(report)
     if as_json:
-        print_json(report.as_dict())
+        print_json(report.to_json_dict())
     else:
         _tell(report)
         say(_SENTENCE[verdict])
@@ -88,11 +88,11 @@ def verify_command(
 def _are_many(targets: list[str] | None, manifest: Path | None) -> bool:
     """A single place is one target, as a data folder with its journals is, or holds sessions."""
     if manifest is None and targets is not None and len(targets) == 1 and Path(targets[0]).exists():
-        from service.offline.archive.places import is_data_folder, sessions_in
+        from service.offline.archive.locations import find_session_locations, is_data_folder
 
         if not Path(targets[0]).is_dir() or is_data_folder(targets[0]):
             return False
-        return not is_one(targets, None) and next(sessions_in(targets), None) is not None
+        return not is_one(targets, None) and next(find_session_locations(targets), None) is not None
     return not is_one(targets, manifest)
 
 
@@ -132,18 +132,18 @@ def _path_of(target: str, data: Path | None) -> Path:
 
 
 def _tell(report: Report, *, is_part: bool = False) -> None:
-    from storage.verify.data import FolderReport
-    from storage.verify.exported import ExportReport
+    from storage.verify.data_folder import DataFolderReport
+    from storage.verify.export import ExportReport
     from storage.verify.segment import SegmentReport
     from storage.verify.session import SessionReport
 
     remarks: list[str] = []
     unproven: list[str] = []
-    if isinstance(report, FolderReport):
+    if isinstance(report, DataFolderReport):
         parts: list[Report] = [*report.sessions, *report.streams]
         for part in parts:
             _tell(part, is_part=True)
-        unproven = report.as_dict()["unproven"]
+        unproven = report.to_json_dict()["unproven"]
         remarks = [f"{name}: set aside, it counts no more" for name in report.set_aside]
     elif isinstance(report, SessionReport):
         say(_session_line(report))
@@ -152,7 +152,7 @@ def _tell(report: Report, *, is_part: bool = False) -> None:
         say(_export_line(report))
     elif isinstance(report, SegmentReport):
         closed = "closed" if report.is_closed else "not closed"
-        say(f"segment {report.path.name}: {report.held.count} frames, {closed}")
+        say(f"segment {report.path.name}: {report.stored.count} frames, {closed}")
         remarks = report.remarks
     else:
         say(_stream_line(report))
@@ -166,12 +166,12 @@ def _tell(report: Report, *, is_part: bool = False) -> None:
 
 
 def _session_line(report: SessionReport) -> str:
-    from storage.verify.data import verdict_of
+    from storage.verify.data_folder import find_verdict
 
-    verdict: Verdict = verdict_of(report)
+    verdict: Verdict = find_verdict(report)
     said = (
         "in the trash"
-        if report.in_trash and verdict != "damaged"
+        if report.is_in_trash and verdict != "damaged"
         else _IN_LINE.get(verdict, verdict)
     )
     name = f" ({report.name})" if report.name else ""
@@ -191,7 +191,7 @@ def _counts(ledger: Ledger | None) -> str:
     counts["pending"] = ledger.pending
     text = f"{ledger.recorded} recorded"
     text += "".join(f", {count} {what}" for what, count in counts.items() if count)
-    tail = ledger.unsynced_tail_max
+    tail = ledger.max_lost_tail_frames
     text += f", and at most {tail} more when it broke off" if tail else ""
     return text + (f", {ledger.missed_slots} slots missed" if ledger.missed_slots else "")
 
@@ -199,8 +199,8 @@ def _counts(ledger: Ledger | None) -> str:
 def _stream_line(report: StreamReport) -> str:
     lost = sum(numbers.count for numbers in report.lost.by_reason.values())
     return (
-        f"journal {report.node}/{report.boot_id}: {report.held.count} frames in "
-        f"{report.segments} segments"
+        f"journal {report.node}/{report.stream_id}: {report.stored.count} frames in "
+        f"{report.segment_count} segments"
         + (f", {lost} lost" if lost else "")
         + (f", {report.missing.count} not here" if report.missing else "")
     )

@@ -14,37 +14,41 @@ import numpy as np
 from scipy.special import stdtrit
 
 from devices.arrays import Bools, Floats
-from service.estimation.calibration import BASIS, TileCalibration, loop_share
+from service.estimation.calibration import CUBIC_TERMS, TileCalibration, compute_loop_share
 
 _UPPER_95 = 0.975
 
 
-def fit_covariance(jacobian: Any, known: Floats) -> Floats:
+def compute_fit_covariance(jacobian: Any, prior_sigma: Floats) -> Floats:
     """Compute the covariance of a least-squares fit with priors and residuals of unit variance.
 
     Args:
         jacobian: (residuals, parameters).
-        known: (parameters,), prior standard uncertainties, which stay for parameters that the
+        prior_sigma: (parameters,), prior standard uncertainties, which stay for parameters that the
             residuals do not determine, such as the time constant of a fraction of zero.
     """
-    j = np.asarray(jacobian) * known
-    return np.asarray(np.linalg.inv(j.T @ j + np.eye(len(known))) * np.outer(known, known))
+    j = np.asarray(jacobian) * prior_sigma
+    return np.asarray(
+        np.linalg.inv(j.T @ j + np.eye(len(prior_sigma))) * np.outer(prior_sigma, prior_sigma)
+    )
 
 
-def beyond_bounds(jacobian: Any, residual: Floats, known: Floats, held: Bools) -> Floats:
+def compute_bound_excess(
+    jacobian: Any, residual: Floats, prior_sigma: Floats, at_bound: Bools
+) -> Floats:
     """Compute the step beyond their bounds of the parameters at a bound, to first order.
 
     A better fit beyond a bound shows an error of the model, and adds to the uncertainty. At most
     `known`; zero for the other parameters.
     """
-    if not held.any():
-        return np.zeros(len(known))
-    j = np.asarray(jacobian) * known
-    step = np.linalg.solve(j.T @ j + np.eye(len(known)), -j.T @ residual)
-    return np.asarray(np.where(held, np.minimum(np.abs(step), 1.0) * known, 0.0))
+    if not at_bound.any():
+        return np.zeros(len(prior_sigma))
+    j = np.asarray(jacobian) * prior_sigma
+    step = np.linalg.solve(j.T @ j + np.eye(len(prior_sigma)), -j.T @ residual)
+    return np.asarray(np.where(at_bound, np.minimum(np.abs(step), 1.0) * prior_sigma, 0.0))
 
 
-def student_t_95(repeats: int) -> float:
+def compute_student_t_95(repeats: int) -> float:
     """Return the half width of a two-sided 95 % interval in standard uncertainties.
 
     Raises:
@@ -55,43 +59,43 @@ def student_t_95(repeats: int) -> float:
     return float(stdtrit(repeats - 1, _UPPER_95))
 
 
-def curve_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+def compute_curve_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
     """Compute the force of the cubic at gauge pressures (m,), zero at zero pressure."""
     coefficients = np.array(tile.coefficients[1:]) * tile.f_scale_n
-    return np.asarray(_basis_of(tile, gauge_kpa) @ coefficients)
+    return np.asarray(_compute_tile_basis(tile, gauge_kpa) @ coefficients)
 
 
-def mean_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+def compute_mean_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
     """Compute the half width of the mean curve's 95 % band, from the covariance over repeats."""
-    return student_t_95(tile.repeats) * np.sqrt(_mean_variance(tile, gauge_kpa))
+    return compute_student_t_95(tile.repeats) * np.sqrt(_compute_mean_variance(tile, gauge_kpa))
 
 
-def new_loading_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+def compute_new_loading_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
     """Compute the half width of the 95 % band of a reading in a new loading.
 
     It consists of the mean's uncertainty, the gain of a new loading, and its hysteresis loop.
     """
-    force_n = curve_n(tile, gauge_kpa)
+    force_n = compute_curve_n(tile, gauge_kpa)
     variance = (
-        _mean_variance(tile, gauge_kpa)
+        _compute_mean_variance(tile, gauge_kpa)
         + (tile.relative_misfit * force_n) ** 2
-        + (tile.loop_misfit_n * loop_share(force_n)) ** 2
+        + (tile.loop_misfit_n * compute_loop_share(force_n)) ** 2
     )
-    return student_t_95(tile.repeats) * np.sqrt(variance)
+    return compute_student_t_95(tile.repeats) * np.sqrt(variance)
 
 
-def _mean_variance(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    basis = _basis_of(tile, gauge_kpa)
+def _compute_mean_variance(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+    basis = _compute_tile_basis(tile, gauge_kpa)
     covariance = np.array(tile.covariance) * tile.f_scale_n**2
     return np.asarray(np.maximum(((basis @ covariance) * basis).sum(axis=1), 0.0))
 
 
-def _basis_of(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    return cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
+def _compute_tile_basis(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+    return compute_cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
 
 
-def cubic_basis(gauge_kpa: Floats, offset_kpa: float, scale_kpa: float) -> Floats:
+def compute_cubic_basis(gauge_kpa: Floats, offset_kpa: float, scale_kpa: float) -> Floats:
     """Compute the basis u^k - u0^k of a cubic, (m, 3), zero at zero pressure by construction."""
     u = (gauge_kpa - offset_kpa) / scale_kpa
     u0 = -offset_kpa / scale_kpa
-    return np.stack([u**k - u0**k for k in range(1, BASIS + 1)], axis=1)
+    return np.stack([u**k - u0**k for k in range(1, CUBIC_TERMS + 1)], axis=1)

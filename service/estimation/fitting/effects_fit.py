@@ -16,86 +16,99 @@ from service.estimation.effects import (
     Parameter,
     RubberEffect,
     TemperatureEffect,
-    values,
+    parameter_values,
 )
-from service.estimation.fitting.bench.indentation import (
+from service.estimation.fitting.dome_model import DomeModel, interpolate_force
+from service.estimation.fitting.effect_selection import fit_significant_effects
+from service.estimation.fitting.rig.indentation import (
     Indentation,
-    Soak,
-    pressed_in,
-    soak,
-    unloaded,
+    ThermalSoak,
+    extract_soak,
+    measure_unloaded,
+    select_loaded,
 )
-from service.estimation.fitting.bench.press import Presses, joined, presses
-from service.estimation.fitting.identify import identify
-from service.estimation.fitting.model import DomeModel, load
-from service.estimation.fitting.soak import fit_soak
-from service.estimation.fitting.timing import UNKNOWN_DELAY
+from service.estimation.fitting.rig.loading import (
+    LoadingPoints,
+    extract_loading_points,
+    join_loading_points,
+)
+from service.estimation.fitting.sample_delay import DEFAULT_REFERENCE_DELAY
+from service.estimation.fitting.thermal_soak import fit_temperature_effect
 
 _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
 """Transform of a cubic without constant term from x = gauge / range to u = 2 x - 1."""
 
 
 def fit_effects(
-    recordings: Sequence[Indentation], tile: TileCalibration, delay: Parameter = UNKNOWN_DELAY
+    recordings: Sequence[Indentation],
+    tile: TileCalibration,
+    reference_delay: Parameter = DEFAULT_REFERENCE_DELAY,
 ) -> Effects:
     """Fit the effects that the recordings determine.
 
     Args:
         recordings: of the tile in the rig, all of one chip.
         tile: its static curve, from the same recordings.
-        delay: of the reference; `late_s` of the answer contains it (see `resolved`).
+        reference_delay: of the reference; `residual_lag_s` of the answer contains it (see
+            `resolved`).
     """
-    points, baseline_kpa = loadings(recordings)
-    noise_kpa = float(np.mean([unloaded(each).noise_kpa for each in pressed_in(recordings)]))
-    soaked = _best([fit_soak(soak(recording, noise_kpa)) for recording in recordings])
-    effects = identify(
+    points, baseline_kpa = collect_loadings(recordings)
+    noise_kpa = float(
+        np.mean([measure_unloaded(each).noise_kpa for each in select_loaded(recordings)])
+    )
+    soaked = _select_best_soak(
+        [fit_temperature_effect(extract_soak(recording, noise_kpa)) for recording in recordings]
+    )
+    effects = fit_significant_effects(
         points,
         scale_kpa=tile.range_kpa[1],
         baseline_kpa=baseline_kpa,
-        first_curve=curve_over_range(tile.coefficients),
-        soaked=soaked,
-        delay=delay,
+        initial_curve=convert_curve_to_range(tile.coefficients),
+        temperature_effect=soaked,
+        reference_delay=reference_delay,
     )
-    effects = _centred(effects)
+    effects = _center_curve(effects)
     if not isinstance(soaked, TemperatureEffect):
         return effects
     # Recovery from the loads before a soak is no effect of temperature.
-    model = dome_model(effects, tile, baseline_kpa)
-    pressed = pressed_in(recordings)
-    soaks = [_recovered(each, pressed, noise_kpa, model) for each in recordings]
-    again = _best([fit_soak(each) for each in soaks])
+    model = make_dome_model(effects, tile, baseline_kpa)
+    pressed = select_loaded(recordings)
+    soaks = [_subtract_recovery(each, pressed, noise_kpa, model) for each in recordings]
+    again = _select_best_soak([fit_temperature_effect(each) for each in soaks])
     if not isinstance(again, TemperatureEffect):
         return effects
-    return effects.model_copy(update={"temperature": _as_doubtful(again, soaked, effects.rubber)})
+    return effects.model_copy(
+        update={"temperature": _add_recovery_uncertainty(again, soaked, effects.rubber)}
+    )
 
 
-def _recovered(
+def _subtract_recovery(
     recording: Indentation, pressed: Sequence[Indentation], noise_kpa: float, model: DomeModel
-) -> Soak:
+) -> ThermalSoak:
     """Return a recording's soak less the dome's recovery from the loads before it."""
-    soaking = soak(recording, noise_kpa)
+    soaking = extract_soak(recording, noise_kpa)
     if not len(soaking.t_s):
         return soaking
     soak_ns = recording.t_ns[recording.phase == "soak"]
-    ends_ns = [_last_ns(each) for each in pressed]
+    ends_ns = [_last_loaded_ns(each) for each in pressed]
     before = [i for i, end_ns in enumerate(ends_ns) if end_ns <= soak_ns[0]]
     if not before:
         return soaking
     last = max(before, key=lambda i: ends_ns[i])
-    points = presses(pressed[last], unloaded(pressed[last]))
+    points = extract_loading_points(pressed[last], measure_unloaded(pressed[last]))
     since_s = (soak_ns - ends_ns[last]) * 1e-9
     t_s = np.concatenate([points.t_s, points.t_s[-1] + since_s])
     force_n = np.concatenate([points.force_n, np.zeros(len(since_s))])
-    left_kpa = model.pressed(t_s, force_n)[len(points.t_s) :, 0] - model.baseline_kpa
+    left_kpa = model.compute_pressures(t_s, force_n)[len(points.t_s) :, 0] - model.baseline_kpa
     return replace(soaking, kpa=soaking.kpa - left_kpa)
 
 
-def _last_ns(pressed: Indentation) -> int:
+def _last_loaded_ns(pressed: Indentation) -> int:
     """Return the last instant at which the tile was under the spindle."""
-    return int(pressed.t_ns[pressed.under_spindle & (pressed.phase != "soak")][-1])
+    return int(pressed.t_ns[pressed.is_under_indenter & (pressed.phase != "soak")][-1])
 
 
-def _as_doubtful(
+def _add_recovery_uncertainty(
     now: TemperatureEffect, before: TemperatureEffect, rubber: RubberEffect | None
 ) -> TemperatureEffect:
     """Add the uncertainty of the recovery that was subtracted."""
@@ -111,7 +124,7 @@ def _as_doubtful(
     )
 
 
-def dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> DomeModel:
+def make_dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> DomeModel:
     """Make the forward model of a tile.
 
     Args:
@@ -120,21 +133,23 @@ def dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> 
         baseline_kpa: absolute pressure unloaded.
     """
     gas, rubber, loop = effects.gas, effects.rubber, effects.hysteresis
-    curve = curve_over_range(tile.coefficients if rubber is None else rubber.coefficients)
+    curve = convert_curve_to_range(tile.coefficients if rubber is None else rubber.coefficients)
     model = DomeModel(curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa)
     if gas is not None:
         model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)
     if rubber is not None:
-        model = replace(model, part=values(rubber.part), creep_s=values(rubber.tau_s))
+        model = replace(
+            model, part=parameter_values(rubber.part), creep_s=parameter_values(rubber.tau_s)
+        )
     if loop is not None:
-        model = replace(model, loop=values(loop.part))
+        model = replace(model, loop=parameter_values(loop.part))
         if (flow := loop.flow) is not None:
-            part, flow_n, power = values((flow.part, flow.stress_n, flow.power)).tolist()
+            part, flow_n, power = parameter_values((flow.part, flow.stress_n, flow.power)).tolist()
             model = replace(model, flow_part=part, flow_n=flow_n, flow_power=power)
     return model
 
 
-def _centred(effects: Effects) -> Effects:
+def _center_curve(effects: Effects) -> Effects:
     """Convert the curve of settled forces to the variable of the tile's static curve."""
     rubber = effects.rubber
     if rubber is None:
@@ -156,24 +171,24 @@ def _centred(effects: Effects) -> Effects:
     return effects.model_copy(update={"rubber": in_u})
 
 
-def loadings(recordings: Sequence[Indentation]) -> tuple[Presses, float]:
+def collect_loadings(recordings: Sequence[Indentation]) -> tuple[LoadingPoints, float]:
     """Return every loading of a tile above one common baseline in kPa, and that baseline."""
-    recordings = pressed_in(recordings)
-    zeros = [unloaded(recording) for recording in recordings]
+    recordings = select_loaded(recordings)
+    zeros = [measure_unloaded(recording) for recording in recordings]
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
     parts = []
     for recording, zero in zip(recordings, zeros, strict=True):
-        part = presses(recording, zero)
+        part = extract_loading_points(recording, zero)
         parts.append(replace(part, kpa=part.kpa - (zero.baseline_kpa - baseline_kpa)))
-    return joined(parts), baseline_kpa
+    return join_loading_points(parts), baseline_kpa
 
 
-def curve_over_range(coefficients: Sequence[float]) -> Floats:
+def convert_curve_to_range(coefficients: Sequence[float]) -> Floats:
     """Convert a curve in the centred variable to c1, c2, c3 over x = gauge / range."""
     return np.asarray(np.linalg.solve(_U_OF_X, np.array(coefficients[1:])))
 
 
-def _best(soaks: Sequence[TemperatureEffect | str]) -> TemperatureEffect | str:
+def _select_best_soak(soaks: Sequence[TemperatureEffect | str]) -> TemperatureEffect | str:
     """Return the effect with the least uncertain rise, else the last soak's reason."""
     told = [warm for warm in soaks if isinstance(warm, TemperatureEffect)]
     return min(told, key=lambda warm: warm.kpa_per_k.sigma) if told else soaks[-1]
@@ -184,7 +199,7 @@ _AFTER_S = 0.1  # the gas cools within it; a longer loading is a hold
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReplaySection:
     """Section of a rig recording around a release or a tap; arrays of m readings.
 
     Attributes:
@@ -200,29 +215,36 @@ class Replay:
     modelled_kpa: Floats
 
 
-def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[str, Replay]:
+def extract_replays(
+    recordings: Sequence[Indentation], tile: TileCalibration
+) -> dict[str, ReplaySection]:
     """Extract a "release" and a "tap" of the tile, if there are any, with their models.
 
     The second of several, because the dome has settled by then.
     """
     if not any(np.isin(recording.phase, ("release", "tap")).any() for recording in recordings):
         return {}
-    points, baseline_kpa = loadings(recordings)
+    points, baseline_kpa = collect_loadings(recordings)
     effects = tile.effects
     # The mean curve of slow strokes contains creep and loop.
     static = DomeModel(
-        curve_over_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa
+        convert_curve_to_range(tile.coefficients),
+        tile.range_kpa[1],
+        baseline_kpa,
+        effects.wall_per_kpa,
     )
-    model = dome_model(effects, tile, baseline_kpa)
+    model = make_dome_model(effects, tile, baseline_kpa)
     late_s = effects.reference_late_s
     late_s += 0.0 if effects.late_s is None else effects.late_s.value
-    force_n = load(points.t_s, points.force_n)(points.t_s + late_s)
+    force_n = interpolate_force(points.t_s, points.force_n)(points.t_s + late_s)
     static_kpa, modelled_kpa = (
-        each.pressed(points.t_s, force_n)[:, 0] - baseline_kpa for each in (static, model)
+        each.compute_pressures(points.t_s, force_n)[:, 0] - baseline_kpa for each in (static, model)
     )
     measured_kpa = points.kpa - baseline_kpa
-    found: dict[str, Replay] = {}
-    for name, centre in _moments(points.t_s, points.force_n, points.loading, points.fast).items():
+    found: dict[str, ReplaySection] = {}
+    for name, centre in _find_event_readings(
+        points.t_s, points.force_n, points.loading, points.is_fast
+    ).items():
         here = points.loading == points.loading[centre]
         # Each loading has its own gain, about one, fitted to its own readings.
         usable = here & np.isfinite(measured_kpa)
@@ -231,13 +253,15 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
         gain = product / square if square > 0.0 else 1.0
         t_s = points.t_s - points.t_s[centre]
         rows = (t_s >= -_BEFORE_S) & (t_s <= _AFTER_S)
-        found[name] = Replay(
+        found[name] = ReplaySection(
             t_s[rows], measured_kpa[rows], static_kpa[rows], gain * modelled_kpa[rows]
         )
     return found
 
 
-def _moments(t_s: Floats, force_n: Floats, loading: Ints, fast: Bools) -> dict[str, int]:
+def _find_event_readings(
+    t_s: Floats, force_n: Floats, loading: Ints, fast: Bools
+) -> dict[str, int]:
     """Return the reading of the second release, and of the second tap."""
     held: list[int] = []
     tapped: list[int] = []

@@ -16,14 +16,14 @@ import numpy as np
 from devices.arrays import Bools, Floats
 
 _STEPS = 60  # a bound; a good start needs ten
-ENOUGH = 1e-4
+COST_TOLERANCE = 1e-4
 """Decrease of the sum of squares at which the search ends: 0.01 standard uncertainties."""
 _DIFFERENCE = 1e-6  # of an unknown's scale: balances rounding and curvature
 _DAMPING = (1e-9, 1e-3, 1e9)  # least, first, and largest
 
 
 @dataclass(frozen=True)
-class Found:
+class LeastSquaresResult:
     """Minimum of a least-squares problem.
 
     Attributes:
@@ -39,14 +39,14 @@ class Found:
     at_bound: Bools
 
 
-def least_squares(
+def minimize_squares(
     residual: Callable[[Floats], Floats],
     x: Floats,
     low: Floats,
     high: Floats,
     scale: Floats,
-    enough: float = ENOUGH,
-) -> Found:
+    cost_tolerance: float = COST_TOLERANCE,
+) -> LeastSquaresResult:
     """Minimize a sum of squares within bounds.
 
     Args:
@@ -55,18 +55,18 @@ def least_squares(
         low: lower bounds.
         high: upper bounds.
         scale: typical changes of the unknowns.
-        enough: decrease of the sum of squares at which the search ends.
+        cost_tolerance: decrease of the sum of squares at which the search ends.
     """
     _, damping, most = _DAMPING
     off = residual(x)
     cost = float(off @ off)
     for _ in range(_STEPS):
-        jacobian = _jacobian(residual, x, off, high, scale)
+        jacobian = _compute_jacobian(residual, x, off, high, scale)
         normal, slope = jacobian.T @ jacobian, jacobian.T @ off
         held = ((x <= low) & (slope > 0.0)) | ((x >= high) & (slope < 0.0))
         better = None
         while better is None and damping < most:
-            trial = np.clip(x + _step(normal, slope, held, damping), low, high)
+            trial = np.clip(x + _compute_step(normal, slope, held, damping), low, high)
             trial_off = residual(trial)
             trial_cost = float(trial_off @ trial_off)
             better = trial if trial_cost <= cost else None  # NaN is no better
@@ -74,15 +74,15 @@ def least_squares(
         if better is None:
             break
         gained, x, off, cost = cost - trial_cost, better, trial_off, trial_cost
-        if gained < enough:
+        if gained < cost_tolerance:
             break
-    jacobian = _jacobian(residual, x, off, high, scale)
+    jacobian = _compute_jacobian(residual, x, off, high, scale)
     slope = jacobian.T @ off
     held = ((x <= low) & (slope > 0.0)) | ((x >= high) & (slope < 0.0))
-    return Found(x, off, jacobian, held)
+    return LeastSquaresResult(x, off, jacobian, held)
 
 
-def _jacobian(
+def _compute_jacobian(
     residual: Callable[[Floats], Floats], x: Floats, off: Floats, high: Floats, scale: Floats
 ) -> Floats:
     columns = []
@@ -93,7 +93,7 @@ def _jacobian(
     return np.stack(columns, axis=1)
 
 
-def _step(normal: Floats, slope: Floats, held: Bools, damping: float) -> Floats:
+def _compute_step(normal: Floats, slope: Floats, held: Bools, damping: float) -> Floats:
     """Compute the damped step of the unknowns that no bound stops."""
     free = np.flatnonzero(~held)
     step = np.zeros(len(slope))

@@ -14,11 +14,15 @@ import numpy as np
 from scipy.optimize import nnls
 
 from devices.arrays import Bools, Floats
-from service.estimation.fitting.bench.press import Presses
-from service.estimation.fitting.confidence import beyond_bounds, fit_covariance
-from service.estimation.fitting.least_squares import ENOUGH, Found, least_squares
-from service.estimation.fitting.model import DomeModel, load
-from service.estimation.fitting.unknowns import Parts, told_s, unknowns_of
+from service.estimation.fitting.confidence import compute_bound_excess, compute_fit_covariance
+from service.estimation.fitting.dome_model import DomeModel, interpolate_force
+from service.estimation.fitting.least_squares import (
+    COST_TOLERANCE,
+    LeastSquaresResult,
+    minimize_squares,
+)
+from service.estimation.fitting.rig.loading import LoadingPoints
+from service.estimation.fitting.unknowns import FittedEffects, compute_creep_range_s, list_unknowns
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _SCATTER = (0.003, 0.03)
@@ -35,23 +39,23 @@ _OPENS_N = 0.1
 
 
 @dataclass(frozen=True)
-class Fit:
+class DomeFit:
     """Fitted model of a dome.
 
     Attributes:
         model: fitted parameters.
         gains: (loadings,), gain of each loading.
         scatter: standard deviation of the gains.
-        modelled: (m, 3), answer of `pressed`.
+        modelled: (m, 3), answer of `compute_pressures`.
         sigma: standard uncertainties by the name of the unknown: "late_s", "gamma", "ln_tau",
             "part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power", if fitted; and of
             sums over neighbouring terms, which are correlated: "part_sum", "loop_n".
         curve_covariance: (3, 3), covariance of the curve's coefficients.
         at_bound: names of unknowns at a bound.
-        unknowns: number of unknowns.
-        unseen: (loadings,), leave-one-loading-out sums of squares.
-        unsure: relative uncertainty of the corrections "gas" and "rubber" by their parameters, root
-            mean square in the rig.
+        n_unknowns: number of unknowns.
+        left_out_squares: (loadings,), leave-one-loading-out sums of squares.
+        correction_uncertainty: relative uncertainty of the corrections "gas" and "rubber" by their
+            parameters, root mean square in the rig.
     """
 
     model: DomeModel
@@ -61,13 +65,13 @@ class Fit:
     sigma: dict[str, Floats]
     curve_covariance: Floats
     at_bound: tuple[str, ...]
-    unknowns: int
-    unseen: Floats
-    unsure: dict[str, float]
+    n_unknowns: int
+    left_out_squares: Floats
+    correction_uncertainty: dict[str, float]
 
 
 @dataclass(frozen=True)
-class Misfits:
+class CorrectionMisfits:
     """Root mean square errors of the gas correction, of the creep correction, and of the curve."""
 
     gas: float
@@ -83,7 +87,7 @@ class OutputErrorProblem:
         static: start model, without effects.
     """
 
-    def __init__(self, points: Presses, static: DomeModel) -> None:
+    def __init__(self, points: LoadingPoints, static: DomeModel) -> None:
         self._points = points
         self._static = static
         gauge_kpa = points.kpa - static.baseline_kpa
@@ -94,50 +98,50 @@ class OutputErrorProblem:
         noise_kpa = 1.0 / np.where(self._usable, points.weight, 1.0)
         weight = 1.0 / np.hypot(noise_kpa, _MODEL * self._gauge_kpa)
         self._weight = np.where(self._usable, weight, 0.0)
-        between = load(points.t_s, points.force_n)
+        between = interpolate_force(points.t_s, points.force_n)
         # Depends on one unknown only, and interpolation costs as much as the smaller models.
         self._force_n = lru_cache(maxsize=2)(lambda late_s: between(points.t_s + late_s))
-        self._told_s = told_s(points)
+        self._told_s = compute_creep_range_s(points)
 
-    def fit(self, parts: Parts, scatter: float | None = None) -> Fit:
+    def fit(self, parts: FittedEffects, scatter: float | None = None) -> DomeFit:
         """Fit the curve and these effects.
 
         Args:
             parts: effects to fit.
             scatter: of the loadings; None: determine it.
         """
-        unknowns = unknowns_of(parts, self._static.curve, self._told_s)
-        likely = np.concatenate([u.likely for u in unknowns])
-        within = np.concatenate([np.full(len(u.likely), u.within) for u in unknowns])
-        low = np.concatenate([u.least for u in unknowns])
-        high = np.concatenate([u.most for u in unknowns])
+        unknowns = list_unknowns(parts, self._static.curve, self._told_s)
+        likely = np.concatenate([u.prior for u in unknowns])
+        within = np.concatenate([np.full(len(u.prior), u.prior_sigma) for u in unknowns])
+        low = np.concatenate([u.lower for u in unknowns])
+        high = np.concatenate([u.upper for u in unknowns])
         at: dict[str, slice] = {}
         stop = 0
         for each in unknowns:
-            at[each.name] = slice(stop, stop + len(each.likely))
-            stop += len(each.likely)
+            at[each.name] = slice(stop, stop + len(each.prior))
+            stop += len(each.prior)
         x = np.clip(likely, low, high)
         known = scatter is not None
         scatter = _SCATTER[1] if scatter is None else scatter
-        for enough in (ENOUGH,) if known else (_ROUGHLY, ENOUGH):
+        for enough in (COST_TOLERANCE,) if known else (_ROUGHLY, COST_TOLERANCE):
 
             def residual(x: Floats, scatter: float = scatter) -> Floats:
-                off = self.residual(self._model(x, at), scatter)
+                off = self.compute_residual(self._make_model(x, at), scatter)
                 return np.concatenate([off, (x - likely) / within])
 
-            found = least_squares(residual, x, low, high, within, enough)
+            found = minimize_squares(residual, x, low, high, within, enough)
             x = found.x
-            model = self._model(x, at)
-            gains, modelled = self._gains(model, scatter)
+            model = self._make_model(x, at)
+            gains, modelled = self._fit_gains(model, scatter)
             # About 1, not about their mean: the curve absorbs most of the mean, and they are few.
             if not known:
                 scatter = max(_SCATTER[0], float(np.sqrt(np.mean((gains - 1.0) ** 2))))
         read = slice(0, len(found.residual) - len(x))
         jacobian, off = found.jacobian[read], found.residual[read]
-        covariance = fit_covariance(jacobian, within)
+        covariance = compute_fit_covariance(jacobian, within)
         every = np.hypot(
             np.sqrt(np.maximum(np.diag(covariance), 0.0)),
-            beyond_bounds(jacobian, off, within, found.at_bound),
+            compute_bound_excess(jacobian, off, within, found.at_bound),
         )
         sigma = {name: every[where] for name, where in at.items()}
         for name, total, weights in (
@@ -147,7 +151,7 @@ class OutputErrorProblem:
             if name in at:
                 variance = float(weights @ covariance[at[name], at[name]] @ weights)
                 sigma[total] = np.array([np.sqrt(max(0.0, variance))])
-        return Fit(
+        return DomeFit(
             model=model,
             gains=gains,
             scatter=scatter,
@@ -155,12 +159,14 @@ class OutputErrorProblem:
             sigma=sigma,
             curve_covariance=covariance[at["curve"], at["curve"]],
             at_bound=tuple(name for name, where in at.items() if found.at_bound[where].any()),
-            unknowns=len(x),
-            unseen=self._unseen(found, within),
-            unsure=self._unsure(jacobian, covariance, modelled, model, at),
+            n_unknowns=len(x),
+            left_out_squares=self._compute_left_out_squares(found, within),
+            correction_uncertainty=self._compute_correction_uncertainty(
+                jacobian, covariance, modelled, model, at
+            ),
         )
 
-    def _unseen(self, found: Found, within: Floats) -> Floats:
+    def _compute_left_out_squares(self, found: LeastSquaresResult, within: Floats) -> Floats:
         """Return leave-one-loading-out sums of squares, to first order.
 
         Without the residuals r of a loading and their slopes J, the unknowns would move by
@@ -169,7 +175,7 @@ class OutputErrorProblem:
         free = ~found.at_bound
         slopes = found.jacobian[:, free] * within[free]
         normal = slopes.T @ slopes
-        m, n = len(self._points.loading), self._points.loadings
+        m, n = len(self._points.loading), self._points.n_loadings
         squares = np.zeros(n)
         # Points in the order of time, then the gains: loading by loading is row by row.
         begins = np.searchsorted(self._points.loading, np.arange(n + 1))
@@ -180,7 +186,7 @@ class OutputErrorProblem:
             squares[k] = float(((off + own @ moved) ** 2).sum())
         return squares
 
-    def _unsure(
+    def _compute_correction_uncertainty(
         self,
         jacobian: Floats,
         covariance: Floats,
@@ -188,11 +194,11 @@ class OutputErrorProblem:
         model: DomeModel,
         at: dict[str, slice],
     ) -> dict[str, float]:
-        """Return `Fit.unsure`."""
+        """Return `DomeFit.unsure`."""
         x = (modelled[:, 1] - model.baseline_kpa) / model.scale_kpa
         corrected = {
             "gas": (("gamma", "ln_tau"), modelled[:, 0] - modelled[:, 1]),
-            "rubber": (_OF_RUBBER, modelled[:, 2] / _n_per_kpa(model, x)),
+            "rubber": (_OF_RUBBER, modelled[:, 2] / _compute_slope_n_per_kpa(model, x)),
         }
         unsure = {}
         for name, (names, kpa) in corrected.items():
@@ -203,16 +209,18 @@ class OutputErrorProblem:
             unsure[name] = float(np.sqrt(variance / square)) if square > 0.0 else 0.0
         return unsure
 
-    def misfits(self, fit: Fit) -> Misfits:
+    def compute_misfits(self, fit: DomeFit) -> CorrectionMisfits:
         """Compute the fit's residual errors relative to the corrections."""
         rows, points, model = self._usable, self._points, fit.model
         gauge_kpa = fit.modelled[:, 0] - model.baseline_kpa
         residual_kpa = (fit.gains[points.loading] * gauge_kpa - self._gauge_kpa)[rows]
         gas_kpa = (fit.modelled[:, 0] - fit.modelled[:, 1])[rows]
         x = (fit.modelled[:, 1] - model.baseline_kpa)[rows] / model.scale_kpa
-        n_per_kpa = _n_per_kpa(model, x)
+        n_per_kpa = _compute_slope_n_per_kpa(model, x)
         residual_n = residual_kpa * n_per_kpa
-        curve_n = _systematic_n(residual_n, points.force_n[rows], points.fast[rows])
+        curve_n = _compute_systematic_error_n(
+            residual_n, points.force_n[rows], points.is_fast[rows]
+        )
         # Squares beyond those of noise and curve, over the squares of the corrections. The noise is
         # that of differences of successive readings, without outliers.
         weighted = residual_kpa * self._weight[rows]
@@ -221,10 +229,13 @@ class OutputErrorProblem:
         rubber_kpa = fit.modelled[rows, 2] / n_per_kpa
         parts = np.stack([gas_kpa**2, rubber_kpa**2], axis=1) / variance[:, None]
         shares, _ = nnls(parts, residual_kpa**2 / variance - 1.0)
-        gas, rubber = np.hypot(np.sqrt(shares), [fit.unsure["gas"], fit.unsure["rubber"]])
-        return Misfits(gas=float(gas), rubber=float(rubber), curve_n=curve_n)
+        gas, rubber = np.hypot(
+            np.sqrt(shares),
+            [fit.correction_uncertainty["gas"], fit.correction_uncertainty["rubber"]],
+        )
+        return CorrectionMisfits(gas=float(gas), rubber=float(rubber), curve_n=curve_n)
 
-    def _model(self, x: Floats, at: dict[str, slice]) -> DomeModel:
+    def _make_model(self, x: Floats, at: dict[str, slice]) -> DomeModel:
         model = replace(self._static, curve=x[at["curve"]])
         if "late_s" in at:
             model = replace(model, late_s=float(x[at["late_s"]][0]))
@@ -239,49 +250,51 @@ class OutputErrorProblem:
             model = replace(model, flow_part=part, flow_n=flow_n, flow_power=power)
         return replace(model, loop=x[at["loop"]]) if "loop" in at else model
 
-    def _gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:
+    def _fit_gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:
         """Compute the gain of each loading, with a prior of one, and the modelled pressures."""
         points = self._points
-        modelled = model.pressed(points.t_s, self._force_n(model.late_s))
+        modelled = model.compute_pressures(points.t_s, self._force_n(model.late_s))
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
-        n = points.loadings
+        n = points.n_loadings
         prior = 1.0 / scatter**2
         square = np.bincount(points.loading, (self._weight * gauge_kpa) ** 2, n)
         product = np.bincount(points.loading, self._weight**2 * gauge_kpa * self._gauge_kpa, n)
         return (product + prior) / (square + prior), modelled
 
-    def residual(self, model: DomeModel, scatter: float) -> Floats:
+    def compute_residual(self, model: DomeModel, scatter: float) -> Floats:
         """Compute the residuals of pressures and gains in their standard uncertainties."""
-        gains, modelled = self._gains(model, scatter)
+        gains, modelled = self._fit_gains(model, scatter)
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         off = (gains[self._points.loading] * gauge_kpa - self._gauge_kpa) * self._weight
         return np.concatenate([off, (gains - 1.0) / scatter])
 
     @property
-    def most_n(self) -> float:
+    def max_force_n(self) -> float:
         """Largest reference force."""
         return float(self._points.force_n.max())
 
-    def heat_n(self, fit: Fit) -> float:
+    def compute_max_heat_force_n(self, fit: DomeFit) -> float:
         """Return the largest effect of the gas' heat on a force."""
         model, rows = fit.model, self._usable
         heated_kpa, settled_kpa = fit.modelled[rows, 0], fit.modelled[rows, 1]
-        slope = _n_per_kpa(model, (settled_kpa - model.baseline_kpa) / model.scale_kpa)
+        slope = _compute_slope_n_per_kpa(
+            model, (settled_kpa - model.baseline_kpa) / model.scale_kpa
+        )
         return float(np.abs((heated_kpa - settled_kpa) * slope).max())
 
-    def squares(self, model: DomeModel, scatter: float) -> float:
+    def compute_cost(self, model: DomeModel, scatter: float) -> float:
         """Compute the sum of squared residuals."""
-        off = self.residual(model, scatter)
+        off = self.compute_residual(model, scatter)
         return float(off @ off)
 
 
-def _n_per_kpa(model: DomeModel, x: Floats) -> Floats:
+def _compute_slope_n_per_kpa(model: DomeModel, x: Floats) -> Floats:
     """Compute the slope of the curve at parts x of its range."""
     c1, c2, c3 = model.curve
     return np.asarray((c1 + x * (2.0 * c2 + x * 3.0 * c3)) / model.scale_kpa)
 
 
-def _systematic_n(residual_n: Floats, force_n: Floats, fast: Bools) -> float:
+def _compute_systematic_error_n(residual_n: Floats, force_n: Floats, fast: Bools) -> float:
     """Return the root mean square error of the curve where slow strokes agree with one another.
 
     Means over `_BINS` parts of the range of force, on the way in and on the way out.

@@ -17,21 +17,21 @@ from scipy.special import stdtrit
 from devices.arrays import Floats
 from devices.errors import CalibrationError
 from service.estimation.calibration import (
-    BASIS,
+    CUBIC_TERMS,
     BandPoint,
     TileCalibration,
     WeightFacts,
     WeightStep,
 )
+from service.estimation.dead_weights import check_weight_count
 from service.estimation.effects import EffectName, Effects
-from service.estimation.estimates import INTERVAL_95
-from service.estimation.fitting.bench.indentation import Indentation, place
-from service.estimation.fitting.bench.weights import Hold, holds
-from service.estimation.fitting.confidence import cubic_basis, curve_n
+from service.estimation.estimates import SIGMAS_95
+from service.estimation.fitting.confidence import compute_cubic_basis, compute_curve_n
+from service.estimation.fitting.rig.indentation import Indentation, format_origin
+from service.estimation.fitting.rig.weight_holds import WeightHold, measure_holds
 from service.estimation.models.static import StaticCurves
-from service.estimation.weights import check_enough
 
-SMALL_N = 2.0
+SMALL_FORCE_N = 2.0
 """Force below which an error is absolute rather than relative."""
 RESIDUAL_MAX = 0.3
 """Largest relative residual: six times the paper's scatter between loadings."""
@@ -49,16 +49,16 @@ _NOT_SEEN: dict[EffectName, str] = {
 }
 
 
-def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
+def fit_dead_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     """Fit the curve of one tile to all its dead weights, in one recording or several.
 
     Raises:
         CalibrationError: there are too few weights, or they show no curve.
     """
-    where = ", ".join(place(recording) for recording in recordings)
-    per_file = [holds(recording) for recording in recordings]
+    where = ", ".join(format_origin(recording) for recording in recordings)
+    per_file = [measure_holds(recording) for recording in recordings]
     steps = [step for found in per_file for step in found]
-    check_enough([step.weight.force_n for step in steps], where)
+    check_weight_count([step.weight.force_n for step in steps], where)
     drift_kpa = max(
         max(abs(step.baseline_kpa - found[0].baseline_kpa) for step in found)
         for found in per_file
@@ -75,16 +75,16 @@ def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
     force_n = np.array([step.weight.force_n for step in steps])
     gauge_kpa = np.array([step.gauge_kpa for step in steps])
     high_kpa = float(gauge_kpa.max())
-    _refuse_no_rise(force_n, gauge_kpa, steps, where)
-    basis = cubic_basis(gauge_kpa, 0.0, high_kpa)[:, :TERMS]
-    weight = 1.0 / np.hypot(force_n, SMALL_N)
+    _reject_no_rise(force_n, gauge_kpa, steps, where)
+    basis = compute_cubic_basis(gauge_kpa, 0.0, high_kpa)[:, :TERMS]
+    weight = 1.0 / np.hypot(force_n, SMALL_FORCE_N)
     design = basis * weight[:, None]
     (c1, c2), *_ = np.linalg.lstsq(design, force_n * weight, rcond=None)
     residual_n = basis @ np.array([c1, c2]) - force_n
-    _refuse_contradictions(residual_n, force_n, steps, where)
+    _reject_contradictions(residual_n, force_n, steps, where)
     freedom = len(steps) - TERMS
     variance = float(((residual_n * weight) ** 2).sum() / freedom)
-    widened = float(stdtrit(freedom, 0.975)) / INTERVAL_95
+    widened = float(stdtrit(freedom, 0.975)) / SIGMAS_95
     scatter = widened * float(np.sqrt(variance))
     if not min(c1, c1 + 2.0 * c2) > 0.0:
         raise CalibrationError(
@@ -92,7 +92,7 @@ def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
             where=where,
             remedy="Check what each weight is, and put them on the middle of the dome",
         )
-    covariance = np.zeros((BASIS, BASIS))
+    covariance = np.zeros((CUBIC_TERMS, CUBIC_TERMS))
     covariance[:TERMS, :TERMS] = scatter**2 * np.linalg.inv(design.T @ design)
     slope = (c1 + 2.0 * c2 * gauge_kpa / high_kpa) / high_kpa
     settle = slope * np.array([step.settle_kpa for step in steps]) / force_n
@@ -113,10 +113,10 @@ def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
         absolute_scale="measured",
         covariance=tuple(map(tuple, covariance.tolist())),
         relative_misfit=float(np.sqrt(scatter**2 + (settle**2).mean() + scale**2)),
-        loop_misfit_n=scatter * SMALL_N,
+        loop_misfit_n=scatter * SMALL_FORCE_N,
         r2=float(1.0 - (residual_n**2).sum() / (spread_n**2).sum()),
         rmse_n=float(np.sqrt((residual_n**2).mean())),
-        cv_rmse_n=_left_out_rms_n(design, force_n, weight, basis),
+        cv_rmse_n=_compute_left_out_rms_n(design, force_n, weight, basis),
         hysteresis_n=None,
         repeats=len(steps),
         baseline_kpa=float(np.mean([step.baseline_kpa for step in steps])),
@@ -139,28 +139,35 @@ def fit_weights(recordings: Sequence[Indentation]) -> TileCalibration:
                 ),
                 baseline_drift_kpa=drift_kpa,
                 scale_sigma=scale,
-                band_95=_band(tile),
+                band_95=_make_band(tile),
             )
         }
     )
 
 
-def _band(tile: TileCalibration) -> tuple[BandPoint, ...]:
+def _make_band(tile: TileCalibration) -> tuple[BandPoint, ...]:
     """Return the curve with the half widths that an estimate of a settled load states."""
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], _BAND_STEPS + 1)
-    found = StaticCurves([tile]).force(gauge_kpa[:, None])
-    basis = cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
-    mean_n = INTERVAL_95 * np.sqrt(
+    found = StaticCurves([tile]).compute_forces(gauge_kpa[:, None])
+    basis = compute_cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
+    mean_n = SIGMAS_95 * np.sqrt(
         np.maximum(((basis @ np.array(tile.covariance)) * basis).sum(1), 0.0)
     )
-    columns = (gauge_kpa, curve_n(tile, gauge_kpa), mean_n, INTERVAL_95 * found.fit_sigma_n[:, 0])
+    columns = (
+        gauge_kpa,
+        compute_curve_n(tile, gauge_kpa),
+        mean_n,
+        SIGMAS_95 * found.fit_sigma_n[:, 0],
+    )
     return tuple(
         BandPoint(gauge_kpa=p, force_n=f, mean_n=mean, new_loading_n=new)
         for p, f, mean, new in zip(*(column.tolist() for column in columns), strict=True)
     )
 
 
-def _left_out_rms_n(design: Floats, force_n: Floats, weight: Floats, basis: Floats) -> float:
+def _compute_left_out_rms_n(
+    design: Floats, force_n: Floats, weight: Floats, basis: Floats
+) -> float:
     """Return the RMS error of the curve at weights that it was not fitted to."""
     errors = []
     for i in range(len(force_n)):
@@ -170,7 +177,9 @@ def _left_out_rms_n(design: Floats, force_n: Floats, weight: Floats, basis: Floa
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def _refuse_no_rise(force_n: Floats, gauge_kpa: Floats, steps: Sequence[Hold], where: str) -> None:
+def _reject_no_rise(
+    force_n: Floats, gauge_kpa: Floats, steps: Sequence[WeightHold], where: str
+) -> None:
     if not gauge_kpa.max() >= RANGE_MIN_KPA:
         raise CalibrationError(
             f"the tile reads {gauge_kpa.max():.2f} kPa at most under {force_n.max():.1f} N",
@@ -192,10 +201,10 @@ def _refuse_no_rise(force_n: Floats, gauge_kpa: Floats, steps: Sequence[Hold], w
             )
 
 
-def _refuse_contradictions(
-    residual_n: Floats, force_n: Floats, steps: Sequence[Hold], where: str
+def _reject_contradictions(
+    residual_n: Floats, force_n: Floats, steps: Sequence[WeightHold], where: str
 ) -> None:
-    off = residual_n / np.hypot(force_n, SMALL_N)
+    off = residual_n / np.hypot(force_n, SMALL_FORCE_N)
     worst = int(np.argmax(np.abs(off)))
     if abs(off[worst]) > RESIDUAL_MAX:
         as_n = force_n[worst] + residual_n[worst]

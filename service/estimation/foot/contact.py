@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from devices.arrays import Times
-from devices.compiled import compiled, inlined
+from devices.jit import jit_cached, jit_inlined
 from service.estimation.records import KernelRecord
 
 
 @dataclass(frozen=True)
-class ContactRule:
+class ContactThresholds:
     """Thresholds of contact.
 
     Attributes:
@@ -35,14 +35,14 @@ class ContactState(KernelRecord):
     since_ns: int
 
 
-@compiled
-def seeming(
+@jit_cached
+def update_candidate(
     on_n: float, off_n: float, state: ContactState, grf_n: float, t_ns: int, after_gap: bool
 ) -> None:
     """Update the candidate of contact with the next frame.
 
     Args:
-        on_n: of `ContactRule`.
+        on_n: of `ContactThresholds`.
         off_n: likewise.
         state: after the frame before; updated.
         grf_n: NaN leaves the candidate as it is.
@@ -55,8 +55,8 @@ def seeming(
     state.is_loaded = loaded
 
 
-@inlined
-def has_lasted(since_ns: Times, t_ns: Times, i: int, end: int, min_ns: int, lag_ns: int) -> bool:
+@jit_inlined
+def is_debounced(since_ns: Times, t_ns: Times, i: int, end: int, min_ns: int, lag_ns: int) -> bool:
     """Return whether the candidate of frame `i` lasts `min_ns` within the look-ahead.
 
     Args:
@@ -64,7 +64,7 @@ def has_lasted(since_ns: Times, t_ns: Times, i: int, end: int, min_ns: int, lag_
         t_ns: (n,), instants.
         i: frame.
         end: frame after the last that is stored; all within the look-ahead must be.
-        min_ns: of `ContactRule`.
+        min_ns: of `ContactThresholds`.
         lag_ns: look-ahead.
     """
     at = i

@@ -11,13 +11,13 @@ import math
 import numpy as np
 
 from devices.arrays import Floats
-from devices.compiled import compiled
 from devices.frames import SAME_PLACE_M, ServoInfo
+from devices.jit import jit_cached
 
-_CURVED_TILES = 3  # least positions along x that determine a parabola
+_PARABOLA_POSITIONS_MIN = 3  # least positions along x that determine a parabola
 
 
-def hull(positions_m: Floats) -> tuple[Floats, Floats]:
+def compute_hull(positions_m: Floats) -> tuple[Floats, Floats]:
     """Compute half-planes `normals @ p <= offsets` whose intersection is the hull of (tiles, 2).
 
     Tiles in a line, or a single one, have a hull without area: two half-planes across every
@@ -40,7 +40,7 @@ def hull(positions_m: Floats) -> tuple[Floats, Floats]:
     return normals, (positions_m @ normals.T).max(axis=0, initial=-np.inf)
 
 
-def grid_indices(
+def compute_grid_indices(
     positions_m: Floats,
 ) -> tuple[Floats, Floats] | None:
     """Return each tile's index along x and y, from 1 (paper eq. 4); None if they fill no grid.
@@ -55,32 +55,34 @@ def grid_indices(
     return x.astype(np.float64) + 1.0, y.astype(np.float64) + 1.0
 
 
-def axes_rad(positions_m: Floats) -> Floats:
+def compute_tile_axes_rad(positions_m: Floats) -> Floats:
     """Compute the angle of each tile's axis to the segment, (tiles,).
 
     Tiles stand upright on their sole, whose shape along x is a parabola through their positions
     (tiles, 3). Zero if these do not determine it. As the segment rolls, tiles are vertical in turn.
     """
     x_m, z_m = positions_m[:, 0], positions_m[:, 2]
-    if len(np.unique(np.round(x_m / SAME_PLACE_M))) < _CURVED_TILES:
+    if len(np.unique(np.round(x_m / SAME_PLACE_M))) < _PARABOLA_POSITIONS_MIN:
         return np.zeros(len(positions_m))
     design = np.stack([np.ones(len(x_m)), x_m, x_m**2], axis=1)
     (_, slope, bend), *_ = np.linalg.lstsq(design, z_m, rcond=None)
     return np.asarray(np.arctan(slope + 2.0 * bend * x_m))
 
 
-def lost_by_tilt(axes: Floats) -> Floats:
+def compute_tilt_loss(axes_rad: Floats) -> Floats:
     """Return the part of a force along each tile's axis that is not along the segment: 1 - cos."""
-    return np.asarray(1.0 - np.cos(axes))
+    return np.asarray(1.0 - np.cos(axes_rad))
 
 
-def rad_per_count(servo: ServoInfo) -> float:
+def compute_rad_per_count(servo: ServoInfo) -> float:
     """Return the segment's angle for a count of the servo; signed."""
     return servo.sign * servo.ratio * 2.0 * math.pi / servo.counts_per_turn
 
 
-@compiled
-def to_ground_x_m(x_m: float, z_m: float, angle_rad: float, ankle_travel_m_per_rad: float) -> float:
+@jit_cached
+def transform_to_ground_x_m(
+    x_m: float, z_m: float, angle_rad: float, ankle_travel_m_per_rad: float
+) -> float:
     """Transform a point's x from foot to ground frame (paper eq. 3 with l = -z, r = -x).
 
     ankle travel + x cos(angle) + z sin(angle); NaN where the ankle's travel is.

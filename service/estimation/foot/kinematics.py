@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 
-from devices.compiled import inlined
-from devices.frames import NO_SERVO_COUNTS, FrameStatus
+from devices.frames import NO_SERVO_COUNTS, FrameFlag
+from devices.jit import jit_inlined
 from service.estimation.records import KernelRecord, RecordArray
 
 _AGE_UNIT_NS = 1000
 """Unit of ages: instants of one reading from two frames may differ by this."""
-_UNKNOWN = int(FrameStatus.SERVO_STALE | FrameStatus.SERVO_TURN_UNKNOWN)
+_UNKNOWN = int(FrameFlag.SERVO_STALE | FrameFlag.SERVO_TURN_UNKNOWN)
 
 
 class ServoReading(KernelRecord):
@@ -30,8 +30,8 @@ class ServoReading(KernelRecord):
     is_next: int  # 1: the reading directly after that of the frame before
 
 
-@inlined
-def carry(
+@jit_inlined
+def store_servo_reading(
     readings: RecordArray[ServoReading],
     i: int,
     t_ns: int,
@@ -49,7 +49,7 @@ def carry(
         t_ns: instant of the frame.
         counts: `servo_counts`.
         age_us: `servo_age_us`.
-        frame_flags: bits of `FrameStatus`.
+        frame_flags: bits of `FrameFlag`.
         counts_per_turn: of the servo. A change of half a turn or more between two readings is a
             wrap from the end of the turn to its beginning.
         after_gap: whether a gap precedes the frame; its reading then has no predecessor.
@@ -66,8 +66,10 @@ def carry(
     now.is_next = 1 if is_next else 0
 
 
-@inlined
-def counts_at(readings: RecordArray[ServoReading], i: int, end: int, lag_ns: int) -> float:
+@jit_inlined
+def interpolate_servo_counts(
+    readings: RecordArray[ServoReading], i: int, end: int, lag_ns: int
+) -> float:
     """Interpolate the servo position to the instant of frame `i`, in counts; NaN where unknown.
 
     Args:
@@ -79,11 +81,11 @@ def counts_at(readings: RecordArray[ServoReading], i: int, end: int, lag_ns: int
     t_ns, here = readings[i].t_ns, i
     if readings[i].is_valid == 0:
         return math.nan
-    after = _following(readings, here, end, t_ns + lag_ns)
+    after = _find_next_reading(readings, here, end, t_ns + lag_ns)
     # A reading that was on its way at the frame's instant was sampled before it.
     if after >= 0 and readings[after].sampled_ns <= t_ns:
         here = after
-        after = _following(readings, here, end, t_ns + lag_ns)
+        after = _find_next_reading(readings, here, end, t_ns + lag_ns)
     counts = float(readings[here].counts)
     if after < 0 or readings[after].sampled_ns <= t_ns:
         return counts
@@ -92,8 +94,10 @@ def counts_at(readings: RecordArray[ServoReading], i: int, end: int, lag_ns: int
     return counts + part * (readings[after].counts - readings[here].counts)
 
 
-@inlined
-def _following(readings: RecordArray[ServoReading], at: int, end: int, until_ns: int) -> int:
+@jit_inlined
+def _find_next_reading(
+    readings: RecordArray[ServoReading], at: int, end: int, until_ns: int
+) -> int:
     """Return the frame with the reading directly after that of frame `at`; -1: none."""
     after = at + 1
     # At the end of the look-ahead only the first frame is there for certain; without any, none.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from devices.compiled import compiled
+from devices.jit import jit_cached
 from service.estimation.records import KernelRecord, RecordArray
 
 SMOOTHING_S = 0.03  # long against noise, short against a foot that sinks in
@@ -22,7 +22,7 @@ HELD_S = 0.2
 
 
 class AmbientParams(KernelRecord):
-    """Parameters of a tile, as in `Ambient`."""
+    """Parameters of a tile, as in `AmbientModel`."""
 
     transmitted_fraction: float
     relative_sigma: float
@@ -35,13 +35,13 @@ class AmbientState(KernelRecord):
     t_ns: int  # instant of the last reading
 
 
-def at_rest() -> RecordArray[AmbientState]:
+def initial_state() -> RecordArray[AmbientState]:
     """Make the state before the first reading."""
     return AmbientState.array(1, pressure_kpa=np.nan)
 
 
 @dataclass(frozen=True)
-class Ambient:
+class AmbientModel:
     """Parameters over load-bearing tiles.
 
     Attributes:
@@ -52,13 +52,13 @@ class Ambient:
     transmitted_fraction: Floats
     relative_sigma: float
 
-    def laws(self) -> RecordArray[AmbientParams]:
+    def to_records(self) -> RecordArray[AmbientParams]:
         """Make the kernel's parameters, (tiles,)."""
         return AmbientParams.array(len(self.transmitted_fraction), **vars(self))
 
 
-@compiled
-def around(state: AmbientState, kpa: float, t_ns: int) -> float:
+@jit_cached
+def update_ambient_pressure(state: AmbientState, kpa: float, t_ns: int) -> float:
     """Return the low-passed surrounding pressure above the tare's; NaN where unknown.
 
     Args:

@@ -16,42 +16,42 @@ from typing import Protocol
 import numpy as np
 
 from devices.arrays import Floats, Ints, Times
-from devices.compiled import compiled, inlined
+from devices.jit import jit_cached, jit_inlined
 from service.estimation.records import RecordArray
 
 PAST_NS = 250_000_000  # reach of the longest window into the past
-REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
+WINDOW_REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
 """Reaches of the windows to either side, in samples."""
-AVERAGED_MAX = 2 * int(REACHES[-1]) + 2
+WINDOW_READINGS_MAX = 2 * int(WINDOW_REACHES[-1]) + 2
 """Number of readings in the longest window, plus one."""
-AGREE = 2.25
+AGREEMENT_SIGMAS = 2.25
 """Largest difference of two windows' values, in standard uncertainties; chance exceeds it in one of
 forty. A compromise between noise in quiet stance and lag at an impact."""
-SAME = 1e-6
+VARIANCE_REDUCTION_MIN = 1e-6
 """Relative reduction of variance below which a longer window differs by rounding only."""
-SINGULAR = 1e-5
+DETERMINANT_MIN = 1e-5
 """Relative determinant below which samples lie too close together for the curve, as two instants
 for a parabola; windows of equal steps have a hundred times more."""
 
 
-Rows = tuple[int, int, int, int]
+WindowRows = tuple[int, int, int, int]
 """First and last row that the window of a line reaches, then those of a parabola."""
-ANYWHERE: Rows = (0, 1 << 62, 0, 1 << 62)
+ALL_ROWS: WindowRows = (0, 1 << 62, 0, 1 << 62)
 """All rows."""
-Columns = tuple[Floats, Floats, Times, Ints]
+SampleColumns = tuple[Floats, Floats, Times, Ints]
 """Values (n, columns), NaN where there is none; standard deviation of each and its instant, both
 (n, columns); and (n,) the number of the gapless run that a frame belongs to."""
-Scratch = tuple[Floats, Floats, Floats]
-"""Work arrays of `averaged`, from `scratch_of_windows`: values of all smaller windows, their
+WindowScratch = tuple[Floats, Floats, Floats]
+"""Work arrays of `average_sample`, from `allocate_scratch`: values of all smaller windows, their
 variances, and 1 for a parabola."""
-KEPT_MAX = 4 * len(REACHES) + 1
+WINDOWS_MAX = 4 * len(WINDOW_REACHES) + 1
 """Largest number of windows around a sample."""
-Moments = tuple[float, float, float, float, float, float, float, float]
+WindowMoments = tuple[float, float, float, float, float, float, float, float]
 """Sums over samples: their number, the first four powers of their times, their values, and these
 times time and its square. Eight numbers that stay in registers."""
 
 
-class TileBend(Protocol):
+class WindowDifference(Protocol):
     """Record of a tile with the change of its average from a shorter window."""
 
     window_difference_n: float
@@ -62,14 +62,14 @@ class TileBend(Protocol):
     """Load that averaging removes, estimated."""
 
 
-@compiled
-def scratch_of_windows() -> Scratch:
-    """Allocate the work arrays of `averaged`."""
-    return np.empty(KEPT_MAX), np.empty(KEPT_MAX), np.empty(KEPT_MAX)
+@jit_cached
+def allocate_scratch() -> WindowScratch:
+    """Allocate the work arrays of `average_sample`."""
+    return np.empty(WINDOWS_MAX), np.empty(WINDOWS_MAX), np.empty(WINDOWS_MAX)
 
 
-@inlined
-def in_sight(
+@jit_inlined
+def find_window_limits(
     frame_t_ns: Times, i: int, first: int, end: int, rows: tuple[int, int], look_ns: int
 ) -> tuple[int, int]:
     """Return the oldest and the newest row that windows of row `i` may reach.
@@ -93,17 +93,17 @@ def in_sight(
     return oldest, newest
 
 
-@compiled
-def averaged(
-    columns: Columns,
+@jit_cached
+def average_sample(
+    columns: SampleColumns,
     i: int,
     j: int,
     at_ns: int,
     rows: tuple[int, int],
     variance_inflation: Floats,
-    within: Rows,
-    scratch: Scratch,
-) -> tuple[tuple[float, float, float, float], Rows]:
+    within: WindowRows,
+    scratch: WindowScratch,
+) -> tuple[tuple[float, float, float, float], WindowRows]:
     """Average the value of row `i`, column `j`, which must exist.
 
     Args:
@@ -111,16 +111,17 @@ def averaged(
         i: row.
         j: column.
         at_ns: instant at which the fitted curve is evaluated.
-        rows: oldest and newest that windows may reach, from `in_sight`.
-        variance_inflation: (`AVERAGED_MAX` + 1,), variance of a mean of n readings over that of
-            white noise.
-        within: rows that windows may reach: `ANYWHERE`, or those of the sum of tiles.
-        scratch: from `scratch_of_windows`.
+        rows: oldest and newest that windows may reach, from `find_window_limits`.
+        variance_inflation: (`WINDOW_READINGS_MAX` + 1,), variance of a mean of n readings over that
+            of white noise.
+        within: rows that windows may reach: `ALL_ROWS`, or those of the sum of tiles.
+        scratch: from `allocate_scratch`.
 
     Returns:
         The value; its variance in units of that of a single value: remaining noise, and curvature
         within the window; its difference from a window of half the length; and the variance of
-        that by noise, in the same units, for `share_bend`. And the rows reached, as `within`.
+        that by noise, in the same units, for `estimate_smoothing_errors`. And the rows reached, as
+        `within`.
     """
     values, sigmas, t_ns, run = columns
     oldest, newest = rows
@@ -129,14 +130,14 @@ def averaged(
     kept_values, kept_variances, kept_bent = scratch
     line_low, line_high, bent_low, bent_high = within
     nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    moments = _added(nothing, (t_ns[i, j] - at_ns) * 1e-6, values[i, j])
+    moments = _add_sample(nothing, (t_ns[i, j] - at_ns) * 1e-6, values[i, j])
     best = shorter = shortest = values[i, j]
     variance = shorter_variance = shortest_variance = 1.0
     kept_values[0], kept_variances[0], kept_bent[0] = best, variance, 1.0
     stored = 1
     low = high = straight_low = straight_high = i
     open_low = open_high = straight = True
-    for reach in REACHES:
+    for reach in WINDOW_REACHES:
         before, before_variance = best, variance
         for ahead in (False, True):
             if not (open_high if ahead else open_low):
@@ -148,7 +149,7 @@ def averaged(
             while at != end and run[at + way] == run[i]:
                 at += way
                 if not math.isnan(values[at, j]):
-                    trial = _added(trial, (t_ns[at, j] - at_ns) * 1e-6, values[at, j])
+                    trial = _add_sample(trial, (t_ns[at, j] - at_ns) * 1e-6, values[at, j])
             if at == edge:
                 continue
             accepted, remains = math.nan, 0.0
@@ -160,11 +161,13 @@ def averaged(
             for bent in (True, False):
                 if not bent and (not straight or is_beyond):
                     break
-                value, of_noise = _parabola(trial) if bent else _line(trial)
+                value, of_noise = _fit_parabola(trial) if bent else _fit_line(trial)
                 if math.isnan(value):
                     continue
-                of_noise *= _left(variance_inflation, of_noise)
-                if not _agree(scratch, stored, value, of_noise, bent, (AGREE * sigma) ** 2):
+                of_noise *= _interpolate_inflation(variance_inflation, of_noise)
+                if not _is_in_agreement(
+                    scratch, stored, value, of_noise, bent, (AGREEMENT_SIGMAS * sigma) ** 2
+                ):
                     agrees = not bent
                     straight = False
                     break
@@ -185,7 +188,7 @@ def averaged(
                 low = at
             if straight:
                 straight_low, straight_high = low, high
-            if not math.isnan(accepted) and remains < (1.0 - SAME) * variance:
+            if not math.isnan(accepted) and remains < (1.0 - VARIANCE_REDUCTION_MIN) * variance:
                 best, variance = accepted, remains
         if variance < before_variance:
             shortest, shortest_variance = shorter, shorter_variance
@@ -200,8 +203,8 @@ def averaged(
     return (best, variance, bend, of_bend), (straight_low, straight_high, low, high)
 
 
-@inlined
-def share_bend(tiles: RecordArray[TileBend]) -> None:
+@jit_inlined
+def estimate_smoothing_errors(tiles: RecordArray[WindowDifference]) -> None:
     """Write the part of the tiles' window differences that exceeds noise into `smoothing_error_n`.
 
     Tiles bear the same load: a window smooths it in every tile, to the same side. The noise of one
@@ -217,16 +220,16 @@ def share_bend(tiles: RecordArray[TileBend]) -> None:
             sigma_n = tiles[j].window_difference_sigma_n
             variance += sigma_n * sigma_n
     part = 0.0
-    if total * total > AGREE * AGREE * variance:
+    if total * total > AGREEMENT_SIGMAS * AGREEMENT_SIGMAS * variance:
         part = math.sqrt(1.0 - variance / (total * total))
     for j in range(len(tiles)):
         difference_n = tiles[j].window_difference_n
         tiles[j].smoothing_error_n = 0.0 if math.isnan(difference_n) else part * difference_n
 
 
-@inlined
-def _agree(
-    kept: Scratch, stored: int, value: float, of_noise: float, bent: bool, most: float
+@jit_inlined
+def _is_in_agreement(
+    kept: WindowScratch, stored: int, value: float, of_noise: float, bent: bool, most: float
 ) -> bool:
     """Return whether a window's value agrees with the first `stored` of shorter ones.
 
@@ -236,14 +239,14 @@ def _agree(
     apart = 0
     for m in range(stored):  # all of them, several at a time: to stop at one would cost more
         difference, variance = value - values[m], variances[m]
-        within = max(variance - of_noise, SAME * variance)
+        within = max(variance - of_noise, VARIANCE_REDUCTION_MIN * variance)
         of_difference = variance + of_noise if bent and were_bent[m] == 0.0 else within
         apart += difference * difference > most * of_difference
     return apart == 0
 
 
-@compiled
-def _left(variance_inflation: Floats, of_noise: float) -> float:
+@jit_cached
+def _interpolate_inflation(variance_inflation: Floats, of_noise: float) -> float:
     """Interpolate the inflation for a curve's value, as uncertain as a mean of 1/of_noise."""
     readings = min(1.0 / of_noise, len(variance_inflation) - 1.5)
     whole = int(readings)
@@ -252,8 +255,8 @@ def _left(variance_inflation: Floats, of_noise: float) -> float:
     return below + (readings - whole) * (above - below)
 
 
-@inlined
-def _added(m: Moments, time: float, value: float) -> Moments:
+@jit_inlined
+def _add_sample(m: WindowMoments, time: float, value: float) -> WindowMoments:
     square = time * time
     return (
         m[0] + 1.0,
@@ -267,20 +270,20 @@ def _added(m: Moments, time: float, value: float) -> Moments:
     )
 
 
-@compiled
-def _line(m: Moments) -> tuple[float, float]:
+@jit_cached
+def _fit_line(m: WindowMoments) -> tuple[float, float]:
     """Return the fitted line at time 0, and its variance in units of a sample's."""
     det = m[0] * m[2] - m[1] * m[1]
-    if m[0] < 3.0 or det <= SINGULAR * m[0] * m[2]:
+    if m[0] < 3.0 or det <= DETERMINANT_MIN * m[0] * m[2]:
         return math.nan, 0.0
     return (m[2] * m[5] - m[1] * m[6]) / det, m[2] / det
 
 
-@compiled
-def _parabola(m: Moments) -> tuple[float, float]:
+@jit_cached
+def _fit_parabola(m: WindowMoments) -> tuple[float, float]:
     """Return the fitted parabola at time 0, and its variance, by cofactors of its equations."""
     a0, a1, a2 = m[2] * m[4] - m[3] * m[3], m[2] * m[3] - m[1] * m[4], m[1] * m[3] - m[2] * m[2]
     det = m[0] * a0 + m[1] * a1 + m[2] * a2
-    if m[0] < 4.0 or det <= SINGULAR * m[0] * m[2] * m[4]:
+    if m[0] < 4.0 or det <= DETERMINANT_MIN * m[0] * m[2] * m[4]:
         return math.nan, 0.0
     return (a0 * m[5] + a1 * m[6] + a2 * m[7]) / det, a0 / det

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from devices.compiled import compiled
-from service.estimation.foot import UNSEEN_NS
+from devices.jit import jit_cached
+from service.estimation.foot import LONG_GAP_NS
 from service.estimation.records import KernelRecord, RecordArray
 
 STROKE_N_PER_S = 10.0
@@ -30,7 +30,7 @@ _CLOSE = 1e-14  # of the force, or of a newton
 
 
 class FlowParams(KernelRecord):
-    """Parameters of a tile, as in `Flow`."""
+    """Parameters of a tile, as in `FlowModel`."""
 
     fraction: float
     stress_scale_n: float
@@ -45,13 +45,13 @@ class FlowState(KernelRecord):
     t_ns: int  # instant of that reading
 
 
-def at_rest(tiles: int) -> RecordArray[FlowState]:
+def initial_state(tiles: int) -> RecordArray[FlowState]:
     """Make the states before the first reading, (tiles,)."""
     return FlowState.array(tiles, force_n=np.nan)
 
 
 @dataclass(frozen=True)
-class Flow:
+class FlowModel:
     """Parameters over tiles.
 
     Attributes:
@@ -65,13 +65,13 @@ class Flow:
     stress_scale_n: Floats
     exponent: Floats
 
-    def laws(self) -> RecordArray[FlowParams]:
+    def to_records(self) -> RecordArray[FlowParams]:
         """Make the kernel's parameters, (tiles,)."""
         return FlowParams.array(len(self.fraction), **vars(self))
 
 
-@compiled
-def compensated(
+@jit_cached
+def compensate(
     params: FlowParams,
     state: FlowState,
     apparent_n: float,
@@ -87,7 +87,7 @@ def compensated(
         apparent_n: apparent force.
         t_ns: instant.
         state_force_n: force that updates the state instead of the returned one; NaN: that one.
-        gap_force_n: force that the dome may have borne during more than `UNSEEN_NS` without a
+        gap_force_n: force that the dome may have borne during more than `LONG_GAP_NS` without a
             reading: the farther of this force and none from a straight line; NaN: the straight
             line.
     """
@@ -97,30 +97,30 @@ def compensated(
         state.force_n, state.t_ns = 0.0, t_ns
     before, stress, passed_ns = state.force_n, state.stress_n, t_ns - state.t_ns
     dt = max(0.0, passed_ns * 1e-9)
-    if gap_force_n > 0.0 and passed_ns > UNSEEN_NS:  # until just now
+    if gap_force_n > 0.0 and passed_ns > LONG_GAP_NS:  # until just now
         before = gap_force_n if before + apparent_n < gap_force_n else 0.0
         stress, dt = 0.0, 0.0
     g, scale_n, n = params.fraction, params.stress_scale_n, params.exponent
-    found = _inverted(apparent_n, before, stress, g, scale_n, n, dt)
+    found = _solve_force(apparent_n, before, stress, g, scale_n, n, dt)
     now = found if math.isnan(state_force_n) else state_force_n
-    state.stress_n = flowed(stress, g, scale_n, n, now - before, dt)
+    state.stress_n = step_branch_stress(stress, g, scale_n, n, now - before, dt)
     state.force_n, state.t_ns = now, t_ns
     return found
 
 
-@compiled
-def flowed(
+@jit_cached
+def step_branch_stress(
     stress: float, fraction: float, stress_scale_n: float, exponent: float, rise: float, dt: float
 ) -> float:
     """Return the force on the branch after the dome's force has risen by `rise` within `dt`."""
     half = 0.5 * fraction * rise
     between = stress + half
-    decay = _spread(between, fraction, stress_scale_n, exponent, dt)
+    decay = _compute_flow_decay(between, fraction, stress_scale_n, exponent, dt)
     return float(between * decay ** (1.0 / (1.0 - exponent)) + half)
 
 
-@compiled
-def _spread(
+@jit_cached
+def _compute_flow_decay(
     stress: float, fraction: float, stress_scale_n: float, exponent: float, dt: float
 ) -> float:
     """Return (s(0)/s(t))^(n - 1) of the flow alone, within `dt`."""
@@ -129,8 +129,8 @@ def _spread(
     return decay
 
 
-@compiled
-def _inverted(
+@jit_cached
+def _solve_force(
     apparent: float,
     before: float,
     stress: float,
@@ -148,7 +148,7 @@ def _inverted(
     for _ in range(_ITERATIONS):
         half = 0.5 * fraction * (force - before)
         between = stress + half
-        decay = _spread(between, fraction, stress_scale_n, exponent, dt)
+        decay = _compute_flow_decay(between, fraction, stress_scale_n, exponent, dt)
         value = force - half - between * decay ** (1.0 / (1.0 - exponent))
         slope = 1.0 - 0.5 * fraction * (1.0 + decay ** (exponent / (1.0 - exponent)))
         step = (value - apparent) / slope

@@ -21,16 +21,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from devices.compiled import compiled
-from service.estimation.foot import UNSEEN_NS
+from devices.jit import jit_cached
+from service.estimation.foot import LONG_GAP_NS
 from service.estimation.records import KernelRecord, RecordArray
 
-RESTART = 5.0
+RESTART_TIME_CONSTANTS = 5.0
 """Time without a reading, in gamma tau, after which the gas is as warm as its wall."""
 
 
 class GasParams(KernelRecord):
-    """Parameters of a tile, as in `Gas`."""
+    """Parameters of a tile, as in `GasModel`."""
 
     gamma: float
     tau_s: float
@@ -46,13 +46,13 @@ class GasState(KernelRecord):
     t_ns: int  # instant of that reading
 
 
-def at_rest(tiles: int) -> RecordArray[GasState]:
+def initial_state(tiles: int) -> RecordArray[GasState]:
     """Make the states before the first reading, (tiles,)."""
     return GasState.array(tiles, temperature_ratio=1.0, ln_kpa=np.nan)
 
 
 @dataclass(frozen=True)
-class Gas:
+class GasModel:
     """Parameters over tiles.
 
     Attributes:
@@ -67,13 +67,15 @@ class Gas:
     wall_per_kpa: Floats
     baseline_kpa: Floats
 
-    def laws(self) -> RecordArray[GasParams]:
+    def to_records(self) -> RecordArray[GasParams]:
         """Make the kernel's parameters, (tiles,)."""
         return GasParams.array(len(self.gamma), **vars(self))
 
 
-@compiled
-def settled(params: GasParams, state: GasState, kpa: float, t_ns: int, gap_kpa: float) -> float:
+@jit_cached
+def compute_isothermal_pressure(
+    params: GasParams, state: GasState, kpa: float, t_ns: int, gap_kpa: float
+) -> float:
     """Return the pressure after cooling; NaN gives NaN and leaves the state unchanged.
 
     Args:
@@ -81,7 +83,7 @@ def settled(params: GasParams, state: GasState, kpa: float, t_ns: int, gap_kpa: 
         state: after the tile's readings before; updated.
         kpa: absolute pressure.
         t_ns: instant of the reading.
-        gap_kpa: pressure that the gas may have had until just now, after more than `UNSEEN_NS`
+        gap_kpa: pressure that the gas may have had until just now, after more than `LONG_GAP_NS`
             without a reading: the farther of this pressure and the baseline; NaN: a straight line
             in between, or cooled gas.
     """
@@ -92,11 +94,13 @@ def settled(params: GasParams, state: GasState, kpa: float, t_ns: int, gap_kpa: 
     ln_p, passed_ns = math.log(kpa), t_ns - state.t_ns
     h = passed_ns / (params.gamma * params.tau_s * 1e9)
     has_reading = not math.isnan(state.ln_kpa)
-    if has_reading and gap_kpa > p0 and passed_ns > UNSEEN_NS:
+    if has_reading and gap_kpa > p0 and passed_ns > LONG_GAP_NS:
         farther = gap_kpa if gap_kpa * p0 > kpa * kpa else p0
         state.temperature_ratio = (kpa / farther) ** k
-    elif has_reading and 0.0 <= h <= RESTART:
-        state.temperature_ratio = warmed(state.temperature_ratio, ln_p - state.ln_kpa, h, k)
+    elif has_reading and 0.0 <= h <= RESTART_TIME_CONSTANTS:
+        state.temperature_ratio = step_temperature_ratio(
+            state.temperature_ratio, ln_p - state.ln_kpa, h, k
+        )
     else:
         state.temperature_ratio = 1.0
     state.ln_kpa, state.t_ns = ln_p, t_ns
@@ -104,22 +108,22 @@ def settled(params: GasParams, state: GasState, kpa: float, t_ns: int, gap_kpa: 
     return iso * (1.0 + c * (kpa - p0)) / (1.0 + c * (iso - p0))
 
 
-@compiled
-def copy(state: GasState, to: GasState) -> None:
+@jit_cached
+def copy_state(state: GasState, to: GasState) -> None:
     """Copy a state into another."""
     to.temperature_ratio, to.ln_kpa, to.t_ns = state.temperature_ratio, state.ln_kpa, state.t_ns
 
 
-@compiled
-def is_same(one: GasState, other: GasState) -> bool:
+@jit_cached
+def is_same_state(one: GasState, other: GasState) -> bool:
     """Return whether two states are equal; NaN equals NaN."""
     pressure = one.ln_kpa == other.ln_kpa or (math.isnan(one.ln_kpa) and math.isnan(other.ln_kpa))
     ratio = one.temperature_ratio == other.temperature_ratio
     return pressure and ratio and one.t_ns == other.t_ns
 
 
-@compiled
-def settled_at_least(params: GasParams, kpa: float) -> float:
+@jit_cached
+def bound_isothermal_pressure(params: GasParams, kpa: float) -> float:
     """Return the lower bound of the pressure after cooling from `kpa`, or from more.
 
     None of its heat has gone: p (p0/p)^k. Heat that has gone before only leaves the gas colder.
@@ -134,8 +138,8 @@ def settled_at_least(params: GasParams, kpa: float) -> float:
     return lowest_kpa
 
 
-@compiled
-def warmed(before: float, change_ln_p: float, h: float, k: float) -> float:
+@jit_cached
+def step_temperature_ratio(before: float, change_ln_p: float, h: float, k: float) -> float:
     """Return the temperature over the wall's after a step of `h` gamma tau, ln p linear in it."""
     x = h - k * change_ln_p
     # (1 - exp(-x))/x, which is 1 at x = 0

@@ -18,20 +18,20 @@ from typing import Annotated
 import numpy as np
 
 from devices.arrays import Floats
-from devices.compiled import compiled
+from devices.jit import jit_cached
 from service.estimation.records import KernelRecord, RecordArray
 
 WIDTHS_N = np.array([0.6, 1.5, 4.0])
 """Half widths of the plays; their weights are fitted."""
-OPENS = 0.4
-_ITERATIONS = 100  # a bound; see `_inverted`
+LOOP_OPENING = 0.4
+_ITERATIONS = 100  # a bound; see `_solve_force`
 _CLOSE = 1e-14
 """Smallest relative step of the iteration."""
 PLAYS = len(WIDTHS_N)
 
 
 class HysteresisParams(KernelRecord):
-    """Parameters of a tile, as in `Hysteresis`."""
+    """Parameters of a tile, as in `HysteresisModel`."""
 
     play_weights: Annotated[Floats, (PLAYS,)]
 
@@ -42,24 +42,24 @@ class HysteresisState(KernelRecord):
     plays_n: Annotated[Floats, (PLAYS,)]
 
 
-def at_rest(tiles: int) -> RecordArray[HysteresisState]:
+def initial_state(tiles: int) -> RecordArray[HysteresisState]:
     """Make the states before the first reading, (tiles,)."""
     return HysteresisState.array(tiles)
 
 
 @dataclass(frozen=True)
-class Hysteresis:
+class HysteresisModel:
     """Weights (tiles, plays) of the plays of half widths `WIDTHS_N`; in sum below 1."""
 
     play_weights: Floats
 
-    def laws(self) -> RecordArray[HysteresisParams]:
+    def to_records(self) -> RecordArray[HysteresisParams]:
         """Make the kernel's parameters, (tiles,)."""
         return HysteresisParams.array(len(self.play_weights), play_weights=self.play_weights)
 
 
-@compiled
-def compensated(
+@jit_cached
+def compensate(
     params: HysteresisParams, state: HysteresisState, apparent_n: float, state_force_n: float
 ) -> float:
     """Return the force behind an apparent one; NaN gives NaN and leaves the state unchanged.
@@ -72,22 +72,22 @@ def compensated(
     """
     if not math.isfinite(apparent_n):
         return math.nan
-    found = _inverted(apparent_n, params.play_weights, state.plays_n)
+    found = _solve_force(apparent_n, params.play_weights, state.plays_n)
     force = found if math.isnan(state_force_n) else state_force_n
     for m in range(PLAYS):
-        state.plays_n[m] = played(force, WIDTHS_N[m], state.plays_n[m])
+        state.plays_n[m] = step_play(force, WIDTHS_N[m], state.plays_n[m])
     return found
 
 
-@compiled
-def played(force: float, width: float, before: float) -> float:
+@jit_cached
+def step_play(force: float, width: float, before: float) -> float:
     """Return a play after a force; it lags behind by no more than its width allows."""
-    half = min(width, OPENS * max(force, 0.0))
+    half = min(width, LOOP_OPENING * max(force, 0.0))
     return min(max(before, force - half), force + half)
 
 
-@compiled
-def _inverted(apparent: float, weights: Floats, plays: Floats) -> float:
+@jit_cached
+def _solve_force(apparent: float, weights: Floats, plays: Floats) -> float:
     """Solve for the force that gives `apparent` with these plays.
 
     The apparent force is piecewise linear over the force and rises with it. Newton's method ends on
@@ -99,7 +99,7 @@ def _inverted(apparent: float, weights: Floats, plays: Floats) -> float:
     for _ in range(_ITERATIONS):
         value, slope = force, 1.0
         for m in range(PLAYS):
-            value += weights[m] * (played(force, WIDTHS_N[m], plays[m]) - force)
+            value += weights[m] * (step_play(force, WIDTHS_N[m], plays[m]) - force)
             slope += weights[m] * _play_slope(force, WIDTHS_N[m], plays[m])
         if value > apparent:
             high = force
@@ -112,11 +112,11 @@ def _inverted(apparent: float, weights: Floats, plays: Floats) -> float:
     return force
 
 
-@compiled
+@jit_cached
 def _play_slope(force: float, width: float, before: float) -> float:
     """Return the slope of a play's distance from the force over the force."""
-    half = min(width, OPENS * force)
+    half = min(width, LOOP_OPENING * force)
     if force - half <= before <= force + half:
         return -1.0
-    opening = OPENS if half < width else 0.0
+    opening = LOOP_OPENING if half < width else 0.0
     return opening if before > force else -opening

@@ -18,17 +18,17 @@ from typing import Annotated
 import numpy as np
 
 from devices.arrays import Floats
-from devices.compiled import compiled
-from service.estimation.effects import PARTS_MAX
-from service.estimation.foot import UNSEEN_NS
+from devices.jit import jit_cached
+from service.estimation.effects import TERMS_MAX
+from service.estimation.foot import LONG_GAP_NS
 from service.estimation.records import KernelRecord, RecordArray
 
 
 class RubberParams(KernelRecord):
-    """Parameters of a tile, as in `Rubber`."""
+    """Parameters of a tile, as in `CreepModel`."""
 
-    creep_fraction: Annotated[Floats, (PARTS_MAX,)]
-    tau_s: Annotated[Floats, (PARTS_MAX,)]
+    creep_fraction: Annotated[Floats, (TERMS_MAX,)]
+    tau_s: Annotated[Floats, (TERMS_MAX,)]
     n_terms: int
 
 
@@ -37,23 +37,23 @@ class RubberState(KernelRecord):
 
     force_n: float  # at the previous reading; NaN before the first
     t_ns: int  # instant of that reading
-    crept_n: Annotated[Floats, (PARTS_MAX,)]  # z of each term
-    force_share: Annotated[Floats, (PARTS_MAX,)]  # scratch: weight of the present force in z
+    crept_n: Annotated[Floats, (TERMS_MAX,)]  # z of each term
+    force_share: Annotated[Floats, (TERMS_MAX,)]  # scratch: weight of the present force in z
 
 
-def at_rest(tiles: int) -> RecordArray[RubberState]:
+def initial_state(tiles: int) -> RecordArray[RubberState]:
     """Make the states before the first reading, (tiles,)."""
     return RubberState.array(tiles, force_n=np.nan)
 
 
 @dataclass(frozen=True)
-class Rubber:
+class CreepModel:
     """Parameters (tiles, terms): parts of the force that appear later, and their time constants."""
 
     creep_fraction: Floats
     tau_s: Floats
 
-    def laws(self) -> RecordArray[RubberParams]:
+    def to_records(self) -> RecordArray[RubberParams]:
         """Make the kernel's parameters, (tiles,)."""
         tiles, terms = self.creep_fraction.shape
         made = RubberParams.array(tiles, n_terms=terms)
@@ -62,8 +62,8 @@ class Rubber:
         return made
 
 
-@compiled
-def compensated(
+@jit_cached
+def compensate(
     params: RubberParams,
     state: RubberState,
     apparent_n: float,
@@ -79,7 +79,7 @@ def compensated(
         apparent_n: apparent force.
         t_ns: instant.
         state_force_n: force that updates the state instead of the returned one; NaN: that one.
-        gap_force_n: force that the dome may have borne during more than `UNSEEN_NS` without a
+        gap_force_n: force that the dome may have borne during more than `LONG_GAP_NS` without a
             reading: the farther of this force and none from a straight line; NaN: the straight
             line.
     """
@@ -88,11 +88,13 @@ def compensated(
     if math.isnan(state.force_n):  # the first reading: at rest without a force
         state.force_n, state.t_ns = 0.0, t_ns
     before, passed_ns = state.force_n, t_ns - state.t_ns
-    after_gap = gap_force_n > 0.0 and passed_ns > UNSEEN_NS
+    after_gap = gap_force_n > 0.0 and passed_ns > LONG_GAP_NS
     meanwhile_n = gap_force_n if before + apparent_n < gap_force_n else 0.0
     divisor, known = 1.0, apparent_n
     for m in range(params.n_terms):
-        decay, of_before, of_now = crept_parts(max(0.0, passed_ns * 1e-9 / params.tau_s[m]))
+        decay, of_before, of_now = compute_creep_weights(
+            max(0.0, passed_ns * 1e-9 / params.tau_s[m])
+        )
         if after_gap:  # until just now
             carried, share = decay * state.crept_n[m] + (1.0 - decay) * meanwhile_n, 0.0
         else:
@@ -108,8 +110,8 @@ def compensated(
     return found
 
 
-@compiled
-def crept_parts(h: float) -> tuple[float, float, float]:
+@jit_cached
+def compute_creep_weights(h: float) -> tuple[float, float, float]:
     """Return the weights of z, of the previous and of the present force after `h` time constants.
 
     Their sum is the crept part z at the end of a step in which the force is linear.

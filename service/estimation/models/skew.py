@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from devices.compiled import compiled
+from devices.jit import jit_cached
 from service.estimation.records import KernelRecord, RecordArray
 
 
@@ -21,13 +21,15 @@ class SkewState(KernelRecord):
     t_ns: int
 
 
-def at_rest(tiles: int) -> RecordArray[SkewState]:
+def initial_state(tiles: int) -> RecordArray[SkewState]:
     """Make the states before the first frame, (tiles,)."""
     return SkewState.array(tiles, value=np.nan)
 
 
-@compiled
-def at_frame(state: SkewState, value: float, t_ns: int, frame_t_ns: int, after_gap: bool) -> float:
+@jit_cached
+def interpolate_to_frame(
+    state: SkewState, value: float, t_ns: int, frame_t_ns: int, after_gap: bool
+) -> float:
     """Interpolate a tile's value to the frame's instant.
 
     Args:

@@ -15,8 +15,13 @@ from typing import Annotated
 import numpy as np
 
 from devices.arrays import Floats
-from devices.compiled import compiled
-from service.estimation.calibration import BASIS, CURVE_OPENS_N, LOOP_OPENS_N, TileCalibration
+from devices.jit import jit_cached
+from service.estimation.calibration import (
+    CUBIC_TERMS,
+    CURVE_MISFIT_HALF_FORCE_N,
+    LOOP_HALF_WIDTH_FORCE_N,
+    TileCalibration,
+)
 from service.estimation.records import KernelRecord, RecordArray
 
 
@@ -37,8 +42,8 @@ class StaticParams(KernelRecord):
     offset_kpa: float
     scale_kpa: float
     u_zero: float  # the polynomial's variable at zero pressure
-    coefficients: Annotated[Floats, (BASIS,)]
-    covariance: Annotated[Floats, (BASIS, BASIS)]
+    coefficients: Annotated[Floats, (CUBIC_TERMS,)]
+    covariance: Annotated[Floats, (CUBIC_TERMS, CUBIC_TERMS)]
     zero_n: float  # force at zero pressure
     slope_at_zero_n_per_kpa: float
     relative_misfit: float
@@ -52,17 +57,19 @@ class StaticCurves:
 
     Args:
         tiles: calibrations of the tiles.
-        lasting: use the curves of settled forces, which lie beneath creep and loop, for the model
-            `rubber`; a tile without that model keeps the curve of its slow strokes.
+        use_settled_curve: use the curves of settled forces, which lie beneath creep and loop, for
+            the model `rubber`; a tile without that model keeps the curve of its slow strokes.
     """
 
-    def __init__(self, tiles: Sequence[TileCalibration], *, lasting: bool = False) -> None:
+    def __init__(
+        self, tiles: Sequence[TileCalibration], *, use_settled_curve: bool = False
+    ) -> None:
         scatter = curve_misfit_n = np.zeros(len(tiles))
-        if lasting:
+        if use_settled_curve:
             rubbers = [tile.effects.rubber for tile in tiles]
             scatter = np.array([0.0 if r is None else r.scatter for r in rubbers])
             curve_misfit_n = np.array([0.0 if r is None else r.curve_misfit_n for r in rubbers])
-            tiles = [_lasting(tile) for tile in tiles]
+            tiles = [_use_settled_curve(tile) for tile in tiles]
         offset_kpa = np.array([t.p_offset_kpa for t in tiles])
         scale_kpa = np.array([t.p_scale_kpa for t in tiles])
         c1, c2, c3 = (np.array([t.coefficients[k] * t.f_scale_n for t in tiles]) for k in (1, 2, 3))
@@ -71,12 +78,12 @@ class StaticCurves:
             t.f_offset_n + t.f_scale_n * _horner(t, u) if t.zero_mode == "as_fitted" else 0.0
             for t, u in zip(tiles, u0, strict=True)
         ]
-        self.low_kpa = np.array([t.range_kpa[0] for t in tiles])
-        self.high_kpa = np.array([t.range_kpa[1] for t in tiles])
+        self.range_low_kpa = np.array([t.range_kpa[0] for t in tiles])
+        self.range_high_kpa = np.array([t.range_kpa[1] for t in tiles])
         self.slope_at_zero_n_per_kpa = (c1 + u0 * (2.0 * c2 + u0 * (3.0 * c3))) / scale_kpa
         self._params = StaticParams.array(
             len(tiles),
-            range_high_kpa=self.high_kpa,
+            range_high_kpa=self.range_high_kpa,
             offset_kpa=offset_kpa,
             scale_kpa=scale_kpa,
             u_zero=u0,
@@ -90,19 +97,19 @@ class StaticCurves:
             curve_misfit_n=curve_misfit_n,
         )
 
-    def laws(self) -> RecordArray[StaticParams]:
+    def to_records(self) -> RecordArray[StaticParams]:
         """Return the kernel's parameters, (tiles,)."""
         return self._params
 
-    def force(self, gauge_kpa: Floats) -> StaticForce:
+    def compute_forces(self, gauge_kpa: Floats) -> StaticForce:
         """Compute force, slope and calibration uncertainty at gauge pressures (n, tiles)."""
         force, slope, sigma = (np.empty(gauge_kpa.shape) for _ in range(3))
-        _curve(self._params, gauge_kpa, force, slope, sigma)
+        _evaluate_curves(self._params, gauge_kpa, force, slope, sigma)
         return StaticForce(force, slope, sigma)
 
 
-@compiled
-def curve(params: StaticParams, gauge_kpa: float) -> tuple[float, float, float]:
+@jit_cached
+def evaluate_curve(params: StaticParams, gauge_kpa: float) -> tuple[float, float, float]:
     """Compute force (N), slope (N/kPa) and calibration uncertainty (N) at a gauge pressure."""
     inside = gauge_kpa if math.isnan(gauge_kpa) else min(max(gauge_kpa, 0.0), params.range_high_kpa)
     u, u0 = (inside - params.offset_kpa) / params.scale_kpa, params.u_zero
@@ -115,20 +122,25 @@ def curve(params: StaticParams, gauge_kpa: float) -> tuple[float, float, float]:
     rise = (c1 + u * (2.0 * c2 + u * (3.0 * c3))) / params.scale_kpa
     basis = (d, u * u - u0 * u0, u * u * u - u0 * u0 * u0)
     variance = 0.0
-    for k in range(BASIS):
-        for m in range(BASIS):
+    for k in range(CUBIC_TERMS):
+        for m in range(CUBIC_TERMS):
             variance += params.covariance[k, m] * basis[k] * basis[m]
     size = abs(value)
     variance = max(variance, 0.0)  # rounding may leave a trace below zero
     scatter_n = params.loading_scatter * rise * inside
     variance += (params.relative_misfit * value) ** 2 + scatter_n**2
-    variance += (params.loop_misfit_n * (1.0 - LOOP_OPENS_N / (size + LOOP_OPENS_N))) ** 2
-    variance += (params.curve_misfit_n * (1.0 - CURVE_OPENS_N / (size + CURVE_OPENS_N))) ** 2
+    variance += (
+        params.loop_misfit_n * (1.0 - LOOP_HALF_WIDTH_FORCE_N / (size + LOOP_HALF_WIDTH_FORCE_N))
+    ) ** 2
+    variance += (
+        params.curve_misfit_n
+        * (1.0 - CURVE_MISFIT_HALF_FORCE_N / (size + CURVE_MISFIT_HALF_FORCE_N))
+    ) ** 2
     return value + params.zero_n, rise, math.sqrt(variance)
 
 
-@compiled
-def _curve(
+@jit_cached
+def _evaluate_curves(
     params: RecordArray[StaticParams],
     gauge_kpa: Floats,
     force: Floats,
@@ -138,10 +150,10 @@ def _curve(
     n, tiles = gauge_kpa.shape
     for i in range(n):
         for j in range(tiles):
-            force[i, j], slope[i, j], sigma[i, j] = curve(params[j], gauge_kpa[i, j])
+            force[i, j], slope[i, j], sigma[i, j] = evaluate_curve(params[j], gauge_kpa[i, j])
 
 
-def _lasting(tile: TileCalibration) -> TileCalibration:
+def _use_settled_curve(tile: TileCalibration) -> TileCalibration:
     rubber, loop = tile.effects.rubber, tile.effects.hysteresis
     if rubber is None:
         return tile

@@ -19,23 +19,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats, Times
-from devices.compiled import compiled
+from devices.jit import jit_cached
 from service.estimation.records import KernelRecord, RecordArray
 
-SETTLE_S = 0.5
+STARTUP_S = 0.5
 """Time at first for which the chip's mean temperature stands for the gas."""
-NEAR_COUNTS = 2.0
+START_TOLERANCE_COUNTS = 2.0
 """Largest distance from the tare's temperature at which a starting gas is as warm as its chip."""
-SMOOTH_LEAST_S = 0.1
+SMOOTHING_MIN_S = 0.1
 """Shortest time over which a chip's temperature is smoothed for its rise."""
-SMOOTH_PART = 0.125
+SMOOTHING_PER_LAG = 0.125
 """Smoothing time of a chip that lags its gas, as a part of the lag."""
-NOISE_COUNTS = 0.5
+READING_NOISE_COUNTS = 0.5
 """Standard deviation of a raw temperature reading (hardware.md 1.3)."""
 
 
 class TemperatureParams(KernelRecord):
-    """Parameters of a tile, as in `Temperature`; the last two follow from the others."""
+    """Parameters of a tile, as in `TemperatureModel`; the last two follow from the others."""
 
     kpa_per_count: float
     relative_sigma: float
@@ -60,7 +60,7 @@ class TemperatureState(KernelRecord):
     rise_counts_per_s: float  # of the gas
 
 
-def at_rest(tiles: int) -> RecordArray[TemperatureState]:
+def initial_state(tiles: int) -> RecordArray[TemperatureState]:
     """Make the states before the first reading, (tiles,)."""
     counts = ("smoothed", "smoothed_twice", "chip", "first", "gas")
     unknown = {f"{name}_counts": np.nan for name in counts}
@@ -68,7 +68,7 @@ def at_rest(tiles: int) -> RecordArray[TemperatureState]:
 
 
 @dataclass(frozen=True)
-class Temperature:
+class TemperatureModel:
     """Parameters over tiles.
 
     Attributes:
@@ -89,33 +89,37 @@ class Temperature:
     baseline_kpa: Floats
     step_s: float
 
-    def laws(self) -> RecordArray[TemperatureParams]:
+    def to_records(self) -> RecordArray[TemperatureParams]:
         """Make the kernel's parameters, (tiles,)."""
         given = {name: value for name, value in vars(self).items() if name != "step_s"}
         return TemperatureParams.array(
             len(self.lag_s),
             **given,
-            smoothing_s=smoothing_s(self.lag_s),
-            noise_counts=noise_counts(self.lag_s, self.step_s),
+            smoothing_s=compute_smoothing_s(self.lag_s),
+            noise_counts=compute_gas_noise_counts(self.lag_s, self.step_s),
         )
 
 
-def smoothing_s(lag_s: Floats) -> Floats:
+def compute_smoothing_s(lag_s: Floats) -> Floats:
     """Return the smoothing time of the chip by the lag: the lag itself if the gas lags."""
-    time_s = np.where(lag_s >= 0.0, lag_s, -SMOOTH_PART * lag_s)
-    return np.asarray(np.maximum(time_s, SMOOTH_LEAST_S))
+    time_s = np.where(lag_s >= 0.0, lag_s, -SMOOTHING_PER_LAG * lag_s)
+    return np.asarray(np.maximum(time_s, SMOOTHING_MIN_S))
 
 
-def noise_counts(lag_s: Floats, step_s: float) -> Floats:
+def compute_gas_noise_counts(lag_s: Floats, step_s: float) -> Floats:
     """Return the noise of the gas' counts by that of the raw temperature; 0 where the gas lags."""
-    time_s = smoothing_s(lag_s)
+    time_s = compute_smoothing_s(lag_s)
     lead = np.where(lag_s < 0.0, 1.0 - lag_s / time_s, 0.0)
     # (1 + (1 + lead) S s)/(1 + S s)^2 of white noise; the low-pass of a lag removes nearly all.
     power = step_s * (1.0 + (1.0 + lead) ** 2) / (4.0 * time_s)
-    return np.asarray(np.where(lag_s < 0.0, NOISE_COUNTS * np.sqrt(np.minimum(power, 4.0)), 0.0))
+    return np.asarray(
+        np.where(lag_s < 0.0, READING_NOISE_COUNTS * np.sqrt(np.minimum(power, 4.0)), 0.0)
+    )
 
 
-def followed(temperature_raw: Floats, t_ns: Times, lag_s: Floats) -> tuple[Floats, Floats]:
+def compute_gas_temperatures(
+    temperature_raw: Floats, t_ns: Times, lag_s: Floats
+) -> tuple[Floats, Floats]:
     """Compute every tile's gas temperature in counts, and its rise in counts a second, from rest.
 
     Args:
@@ -124,13 +128,15 @@ def followed(temperature_raw: Floats, t_ns: Times, lag_s: Floats) -> tuple[Float
         lag_s: (tiles,), negative where the chip lags.
     """
     gas, rise = np.empty(temperature_raw.shape), np.empty(temperature_raw.shape)
-    params = TemperatureParams.array(len(lag_s), lag_s=lag_s, smoothing_s=smoothing_s(lag_s))
-    _follow(params, at_rest(len(lag_s)), temperature_raw, t_ns, gas, rise)
+    params = TemperatureParams.array(
+        len(lag_s), lag_s=lag_s, smoothing_s=compute_smoothing_s(lag_s)
+    )
+    _update_gas_temperatures(params, initial_state(len(lag_s)), temperature_raw, t_ns, gas, rise)
     return gas, rise
 
 
-@compiled
-def at_tare(
+@jit_cached
+def refer_to_tare_temperature(
     params: TemperatureParams,
     state: TemperatureState,
     kpa: float,
@@ -146,14 +152,14 @@ def at_tare(
         temperature_raw: counts, NaN if there are none.
         t_ns: instant.
     """
-    follow(params, state, temperature_raw, t_ns)
+    update_gas_temperature(params, state, temperature_raw, t_ns)
     # A chip that starts away from the tare's temperature says nothing of its gas: all of the
     # distance is uncertain, and less so with every lag that passes.
     start_counts = state.first_counts - params.tare_counts
     unknown_counts = 0.0
-    if abs(start_counts) > NEAR_COUNTS:
+    if abs(start_counts) > START_TOLERANCE_COUNTS:
         since_s = max(t_ns - state.first_ns, 0) * 1e-9
-        unknown_counts = start_counts * math.exp(-since_s / max(abs(params.lag_s), SMOOTH_LEAST_S))
+        unknown_counts = start_counts * math.exp(-since_s / max(abs(params.lag_s), SMOOTHING_MIN_S))
     warmed_kpa = params.kpa_per_count * (state.gas_counts - params.tare_counts)
     sigma_kpa = math.sqrt(
         (params.relative_sigma * warmed_kpa) ** 2
@@ -166,8 +172,8 @@ def at_tare(
     return kpa / scale if scale > 0.0 else math.nan, sigma_kpa
 
 
-@compiled
-def follow(
+@jit_cached
+def update_gas_temperature(
     params: TemperatureParams, state: TemperatureState, temperature_raw: float, t_ns: int
 ) -> None:
     """Update the gas' temperature with a reading of the chip, or without one (NaN)."""
@@ -180,7 +186,7 @@ def follow(
             dt = max(0.0, (t_ns - state.t_ns) * 1e-9)
             known_s = (t_ns - state.first_ns) * 1e-9
             # At first a plain mean: a single noisy count would stay for the whole lag.
-            time = smooth if known_s > SETTLE_S else min(smooth, max(dt, known_s))
+            time = smooth if known_s > STARTUP_S else min(smooth, max(dt, known_s))
             if dt > 0.0:
                 # Exact for a chip whose temperature is linear between readings; the smoothed one
                 # is taken for linear, too.
@@ -204,8 +210,8 @@ def follow(
     state.rise_counts_per_s = ahead / smooth
 
 
-@compiled
-def _follow(
+@jit_cached
+def _update_gas_temperatures(
     params: RecordArray[TemperatureParams],
     states: RecordArray[TemperatureState],
     temperature_raw: Floats,
@@ -216,5 +222,5 @@ def _follow(
     n, tiles = temperature_raw.shape
     for i in range(n):
         for j in range(tiles):
-            follow(params[j], states[j], temperature_raw[i, j], t_ns[i, j])
+            update_gas_temperature(params[j], states[j], temperature_raw[i, j], t_ns[i, j])
             gas[i, j], rise[i, j] = states[j].gas_counts, states[j].rise_counts_per_s

@@ -9,11 +9,11 @@ the driver flags it, and it never becomes a pressure.
 from __future__ import annotations
 
 from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MIN_KPA
-from devices.compiled import compiled
+from devices.jit import jit_cached
 
 
-@compiled
-def unwrapped(kpa: float, kpa_per_count: float) -> float:
+@jit_cached
+def unwrap_pressure(kpa: float, kpa_per_count: float) -> float:
     """Return the absolute pressure with a wrapped count corrected to below zero.
 
     Args:

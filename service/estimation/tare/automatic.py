@@ -1,9 +1,9 @@
 """Automatic tare: follows the drift of baselines while the stream runs, without taring loads away.
 
 A slow load looks like a dome that warms up. The chip's temperature tells them apart, and limits
-bound the error: beyond the change that temperature explains a baseline moves by at most `NEAR_KPA`
-at once, `APART_NS` apart, and by `FAR_KPA` in all since the last tare by hand. So at most half a
-newton of a slow load on a tile is tared away.
+bound the error: beyond the change that temperature explains a baseline moves by at most
+`SHIFT_MAX_KPA` at once, `TARE_INTERVAL_MIN_NS` apart, and by `TOTAL_SHIFT_MAX_KPA` in all since the
+last tare by hand. So at most half a newton of a slow load on a tile is tared away.
 
 The tare comes from the newest unloaded window among the last frames of the stream.
 """
@@ -17,26 +17,26 @@ import numpy as np
 from devices.arrays import Bools, Times
 from devices.errors import TareError
 from devices.frames import NOT_READ, FrameBatch
-from service.estimation.tare.tare import Tare, expected_shift_kpa, warmer_k
-from service.estimation.tare.unloaded import (
+from service.estimation.tare.tare import Tare, compute_thermal_shift_kpa, compute_warming_k
+from service.estimation.tare.unloaded_windows import (
     FRAMES_MIN,
     LOADED_KPA,
     NEAR_BASELINE_KPA,
     TareFrames,
-    lowest,
-    window_begins,
+    compute_window_starts,
+    select_lowest_windows,
 )
 
-LOOK_BACK_NS = 10_000_000_000  # a foot that walks is in the air within that time
+HISTORY_NS = 10_000_000_000  # a foot that walks is in the air within that time
 WINDOW_NS = 250_000_000  # fits into the flight of a hop, and holds enough readings
-WARMING_COUNTS = 4.0
+TEMPERATURE_CHANGE_MAX_COUNTS = 4.0
 """Largest change of a chip's temperature for a tare, 0.75 K: 0.25 kPa or half a newton."""
 WINDOW_MAX_NS = 1_000_000_000
 """Longest window, for slow arrays, whose shorter windows have too few frames."""
 
 
-def newest_unloaded_tare(
-    seen: TareFrames, *, present: Tare | None, bears: Bools | None = None
+def compute_newest_unloaded_tare(
+    recent: TareFrames, *, present: Tare | None, is_load_bearing: Bools | None = None
 ) -> Tare:
     """Compute the tare from the newest unloaded window of the last frames.
 
@@ -44,89 +44,92 @@ def newest_unloaded_tare(
     window, and none is far above the present tare or, without one, the rig baseline.
 
     Args:
-        seen: the last `LOOK_BACK_NS` of the stream, in order.
+        recent: the last `HISTORY_NS` of the stream, in order.
         present: the tare in force.
-        bears: (tiles,), False for bare tiles, which follow the weather; None: all bear load.
+        is_load_bearing: (tiles,), False for bare tiles, which follow the weather; None: all bear
+            load.
 
     Raises:
         TareError: the foot was loaded or moved all the time, or a tile gave no readings.
     """
-    frames, since_ns = seen.frames, seen.since_ns
-    there = np.isfinite(seen.kpa).any(axis=0)
+    frames, since_ns = recent.frames, recent.since_ns
+    there = np.isfinite(recent.kpa).any(axis=0)
     if not there.all():
-        silent = [seen.serials[i] for i in np.flatnonzero(~there)]
+        silent = [recent.serials[i] for i in np.flatnonzero(~there)]
         raise TareError(
             f"tile {', '.join(silent)} gave no readings in the last seconds",
             remedy="Plug it in, or take it out of the scene",
         )
     if len(frames) < FRAMES_MIN:
         raise TareError(f"only {len(frames)} frames have come", expected=f"at least {FRAMES_MIN}")
-    usual_kpa = seen.bench_noise_kpa
+    usual_kpa = recent.rig_noise_kpa
     if present is not None:
         usual_kpa = np.where(np.isnan(usual_kpa), present.noise_kpa, usual_kpa)
-    floor_kpa = seen.rounding_kpa(np.nanmedian(frames.tadc, axis=0))
-    steps_kpa = np.maximum(seen.step_noise_kpa, floor_kpa)
+    floor_kpa = recent.compute_rounding_sigma_kpa(np.nanmedian(frames.temperature_raw, axis=0))
+    steps_kpa = np.maximum(recent.step_noise_kpa, floor_kpa)
     usual_kpa = np.where(np.isnan(usual_kpa), steps_kpa, usual_kpa)
-    window_ns = _window_ns(since_ns)
+    window_ns = _compute_window_ns(since_ns)
     last_ns = int(since_ns[-1]) - window_ns
-    begins_ns = window_begins(since_ns, last_ns, -(-window_ns // 4), window_ns)
+    begins_ns = compute_window_starts(since_ns, last_ns, -(-window_ns // 4), window_ns)
     begins_ns = begins_ns[begins_ns <= last_ns][::-1]
     firsts = np.searchsorted(since_ns, begins_ns)
     ends = np.searchsorted(since_ns, begins_ns + window_ns, side="right")
-    windows = seen.quiet_windows(zip(firsts.tolist(), ends.tolist(), strict=True), usual_kpa)
+    windows = recent.find_quiet_windows(zip(firsts.tolist(), ends.tolist(), strict=True), usual_kpa)
     if not windows:
         raise TareError(
             "the foot moved or was loaded all the time in the last seconds",
             expected=f"{WINDOW_NS / 1e9:g} s at rest in the air",
             remedy="Lift the foot, hold it still for a second, and tare again",
         )
-    low = lowest(windows)
+    low = select_lowest_windows(windows)
     if not low:
         raise TareError(
             "no tile was unloaded while all others were, in the last seconds",
             remedy="Lift the whole foot, hold it still for a second, and tare again",
         )
-    tare = seen.tare(low[0].rows, "unloaded")
+    tare = recent.compute_tare(low[0].rows, "unloaded")
     if present is not None:
-        _refuse_above(tare, present, seen.serials, bears)
-    _refuse_warming(frames, tare, seen.serials)
-    seen.refuse_loaded(tare)
-    seen.refuse_stuck(tare, low[0].rows)
+        _reject_above(tare, present, recent.serials, is_load_bearing)
+    _reject_warming(frames, tare, recent.serials)
+    recent.reject_loaded(tare)
+    recent.reject_stuck(tare, low[0].rows)
     return tare
 
 
-def _window_ns(since_ns: Times) -> int:
+def _compute_window_ns(since_ns: Times) -> int:
     enough_ns = 1.25 * FRAMES_MIN * float(np.median(np.diff(since_ns)))
     return int(min(max(WINDOW_NS, enough_ns), WINDOW_MAX_NS))
 
 
-def _refuse_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) -> None:
+def _reject_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) -> None:
     """Reject a tare while a chip's temperature changes: its gas lags by seconds."""
-    tadc = np.where(frames.tadc == NOT_READ, np.nan, frames.tadc.astype(np.float64))
+    temperature_raw = np.where(
+        frames.temperature_raw == NOT_READ, np.nan, frames.temperature_raw.astype(np.float64)
+    )
     since_ns = frames.t_ns - frames.t_ns[0]
-    begin = tadc[since_ns <= WINDOW_NS]
+    begin = temperature_raw[since_ns <= WINDOW_NS]
     known = np.isfinite(begin).any(axis=0)
     moved = np.zeros(len(serials))
-    moved[known] = np.abs(np.nanmean(begin[:, known], axis=0) - tare.tadc_counts[known])
+    moved[known] = np.abs(np.nanmean(begin[:, known], axis=0) - tare.temperature_raw_counts[known])
     worst = int(np.argmax(np.nan_to_num(moved)))
-    if moved[worst] > WARMING_COUNTS:
+    if moved[worst] > TEMPERATURE_CHANGE_MAX_COUNTS:
         raise TareError(
             f"the temperature of tile {serials[worst]} has moved by {moved[worst]:.0f} counts in "
             "the last seconds, and the gas in its dome is still behind",
-            expected=f"at most {WARMING_COUNTS:g} counts in {LOOK_BACK_NS / 1e9:g} s",
+            expected=f"at most {TEMPERATURE_CHANGE_MAX_COUNTS:g} counts in {HISTORY_NS / 1e9:g} s",
             remedy="Wait for half a minute and tare again",
         )
 
 
-def _refuse_above(
+def _reject_above(
     tare: Tare,
     present: Tare,
     serials: tuple[str, ...],
-    bears: Bools | None,
+    is_load_bearing: Bools | None,
 ) -> None:
     rise_kpa = tare.baseline_kpa - present.baseline_kpa
-    if bears is not None:
-        rise_kpa = np.where(bears, rise_kpa, -np.inf)
+    if is_load_bearing is not None:
+        rise_kpa = np.where(is_load_bearing, rise_kpa, -np.inf)
     worst = int(np.argmax(rise_kpa))
     if rise_kpa[worst] > NEAR_BASELINE_KPA:
         raise TareError(
@@ -138,130 +141,151 @@ def _refuse_above(
         )
 
 
-APART_NS = 60_000_000_000
+TARE_INTERVAL_MIN_NS = 60_000_000_000
 """Least time between two automatic tares."""
-RATE_KPA_PER_S = 0.005
+SHIFT_RATE_MAX_KPA_PER_S = 0.005
 """Fastest shift of a baseline: a kelvin a minute, as of a dome in the sun."""
-NEAR_KPA = 0.15
+SHIFT_MAX_KPA = 0.15
 """Largest single shift beyond the shift by temperature: 0.3 N on a tile, the noise of a reading."""
-FAR_KPA = 0.25
+TOTAL_SHIFT_MAX_KPA = 0.25
 """Largest shift in all since the last tare that was not automatic: half a newton."""
-EXPLAINED_PART = 0.5
+THERMAL_SHIFT_UNCERTAINTY = 0.5
 """Uncertain part of the shift by temperature: gas and chip differ, and the wall gives way."""
-SETTLE_NS = 100_000_000
+RECOVERY_NS = 100_000_000
 """Recovery time of the rubber after a contact, before a window may start."""
-CONFIRM_NS = 900_000_000_000
+RENEWAL_NS = 900_000_000_000
 """Time after which a tare without drift is renewed, long before it counts as old."""
-MOVED_SIGMAS = 4.0  # of both tares: less may be chance
-MOVED_MIN_KPA = 0.02
+SHIFT_MIN_SIGMAS = 4.0  # of both tares: less may be chance
+SHIFT_MIN_KPA = 0.02
 """Least shift that makes an entry in the history."""
 
 
 @dataclass(frozen=True)
-class Look:
+class FlightTareResult:
     """Result of a check of the last seconds.
 
     Attributes:
         tare: to be put in force; None if the present one is good.
         reason: reason for the tare, for the history.
-        doubt: reason why no tare was made although the foot seems to be in the air.
+        rejection: reason why no tare was made although the foot seems to be in the air.
     """
 
     tare: Tare | None = None
     reason: str = ""
-    doubt: str | None = None
+    rejection: str | None = None
 
 
-NOTHING = Look()
+NO_TARE = FlightTareResult()
 
 
-def look_in_flight(
-    seen: TareFrames,
+def compute_flight_tare(
+    recent: TareFrames,
     *,
     present: Tare,
-    anchor: Tare | None,
-    free_since_t_ns: int,
-    bears: Bools | None = None,
-) -> Look:
+    last_manual: Tare | None,
+    no_contact_since_t_ns: int,
+    is_load_bearing: Bools | None = None,
+) -> FlightTareResult:
     """Check whether a foot in the air needs a new tare.
 
     Args:
-        seen: the last `LOOK_BACK_NS` of the stream, in order.
+        recent: the last `HISTORY_NS` of the stream, in order.
         present: the tare in force.
-        anchor: the last tare that was not automatic; None without one.
-        free_since_t_ns: start of the present time without contact, known in every frame.
-        bears: (tiles,), False for bare tiles, which follow the weather and no load; None: all do.
+        last_manual: the last tare that was not automatic; None without one.
+        no_contact_since_t_ns: start of the present time without contact, known in every frame.
+        is_load_bearing: (tiles,), False for bare tiles, which follow the weather and no load;
+            None: all do.
     """
-    frames, serials = seen.frames, seen.serials
-    if bears is None:
-        bears = np.ones(len(serials), dtype=bool)
-    if not len(frames) or frames.t_ns[-1] - free_since_t_ns < SETTLE_NS + WINDOW_NS:
-        return NOTHING
+    frames, serials = recent.frames, recent.serials
+    if is_load_bearing is None:
+        is_load_bearing = np.ones(len(serials), dtype=bool)
+    if not len(frames) or frames.t_ns[-1] - no_contact_since_t_ns < RECOVERY_NS + WINDOW_NS:
+        return NO_TARE
     try:
-        tare = newest_unloaded_tare(seen, present=present, bears=bears)
+        tare = compute_newest_unloaded_tare(
+            recent, present=present, is_load_bearing=is_load_bearing
+        )
     except TareError:  # it moves, a tile is silent, or it bears a load: no flight
-        return NOTHING
+        return NO_TARE
     begin_t_ns = int(frames.t_ns[0]) + round(tare.begin_s * 1e9)
-    if begin_t_ns < free_since_t_ns + SETTLE_NS or tare.t_ns - present.t_ns < APART_NS:
-        return NOTHING
-    shift_kpa = np.where(bears, tare.baseline_kpa - present.baseline_kpa, 0.0)
-    doubt = _too_far(tare, present, NEAR_KPA, serials, bears, "the last tare")
-    if doubt is None and anchor is not None:
-        doubt = _too_far(tare, anchor, FAR_KPA, serials, bears, "the last tare by hand")
+    if (
+        begin_t_ns < no_contact_since_t_ns + RECOVERY_NS
+        or tare.t_ns - present.t_ns < TARE_INTERVAL_MIN_NS
+    ):
+        return NO_TARE
+    shift_kpa = np.where(is_load_bearing, tare.baseline_kpa - present.baseline_kpa, 0.0)
+    doubt = _explain_excess_shift(
+        tare, present, SHIFT_MAX_KPA, serials, is_load_bearing, "the last tare"
+    )
+    if doubt is None and last_manual is not None:
+        doubt = _explain_excess_shift(
+            tare,
+            last_manual,
+            TOTAL_SHIFT_MAX_KPA,
+            serials,
+            is_load_bearing,
+            "the last tare by hand",
+        )
     if doubt is not None:
-        return Look(doubt=doubt)
+        return FlightTareResult(rejection=doubt)
     since_s = (tare.t_ns - present.t_ns) * 1e-9
-    if (np.abs(shift_kpa) > RATE_KPA_PER_S * since_s).any():
-        return NOTHING  # perhaps in a minute
+    if (np.abs(shift_kpa) > SHIFT_RATE_MAX_KPA_PER_S * since_s).any():
+        return NO_TARE  # perhaps in a minute
     sigma_kpa = np.hypot(tare.baseline_sigma_kpa, present.baseline_sigma_kpa)
-    moved = np.abs(shift_kpa) > np.maximum(MOVED_MIN_KPA, MOVED_SIGMAS * sigma_kpa)
-    if not moved.any() and tare.t_ns - present.t_ns < CONFIRM_NS:
-        return NOTHING
+    moved = np.abs(shift_kpa) > np.maximum(SHIFT_MIN_KPA, SHIFT_MIN_SIGMAS * sigma_kpa)
+    if not moved.any() and tare.t_ns - present.t_ns < RENEWAL_NS:
+        return NO_TARE
     most = int(np.argmax(np.abs(shift_kpa)))
     reason = (
         f"in flight; {serials[most]} by {shift_kpa[most]:+.2f} kPa in {since_s / 60:.0f} min"
         if moved.any()
         else f"in flight; nothing has moved in {since_s / 60:.0f} min"
     )
-    return Look(replace(tare, source="flight"), reason)
+    return FlightTareResult(replace(tare, source="flight"), reason)
 
 
-def first_in_flight(seen: TareFrames) -> Look:
+def compute_first_flight_tare(recent: TareFrames) -> FlightTareResult:
     """Make a first tare without a request, if the foot has certainly been lifted.
 
     It has to have been loaded in these seconds and to be off the ground at their end, every tile
     near its rig baseline: a lightly loaded foot is quiet and near its baseline as well.
     """
-    if not seen.has_bench or not len(seen.frames):
-        return NOTHING
+    if not recent.has_rig_baselines or not len(recent.frames):
+        return NO_TARE
     try:
-        tare = newest_unloaded_tare(seen, present=None)
+        tare = compute_newest_unloaded_tare(recent, present=None)
     except TareError:
-        return NOTHING
-    off_kpa = np.abs(tare.baseline_kpa - seen.bench_kpa)
-    above_kpa = seen.kpa - tare.baseline_kpa
+        return NO_TARE
+    off_kpa = np.abs(tare.baseline_kpa - recent.rig_baseline_kpa)
+    above_kpa = recent.kpa - tare.baseline_kpa
     # A sum over the foot, and for a tenth of a second: an outlier is no step.
-    steps = np.nansum(np.maximum(above_kpa, 0.0), axis=1) > LOADED_KPA * np.sqrt(len(seen.serials))
-    stepped_ns = steps.mean() * float(seen.since_ns[-1])
-    if (off_kpa > NEAR_BASELINE_KPA).any() or stepped_ns < SETTLE_NS:
-        return NOTHING
-    return Look(replace(tare, source="flight"), "in flight, between two steps; there was none yet")
+    steps = np.nansum(np.maximum(above_kpa, 0.0), axis=1) > LOADED_KPA * np.sqrt(
+        len(recent.serials)
+    )
+    stepped_ns = steps.mean() * float(recent.since_ns[-1])
+    if (off_kpa > NEAR_BASELINE_KPA).any() or stepped_ns < RECOVERY_NS:
+        return NO_TARE
+    return FlightTareResult(
+        replace(tare, source="flight"), "in flight, between two steps; there was none yet"
+    )
 
 
-def _too_far(
+def _explain_excess_shift(
     tare: Tare,
     other: Tare,
     bound_kpa: float,
     serials: tuple[str, ...],
-    bears: Bools,
+    is_load_bearing: Bools,
     which: str,
 ) -> str | None:
     """Return the reason why a baseline is too far from another one; None if it is near."""
-    warmer = np.nan_to_num(warmer_k(other, tare.tadc_counts), nan=0.0)
-    explained_kpa = expected_shift_kpa(other, warmer)
+    warmer = np.nan_to_num(compute_warming_k(other, tare.temperature_raw_counts), nan=0.0)
+    explained_kpa = compute_thermal_shift_kpa(other, warmer)
     shift_kpa = tare.baseline_kpa - other.baseline_kpa
-    excess_kpa = np.abs(shift_kpa - explained_kpa) - EXPLAINED_PART * np.abs(explained_kpa)
-    excess_kpa = np.where(bears, excess_kpa, -np.inf)
+    excess_kpa = np.abs(shift_kpa - explained_kpa) - THERMAL_SHIFT_UNCERTAINTY * np.abs(
+        explained_kpa
+    )
+    excess_kpa = np.where(is_load_bearing, excess_kpa, -np.inf)
     worst = int(np.argmax(excess_kpa))
     if excess_kpa[worst] <= bound_kpa:
         return None

@@ -16,8 +16,8 @@ from devices.arrays import Bools, Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import TareError
 
-TakenFrom = Literal["interval", "lead", "recognised", "unloaded", "flight"]
-Source = TakenFrom | Literal["lost"]
+IntervalSource = Literal["interval", "lead", "recognised", "unloaded", "flight"]
+TareSource = IntervalSource | Literal["lost"]
 _LASTING_MAX = {"noise_lasting": 1.0, "noise_lasting_s": 3600.0}
 _KPA_MAX = 1000.0
 """Largest valid pressure: nine times a chip's range, and no square overflows."""
@@ -32,7 +32,8 @@ class Tare:
         baseline_kpa: absolute pressure unloaded.
         baseline_sigma_kpa: its standard uncertainty.
         noise_kpa: standard deviation of a single reading.
-        tadc_counts: mean raw temperature; NaN in tares of older versions, which stored none.
+        temperature_raw_counts: mean raw temperature; NaN in tares of older versions, which stored
+            none.
         t_ns: instant at which the interval ended, in UTC.
         begin_s: begin of the interval, in seconds from the first frame.
         end_s: its end.
@@ -47,17 +48,17 @@ class Tare:
     baseline_kpa: Floats
     baseline_sigma_kpa: Floats
     noise_kpa: Floats
-    tadc_counts: Floats
+    temperature_raw_counts: Floats
     t_ns: int
     begin_s: float
     end_s: float
     frames: int
-    source: Source
+    source: TareSource
     noise_lasting: Floats | None = None
     noise_lasting_s: Floats | None = None
 
     @classmethod
-    def lost(cls, *, tiles: int, t_ns: int) -> Tare:
+    def make_lost(cls, *, tiles: int, t_ns: int) -> Tare:
         """Make the stand-in of a lost tare that may have been in force from `t_ns` on."""
         unknown = np.full(tiles, np.nan)
         return cls(unknown, unknown, unknown, unknown, t_ns, 0.0, 0.0, 0, "lost")
@@ -86,8 +87,8 @@ class Tare:
         """
         try:
             if content["source"] == "lost":
-                return cls.lost(tiles=tiles, t_ns=int(content["t_ns"]))
-            if content["source"] not in get_args(TakenFrom):
+                return cls.make_lost(tiles=tiles, t_ns=int(content["t_ns"]))
+            if content["source"] not in get_args(IntervalSource):
                 raise ValueError(f"source {content['source']!r}")  # noqa: TRY301  # caught with the others
             values: dict[str, Any] = {"source": content["source"]}
             values |= {name: int(content[name]) for name in ("t_ns", "frames")}
@@ -99,11 +100,15 @@ class Tare:
                 is_possible = (values[name] >= 0.0) & (values[name] <= _KPA_MAX)
                 if values[name].shape != (tiles,) or not is_possible.all():
                     raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301  # caught with the others
-            counts = content.get("tadc_counts") or [None] * tiles
-            values["tadc_counts"] = np.array(counts, dtype=np.float64)  # None becomes NaN
-            is_none = (values["tadc_counts"] < 0.0) | (values["tadc_counts"] > _TADC_MAX)
-            if values["tadc_counts"].shape != (tiles,) or is_none.any():
-                raise ValueError(f"tadc_counts are not those of {tiles} tiles")  # noqa: TRY301  # caught with the others
+            counts = content.get("temperature_raw_counts") or [None] * tiles
+            values["temperature_raw_counts"] = np.array(
+                counts, dtype=np.float64
+            )  # None becomes NaN
+            is_none = (values["temperature_raw_counts"] < 0.0) | (
+                values["temperature_raw_counts"] > _TADC_MAX
+            )
+            if values["temperature_raw_counts"].shape != (tiles,) or is_none.any():
+                raise ValueError(f"temperature_raw_counts are not those of {tiles} tiles")  # noqa: TRY301  # caught with the others
             for name in ("noise_lasting", "noise_lasting_s"):
                 if content.get(name) is not None:
                     values[name] = np.array(content[name], dtype=np.float64)
@@ -115,9 +120,9 @@ class Tare:
             raise TareError(f"a recorded tare is not readable: {error}") from error
 
 
-SEALED_AT_K = 298.0
+SEAL_TEMPERATURE_K = 298.0
 """A sealed bubble's pressure is proportional to its absolute temperature; about 25 degC."""
-WARMED_COUNTS = 4.0
+TEMPERATURE_CHANGE_MAX_COUNTS = 4.0
 """Largest change of a chip's temperature since the tare with a valid baseline: 0.75 K are 0.25 kPa,
 half a newton on a tile and one and a half on a foot of four."""
 TREND_OVER_NS = 6 * 3_600_000_000_000
@@ -126,29 +131,31 @@ TREND_SPAN_MIN_NS = 600_000_000_000
 """Least time span of a trend in kPa/h."""
 
 
-def warmer_k(tare: Tare, tadc_counts: Floats) -> Floats:
+def compute_warming_k(tare: Tare, temperature_counts: Floats) -> Floats:
     """Return the rise of each chip's temperature since the tare in kelvin; NaN where unknown."""
-    return np.asarray((tadc_counts - tare.tadc_counts) / TADC_PER_KELVIN)
+    return np.asarray((temperature_counts - tare.temperature_raw_counts) / TADC_PER_KELVIN)
 
 
-def expected_shift_kpa(tare: Tare, warmer: Floats) -> Floats:
+def compute_thermal_shift_kpa(tare: Tare, warming_k: Floats) -> Floats:
     """Return the shift of a sealed bubble's baseline for a rise of temperature in kelvin."""
-    return np.asarray(tare.baseline_kpa / SEALED_AT_K * warmer)
+    return np.asarray(tare.baseline_kpa / SEAL_TEMPERATURE_K * warming_k)
 
 
-def has_warmed(tare: Tare, tadc_counts: npt.ArrayLike) -> Bools:
+def has_warmed(tare: Tare, temperature_counts: npt.ArrayLike) -> Bools:
     """Return a mask of tiles whose temperature since the tare invalidates the baseline.
 
     Args:
         tare: in force; False for tiles without a temperature.
-        tadc_counts: (..., tiles), NaN where unknown.
+        temperature_counts: (..., tiles), NaN where unknown.
     """
-    moved_counts = np.abs(np.asarray(tadc_counts, dtype=np.float64) - tare.tadc_counts)
-    return np.asarray(moved_counts > WARMED_COUNTS)
+    moved_counts = np.abs(
+        np.asarray(temperature_counts, dtype=np.float64) - tare.temperature_raw_counts
+    )
+    return np.asarray(moved_counts > TEMPERATURE_CHANGE_MAX_COUNTS)
 
 
 @dataclass(frozen=True)
-class Trend:
+class BaselineTrend:
     """Straight lines through a history of baselines; arrays over tiles, NaN if undetermined.
 
     Attributes:
@@ -162,7 +169,7 @@ class Trend:
     kelvin_per_hour: Floats
 
 
-def trend(tares: Sequence[Tare], *, tiles: int) -> Trend:
+def fit_trend(tares: Sequence[Tare], *, tiles: int) -> BaselineTrend:
     """Fit the trend of the last hours.
 
     Args:
@@ -174,15 +181,16 @@ def trend(tares: Sequence[Tare], *, tiles: int) -> Trend:
     t_ns = np.array([tare.t_ns - newest_ns for tare in recent], dtype=np.float64)
     if not recent or -t_ns.min() < TREND_SPAN_MIN_NS:
         unknown = np.full(tiles, np.nan)
-        return Trend(unknown, unknown, unknown)
+        return BaselineTrend(unknown, unknown, unknown)
     hours = t_ns / 3.6e12
     lever = (hours - hours.mean()) / ((hours - hours.mean()) ** 2).sum()
     by_tare = {
         name: np.array([getattr(tare, name) for tare in recent])
-        for name in ("baseline_kpa", "baseline_sigma_kpa", "tadc_counts")
+        for name in ("baseline_kpa", "baseline_sigma_kpa", "temperature_raw_counts")
     }
-    return Trend(
+    return BaselineTrend(
         kpa_per_hour=(lever[:, None] * by_tare["baseline_kpa"]).sum(axis=0),
         sigma_kpa_per_hour=np.sqrt(((lever[:, None] * by_tare["baseline_sigma_kpa"]) ** 2).sum(0)),
-        kelvin_per_hour=(lever[:, None] * by_tare["tadc_counts"]).sum(axis=0) / TADC_PER_KELVIN,
+        kelvin_per_hour=(lever[:, None] * by_tare["temperature_raw_counts"]).sum(axis=0)
+        / TADC_PER_KELVIN,
     )

@@ -17,14 +17,14 @@ from typing import Any, Literal
 import pyarrow as pa
 
 from devices.errors import FootTileError, StateError, UsageError
-from service.offline.archive.pieces import Pieces
-from service.offline.archive.places import Place, check_text, is_remote
-from service.offline.archive.results import Note, Results, files_in
-from service.offline.archive.staging import identity, staged
-from service.offline.archive.tasks import LongTask, Task
-from service.offline.archive.workspace import SYSTEM, workspace
-from service.offline.processes import GoesOn
-from service.version import exact_software
+from service.offline.archive.chunk_store import ChunkStore
+from service.offline.archive.local_copies import hash_session, open_local_session
+from service.offline.archive.locations import SessionLocation, check_utf8, is_remote
+from service.offline.archive.result_store import ResultNote, ResultStore, hash_files
+from service.offline.archive.tasks import ChunkedTask, SessionTask
+from service.offline.archive.temporary_folders import SYSTEM_TEMP_FOLDER, create_workspace
+from service.offline.process_pool import Unfinished
+from service.version import compute_exact_version
 
 log = logging.getLogger("foottile.archive")
 
@@ -34,16 +34,16 @@ class Job:
     """Task applied to one session.
 
     Attributes:
-        place: location of the session.
+        location: location of the session.
         task: the operation.
-        out: results folder, as a path or URI; None: results are discarded.
-        software: the client's version; a worker of another version refuses the job.
+        results_location: results folder, as a path or URI; None: results are discarded.
+        client_version: the client's version; a worker of another version refuses the job.
     """
 
-    place: Place
-    task: Task
-    out: str | None
-    software: str = field(default_factory=exact_software)
+    location: SessionLocation
+    task: SessionTask
+    results_location: str | None
+    client_version: str = field(default_factory=compute_exact_version)
 
 
 @dataclass(frozen=True)
@@ -65,110 +65,114 @@ class Outcome:
     reason: str = ""
 
 
-def begin_worker() -> None:
+def limit_arrow_threads() -> None:
     """Limit Arrow to one thread: there is one worker process per core."""
     pa.set_cpu_count(1)
 
 
-def run_job(job: Job) -> Outcome | GoesOn:
+def run_job(job: Job) -> Outcome | Unfinished:
     """Run a job, or one chunk of it if the session is long; skip it if its result exists.
 
     Raises:
         UsageError: worker and client run different versions.
     """
-    if job.software != exact_software():
+    if job.client_version != compute_exact_version():
         raise UsageError(
-            f"a worker is {exact_software()}, and the client {job.software}",
+            f"a worker is {compute_exact_version()}, and the client {job.client_version}",
             remedy="Install the same foottile for both: others may give other numbers",
         )
-    name, where = job.place.name, job.place.where
+    name, where = job.location.session_id, job.location.uri
     try:
-        done = _done(job)
+        done = _run_unless_done(job)
     except FootTileError as error:
-        return failed(job, str(error))
+        return make_failed_outcome(job, str(error))
     except Exception as error:  # one session must not stop the others
         log.exception("%s: this is a bug", where)
-        return failed(job, f"this is a bug: {type(error).__name__}: {error}")
-    return done if isinstance(done, GoesOn) else Outcome(name, where, *done)
+        return make_failed_outcome(job, f"this is a bug: {type(error).__name__}: {error}")
+    return done if isinstance(done, Unfinished) else Outcome(name, where, *done)
 
 
-def failed(job: Job, reason: str) -> Outcome:
+def make_failed_outcome(job: Job, reason: str) -> Outcome:
     """Return the outcome of a failed job."""
-    return Outcome(job.place.name, job.place.where, "failed", reason=reason)
+    return Outcome(job.location.session_id, job.location.uri, "failed", reason=reason)
 
 
-def _done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]] | GoesOn:
-    task, place = job.task, job.place
-    check_text(place)
-    if job.out is None:
-        with staged(place) as source, workspace(SYSTEM) as work:
-            return "made", task.run(source, work)
-    _check_target(place, job.out)
-    results = Results(job.out)
-    asked = Note(
+def _run_unless_done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]] | Unfinished:
+    task, place = job.task, job.location
+    check_utf8(place)
+    if job.results_location is None:
+        with open_local_session(place) as source, create_workspace(SYSTEM_TEMP_FOLDER) as work:
+            return "made", task.process_session(source, work)
+    _check_result_folder(place, job.results_location)
+    results = ResultStore(job.results_location)
+    asked = ResultNote(
         command=task.command,
-        software=job.software,
-        place=place.where,
-        input_sha256=identity(place),
-        options=plain(task.options()),
+        software=job.client_version,
+        place=place.uri,
+        input_sha256=hash_session(place),
+        options=normalize_json(task.describe_options()),
         files={},
         facts={},
     )
-    there = results.note(place.name, task.command)
+    there = results.read_complete_note(place.session_id, task.command)
     if there is not None:
-        if there.is_of(asked):
+        if there.has_same_inputs(asked):
             return "there", dict(there.facts)
-        if there.place != place.where and there.input_sha256 != asked.input_sha256:
+        if there.place != place.uri and there.input_sha256 != asked.input_sha256:
             raise StateError(
                 f"another session of this name has its result there: {there.place}",
-                where=place.where,
+                where=place.uri,
                 remedy="Name another --out for it, or delete that result",
             )
     pieces = None
-    with staged(place) as source:
-        if isinstance(task, LongTask) and task.is_long(source):
-            pieces = Pieces(job.out, place.name, asked.key)
-            with pieces.folder(task.PIECES) as folder:
-                if task.make_piece(source, folder):
-                    return GoesOn()
-            with pieces.folder() as folder:
-                made = _made(results, place.name, task, partial(task.join, source, folder))
+    with open_local_session(place) as source:
+        if isinstance(task, ChunkedTask) and task.needs_chunks(source):
+            pieces = ChunkStore(job.results_location, place.session_id, asked.input_key)
+            with pieces.open_folder(task.CHUNK_SUFFIXES) as folder:
+                if task.process_next_chunk(source, folder):
+                    return Unfinished()
+            with pieces.open_folder() as folder:
+                made = _make_result(
+                    results, place.session_id, task, partial(task.join_chunks, source, folder)
+                )
         else:
-            made = _made(results, place.name, task, partial(task.run, source))
+            made = _make_result(
+                results, place.session_id, task, partial(task.process_session, source)
+            )
     facts, files = made
-    results.keep(place.name, replace(asked, files=files, facts=facts))
+    results.write_note(place.session_id, replace(asked, files=files, facts=facts))
     if pieces is not None:
-        pieces.forget()
+        pieces.delete()
     return "made", facts
 
 
-def _made(
-    results: Results, name: str, task: Task, run: Callable[[Path], dict[str, Any]]
+def _make_result(
+    results: ResultStore, name: str, task: SessionTask, run: Callable[[Path], dict[str, Any]]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    with results.made(name, task.command) as work:
-        return plain(run(work)), files_in(work)
+    with results.open_result_folder(name, task.command) as work:
+        return normalize_json(run(work)), hash_files(work)
 
 
-def _check_target(place: Place, out: str) -> None:
+def _check_result_folder(place: SessionLocation, out: str) -> None:
     """Check that the result folder lies directly in `out` and is not the session's own folder.
 
     Raises:
         UsageError: it is the session's folder, or the name is not usable.
     """
-    if place.name.startswith(".") or not place.name:
-        raise UsageError(f"{place.name!r} cannot be the name of a result", where=place.where)
-    target = f"{out.rstrip('/')}/{place.name}"
-    is_same = target == place.where
-    if not (is_remote(target) or is_remote(place.where)):
-        is_same = os.path.realpath(target) == os.path.realpath(place.where)
+    if place.session_id.startswith(".") or not place.session_id:
+        raise UsageError(f"{place.session_id!r} cannot be the name of a result", where=place.uri)
+    target = f"{out.rstrip('/')}/{place.session_id}"
+    is_same = target == place.uri
+    if not (is_remote(target) or is_remote(place.uri)):
+        is_same = os.path.realpath(target) == os.path.realpath(place.uri)
     if is_same:
         raise UsageError(
             "its result would take the place of the session itself",
-            where=place.where,
+            where=place.uri,
             remedy="Name another --out",
         )
 
 
-def plain(value: Any) -> Any:
+def normalize_json(value: Any) -> Any:
     """Return a value as a JSON round trip gives it back."""
     return json.loads(json.dumps(value))

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from devices.errors import FileFormatError, UsageError, needs_extra
+from devices.errors import FileFormatError, UsageError, require_extra
 
 if TYPE_CHECKING:
     import duckdb
 
-    from service.offline.archive.sealed import Archive
+    from service.offline.archive.session_tables import SessionArchive
 
-VIEWS = ("sessions", "stances", "events", "frames")
-LOCKED: dict[str, Any] = {
+VIEWS = ("sessions", "stances", "markers", "frames")
+LOCKED_SETTINGS: dict[str, Any] = {
     "enable_external_access": False,  # no file is read or written, nothing attached or loaded
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
@@ -36,7 +36,7 @@ LOCKED: dict[str, Any] = {
 }
 
 
-def ask(archive: Archive, sql: str) -> pa.Table:
+def run_query(archive: SessionArchive, sql: str) -> pa.Table:
     """Run one SELECT statement.
 
     Args:
@@ -48,27 +48,29 @@ def ask(archive: Archive, sql: str) -> pa.Table:
         UsageError: it is not one SELECT, names an unknown object, or needs disabled access.
         FileFormatError: frames that it reads are damaged.
     """
-    with needs_extra("archive", "`foottile query`"):
+    with require_extra("archive", "`foottile query`"):
         import duckdb
-    with duckdb.connect(":memory:", config=LOCKED) as connection:
+    with duckdb.connect(":memory:", config=LOCKED_SETTINGS) as connection:
         try:
-            _check(connection, sql)
+            _check_is_select(connection, sql)
             makers: dict[str, Callable[[], Any]] = {
-                "frames": archive.frames,
-                "stances": archive.stances_table,
-                "events": archive.events_table,
-                "sessions": archive.sessions_table,  # last: without those found damaged
+                "frames": archive.open_frames_dataset,
+                "stances": archive.build_stances_table,
+                "markers": archive.build_markers_table,
+                "sessions": archive.build_sessions_table,  # last: without those found damaged
             }
-            asked = _views_in(connection, sql)
+            asked = _find_named_views(connection, sql)
             for name, make in makers.items():
                 if name in asked:
                     connection.register(name, make())
-            return _plain(_without_intervals(connection.sql(sql)).to_arrow_table())
+            return _cast_sums_to_int64(
+                _cast_intervals_to_text(connection.sql(sql)).to_arrow_table()
+            )
         except (duckdb.Error, pa.ArrowException) as error:
-            raise _explained(error) from error
+            raise _convert_duckdb_error(error) from error
 
 
-def _check(connection: duckdb.DuckDBPyConnection, sql: str) -> None:
+def _check_is_select(connection: duckdb.DuckDBPyConnection, sql: str) -> None:
     kinds = [statement.type.name for statement in connection.extract_statements(sql)]
     if kinds not in (["SELECT"], ["EXPLAIN"]):
         raise UsageError(
@@ -77,27 +79,27 @@ def _check(connection: duckdb.DuckDBPyConnection, sql: str) -> None:
         )
 
 
-def _views_in(connection: duckdb.DuckDBPyConnection, sql: str) -> set[str]:
+def _find_named_views(connection: duckdb.DuckDBPyConnection, sql: str) -> set[str]:
     """Return the views that a statement names; data of other views is not read."""
     mentioned = {name for name in VIEWS if re.search(rf"\b{name}\b", sql, re.IGNORECASE)}
     found = connection.execute("SELECT json_serialize_sql(?::VARCHAR)", [sql]).fetchall()
     tree = json.loads(found[0][0])
     if tree["error"]:  # not given for some statements, such as EXPLAIN
         return mentioned
-    return {name for name in _tables_in(tree) if name in mentioned}
+    return {name for name in _iterate_table_names(tree) if name in mentioned}
 
 
-def _tables_in(node: Any) -> Iterator[str]:
+def _iterate_table_names(node: Any) -> Iterator[str]:
     if isinstance(node, dict):
         if isinstance(name := node.get("table_name"), str):
             yield name.lower()
         node = list(node.values())
     if isinstance(node, list):
         for each in node:
-            yield from _tables_in(each)
+            yield from _iterate_table_names(each)
 
 
-def _without_intervals(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
+def _cast_intervals_to_text(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
     """Cast intervals to text: CSV, Parquet and JSON have no type for months."""
     if not any("INTERVAL" in str(kind) for kind in answer.types):
         return answer
@@ -110,7 +112,7 @@ def _without_intervals(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelati
     )
 
 
-def _plain(table: pa.Table) -> pa.Table:
+def _cast_sums_to_int64(table: pa.Table) -> pa.Table:
     """Cast integer sums to int64: DuckDB returns decimals of 38 digits."""
     if len(set(table.column_names)) < len(table.column_names):
         twice = next(n for n in table.column_names if table.column_names.count(n) > 1)
@@ -122,7 +124,7 @@ def _plain(table: pa.Table) -> pa.Table:
     return table
 
 
-def _explained(error: Exception) -> UsageError | FileFormatError:
+def _convert_duckdb_error(error: Exception) -> UsageError | FileFormatError:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     what = lines[0] if lines else type(error).__name__
     if "checksum" in str(error).lower() or "IOError" in str(error) or "OSError" in str(error):

@@ -13,46 +13,56 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from devices.errors import UsageError
 from service.estimation.calibration import Calibration
-from service.offline.archive.staging import claims_of, frames_of, identity_of_file, staged_file
-from service.offline.estimate.request import PIECE_FRAMES, EstimateRequest
+from service.json_output import to_json_value
+from service.offline.archive.local_copies import (
+    get_sealed_frames_path,
+    hash_file_or_session,
+    open_local_file,
+    read_session_metadata,
+)
+from service.offline.estimate.request import CHUNK_FRAMES, EstimateRequest
 from service.offline.export import ExportOptions, export_session
-from service.plain_json import plain
-from storage.checked_json import with_check
+from storage.checksummed_json import append_checksum
 from storage.clock.file import CLOCK_NAME
-from storage.file_hash import sha256_of
 from storage.formats.slice import Slice
-from storage.formats.written.registry import format_named
-from storage.sessions.beside import EVENTS_NAME
-from storage.sessions.claims import LEDGER_NAME, PULLED_EVENTS_NAME, SESSION_NAME, bytes_of
+from storage.formats.writers.registry import get_format
+from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME
-from storage.sessions.reader import SessionReader
-from storage.verify.data import verdict_of, verify
+from storage.sessions.metadata import (
+    LEDGER_NAME,
+    PULLED_MARKERS_NAME,
+    SESSION_NAME,
+    read_bytes_or_none,
+)
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.sidecars import MARKERS_NAME
+from storage.verify.data_folder import find_verdict, verify_path
 
 if TYPE_CHECKING:
     from service.offline.comparison import CompareOptions
-    from service.offline.estimate.session import Estimated
+    from service.offline.estimate.session import EstimateResult
 
-_BESIDE = (EVENTS_NAME, CLOCK_NAME, LEDGER_NAME, PULLED_EVENTS_NAME)
+_SIDECAR_NAMES = (MARKERS_NAME, CLOCK_NAME, LEDGER_NAME, PULLED_MARKERS_NAME)
 
 _ALL = Slice()
 
 
-class Task(Protocol):
+class SessionTask(Protocol):
     """Operation on one session."""
 
     @property
     def command(self) -> str:
         """Name of the command, used in the names of notes and reports."""
 
-    def options(self) -> dict[str, Any]:
+    def describe_options(self) -> dict[str, Any]:
         """Return the options as JSON values."""
 
-    def run(self, source: Path, work: Path) -> dict[str, Any]:
+    def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
         """Process one session.
 
         Args:
             source: the session's folder or file.
-            work: empty folder for the result's files; the caller makes them durable.
+            result_folder: empty folder for the result's files; the caller makes them durable.
 
         Returns:
             Report of the task, as JSON values.
@@ -63,21 +73,21 @@ class Task(Protocol):
 
 
 @runtime_checkable
-class LongTask(Task, Protocol):
+class ChunkedTask(SessionTask, Protocol):
     """Task that processes a long session in consecutive chunks."""
 
-    PIECES: ClassVar[tuple[str, ...]]
+    CHUNK_SUFFIXES: ClassVar[tuple[str, ...]]
     """Suffixes of the files of earlier chunks that the next chunk needs."""
 
-    def is_long(self, source: Path) -> bool:
+    def needs_chunks(self, source: Path) -> bool:
         """Return whether the session needs more than one chunk."""
 
-    def make_piece(self, source: Path, folder: Path) -> bool:
+    def process_next_chunk(self, source: Path, chunks_folder: Path) -> bool:
         """Process the next chunk.
 
         Args:
             source: as for `run`.
-            folder: folder of the chunks; the new one is written to it.
+            chunks_folder: folder of the chunks; the new one is written to it.
 
         Returns:
             False if all chunks existed already.
@@ -86,7 +96,7 @@ class LongTask(Task, Protocol):
             FootTileError: as for `run`.
         """
 
-    def join(self, source: Path, folder: Path, work: Path) -> dict[str, Any]:
+    def join_chunks(self, source: Path, chunks_folder: Path, result_folder: Path) -> dict[str, Any]:
         """Make the result of `run` from the folder of the chunks."""
 
 
@@ -98,12 +108,12 @@ class EstimateTask(EstimateRequest):
         piece_frames: frames of a chunk of a long session; the result does not depend on it.
     """
 
-    piece_frames: int = PIECE_FRAMES
+    piece_frames: int = CHUNK_FRAMES
     command: ClassVar[str] = "estimate"
-    PIECES: ClassVar[tuple[str, ...]] = ("json", "npz")
+    CHUNK_SUFFIXES: ClassVar[tuple[str, ...]] = ("json", "npz")
 
-    def options(self) -> dict[str, Any]:
-        """See `Task`."""
+    def describe_options(self) -> dict[str, Any]:
+        """See `SessionTask`."""
         named = self.calibration
         return {
             **{name: value for name, value in vars(self).items() if name != "piece_frames"},
@@ -112,44 +122,50 @@ class EstimateTask(EstimateRequest):
             "part": vars(self.part),
         }
 
-    def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
+    def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
+        """See `SessionTask`."""
         from service.offline.estimate.session import estimate_session
 
-        frames, remarks = frames_of(source), list[str]()
-        out = work / FRAMES_NAME
-        made = estimate_session(frames, out, self, remark=remarks.append, is_judged=False)
-        return self._finished(source, work, made, remarks)
+        frames, remarks = get_sealed_frames_path(source), list[str]()
+        out = result_folder / FRAMES_NAME
+        made = estimate_session(frames, out, self, on_remark=remarks.append, with_findings=False)
+        return self._complete_result(source, result_folder, made, remarks)
 
-    def is_long(self, source: Path) -> bool:
-        """See `LongTask`."""
-        from service.offline.estimate.pieces import has_pieces
+    def needs_chunks(self, source: Path) -> bool:
+        """See `ChunkedTask`."""
+        from service.offline.estimate.chunks import needs_chunks
 
-        return has_pieces(frames_of(source), self, self.piece_frames)
+        return needs_chunks(get_sealed_frames_path(source), self, self.piece_frames)
 
-    def make_piece(self, source: Path, folder: Path) -> bool:
-        """See `LongTask`."""
-        from service.offline.estimate.pieces import make_piece
+    def process_next_chunk(self, source: Path, chunks_folder: Path) -> bool:
+        """See `ChunkedTask`."""
+        from service.offline.estimate.chunks import estimate_next_chunk
 
-        return make_piece(
-            frames_of(source), folder, self, piece_frames=self.piece_frames, remark=lambda _: None
+        return estimate_next_chunk(
+            get_sealed_frames_path(source),
+            chunks_folder,
+            self,
+            chunk_frames=self.piece_frames,
+            on_remark=lambda _: None,
         )
 
-    def join(self, source: Path, folder: Path, work: Path) -> dict[str, Any]:
-        """See `LongTask`."""
-        from service.offline.estimate.pieces import join_pieces
+    def join_chunks(self, source: Path, chunks_folder: Path, result_folder: Path) -> dict[str, Any]:
+        """See `ChunkedTask`."""
+        from service.offline.estimate.chunks import join_chunks
 
-        remarks, out = list[str](), work / FRAMES_NAME
-        made = join_pieces(frames_of(source), folder, out, self, remark=remarks.append)
-        return self._finished(source, work, made, remarks)
+        remarks, out = list[str](), result_folder / FRAMES_NAME
+        made = join_chunks(
+            get_sealed_frames_path(source), chunks_folder, out, self, on_remark=remarks.append
+        )
+        return self._complete_result(source, result_folder, made, remarks)
 
-    def _finished(
-        self, source: Path, work: Path, made: Estimated, remarks: list[str]
+    def _complete_result(
+        self, source: Path, work: Path, made: EstimateResult, remarks: list[str]
     ) -> dict[str, Any]:
-        if source.is_dir() and self.part.is_all:
-            _complete(source, work)
+        if source.is_dir() and self.part.is_whole_session:
+            _copy_session_files(source, work)
         return {
-            "frames": made.frames,
+            "frames": made.frame_count,
             "calibration_id": made.plan.calibration.id,
             "models": made.plan.models,
             "remarks": remarks,
@@ -163,16 +179,16 @@ class ExportTask:
     export: ExportOptions
     command: ClassVar[str] = "export"
 
-    def options(self) -> dict[str, Any]:
-        """See `Task`."""
+    def describe_options(self) -> dict[str, Any]:
+        """See `SessionTask`."""
         asked = self.export.options.model_dump(exclude_none=True)
         return {**vars(self.export), "part": vars(self.export.part), "options": asked}
 
-    def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
-        name = f"{Path(FRAMES_NAME).stem}.{format_named(self.export.to).ending}"
-        done = export_session(frames_of(source), work / name, self.export)
-        left_out = {mark.event.label: mark.left_out for mark in done.left_out}
+    def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
+        """See `SessionTask`."""
+        name = f"{Path(FRAMES_NAME).stem}.{get_format(self.export.to).ending}"
+        done = export_session(get_sealed_frames_path(source), result_folder / name, self.export)
+        left_out = {mark.marker.label: mark.exclusion_reason for mark in done.left_out_markers}
         return {"bytes": done.size_bytes, "marks_left_out": left_out}
 
 
@@ -182,16 +198,16 @@ class VerifyTask:
 
     command: ClassVar[str] = "verify"
 
-    def options(self) -> dict[str, Any]:
-        """See `Task`."""
+    def describe_options(self) -> dict[str, Any]:
+        """See `SessionTask`."""
         return {}
 
-    def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
-        report = verify(source)
-        text = json.dumps(report.as_dict(), indent=1).encode()
-        (work / "verify.json").write_bytes(text)
-        return {"verdict": verdict_of(report), "problems": report.problems}
+    def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
+        """See `SessionTask`."""
+        report = verify_path(source)
+        text = json.dumps(report.to_json_dict(), indent=1).encode()
+        (result_folder / "verify.json").write_bytes(text)
+        return {"verdict": find_verdict(report), "problems": report.problems}
 
 
 @dataclass(frozen=True)
@@ -204,56 +220,65 @@ class CompareTask:
     limits: Mapping[str, float]
     command: ClassVar[str] = "compare"
 
-    def options(self) -> dict[str, Any]:
+    def describe_options(self) -> dict[str, Any]:
         """Return the options as JSON values, with the reference by its hash."""
-        said = identity_of_file(self.reference)
+        said = hash_file_or_session(self.reference)
         options = {**vars(self.compare), "stated": asdict(self.compare.stated)}
         return {"reference_sha256": said, "limits": self.limits, **options}
 
-    def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
-        from service.offline.comparison_files import write_comparison
+    def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
+        """See `SessionTask`."""
+        from service.offline.comparison_output import write_comparison
 
         title = f"{source.name} against {self.reference.rpartition('/')[2]}"
-        with staged_file(self.reference) as reference:
+        with open_local_file(self.reference) as reference:
             done = write_comparison(
-                frames_of(source), reference, self.compare, self.limits, work, title
+                get_sealed_frames_path(source),
+                reference,
+                self.compare,
+                self.limits,
+                result_folder,
+                title,
             )
         means = {name: figure.mean for name, figure in done.content["figures"].items()}
-        verdict = {"verdict": "limit missed", "missed": list(done.missed)} if done.missed else {}
-        return {"means": plain(means), **verdict}
+        verdict = (
+            {"verdict": "limit missed", "missed": list(done.missed_limits)}
+            if done.missed_limits
+            else {}
+        )
+        return {"means": to_json_value(means), **verdict}
 
 
 @dataclass(frozen=True)
-class RefusedTask:
+class InvalidTask:
     """Task with invalid options for one session; running it raises `UsageError`."""
 
     reason: str
     command: str
 
-    def options(self) -> dict[str, Any]:
-        """See `Task`."""
+    def describe_options(self) -> dict[str, Any]:
+        """See `SessionTask`."""
         raise UsageError(self.reason)
 
-    def run(self, source: Path, work: Path) -> dict[str, Any]:
-        """See `Task`."""
+    def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
+        """See `SessionTask`."""
         raise UsageError(self.reason)
 
 
-def _complete(source: Path, work: Path) -> None:
+def _copy_session_files(source: Path, work: Path) -> None:
     """Complete the session's folder: `session.json`, and copies of the source's sidecar files."""
-    said = claims_of(source)
+    said = read_session_metadata(source)
     out = work / FRAMES_NAME
-    with SessionReader(out, is_checked=True) as session:
+    with SealedFileReader(out, skip_verification=True) as session:
         about: Mapping[str, Any] = {
             "bytes": out.stat().st_size,
-            "sha256": sha256_of(out),
+            "sha256": compute_sha256(out),
             "calibration_id": session.notes.get("calibration_id"),
             "absolute_scale": session.notes.get("absolute_scale"),
             "problem": None,
         }
-    for name in _BESIDE:
-        if (content := bytes_of(source / name)) is not None:
+    for name in _SIDECAR_NAMES:
+        if (content := read_bytes_or_none(source / name)) is not None:
             (work / name).write_bytes(content)
     text = json.dumps({**said.content, **about}, indent=1).encode()
-    (work / SESSION_NAME).write_bytes(with_check(text))
+    (work / SESSION_NAME).write_bytes(append_checksum(text))

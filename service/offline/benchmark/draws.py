@@ -21,36 +21,36 @@ from devices.chips.compensation import Compensation
 from devices.emulation.world import World
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
-from devices.scene.file import Scene
+from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
-from service.estimation.ladder.plan import EstimationPlan, make_plan
-from service.estimation.tare.unloaded import take_tare
-from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
-from service.offline.benchmark.rungs import Rung
-from service.offline.calibrations import find_calibration
-from service.offline.findings import joined
-from service.offline.simulate import SimulateOptions, Simulation
-from service.rig.emulated import EmulatedFoot
-from service.sessions.pipeline import CHUNK, EstimateOptions, EstimateStream
+from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.tare.unloaded_windows import compute_recording_tare
+from service.offline.accuracy import ACCURACY_COLUMNS, Accuracy, compute_accuracy
+from service.offline.benchmark.model_sets import ComparedModelSet
+from service.offline.calibration_lookup import find_calibration
+from service.offline.estimate_summary import concatenate_columns
+from service.offline.simulation import EmulatedRun, SimulationOptions
+from service.rig.emulated_foot import EmulatedFoot
+from service.sessions.pipeline import ROWS_PER_STEP, EstimateOptions, EstimateStream
 
-BATCH: Mapping[str, int] = {"live": 10, "offline": CHUNK}
+BATCH_FRAMES: Mapping[str, int] = {"live": 10, "offline": ROWS_PER_STEP}
 """Frames per estimator step, by mode."""
-_WARM_STEPS = 30
+_WARM_UP_STEPS = 30
 
 
-class Endless:
+class RepeatedRecording:
     """Recording that is repeated endlessly, as one stream without gaps."""
 
     def __init__(self, frames: FrameBatch) -> None:
         self._frames = frames
         self._period_ns = round(float(np.median(np.diff(frames.t_mono_ns))))
 
-    def rows(self, begin: int, end: int) -> FrameBatch:
+    def get_frames(self, begin: int, end: int) -> FrameBatch:
         """Return frames `begin` to `end` of the stream, with rising `seq` and time."""
         n = len(self._frames)
         lap, at = np.divmod(np.arange(begin, end), n)
-        once = self._frames.select(at)
+        once = self._frames.select_rows(at)
         span_ns = int(self._frames.t_mono_ns[-1] - self._frames.t_mono_ns[0]) + self._period_ns
         return replace(
             once,
@@ -60,62 +60,74 @@ class Endless:
         )
 
 
-def time_rungs(
-    recording: Recording,
-    rungs: Sequence[Rung],
-    frames: Mapping[str, int],
+def time_model_sets(
+    recording: DrawRecording,
+    model_sets: Sequence[ComparedModelSet],
+    frames_per_repetition: Mapping[str, int],
     repetitions: int,
-) -> tuple[dict[tuple[str, str], list[float]], list[Failure]]:
+) -> tuple[dict[tuple[str, str], list[float]], list[MeasurementFailure]]:
     """Measure ns per frame in every repetition, by mode and label of the model set.
 
     Args:
         recording: recording that is estimated repeatedly.
-        rungs: model sets to time.
-        frames: frames per repetition, by mode.
+        model_sets: model sets to time.
+        frames_per_repetition: frames per repetition, by mode.
         repetitions: number of repetitions.
 
     Returns:
         The times, and the model sets that could not be timed.
     """
-    stream = Endless(recording.frames)
+    stream = RepeatedRecording(recording.frames)
     plans: dict[tuple[str, str], EstimationPlan] = {}
     failures = []
-    for rung in rungs:
+    for rung in model_sets:
         for mode in LAGS_MS:
             try:
-                plan = plan_of(recording, rung.models, LAGS_MS[mode])
-                ns_per_frame(plan, stream, _WARM_STEPS * BATCH[mode], BATCH[mode])
+                plan = make_recording_plan(recording, rung.models, LAGS_MS[mode])
+                measure_ns_per_frame(
+                    plan, stream, _WARM_UP_STEPS * BATCH_FRAMES[mode], BATCH_FRAMES[mode]
+                )
             except Exception as error:
-                failures.append(Failure(f"time of {rung.label}, {mode}", reason(error)))
+                failures.append(
+                    MeasurementFailure(f"time of {rung.label}, {mode}", describe_error(error))
+                )
             else:
                 plans[mode, rung.label] = plan
     times: dict[tuple[str, str], list[float]] = {key: [] for key in plans}
     for _ in range(repetitions):
         for (mode, label), plan in plans.items():
-            spent_ns = ns_per_frame(plan, stream, frames[mode], BATCH[mode])
+            spent_ns = measure_ns_per_frame(
+                plan, stream, frames_per_repetition[mode], BATCH_FRAMES[mode]
+            )
             times[mode, label].append(spent_ns)
     return times, failures
 
 
-def plan_of(recording: Recording, models: tuple[str, ...], lag_ms: float) -> EstimationPlan:
+def make_recording_plan(
+    recording: DrawRecording, models: tuple[str, ...], lag_ms: float
+) -> EstimationPlan:
     """Make the constants of a recording's estimate, with the tare from its lead-in.
 
     Raises:
         FootTileError: the recording cannot be estimated with these models.
     """
     info, calibration = recording.info, recording.calibration
-    tare = take_tare(recording.frames, Compensation(info.tiles), calibration, info.serials)
+    tare = compute_recording_tare(
+        recording.frames, Compensation(info.tiles), calibration, info.serials
+    )
     return make_plan(info, calibration, tare, models=models, lag_ms=lag_ms)
 
 
-def ns_per_frame(plan: EstimationPlan, stream: Endless, frames: int, batch: int) -> float:
-    """Measure the CPU time per frame in ns, over `frames` frames, `batch` per step."""
+def measure_ns_per_frame(
+    plan: EstimationPlan, stream: RepeatedRecording, frames: int, batch_frames: int
+) -> float:
+    """Measure the CPU time per frame in ns, over `frames` frames, `batch_frames` per step."""
     estimator = Estimator(plan)
     spent_ns = 0
-    for begin in range(0, frames, batch):
-        rows = stream.rows(begin, min(begin + batch, frames))
+    for begin in range(0, frames, batch_frames):
+        rows = stream.get_frames(begin, min(begin + batch_frames, frames))
         began_ns = time.thread_time_ns()
-        estimator.step(rows)
+        estimator.process_frames(rows)
         spent_ns += time.thread_time_ns() - began_ns
     began_ns = time.thread_time_ns()
     estimator.finish()
@@ -125,14 +137,14 @@ def ns_per_frame(plan: EstimationPlan, stream: Endless, frames: int, batch: int)
 LAGS_MS: Mapping[str, float] = {"live": 10.0, "offline": 100.0}
 """Look-ahead of the two estimation modes."""
 
-SECONDS = 20.0
+DEFAULT_SCENE_SECONDS = 20.0
 """Duration of a scene without an end."""
 
-_TRUTH = (*(name for name in COMPARED if name.startswith("true_")), "true_force_n")
+_TRUTH = (*(name for name in ACCURACY_COLUMNS if name.startswith("true_")), "true_force_n")
 
 
 @dataclass(frozen=True)
-class Recording:
+class DrawRecording:
     """Frames of one draw with their truth, and the calibration of its tiles."""
 
     info: ArrayInfo
@@ -142,17 +154,17 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Task:
+class DrawTask:
     """Work of one process: one draw of a scene, estimated by all model sets."""
 
     scene: Scene
     seconds: float | None
     draw: int
-    rungs: tuple[Rung, ...]
+    model_sets: tuple[ComparedModelSet, ...]
 
 
 @dataclass(frozen=True)
-class Failure:
+class MeasurementFailure:
     """Measurement that failed, with the reason."""
 
     what: str
@@ -160,7 +172,7 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawResult:
     """Result of one draw.
 
     Attributes:
@@ -173,22 +185,22 @@ class Drawn:
     draw: int
     frames: int
     accuracy: Mapping[tuple[str, str], Accuracy]
-    failures: tuple[Failure, ...]
+    failures: tuple[MeasurementFailure, ...]
 
 
-def record(
+def record_draw(
     scene: Scene,
     seconds: float | None,
     draw: int,
-    progress: Callable[[str], None] = lambda message: None,
-) -> Recording:
+    on_progress: Callable[[str], None] = lambda message: None,
+) -> DrawRecording:
     """Calibrate the tiles of a draw as a user would, and record the scene with them.
 
     Args:
         scene: scene to run.
-        seconds: duration; None: the scene's, or `SECONDS` if it has no end.
+        seconds: duration; None: the scene's, or `DEFAULT_SCENE_SECONDS` if it has no end.
         draw: seed of tiles and noise.
-        progress: called before slow steps.
+        on_progress: called before slow steps.
 
     Raises:
         FootTileError: scene or calibration is not usable.
@@ -198,23 +210,23 @@ def record(
         [tile.serial for tile in scene.tile if not tile.reference],
         parts_seed=draw,
         family=scene.emulation.family,
-        progress=progress,
+        on_progress=on_progress,
     )
-    return recorded(scene, seconds, draw, calibration)[0]
+    return record_with_calibration(scene, seconds, draw, calibration)[0]
 
 
-def recorded(
+def record_with_calibration(
     scene: Scene,
     seconds: float | None,
     draw: int,
     calibration: Calibration,
     foot: EmulatedFoot = EmulatedFoot(),  # noqa: B008  # frozen, so one for all is safe
-) -> tuple[Recording, World]:
+) -> tuple[DrawRecording, World]:
     """Record a scene with calibrated tiles of a draw; also return the emulated world.
 
     Args:
         scene: scene to run.
-        seconds: duration, as for `record`.
+        seconds: duration, as for `record_draw`.
         draw: seed of tiles and noise.
         calibration: calibration of the tiles.
         foot: emulated foot; the draw replaces its seeds.
@@ -224,32 +236,38 @@ def recorded(
     """
     with ExitStack() as stack:
         foot = replace(foot, seed=draw, parts_seed=draw)
-        options = SimulateOptions(scene, seconds, otherwise_s=SECONDS, truth=True, foot=foot)
-        simulation = Simulation(options, stack)
+        options = SimulationOptions(
+            scene, seconds, default_seconds=DEFAULT_SCENE_SECONDS, with_truth=True, foot=foot
+        )
+        simulation = EmulatedRun(options, stack)
         pieces = [
             (frames, {name: extra[name] for name in _TRUTH})
-            for frames, extra in simulation.pieces()
+            for frames, extra in simulation.run_frames()
         ]
-    recording = Recording(
+    recording = DrawRecording(
         simulation.info,
         FrameBatch.concatenate([frames for frames, _ in pieces]),
-        joined([truth for _, truth in pieces]),
+        concatenate_columns([truth for _, truth in pieces]),
         calibration,
     )
     return recording, simulation.world
 
 
-def estimated(recording: Recording, models: tuple[str, ...], lag_ms: float) -> Accuracy:
+def compute_recording_accuracy(
+    recording: DrawRecording, models: tuple[str, ...], lag_ms: float
+) -> Accuracy:
     """Estimate a recording, with the tare from its lead-in, and compute the errors.
 
     Raises:
         FootTileError: the recording cannot be estimated with these models.
     """
-    return accuracy_of(estimates_of(recording, models, lag_ms, COMPARED), lag_ms=lag_ms)
+    return compute_accuracy(
+        compute_estimates(recording, models, lag_ms, ACCURACY_COLUMNS), lag_ms=lag_ms
+    )
 
 
-def estimates_of(
-    recording: Recording, models: tuple[str, ...], lag_ms: float, names: Sequence[str]
+def compute_estimates(
+    recording: DrawRecording, models: tuple[str, ...], lag_ms: float, column_names: Sequence[str]
 ) -> dict[str, npt.NDArray[Any]]:
     """Estimate a recording; return columns of estimates and truth, one row per frame.
 
@@ -259,30 +277,34 @@ def estimates_of(
     options = EstimateOptions(recording.calibration, models, lag_ms, exact=True)
     stream = EstimateStream(recording.info, options)
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
-    for frames, columns in stream.run([(recording.frames, recording.truth)]):
+    for frames, columns in stream.estimate_batches([(recording.frames, recording.truth)]):
         columns["t_ns"] = frames.t_ns
-        judged.append({name: np.asarray(columns[name]) for name in names})
-    return joined(judged)
+        judged.append({name: np.asarray(columns[name]) for name in column_names})
+    return concatenate_columns(judged)
 
 
-def run_draw(task: Task) -> Drawn:
+def run_draw(task: DrawTask) -> DrawResult:
     """Record one draw and estimate it by every model set; failures are returned, not raised."""
     try:
-        recording = record(task.scene, task.seconds, task.draw)
+        recording = record_draw(task.scene, task.seconds, task.draw)
     except Exception as error:
-        return Drawn(task.draw, 0, {}, (Failure(f"draw {task.draw}", reason(error)),))
+        return DrawResult(
+            task.draw, 0, {}, (MeasurementFailure(f"draw {task.draw}", describe_error(error)),)
+        )
     accuracy: dict[tuple[str, str], Accuracy] = {}
     failures = []
-    for rung in task.rungs:
+    for rung in task.model_sets:
         for mode, lag_ms in LAGS_MS.items():
             try:
-                accuracy[mode, rung.label] = estimated(recording, rung.models, lag_ms)
+                accuracy[mode, rung.label] = compute_recording_accuracy(
+                    recording, rung.models, lag_ms
+                )
             except Exception as error:
                 what = f"draw {task.draw}, {rung.label}, {mode}"
-                failures.append(Failure(what, reason(error)))
-    return Drawn(task.draw, len(recording.frames), accuracy, tuple(failures))
+                failures.append(MeasurementFailure(what, describe_error(error)))
+    return DrawResult(task.draw, len(recording.frames), accuracy, tuple(failures))
 
 
-def reason(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """Describe an error; an unexpected one with its type."""
     return str(error) if isinstance(error, FootTileError) else f"{type(error).__name__}: {error}"

@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from service.offline.accuracy import PHASES, Accuracy, Covered
-from service.offline.benchmark.draws import LAGS_MS, Drawn, Failure
-from service.offline.benchmark.rungs import Rung
+from service.offline.accuracy import PHASES, Accuracy, CoverageCount
+from service.offline.benchmark.draws import LAGS_MS, DrawResult, MeasurementFailure
+from service.offline.benchmark.model_sets import ComparedModelSet
 
-GRF_MAE_N = {
+GRF_MAE_GOALS_N = {
     "rolling": {"live": 0.25, "offline": 0.18},
     "poppy": {"live": 0.25, "offline": 0.18},
     "mud": {"live": 0.5, "offline": 0.4},
 }
-COP_P95_M = {"live": 0.001, "offline": 0.0007}
-FLIGHT_MEAN_N = 0.1
-SIGMA_MID_STANCE_N = 0.25
-COVERAGE = (0.93, 0.97)
-COVERAGE_OF_A_PHASE = (0.90, 0.99)
-COVERAGE_DRAWS = 100
+COP_P95_GOALS_M = {"live": 0.001, "offline": 0.0007}
+FLIGHT_MEAN_GOAL_N = 0.1
+SIGMA_MID_STANCE_GOAL_N = 0.25
+COVERAGE_GOAL = (0.93, 0.97)
+PHASE_COVERAGE_GOAL = (0.90, 0.99)
+COVERAGE_GOAL_DRAWS = 100
 """Number of draws for which the coverage goals are defined."""
 
 
@@ -46,29 +46,29 @@ class Goal:
     most: float
 
     @property
-    def met(self) -> bool:
+    def is_met(self) -> bool:
         """True if the value is within the limits; False for NaN."""
         low = -math.inf if self.least is None else self.least
         return low <= self.value <= self.most
 
     def as_dict(self) -> dict[str, object]:
         """Return the JSON representation."""
-        return asdict(self) | {"met": self.met}
+        return asdict(self) | {"met": self.is_met}
 
 
-def goals_of(figures: SceneFigures) -> list[Goal]:
+def compare_with_goals(figures: SceneFigures) -> list[Goal]:
     """Compare a scene's figures with the goals."""
     goals = []
     for mode in LAGS_MS:
-        measured = figures.measured[mode, figures.default.label]
+        measured = figures.figures_by_mode_and_label[mode, figures.default_model_set.label]
         medians = {name: spread.median for name, spread in measured.figures.items()}
         limits = [
-            ("COP 95th percentile, mm", "cop_p95_m", 1e3, COP_P95_M[mode]),
-            ("GRF in flight, magnitude of the mean, N", "flight_mean_n", 1.0, FLIGHT_MEAN_N),
-            ("GRF sigma in mid-stance, N", "grf_sigma_mid_stance_n", 1.0, SIGMA_MID_STANCE_N),
+            ("COP 95th percentile, mm", "cop_p95_m", 1e3, COP_P95_GOALS_M[mode]),
+            ("GRF in flight, magnitude of the mean, N", "flight_mean_n", 1.0, FLIGHT_MEAN_GOAL_N),
+            ("GRF sigma in mid-stance, N", "grf_sigma_mid_stance_n", 1.0, SIGMA_MID_STANCE_GOAL_N),
         ]
-        if figures.scene in GRF_MAE_N:
-            most_n = GRF_MAE_N[figures.scene][mode]
+        if figures.scene in GRF_MAE_GOALS_N:
+            most_n = GRF_MAE_GOALS_N[figures.scene][mode]
             limits.insert(0, ("GRF mean absolute error, N", "grf_mae_n", 1.0, most_n))
         goals += [
             Goal(mode, title, scale * medians[name], None, scale * most)
@@ -77,13 +77,13 @@ def goals_of(figures: SceneFigures) -> list[Goal]:
         for name, covered in measured.coverage.items():
             if name == "after_saturation":
                 continue  # reported, without a goal
-            low, high = COVERAGE_OF_A_PHASE if name in PHASES else COVERAGE
-            title = f"covered by the 95 % interval, {COVERED[name]}, %"
+            low, high = PHASE_COVERAGE_GOAL if name in PHASES else COVERAGE_GOAL
+            title = f"covered by the 95 % interval, {COVERAGE_TITLES[name]}, %"
             goals.append(Goal(mode, title, 100 * covered.share, 100 * low, 100 * high))
     return goals
 
 
-COVERED = {
+COVERAGE_TITLES = {
     "all": "GRF, all frames",
     **{phase: f"GRF, {phase.replace('_', '-')}" for phase in PHASES},
     "cop_x": "COP x",
@@ -92,16 +92,16 @@ COVERED = {
 """Titles of the coverage figures."""
 
 
-MAGNITUDES = ("flight_mean_n", "grf_bias_n")
+SIGNED_FIGURES = ("flight_mean_n", "grf_bias_n")
 """Signed figures, summarized by magnitude so that draws do not cancel."""
 
 
-BUDGETED = ("grf_mae_n", "cop_p95_m")
+BUDGET_FIGURES = ("grf_mae_n", "cop_p95_m")
 """Figures that are compared with those of the full model set, draw by draw."""
 
 
 @dataclass(frozen=True)
-class Spread:
+class Quantiles:
     """Median, 5th and 95th percentile and number of a figure's values over draws or repetitions."""
 
     median: float
@@ -110,7 +110,7 @@ class Spread:
     n: int
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
+    def from_values(cls, values: Sequence[float]) -> Quantiles:
         """Compute the percentiles of all finite values."""
         finite = [value for value in values if math.isfinite(value)]
         if not finite:
@@ -120,7 +120,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Measured:
+class ModelSetFigures:
     """Figures of one model set in one mode.
 
     Attributes:
@@ -129,15 +129,15 @@ class Measured:
         figures: fields of `Accuracy` over draws; magnitudes of signed ones.
         coverage: pooled over all frames of all draws: GRF in all frames and in each of `PHASES`,
             "cop_x" and "after_saturation".
-        beyond_whole: excess of `BUDGETED` over those of the full model set in the same
+        beyond_whole: excess of `BUDGET_FIGURES` over those of the full model set in the same
             draw, over draws.
     """
 
     lag_ms: float
-    ns_per_frame: Spread
-    figures: Mapping[str, Spread]
-    coverage: Mapping[str, Covered]
-    beyond_whole: Mapping[str, Spread]
+    ns_per_frame: Quantiles
+    figures: Mapping[str, Quantiles]
+    coverage: Mapping[str, CoverageCount]
+    beyond_whole: Mapping[str, Quantiles]
 
 
 @dataclass(frozen=True)
@@ -145,59 +145,59 @@ class SceneFigures:
     """Figures of one scene."""
 
     scene: str
-    tiles: int
+    tile_count: int
     rate_hz: float
     absent_models: tuple[str, ...]
     assumed_scale: bool
-    draws: int
+    draw_count: int
     """Number of draws with figures."""
-    frames: Spread
-    rungs: tuple[Rung, ...]
-    measured: Mapping[tuple[str, str], Measured]
+    frames: Quantiles
+    model_sets: tuple[ComparedModelSet, ...]
+    figures_by_mode_and_label: Mapping[tuple[str, str], ModelSetFigures]
     """Figures by mode and label of the model set."""
-    failures: tuple[Failure, ...]
+    failures: tuple[MeasurementFailure, ...]
 
     @property
-    def default(self) -> Rung:
+    def default_model_set(self) -> ComparedModelSet:
         """The scene's full model set."""
-        return next(rung for rung in self.rungs if rung.is_default)
+        return next(rung for rung in self.model_sets if rung.is_full_set)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON representation."""
         return {
             "scene": self.scene,
-            "tiles": self.tiles,
+            "tiles": self.tile_count,
             "rate_hz": self.rate_hz,
-            "models": list(self.default.models),
+            "models": list(self.default_model_set.models),
             "absent_models": list(self.absent_models),
             "absolute_scale": "assumed" if self.assumed_scale else "measured",
-            "draws": self.draws,
+            "draws": self.draw_count,
             "frames": self.frames,
             "failures": self.failures,
             "rungs": [
                 {
                     "label": rung.label,
                     "models": list(rung.models),
-                    "adds": rung.adds,
-                    "lacks": rung.lacks,
-                    "spare": rung.spare,
-                    "default": rung.is_default,
-                    **{mode: self.measured[mode, rung.label] for mode in LAGS_MS},
+                    "adds": rung.added_model,
+                    "lacks": rung.missing_model,
+                    "spare": rung.extra_model,
+                    "default": rung.is_full_set,
+                    **{mode: self.figures_by_mode_and_label[mode, rung.label] for mode in LAGS_MS},
                 }
-                for rung in self.rungs
+                for rung in self.model_sets
             ],
         }
 
 
-def measured_of(
-    rungs: Sequence[Rung],
-    draws: Sequence[Drawn],
+def summarize_model_sets(
+    model_sets: Sequence[ComparedModelSet],
+    draws: Sequence[DrawResult],
     times_ns: Mapping[tuple[str, str], Sequence[float]],
-) -> dict[tuple[str, str], Measured]:
+) -> dict[tuple[str, str], ModelSetFigures]:
     """Summarize every model set in every mode, by mode and label."""
     measured = {}
-    whole = next(rung for rung in rungs if rung.is_default)
-    for rung in rungs:
+    whole = next(rung for rung in model_sets if rung.is_full_set)
+    for rung in model_sets:
         for mode, lag_ms in LAGS_MS.items():
             key = mode, rung.label
             judged = [d.accuracy[key] for d in draws if key in d.accuracy]
@@ -206,42 +206,46 @@ def measured_of(
                 for d in draws
                 if key in d.accuracy and (mode, whole.label) in d.accuracy
             ]
-            measured[key] = Measured(
+            measured[key] = ModelSetFigures(
                 lag_ms,
-                Spread.of(times_ns.get(key, ())),
-                figures_of(judged),
-                coverage_of(judged),
+                Quantiles.from_values(times_ns.get(key, ())),
+                summarize_accuracy(judged),
+                pool_coverage(judged),
                 {
-                    name: Spread.of([getattr(a, name) - getattr(b, name) for a, b in both])
-                    for name in BUDGETED
+                    name: Quantiles.from_values(
+                        [getattr(a, name) - getattr(b, name) for a, b in both]
+                    )
+                    for name in BUDGET_FIGURES
                 },
             )
     return measured
 
 
-def figures_of(judged: Sequence[Accuracy]) -> dict[str, Spread]:
+def summarize_accuracy(accuracies: Sequence[Accuracy]) -> dict[str, Quantiles]:
     """Summarize every numeric field of `Accuracy` over draws."""
     names = [f.name for f in fields(Accuracy) if f.type in ("float", "int")]
     figures = {}
     for name in names:
-        values = [float(getattr(a, name)) for a in judged]
-        figures[name] = Spread.of([abs(v) for v in values] if name in MAGNITUDES else values)
+        values = [float(getattr(a, name)) for a in accuracies]
+        figures[name] = Quantiles.from_values(
+            [abs(v) for v in values] if name in SIGNED_FIGURES else values
+        )
     return figures
 
 
-def coverage_of(judged: Sequence[Accuracy]) -> dict[str, Covered]:
+def pool_coverage(accuracies: Sequence[Accuracy]) -> dict[str, CoverageCount]:
     """Pool the coverage of the 95 % interval over the frames of all draws."""
-    nothing = Covered(0, 0)
-    phases = {phase: sum((a.grf_phases[phase] for a in judged), nothing) for phase in PHASES}
+    nothing = CoverageCount(0, 0)
+    phases = {phase: sum((a.grf_phases[phase] for a in accuracies), nothing) for phase in PHASES}
     return {
         "all": sum(phases.values(), nothing),
         **phases,
-        "cop_x": sum((a.cop_covered for a in judged), nothing),
-        "after_saturation": sum((a.after_saturation for a in judged), nothing),
+        "cop_x": sum((a.cop_covered for a in accuracies), nothing),
+        "after_saturation": sum((a.after_saturation for a in accuracies), nothing),
     }
 
 
-def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
+def find_pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Return the indices of the Pareto front, by rising first coordinate.
 
     A point is dominated by one that is no worse in both coordinates and better in one. Points that

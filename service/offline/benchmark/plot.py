@@ -11,10 +11,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from service.offline.benchmark.draws import LAGS_MS
-from service.offline.benchmark.figures import GRF_MAE_N, SceneFigures, Spread, pareto
-from service.offline.benchmark.report import draws_text
-from service.offline.benchmark.rungs import Rung
-from service.offline.plots import DPI, new_figure, png_of
+from service.offline.benchmark.figures import (
+    GRF_MAE_GOALS_N,
+    Quantiles,
+    SceneFigures,
+    find_pareto_front,
+)
+from service.offline.benchmark.model_sets import ComparedModelSet
+from service.offline.benchmark.report import format_draw_count
+from service.offline.figure_output import DPI, create_figure, render_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,42 +33,47 @@ GOAL_DASHES = (0, (5, 4))
 
 
 @dataclass(frozen=True)
-class _Mark:
-    rung: Rung
+class _Point:
+    rung: ComparedModelSet
     ns: float
-    error_n: Spread
+    error_n: Quantiles
 
     @property
     def name(self) -> str:
         if self.rung.is_built_up:
             return self.rung.label
-        return f"++{self.rung.spare}" if self.rung.spare else f"\N{MINUS SIGN}{self.rung.lacks}"
+        return (
+            f"++{self.rung.extra_model}"
+            if self.rung.extra_model
+            else f"\N{MINUS SIGN}{self.rung.missing_model}"
+        )
 
 
-def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
+def plot_benchmark(scenes: Sequence[SceneFigures]) -> bytes:
     """Draw the plot as a PNG.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    figure = new_figure(9.0, 1.4 + 5.0 * len(scenes))
+    figure = create_figure(9.0, 1.4 + 5.0 * len(scenes))
     panels = figure.subplots(len(scenes), 2, squeeze=False)
-    to_label: list[tuple[Axes, str, float | None, list[_Mark]]] = []
+    to_label: list[tuple[Axes, str, float | None, list[_Point]]] = []
     for figures, (left, right) in zip(scenes, panels, strict=True):
         for mode, axes in zip(HALVES, (left, right), strict=True):
-            goal_n = GRF_MAE_N.get(figures.scene, {}).get(mode)
-            to_label.append((axes, mode, goal_n, _half(axes, figures, mode, goal_n)))
+            goal_n = GRF_MAE_GOALS_N.get(figures.scene, {}).get(mode)
+            to_label.append((axes, mode, goal_n, _plot_mode(axes, figures, mode, goal_n)))
         left.set_ylabel("GRF error, mean absolute, N")
         right.tick_params(axis="y", length=0, labelleft=False)
         right.spines["left"].set_visible(False)
         left.set_title(
-            f"{figures.scene}: {figures.tiles} tiles, median of {draws_text(figures.draws)}",
+            f"{figures.scene}: {figures.tile_count} tiles, "
+            f"median of {format_draw_count(figures.draw_count)}",
             loc="left",
             fontsize=12,
             pad=22,
         )
     figure.suptitle("What the estimate of a frame costs, and how far its force is off", fontsize=14)
-    _legend(figure)
+    _draw_legend(figure)
     # Pixel positions are known only after the layout is done.
     figure.set_dpi(DPI)
     engine: Any = figure.get_layout_engine()
@@ -71,40 +81,40 @@ def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for of_half in to_label:
-        _label(*of_half)
-    return png_of(figure)
+        _place_labels(*of_half)
+    return render_png(figure)
 
 
-def _half(axes: Axes, figures: SceneFigures, mode: str, goal_n: float | None) -> list[_Mark]:
+def _plot_mode(axes: Axes, figures: SceneFigures, mode: str, goal_n: float | None) -> list[_Point]:
     """Draw points, bars, front and goal of one mode."""
     colour, shape = STYLES[mode]
     marks = []
-    for rung in figures.rungs:
-        m = figures.measured[mode, rung.label]
-        mark = _Mark(rung, m.ns_per_frame.median, m.figures["grf_mae_n"])
+    for rung in figures.model_sets:
+        m = figures.figures_by_mode_and_label[mode, rung.label]
+        mark = _Point(rung, m.ns_per_frame.median, m.figures["grf_mae_n"])
         if math.isfinite(mark.ns) and math.isfinite(mark.error_n.median):
             marks.append(mark)
     for mark in marks:
-        error_n, is_default = mark.error_n, mark.rung.is_default
+        error_n, is_full_set = mark.error_n, mark.rung.is_full_set
         axes.errorbar(
             *([mark.ns], [error_n.median]),
             yerr=[[error_n.median - error_n.p5], [error_n.p95 - error_n.median]],
             marker=shape,
-            markersize=12 if is_default else 6.5,
+            markersize=12 if is_full_set else 6.5,
             markerfacecolor=colour if mark.rung.is_built_up else "white",
-            markeredgecolor="black" if is_default else colour,
-            markeredgewidth=2.0 if is_default else 1.2,
+            markeredgecolor="black" if is_full_set else colour,
+            markeredgewidth=2.0 if is_full_set else 1.2,
             ecolor=colour,
             elinewidth=0.8,
             linestyle="none",
-            zorder=4 if is_default else 3,
+            zorder=4 if is_full_set else 3,
         )
     points = [(mark.ns, mark.error_n.median) for mark in marks]
-    front = [points[i] for i in pareto(points)]
+    front = [points[i] for i in find_pareto_front(points)]
     axes.plot([x for x, _ in front], [y for _, y in front], color=colour, linewidth=1.5, zorder=2)
     if goal_n is not None:
         axes.axhline(goal_n, color=GREY, linewidth=1.0, linestyle=GOAL_DASHES, zorder=1)
-    _scales(axes, figures, [x for x, _ in points])
+    _set_scales(axes, figures, [x for x, _ in points])
     axes.text(
         *(0.5, 1.015),
         f"{mode}, {LAGS_MS[mode]:g} ms look-ahead",
@@ -117,7 +127,7 @@ def _half(axes: Axes, figures: SceneFigures, mode: str, goal_n: float | None) ->
     return marks
 
 
-def _scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> None:
+def _set_scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> None:
     from matplotlib.ticker import LogLocator, NullLocator
 
     axes.set_xscale("log")
@@ -125,13 +135,13 @@ def _scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> Non
         middle = math.sqrt(min(times_ns) * max(times_ns))
         reach = 2.2 * math.sqrt(max(times_ns) / min(times_ns))
         axes.set_xlim(middle / reach, middle * reach)
-    highs = [m.figures["grf_mae_n"].p95 for m in figures.measured.values()]
-    goals_n = GRF_MAE_N.get(figures.scene, {}).values()
+    highs = [m.figures["grf_mae_n"].p95 for m in figures.figures_by_mode_and_label.values()]
+    goals_n = GRF_MAE_GOALS_N.get(figures.scene, {}).values()
     known = [high for high in highs if math.isfinite(high)] + list(goals_n)
     axes.set_ylim(0.0, 1.08 * max(known, default=1.0))
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(time_text)
+    axes.xaxis.set_major_formatter(format_time)
     axes.tick_params(labelsize=9)
     axes.set_xlabel("CPU time per frame")
     axes.grid(visible=True, color="#E6E6E6")
@@ -140,7 +150,7 @@ def _scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> Non
         axes.spines[side].set_visible(False)
 
 
-def time_text(ns: float, _: object = None) -> str:
+def format_time(ns: float, _: object = None) -> str:
     """Format a time in ns with a suitable unit."""
     for unit, size in (("ms", 1e6), ("µs", 1e3)):
         if ns >= size:
@@ -148,7 +158,7 @@ def time_text(ns: float, _: object = None) -> str:
     return f"{ns:g} ns"
 
 
-def _legend(figure: Figure) -> None:
+def _draw_legend(figure: Figure) -> None:
     from matplotlib.lines import Line2D
 
     def mark(face: str, edge: str, width: float, size: float, label: str) -> Line2D:
@@ -186,16 +196,16 @@ def _legend(figure: Figure) -> None:
     )
 
 
-def _label(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_Mark]) -> None:
+def _place_labels(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_Point]) -> None:
     """Place every label in free space, as near to its point as possible."""
     from textalloc import allocate
 
     if not marks:
         return
     # The full model set and the built-up ones first: they get the best places.
-    marks = sorted(marks, key=lambda m: (not m.rung.is_default, not m.rung.is_built_up))
+    marks = sorted(marks, key=lambda m: (not m.rung.is_full_set, not m.rung.is_built_up))
     ns, errors_n = [m.ns for m in marks], [m.error_n.median for m in marks]
-    front = pareto(list(zip(ns, errors_n, strict=True)))
+    front = find_pareto_front(list(zip(ns, errors_n, strict=True)))
     bars = [([m.ns, m.ns], [m.error_n.p5, m.error_n.p95]) for m in marks]
     along = ([ns[i] for i in front], [errors_n[i] for i in front])
     goal = (list(axes.get_xlim()), [goal_n or 0.0] * 2)
@@ -208,9 +218,9 @@ def _label(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_Mark]) 
         x_lines=list(x_lines),
         y_lines=list(y_lines),
         min_distance=0.018,
-        textsize=[9.5 if m.rung.is_default else 8.5 for m in marks],
-        fontweight=["bold" if m.rung.is_default else "normal" for m in marks],
-        textcolor=["black" if m.rung.is_default else colour for m in marks],
+        textsize=[9.5 if m.rung.is_full_set else 8.5 for m in marks],
+        fontweight=["bold" if m.rung.is_full_set else "normal" for m in marks],
+        textcolor=["black" if m.rung.is_full_set else colour for m in marks],
         linecolor=colour,
         linewidth=0.6,
     )

@@ -14,45 +14,55 @@ from typing import Any
 import numpy as np
 
 from devices.errors import FootTileError
-from devices.scene.file import Scene
+from devices.scene.scene_file import Scene
 from service.estimation.calibration import PRESETS
-from service.estimation.ladder.chosen import MODELS
+from service.estimation.pipeline.model_set import MODEL_NAMES
 from service.offline.benchmark.draws import (
-    BATCH,
-    Drawn,
-    Failure,
-    Recording,
-    Task,
-    reason,
-    record,
+    BATCH_FRAMES,
+    DrawRecording,
+    DrawResult,
+    DrawTask,
+    MeasurementFailure,
+    describe_error,
+    record_draw,
     run_draw,
-    time_rungs,
+    time_model_sets,
 )
-from service.offline.benchmark.figures import Goal, SceneFigures, Spread, goals_of, measured_of
-from service.offline.benchmark.rungs import Rung, absent, rungs
-from service.offline.processes import spread
-from service.version import SOFTWARE
+from service.offline.benchmark.figures import (
+    Goal,
+    Quantiles,
+    SceneFigures,
+    compare_with_goals,
+    summarize_model_sets,
+)
+from service.offline.benchmark.model_sets import (
+    ComparedModelSet,
+    list_missing_models,
+    list_model_sets,
+)
+from service.offline.process_pool import map_in_processes
+from service.version import SOFTWARE_VERSION
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class BenchmarkOptions:
     """Options of a benchmark; see `foottile benchmark --help`."""
 
     scenes: tuple[Scene, ...]
     draws: int
     seconds: float | None
-    jobs: int
+    process_count: int
     offline_frames: int
     live_frames: int
     repetitions: int
-    whole_only: bool = False
+    full_only: bool = False
     """Only the scenes' full model sets, for many draws."""
     repeatability: float | None = None
     """Standard deviation between loadings of the emulated domes; None: the scenes'."""
     correlated_ms: float | None = None
     """Correlation time of the emulated noise; None: the scenes'."""
 
-    def emulated(self, scene: Scene) -> Scene:
+    def apply_emulation_options(self, scene: Scene) -> Scene:
         """Return the scene with the options of its emulation replaced."""
         asked = {"repeatability": self.repeatability, "correlated_ms": self.correlated_ms}
         given = {name: value for name, value in asked.items() if value is not None}
@@ -61,11 +71,11 @@ class BenchOptions:
 
 
 @dataclass(frozen=True)
-class Bench:
+class BenchmarkResult:
     """Result of a benchmark."""
 
-    options: BenchOptions
-    made: str
+    options: BenchmarkOptions
+    run_at: str
     """Time of the run, ISO 8601 in UTC."""
     software: str
     machine: str
@@ -74,10 +84,10 @@ class Bench:
     @property
     def goals(self) -> dict[str, list[Goal]]:
         """Goals of every scene."""
-        return {figures.scene: goals_of(figures) for figures in self.scenes}
+        return {figures.scene: compare_with_goals(figures) for figures in self.scenes}
 
     @property
-    def failures(self) -> list[tuple[str, Failure]]:
+    def failures(self) -> list[tuple[str, MeasurementFailure]]:
         """Failed measurements, each with its scene."""
         return [(figures.scene, f) for figures in self.scenes for f in figures.failures]
 
@@ -86,7 +96,7 @@ class Bench:
         options = self.options
         return {
             "software": self.software,
-            "made": self.made,
+            "made": self.run_at,
             "machine": self.machine,
             "draws": options.draws,
             "emulation": {
@@ -94,52 +104,55 @@ class Bench:
                 "correlated_ms": options.correlated_ms,
             },
             "timed": {
-                "live": {"frames": options.live_frames, "batch": BATCH["live"]},
-                "offline": {"frames": options.offline_frames, "batch": BATCH["offline"]},
+                "live": {"frames": options.live_frames, "batch": BATCH_FRAMES["live"]},
+                "offline": {"frames": options.offline_frames, "batch": BATCH_FRAMES["offline"]},
                 "repetitions": options.repetitions,
             },
-            "scenes": [figures.as_dict() | {"goals": goals_of(figures)} for figures in self.scenes],
+            "scenes": [
+                figures.as_dict() | {"goals": compare_with_goals(figures)}
+                for figures in self.scenes
+            ],
         }
 
 
-def run_bench(options: BenchOptions, tell: Callable[[str], None]) -> Bench:
+def run_benchmark(options: BenchmarkOptions, on_progress: Callable[[str], None]) -> BenchmarkResult:
     """Run the benchmark on every scene.
 
     Args:
         options: options of the benchmark.
-        tell: called with progress messages.
+        on_progress: called with progress messages.
 
     Raises:
         FootTileError: every draw of a scene failed.
     """
     scenes = []
-    for scene in map(options.emulated, options.scenes):
-        ladder = rungs(scene.models, offered=_offered(scene))
-        if options.whole_only:
-            ladder = tuple(rung for rung in ladder if rung.is_default)
-        tasks = [Task(scene, options.seconds, seed, ladder) for seed in range(options.draws)]
-        draws: list[Drawn] = []
-        for draw in drawn(tasks, options.jobs):
+    for scene in map(options.apply_emulation_options, options.scenes):
+        ladder = list_model_sets(scene.models, extra_models=_list_supported_models(scene))
+        if options.full_only:
+            ladder = tuple(rung for rung in ladder if rung.is_full_set)
+        tasks = [DrawTask(scene, options.seconds, seed, ladder) for seed in range(options.draws)]
+        draws: list[DrawResult] = []
+        for draw in run_draws(tasks, options.process_count):
             draws.append(draw)
-            tell(f"{scene.name}: {len(draws)} of {options.draws} draws")
+            on_progress(f"{scene.name}: {len(draws)} of {options.draws} draws")
         draws.sort(key=lambda draw: draw.draw)
-        scenes.append(_figures(scene, ladder, draws, options, tell))
+        scenes.append(_measure_scene(scene, ladder, draws, options, on_progress))
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    return Bench(options, made, SOFTWARE, machine(), tuple(scenes))
+    return BenchmarkResult(options, made, SOFTWARE_VERSION, describe_machine(), tuple(scenes))
 
 
-def _offered(scene: Scene) -> tuple[str, ...]:
+def _list_supported_models(scene: Scene) -> tuple[str, ...]:
     has_bare_tile = any(tile.reference for tile in scene.tile)
     if scene.calibration in PRESETS:  # presets have a static curve only
         return ("skew", "denoise")
-    return tuple(name for name in MODELS if name != "ambient" or has_bare_tile)
+    return tuple(name for name in MODEL_NAMES if name != "ambient" or has_bare_tile)
 
 
-def _figures(
+def _measure_scene(
     scene: Scene,
-    ladder: tuple[Rung, ...],
-    draws: Sequence[Drawn],
-    options: BenchOptions,
+    ladder: tuple[ComparedModelSet, ...],
+    draws: Sequence[DrawResult],
+    options: BenchmarkOptions,
     tell: Callable[[str], None],
 ) -> SceneFigures:
     failures = [failure for draw in draws for failure in draw.failures]
@@ -150,38 +163,42 @@ def _figures(
             where=f"scene {scene.name}",
         )
     tell(f"{scene.name}: timing")
-    recording = record(scene, options.seconds, good[0].draw)
+    recording = record_draw(scene, options.seconds, good[0].draw)
     frames = {"live": options.live_frames, "offline": options.offline_frames}
-    times_ns, not_timed = time_rungs(recording, ladder, frames, options.repetitions)
+    times_ns, not_timed = time_model_sets(recording, ladder, frames, options.repetitions)
     return SceneFigures(
         scene=scene.name,
-        tiles=len(scene.tile),
+        tile_count=len(scene.tile),
         rate_hz=recording.info.nominal_rate_hz,
-        absent_models=absent(scene.models),
-        assumed_scale=_is_assumed(recording),
-        draws=len(good),
-        frames=Spread.of([float(draw.frames) for draw in good]),
-        rungs=ladder,
-        measured=measured_of(ladder, good, times_ns),
+        absent_models=list_missing_models(scene.models),
+        assumed_scale=_is_scale_assumed(recording),
+        draw_count=len(good),
+        frames=Quantiles.from_values([float(draw.frames) for draw in good]),
+        model_sets=ladder,
+        figures_by_mode_and_label=summarize_model_sets(ladder, good, times_ns),
         failures=(*failures, *not_timed),
     )
 
 
-def _is_assumed(recording: Recording) -> bool:
+def _is_scale_assumed(recording: DrawRecording) -> bool:
     bearing = [tile.serial for tile in recording.info.tiles if not tile.reference]
-    return any(recording.calibration.of(serial).absolute_scale == "assumed" for serial in bearing)
+    return any(
+        recording.calibration.get_tile(serial).absolute_scale == "assumed" for serial in bearing
+    )
 
 
-def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
+def run_draws(tasks: Sequence[DrawTask], process_count: int) -> Iterator[DrawResult]:
     """Run draws in processes; yield each as it finishes."""
-    for task, draw in spread(run_draw, tasks, jobs):
-        if isinstance(draw, Drawn):
+    for task, draw in map_in_processes(run_draw, tasks, process_count):
+        if isinstance(draw, DrawResult):
             yield draw
         else:
-            yield Drawn(task.draw, 0, {}, (Failure(f"draw {task.draw}", reason(draw)),))
+            yield DrawResult(
+                task.draw, 0, {}, (MeasurementFailure(f"draw {task.draw}", describe_error(draw)),)
+            )
 
 
-def machine() -> str:
+def describe_machine() -> str:
     """Describe this machine, for the report."""
     model = platform.machine()
     with suppress(OSError, StopIteration):

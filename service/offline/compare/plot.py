@@ -8,25 +8,38 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from service.estimation.estimates import INTERVAL_95
-from service.offline.compare.errors import Errors
-from service.offline.compare.pairs import Pairs
-from service.offline.plots import new_figure, png_of
+from service.estimation.estimates import SIGMAS_95
+from service.offline.compare.error_figures import ComparisonErrors
+from service.offline.compare.paired_frames import PairedFrames
+from service.offline.figure_output import create_figure, render_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Okabe and Ito: distinct for any colour vision.
-OURS, THEIRS = "#0072B2", "#D55E00"
-TILES = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#F0E442", "#0072B2", "#D55E00", "#999999")
-SHOWN_S = 4.0
+OUR_COLOUR, REFERENCE_COLOUR = "#0072B2", "#D55E00"
+TILE_COLOURS = (
+    "#56B4E9",
+    "#E69F00",
+    "#009E73",
+    "#CC79A7",
+    "#F0E442",
+    "#0072B2",
+    "#D55E00",
+    "#999999",
+)
+SHOWN_DURATION_S = 4.0
 """Duration of the time plots, from shortly before the first common contact."""
-LEAD_S = 0.2
-POINTS_MAX = 5000
+SHOWN_LEAD_S = 0.2
+MAX_POINTS = 5000
 
 
 def plot_comparison(
-    title: str, pairs: Pairs, force_n: Floats, serials: Sequence[str], errors: Errors
+    title: str,
+    pairs: PairedFrames,
+    force_n: Floats,
+    serials: Sequence[str],
+    errors: ComparisonErrors,
 ) -> bytes:
     """Draw a comparison as a PNG.
 
@@ -40,33 +53,33 @@ def plot_comparison(
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    figure = new_figure(11.0, 13.5)
+    figure = create_figure(11.0, 13.5)
     grid = figure.add_gridspec(6, 2, height_ratios=(3, 1.2, 2.6, 2, 1.2, 3.2))
     over_time = [figure.add_subplot(grid[row, :]) for row in range(5)]
-    rows = _shown(pairs)
+    rows = _select_shown(pairs)
     t_s = pairs.t_s[rows]
-    figure.suptitle(f"{title}\n{stretch(t_s, pairs.t_s)}", fontsize=11)
-    _grf(over_time[0], over_time[1], pairs, rows)
-    _tiles(over_time[2], t_s, force_n[rows], serials, pairs.reference_n[rows])
-    _cop(over_time[3], over_time[4], pairs, rows)
+    figure.suptitle(f"{title}\n{describe_shown_time(t_s, pairs.t_s)}", fontsize=11)
+    _plot_grf(over_time[0], over_time[1], pairs, rows)
+    _plot_tiles(over_time[2], t_s, force_n[rows], serials, pairs.reference_n[rows])
+    _plot_cop(over_time[3], over_time[4], pairs, rows)
     for axis in over_time:
         axis.set_xlim(t_s[0], t_s[-1])
         axis.grid(alpha=0.25)
         axis.tick_params(labelbottom=axis is over_time[-1])
     over_time[-1].set_xlabel("time since the first frame of the session, s")
-    _bland_altman(figure.add_subplot(grid[5, 0]), pairs, errors)
-    _scatter(figure.add_subplot(grid[5, 1]), pairs)
+    _plot_bland_altman(figure.add_subplot(grid[5, 0]), pairs, errors)
+    _plot_scatter(figure.add_subplot(grid[5, 1]), pairs)
     figure.align_ylabels(over_time)
-    return png_of(figure)
+    return render_png(figure)
 
 
-def _shown(pairs: Pairs) -> Bools:
-    both = np.flatnonzero(pairs.contact & (pairs.columns["contact"] == 1))
-    begin_s = pairs.t_s[both[0]] - LEAD_S if len(both) else pairs.t_s[0]
-    return np.asarray((pairs.t_s >= begin_s) & (pairs.t_s < begin_s + SHOWN_S))
+def _select_shown(pairs: PairedFrames) -> Bools:
+    both = np.flatnonzero(pairs.reference_contact & (pairs.columns["contact"] == 1))
+    begin_s = pairs.t_s[both[0]] - SHOWN_LEAD_S if len(both) else pairs.t_s[0]
+    return np.asarray((pairs.t_s >= begin_s) & (pairs.t_s < begin_s + SHOWN_DURATION_S))
 
 
-def stretch(shown_s: Floats, all_s: Floats) -> str:
+def describe_shown_time(shown_s: Floats, all_s: Floats) -> str:
     """Describe the part of the comparison shown in the time plots."""
     shown, whole = (f"{s[0]:.1f} to {s[-1]:.1f} s" for s in (shown_s, all_s))
     if len(shown_s) == len(all_s):
@@ -74,34 +87,36 @@ def stretch(shown_s: Floats, all_s: Floats) -> str:
     return f"over time: {shown}, of {whole} that were compared; below: all of them"
 
 
-def _grf(force: Axes, error: Axes, pairs: Pairs, rows: Bools) -> None:
+def _plot_grf(force: Axes, error: Axes, pairs: PairedFrames, rows: Bools) -> None:
     t_s, grf_n = pairs.t_s[rows], pairs.columns["grf_n"][rows]
-    half_n = INTERVAL_95 * pairs.columns["grf_sigma_n"][rows]
-    _band(force, t_s, grf_n, half_n, OURS, "ours, 95 %")
-    force.plot(t_s, grf_n, color=OURS, linewidth=1.2, label="ours")
-    force.plot(t_s, pairs.reference_n[rows], "--", color=THEIRS, linewidth=1.2, label="reference")
+    half_n = SIGMAS_95 * pairs.columns["grf_sigma_n"][rows]
+    _plot_band(force, t_s, grf_n, half_n, OUR_COLOUR, "ours, 95 %")
+    force.plot(t_s, grf_n, color=OUR_COLOUR, linewidth=1.2, label="ours")
+    force.plot(
+        t_s, pairs.reference_n[rows], "--", color=REFERENCE_COLOUR, linewidth=1.2, label="reference"
+    )
     force.set_ylabel("GRF, N")
     force.legend(fontsize=8, loc="upper right", ncols=3)
-    _band(error, t_s, np.zeros(len(t_s)), half_n, OURS)
+    _plot_band(error, t_s, np.zeros(len(t_s)), half_n, OUR_COLOUR)
     error.plot(t_s, pairs.error_n[rows], color="black", linewidth=0.8)
     error.set_ylabel("ours less\nreference, N")
 
 
-def _band(
+def _plot_band(
     axis: Axes, t_s: Floats, middle: Floats, half: Floats, colour: str, label: str | None = None
 ) -> None:
     low, high = middle - half, middle + half
     axis.fill_between(t_s, low, high, color=colour, alpha=0.25, linewidth=0, label=label)
 
 
-def _tiles(
+def _plot_tiles(
     axis: Axes, t_s: Floats, force_n: Floats, serials: Sequence[str], reference_n: Floats
 ) -> None:
     borne = [i for i in range(force_n.shape[1]) if np.isfinite(force_n[:, i]).any()]
     if borne:
         # Stacked tiles sum to the GRF; negative forces cannot be stacked.
         heights_n = np.maximum(np.nan_to_num(force_n[:, borne].T), 0.0)
-        colours = [TILES[k % len(TILES)] for k in range(len(borne))]
+        colours = [TILE_COLOURS[k % len(TILE_COLOURS)] for k in range(len(borne))]
         names = [serials[i] for i in borne]
         axis.stackplot(t_s, heights_n, labels=names, colors=colours, linewidth=0, alpha=0.85)
     axis.plot(t_s, reference_n, "--", color="black", linewidth=1.1, label="reference")
@@ -109,20 +124,22 @@ def _tiles(
     axis.legend(fontsize=8, loc="upper right", ncols=max(1, (len(borne) + 2) // 2))
 
 
-def _cop(place: Axes, error: Axes, pairs: Pairs, rows: Bools) -> None:
+def _plot_cop(place: Axes, error: Axes, pairs: PairedFrames, rows: Bools) -> None:
     t_s = pairs.t_s[rows]
-    theirs_mm = 1e3 * np.where(pairs.contact[:, None], pairs.reference_cop_m, np.nan)[rows]
+    theirs_mm = (
+        1e3 * np.where(pairs.reference_contact[:, None], pairs.reference_cop_m, np.nan)[rows]
+    )
     stated = np.isfinite(theirs_mm).any()
-    for k, (name, colour) in enumerate((("x", OURS), ("y", "#009E73"))):
+    for k, (name, colour) in enumerate((("x", OUR_COLOUR), ("y", "#009E73"))):
         ours_mm = 1e3 * pairs.columns[f"cop_{name}_m"][rows]
-        half_mm = 1e3 * INTERVAL_95 * pairs.columns[f"cop_sigma_{name}_m"][rows]
-        _band(place, t_s, ours_mm, half_mm, colour)
+        half_mm = 1e3 * SIGMAS_95 * pairs.columns[f"cop_sigma_{name}_m"][rows]
+        _plot_band(place, t_s, ours_mm, half_mm, colour)
         place.plot(t_s, ours_mm, color=colour, linewidth=1.2, label=f"ours, {name}")
         if stated:
             place.plot(t_s, theirs_mm[:, k], "--", color="black", linewidth=0.9 + 0.3 * k)
             off_mm = ours_mm - theirs_mm[:, k]
             error.plot(t_s, off_mm, color=colour, linewidth=0.9, label=name)
-            _band(error, t_s, np.zeros(len(t_s)), half_mm, colour)
+            _plot_band(error, t_s, np.zeros(len(t_s)), half_mm, colour)
     if stated:
         place.plot([], [], "--", color="black", label="reference")
         error.axhline(0.0, color="black", linewidth=0.6)
@@ -133,9 +150,9 @@ def _cop(place: Axes, error: Axes, pairs: Pairs, rows: Bools) -> None:
     error.set_ylabel("ours less\nreference, mm")
 
 
-def _bland_altman(axis: Axes, pairs: Pairs, errors: Errors) -> None:
-    grf_n, error_n = _judged(pairs)
-    axis.plot(grf_n - 0.5 * error_n, error_n, ".", color=OURS, markersize=3, alpha=0.35)
+def _plot_bland_altman(axis: Axes, pairs: PairedFrames, errors: ComparisonErrors) -> None:
+    grf_n, error_n = _select_counted(pairs)
+    axis.plot(grf_n - 0.5 * error_n, error_n, ".", color=OUR_COLOUR, markersize=3, alpha=0.35)
     for trial in errors.trials:
         low_n, high_n = trial.limits_of_agreement_n
         for value_n, style in ((trial.figures["grf_bias_n"], "-"), (low_n, "--"), (high_n, "--")):
@@ -146,9 +163,9 @@ def _bland_altman(axis: Axes, pairs: Pairs, errors: Errors) -> None:
     axis.grid(alpha=0.25)
 
 
-def _scatter(axis: Axes, pairs: Pairs) -> None:
-    grf_n, error_n = _judged(pairs)
-    axis.plot(grf_n - error_n, grf_n, ".", color=OURS, markersize=3, alpha=0.35)
+def _plot_scatter(axis: Axes, pairs: PairedFrames) -> None:
+    grf_n, error_n = _select_counted(pairs)
+    axis.plot(grf_n - error_n, grf_n, ".", color=OUR_COLOUR, markersize=3, alpha=0.35)
     end_n = float(grf_n.max()) if len(grf_n) else 1.0
     axis.plot([0.0, end_n], [0.0, end_n], color="black", linewidth=0.9)
     axis.set_title("every judged frame under load", fontsize=9)
@@ -157,7 +174,7 @@ def _scatter(axis: Axes, pairs: Pairs) -> None:
     axis.grid(alpha=0.25)
 
 
-def _judged(pairs: Pairs) -> tuple[Floats, Floats]:
-    rows = np.flatnonzero(pairs.judged & pairs.contact & np.isfinite(pairs.error_n))
-    rows = rows[:: max(1, len(rows) // POINTS_MAX)]
+def _select_counted(pairs: PairedFrames) -> tuple[Floats, Floats]:
+    rows = np.flatnonzero(pairs.is_counted & pairs.reference_contact & np.isfinite(pairs.error_n))
+    rows = rows[:: max(1, len(rows) // MAX_POINTS)]
     return pairs.columns["grf_n"][rows], pairs.error_n[rows]

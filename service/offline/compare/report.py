@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from devices.words import printable
+from devices.text import escape_control_chars
 from service.offline.accuracy import PHASES
-from service.offline.compare.align import Alignment
-from service.offline.compare.blocks import Estimate
-from service.offline.compare.clocks import ClockLag
-from service.offline.compare.errors import Errors
-from service.offline.compare.pairs import Pairs
-from service.offline.compare.trials import OverTrials
+from service.offline.compare.alignment import Alignment
+from service.offline.compare.block_covariance import UncertainValue
+from service.offline.compare.clock_lag import ClockLag
+from service.offline.compare.error_figures import ComparisonErrors
+from service.offline.compare.paired_frames import PairedFrames
+from service.offline.compare.trials import TrialMean
 
-FIGURES: Mapping[str, str] = {
+FIGURE_TITLES: Mapping[str, str] = {
     "grf_frames": "frames under load that are judged",
     "grf_bias_n": "GRF, mean error, N",
     "grf_mae_n": "GRF, mean absolute error, N",
@@ -40,7 +40,7 @@ FIGURES: Mapping[str, str] = {
     "cop_coverage_y_95": "COP, part within the 95 % interval along y",
 }
 """Title of every figure, by name."""
-AT_LEAST = frozenset(
+FIGURES_WITH_LOWER_LIMIT = frozenset(
     {
         *("grf_frames", "stances", "grf_r2", "grf_coverage_95"),
         *("cop_coverage_x_95", "cop_coverage_y_95"),
@@ -49,31 +49,42 @@ AT_LEAST = frozenset(
 """Figures with a lower limit; the limits of all others are upper limits."""
 
 
-def markdown(
+def format_comparison_report(
     title: str,
     alignment: Alignment,
-    by_clocks: ClockLag | None,
-    pairs: Pairs,
-    errors: Errors,
+    clock_lag: ClockLag | None,
+    pairs: PairedFrames,
+    errors: ComparisonErrors,
     trials_are: str,
     notes: Sequence[str],
 ) -> str:
     """Format the report of a comparison."""
-    lines = [f"# {printable(title)}", "", *(f"- {printable(note)}" for note in notes), ""]
-    lines += _alignment(alignment, by_clocks, pairs)
-    lines += _figures(errors, trials_are)
-    lines += _trials(errors)
-    lines += _phases(errors)
+    lines = [
+        f"# {escape_control_chars(title)}",
+        "",
+        *(f"- {escape_control_chars(note)}" for note in notes),
+        "",
+    ]
+    lines += _format_alignment(alignment, clock_lag, pairs)
+    lines += _format_figures(errors, trials_are)
+    lines += _format_trials(errors)
+    lines += _format_phases(errors)
     return "\n".join(lines) + "\n"
 
 
-def _alignment(alignment: Alignment, by_clocks: ClockLag | None, pairs: Pairs) -> Iterator[str]:
-    removed = ", removed" if pairs.removed else ", not removed"
-    rows: list[tuple[str, Estimate | None, str]] = [
-        (f"lag behind our clock at {alignment.at_s:.2f} s, ms", alignment.lag_s.times(1e3), ""),
+def _format_alignment(
+    alignment: Alignment, by_clocks: ClockLag | None, pairs: PairedFrames
+) -> Iterator[str]:
+    removed = ", removed" if pairs.is_zero_removed else ", not removed"
+    rows: list[tuple[str, UncertainValue | None, str]] = [
+        (
+            f"lag behind our clock at {alignment.mid_t_s:.2f} s, ms",
+            alignment.lag_s.scale_by(1e3),
+            "",
+        ),
         ("drift against our clock, ppm", alignment.drift_ppm, ""),
         ("scale, newtons of ours for one of the reference", alignment.scale, ", never applied"),
-        ("offset of the reference in flight, N", pairs.zero_n, removed),
+        ("offset of the reference in flight, N", pairs.reference_zero_n, removed),
         ("offset by the fit, N", alignment.offset_n, ""),
     ]
     yield from (
@@ -88,22 +99,22 @@ def _alignment(alignment: Alignment, by_clocks: ClockLag | None, pairs: Pairs) -
             continue
         low, high = found.interval_95
         yield (
-            f"| {name}{remark} | {found.value:.4f} | {found.sigma:.4f} | {found.own:.4f} | "
-            f"{low:.4f} to {high:.4f} |"
+            f"| {name}{remark} | {found.value:.4f} | {found.sigma:.4f} | "
+            f"{found.repeating_sigma:.4f} | {low:.4f} to {high:.4f} |"
         )
     if by_clocks is not None:
-        low_s, high_s = (by_clocks.lag_s + side * by_clocks.within_s for side in (-1.0, 1.0))
+        low_s, high_s = (by_clocks.lag_s + side * by_clocks.error_bound_s for side in (-1.0, 1.0))
         yield (
             f"| the same lag by the clock tables, and its bounds, ms | {1e3 * by_clocks.lag_s:.4f} "
             f"| - | - | {1e3 * low_s:.4f} to {1e3 * high_s:.4f} |"
         )
     yield ""
-    yield f"From {alignment.blocks} blocks of time. The reference bears load from"
-    yield f"{pairs.contact_n:.2f} N over its zero."
+    yield f"From {alignment.block_count} blocks of time. The reference bears load from"
+    yield f"{pairs.contact_threshold_n:.2f} N over its zero."
     yield ""
 
 
-def _figures(errors: Errors, trials_are: str) -> Iterator[str]:
+def _format_figures(errors: ComparisonErrors, trials_are: str) -> Iterator[str]:
     count = len(errors.trials)
     yield from (
         "## Over trials",
@@ -116,14 +127,20 @@ def _figures(errors: Errors, trials_are: str) -> Iterator[str]:
         "| figure | | mean | 95 % interval | trials |",
         "|---|---|--:|--:|--:|",
     )
-    for name, what in FIGURES.items():
+    for name, what in FIGURE_TITLES.items():
         if (found := errors.figures.get(name)) is not None:
-            cells = (f"`{name}`", what, number(found.mean), _interval(found), str(found.trials))
+            cells = (
+                f"`{name}`",
+                what,
+                format_number(found.mean),
+                _format_interval(found),
+                str(found.trials),
+            )
             yield f"| {' | '.join(cells)} |"
     yield ""
 
 
-def _trials(errors: Errors) -> Iterator[str]:
+def _format_trials(errors: ComparisonErrors) -> Iterator[str]:
     yield from ("## Trial by trial", "")
     yield (
         "| trial | GRF bias N | MAE N | RMSE N | R² | limits of agreement N | stances (left out) "
@@ -133,17 +150,18 @@ def _trials(errors: Errors) -> Iterator[str]:
     for trial in errors.trials:
         of, (low_n, high_n) = trial.figures, trial.limits_of_agreement_n
         cop = ", ".join(str(trial.cop_frames[name]) for name in ("ours", "reference", "both"))
-        name = _cell(trial.name)
+        name = _escape_cell(trial.name)
         yield (
-            f"| {name} | {number(of['grf_bias_n'])} | {number(of['grf_mae_n'])} | "
-            f"{number(of['grf_rmse_n'])} | {number(of['grf_r2'])} | {number(low_n)} to "
-            f"{number(high_n)} | {len(trial.stances)} ({trial.stances_left_out}) | "
-            f"{number(1e3 * of['cop_p95_m'])} | {cop} |"
+            f"| {name} | {format_number(of['grf_bias_n'])} | {format_number(of['grf_mae_n'])} | "
+            f"{format_number(of['grf_rmse_n'])} | {format_number(of['grf_r2'])} | "
+            f"{format_number(low_n)} to {format_number(high_n)} | "
+            f"{len(trial.stances)} ({trial.stances_left_out}) | "
+            f"{format_number(1e3 * of['cop_p95_m'])} | {cop} |"
         )
     yield ""
 
 
-def _phases(errors: Errors) -> Iterator[str]:
+def _format_phases(errors: ComparisonErrors) -> Iterator[str]:
     yield from ("## By phase", "", "Phases are those of the reference's force.", "")
     yield from (
         "| trial | phase | frames | bias N | MAE N | covered % |",
@@ -154,23 +172,23 @@ def _phases(errors: Errors) -> Iterator[str]:
             phase = trial.phases[name]
             share = math.nan if phase.covered is None else 100.0 * phase.covered.share
             yield (
-                f"| {_cell(trial.name)} | {name.replace('_', '-')} | "
-                f"{phase.frames} | {number(phase.bias_n)} | {number(phase.mae_n)} | "
-                f"{number(share)} |"
+                f"| {_escape_cell(trial.name)} | {name.replace('_', '-')} | "
+                f"{phase.frames} | {format_number(phase.bias_n)} | {format_number(phase.mae_n)} | "
+                f"{format_number(share)} |"
             )
 
 
-def _cell(name: str) -> str:
+def _escape_cell(name: str) -> str:
     """Return a name as a cell of a table in Markdown."""
-    return printable(name).replace("|", "\\|")
+    return escape_control_chars(name).replace("|", "\\|")
 
 
-def _interval(found: OverTrials) -> str:
+def _format_interval(found: TrialMean) -> str:
     if found.interval_95 is None:
         return "-"
-    return f"{number(found.interval_95[0])} to {number(found.interval_95[1])}"
+    return f"{format_number(found.interval_95[0])} to {format_number(found.interval_95[1])}"
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Format a number with four digits; NaN as a dash."""
     return "-" if math.isnan(value) else f"{value:.4g}"

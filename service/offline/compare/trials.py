@@ -13,7 +13,7 @@ from scipy.stats import bootstrap
 
 from devices.arrays import Bools, Floats, Times
 
-BOOTSTRAP_FROM = 20
+MIN_BOOTSTRAP_TRIALS = 20
 """Least number of trials for a bootstrap interval; below, Student's t is used."""
 RESAMPLES = 9999
 _SEED = 0
@@ -21,7 +21,7 @@ _UPPER_95 = 0.975
 
 
 @dataclass(frozen=True)
-class Mark:
+class TrialMarker:
     """Marker that begins a trial.
 
     Attributes:
@@ -47,7 +47,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class OverTrials:
+class TrialMean:
     """Mean of a figure over trials.
 
     Attributes:
@@ -63,8 +63,8 @@ class OverTrials:
     method: str
 
 
-def trials_of(
-    t_ns: Times, part: npt.NDArray[Any], marks: Sequence[Mark]
+def split_into_trials(
+    t_ns: Times, part: npt.NDArray[Any], markers: Sequence[TrialMarker]
 ) -> tuple[list[Trial], str]:
     """Split a session into trials; also return the definition of a trial.
 
@@ -74,10 +74,10 @@ def trials_of(
     Args:
         t_ns: (n,), UTC of the frames.
         part: (n,), session part of the frames.
-        marks: markers in any order.
+        markers: markers in any order.
     """
-    if marks:
-        ordered = sorted(marks, key=lambda mark: mark.t_ns)
+    if markers:
+        ordered = sorted(markers, key=lambda mark: mark.t_ns)
         bounds = [mark.t_ns for mark in ordered] + [np.iinfo(np.int64).max]
         return [
             Trial(f"{i + 1}: {mark.label}", (t_ns >= bounds[i]) & (t_ns < bounds[i + 1]))
@@ -88,16 +88,16 @@ def trials_of(
     ], "each contiguous recording"
 
 
-def over_trials(values: Floats) -> OverTrials:
+def average_over_trials(values: Floats) -> TrialMean:
     """Compute the mean of a figure with its 95 % interval; trials with NaN do not count."""
     known = values[np.isfinite(values)]
     if len(known) < 2:
         mean = float(known[0]) if len(known) else float("nan")
-        return OverTrials(mean, None, len(known), "single")
+        return TrialMean(mean, None, len(known), "single")
     mean = float(known.mean())
-    if len(known) < BOOTSTRAP_FROM or np.ptp(known) == 0.0:
+    if len(known) < MIN_BOOTSTRAP_TRIALS or np.ptp(known) == 0.0:
         half = stdtrit(len(known) - 1, _UPPER_95) * known.std(ddof=1) / np.sqrt(len(known))
-        return OverTrials(mean, (mean - float(half), mean + float(half)), len(known), "t")
+        return TrialMean(mean, (mean - float(half), mean + float(half)), len(known), "t")
     found = bootstrap((known,), np.mean, n_resamples=RESAMPLES, rng=np.random.default_rng(_SEED))
     low, high = found.confidence_interval
-    return OverTrials(mean, (float(low), float(high)), len(known), "bootstrap")
+    return TrialMean(mean, (float(low), float(high)), len(known), "bootstrap")

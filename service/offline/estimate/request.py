@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from devices.scene.file import Scene
+from devices.scene.scene_file import Scene
 from service.estimation.calibration import Calibration
 from storage.formats.slice import Slice
 
 _ALL = Slice()
-PIECE_FRAMES = 1 << 20
+CHUNK_FRAMES = 1 << 20
 """Frames per chunk: half an hour at 544 Hz, some ten seconds of work, which a kill may cost."""
 
 

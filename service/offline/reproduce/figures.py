@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.arrays import Bools, Floats
-from service.estimation.estimates import INTERVAL_95
-from service.estimation.fitting.confidence import curve_n, mean_band_n
-from service.offline.compare.plot import OURS, THEIRS, TILES
-from service.offline.plots import new_figure, png_of
+from service.estimation.estimates import SIGMAS_95
+from service.estimation.fitting.confidence import compute_curve_n, compute_mean_band_n
+from service.offline.compare.plot import OUR_COLOUR, REFERENCE_COLOUR, TILE_COLOURS
+from service.offline.figure_output import create_figure, render_png
 from service.offline.reproduce import paper
-from service.offline.reproduce.judge import Judged
-from service.offline.reproduce.mill import DomeFound
-from service.offline.reproduce.result import Experiment, Reproduction
+from service.offline.reproduce.indentation import DomeResult
+from service.offline.reproduce.result import ExperimentResult, Reproduction
 from service.offline.reproduce.setups import MUD, PRESSURE_PLATE
+from service.offline.reproduce.trial_evaluation import TrialResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MARGIN_S = 0.25
-LIFTED_S = 0.3
+SHOWN_MARGIN_S = 0.25
+MIN_LIFTED_S = 0.3
 """Time without contact after which the foot counts as lifted."""
 _BESIDE_KPA = 0.4
 _MATERIALS = {"40": ("#56B4E9", "#0072B2", "#003B5C"), "60": ("#F5B889", "#D55E00", "#7A3600")}
@@ -33,36 +33,36 @@ _QUANTITIES = (("lag_s", "lag"), ("drift_ppm", "drift"), ("offset_n", "offset"),
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
-def figures_of(result: Reproduction) -> Mapping[str, bytes]:
+def draw_figures(reproduction: Reproduction) -> Mapping[str, bytes]:
     """Draw the figures of all measured experiments; return PNGs by file name.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
     drawn = {}
-    if result.domes:
-        drawn["domes.png"] = _domes(result.domes)
-    for experiment in result.experiments:
+    if reproduction.domes:
+        drawn["domes.png"] = _draw_domes(reproduction.domes)
+    for experiment in reproduction.experiments:
         of_cop = experiment.setup.instrument == PRESSURE_PLATE
-        draw = _rolling if of_cop else _hops
+        draw = _draw_rolling if of_cop else _draw_hops
         drawn[f"{experiment.setup.name}.png"] = draw(experiment)
-    if result.experiments:
-        drawn["references.png"] = _references(result.experiments)
+    if reproduction.experiments:
+        drawn["references.png"] = _draw_references(reproduction.experiments)
     return drawn
 
 
-def _domes(domes: Sequence[DomeFound]) -> bytes:
-    figure = new_figure(9.6, 4.8)
+def _draw_domes(domes: Sequence[DomeResult]) -> bytes:
+    figure = create_figure(9.6, 4.8)
     curves, shapes = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
     for found in domes:
-        tile, colour = found.pressed.tile, _colour(found)
+        tile, colour = found.indented_tile.tile, _colour(found)
         grid_kpa = np.linspace(0.0, min(tile.range_kpa[1], found.end_kpa), 120)
-        force_n, half_n = curve_n(tile, grid_kpa), mean_band_n(tile, grid_kpa)
+        force_n, half_n = compute_curve_n(tile, grid_kpa), compute_mean_band_n(tile, grid_kpa)
         curves.fill_between(
             grid_kpa, force_n - half_n, force_n + half_n, color=colour, alpha=0.25, linewidth=0
         )
         curves.plot(grid_kpa, force_n, color=colour, linewidth=1.6, label=found.dome.name)
-        blocks = found.pressed.strokes
+        blocks = found.indented_tile.strokes
         every = np.flatnonzero(blocks.gauge_kpa <= grid_kpa[-1])[::5]
         curves.plot(
             blocks.gauge_kpa[every],
@@ -73,11 +73,11 @@ def _domes(domes: Sequence[DomeFound]) -> bytes:
             markeredgewidth=0,
         )
         shapes.plot(grid_kpa / grid_kpa[-1], force_n / force_n[-1], color=colour, linewidth=1.4)
-        if found.expected.basis == "paper":
+        if found.expected_range.source == "paper":
             curves.errorbar(
                 [found.end_kpa + _BESIDE_KPA],
-                [np.mean(paper.RANGE_N)],
-                yerr=[0.5 * np.ptp(paper.RANGE_N)],
+                [np.mean(paper.DOME_RANGE_N)],
+                yerr=[0.5 * np.ptp(paper.DOME_RANGE_N)],
                 color="black",
                 capsize=5,
                 label=f"the paper's range of {found.dome.name}",
@@ -89,7 +89,7 @@ def _domes(domes: Sequence[DomeFound]) -> bytes:
     curves.set_xlim(0.0, None)
     curves.set_ylim(0.0, None)
     output = np.linspace(0.0, 1.0, 100)
-    shapes.plot(output, paper.equation_2(output), "--", color="black", linewidth=1.8)
+    shapes.plot(output, paper.compute_normalised_force(output), "--", color="black", linewidth=1.8)
     shapes.plot([], [], "--", color="black", label="the paper's equation 2")
     shapes.plot([], [], color="#666666", label="cubics of the six emulated domes")
     shapes.set_xlabel("output, part of its greatest")
@@ -100,40 +100,47 @@ def _domes(domes: Sequence[DomeFound]) -> bytes:
     shapes.set_ylim(0.0, 1.0)
     for axis in (curves, shapes):
         axis.grid(alpha=0.25)
-    return png_of(figure)
+    return render_png(figure)
 
 
-def _colour(found: DomeFound) -> str:
+def _colour(found: DomeResult) -> str:
     shades = _MATERIALS[found.dome.material.name.split()[-1]]
     return shades[round(found.dome.diameter_mm) - 10]
 
 
-def _rolling(experiment: Experiment) -> bytes:
-    figure = new_figure(9.6, 7.6)
+def _draw_rolling(experiment: ExperimentResult) -> bytes:
+    figure = create_figure(9.6, 7.6)
     force, place, error = figure.subplots(3, 1, height_ratios=(2.2, 1.8, 1.6), sharex=True)
-    first = experiment.judged[0]
-    pairs, rows = first.comparison.pairs, _first_roll(first)
-    t_s = pairs.t_s[rows] - _begin_s(first)
-    _tiles(force, first, rows, t_s)
-    for k, (name, colour) in enumerate((("x", OURS), ("y", "#009E73"))):
+    first = experiment.trials[0]
+    pairs, rows = first.comparison.pairs, _select_first_roll(first)
+    t_s = pairs.t_s[rows] - _find_first_contact_s(first)
+    _draw_tiles(force, first, rows, t_s)
+    for k, (name, colour) in enumerate((("x", OUR_COLOUR), ("y", "#009E73"))):
         ours_mm = 1e3 * pairs.columns[f"cop_{name}_m"][rows]
         if np.isnan(ours_mm).all():  # across a row of tiles
             continue
-        half_mm = INTERVAL_95 * 1e3 * pairs.columns[f"cop_sigma_{name}_m"][rows]
+        half_mm = SIGMAS_95 * 1e3 * pairs.columns[f"cop_sigma_{name}_m"][rows]
         place.fill_between(
             t_s, ours_mm - half_mm, ours_mm + half_mm, color=colour, alpha=0.3, linewidth=0
         )
         along = "forward" if name == "x" else "to the left"
         place.plot(t_s, ours_mm, color=colour, linewidth=1.3, label=f"foot, {along}")
-        theirs_mm = 1e3 * np.where(pairs.contact, pairs.reference_cop_m[:, k], np.nan)[rows]
+        theirs_mm = (
+            1e3 * np.where(pairs.reference_contact, pairs.reference_cop_m[:, k], np.nan)[rows]
+        )
         place.plot(t_s, theirs_mm, "--", color="black", linewidth=1.0)
     place.plot([], [], "--", color="black", label="pressure plate")
     place.set_ylabel("COP, mm")
     place.set_ylim(-28, 28)
     place.legend(fontsize=8, loc="upper left")
-    error.axhspan(-1e3 * paper.COP_M, 1e3 * paper.COP_M, color="#EEEEEE", label="the paper's 4 mm")
-    for number, one in enumerate(experiment.judged):
-        off_mm, own_s = _off_along_x(one)
+    error.axhspan(
+        -1e3 * paper.MAX_COP_ERROR_M,
+        1e3 * paper.MAX_COP_ERROR_M,
+        color="#EEEEEE",
+        label="the paper's 4 mm",
+    )
+    for number, one in enumerate(experiment.trials):
+        off_mm, own_s = _compute_cop_error_x(one)
         error.plot(
             own_s,
             off_mm,
@@ -150,31 +157,31 @@ def _rolling(experiment: Experiment) -> bytes:
         axis.grid(alpha=0.25)
         axis.set_xlim(t_s[0], t_s[-1])
     figure.suptitle(
-        f"{experiment.setup.title}: {_first_of(experiment, 'run')}",
+        f"{experiment.setup.title}: {_describe_trials(experiment, 'run')}",
         fontsize=10.5,
     )
     figure.align_ylabels((force, place, error))
-    return png_of(figure)
+    return render_png(figure)
 
 
-def _tiles(axis: Axes, one: Judged, rows: Bools, t_s: Floats) -> None:
-    force_n = one.comparison.force_n[rows]
+def _draw_tiles(axis: Axes, one: TrialResult, rows: Bools, t_s: Floats) -> None:
+    force_n = one.comparison.tile_force_n[rows]
     borne = [i for i in range(force_n.shape[1]) if np.isfinite(force_n[:, i]).any()]
     heights_n = np.maximum(np.nan_to_num(force_n[:, borne].T), 0.0)
     axis.stackplot(
         t_s,
         heights_n,
         labels=[one.comparison.serials[i] for i in borne],
-        colors=[TILES[k % len(TILES)] for k in range(len(borne))],
+        colors=[TILE_COLOURS[k % len(TILE_COLOURS)] for k in range(len(borne))],
         linewidth=0,
         alpha=0.9,
     )
     reference_n = one.comparison.pairs.reference_n[rows]
     axis.plot(t_s, reference_n, "--", color="black", linewidth=1.1, label="pressure plate")
-    axis.axhline(paper.LEG_N, color="#666666", linewidth=0.8)
+    axis.axhline(paper.LEG_WEIGHT_N, color="#666666", linewidth=0.8)
     axis.annotate(
         "weight of the leg",
-        (t_s[-1], paper.LEG_N),
+        (t_s[-1], paper.LEG_WEIGHT_N),
         (-4, 3),
         textcoords="offset points",
         ha="right",
@@ -186,33 +193,44 @@ def _tiles(axis: Axes, one: Judged, rows: Bools, t_s: Floats) -> None:
     axis.legend(fontsize=8, loc="upper left", ncols=5)
 
 
-def _hops(experiment: Experiment) -> bytes:
-    figure = new_figure(9.6, 5.6)
+def _draw_hops(experiment: ExperimentResult) -> bytes:
+    figure = create_figure(9.6, 5.6)
     grid = figure.add_gridspec(2, 2, height_ratios=(2.2, 1.0), width_ratios=(5.0, 1.0))
     force, error = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     means = figure.add_subplot(grid[:, 1])
-    first = experiment.judged[0]
-    pairs, rows = first.comparison.pairs, _shown(first)
-    t_s = pairs.t_s[rows] - _begin_s(first)
+    first = experiment.trials[0]
+    pairs, rows = first.comparison.pairs, _select_shown(first)
+    t_s = pairs.t_s[rows] - _find_first_contact_s(first)
     ours_n = pairs.columns["grf_n"][rows]
-    half_n = INTERVAL_95 * pairs.columns["grf_sigma_n"][rows]
+    half_n = SIGMAS_95 * pairs.columns["grf_sigma_n"][rows]
     force.fill_between(
-        t_s, ours_n - half_n, ours_n + half_n, color=OURS, alpha=0.3, linewidth=0, label="its 95 %"
+        t_s,
+        ours_n - half_n,
+        ours_n + half_n,
+        color=OUR_COLOUR,
+        alpha=0.3,
+        linewidth=0,
+        label="its 95 %",
     )
-    force.plot(t_s, ours_n, color=OURS, linewidth=1.2, label="foot")
-    force.plot(t_s, pairs.reference_n[rows], color=THEIRS, linewidth=1.0, label="force plate")
+    force.plot(t_s, ours_n, color=OUR_COLOUR, linewidth=1.2, label="foot")
+    force.plot(
+        t_s, pairs.reference_n[rows], color=REFERENCE_COLOUR, linewidth=1.0, label="force plate"
+    )
     force.set_ylabel("GRF, N")
     force.legend(fontsize=8, loc="upper center", ncols=3)
     force.tick_params(labelbottom=False)
     error.axhspan(
-        -paper.GRF_N, paper.GRF_N, color="#EEEEEE", label=_LINES_N[experiment.setup is MUD]
+        -paper.MAX_GRF_ERROR_N,
+        paper.MAX_GRF_ERROR_N,
+        color="#EEEEEE",
+        label=_LINES_N[experiment.setup is MUD],
     )
-    error.fill_between(t_s, -half_n, half_n, color=OURS, alpha=0.3, linewidth=0)
+    error.fill_between(t_s, -half_n, half_n, color=OUR_COLOUR, alpha=0.3, linewidth=0)
     error.plot(t_s, pairs.error_n[rows], color="black", linewidth=0.8)
     error.set_ylabel("foot less\nplate, N")
     error.set_xlabel("time since first contact, s")
     # The error while mud pulls at the foot would dominate the scale.
-    loaded = rows & pairs.contact
+    loaded = rows & pairs.reference_contact
     edge_n = max(2.5, 1.2 * float(np.nanpercentile(np.abs(pairs.error_n[loaded]), 98.0)))
     error.set_ylim(-edge_n, edge_n)
     error.legend(fontsize=8, loc="lower right")
@@ -220,20 +238,20 @@ def _hops(experiment: Experiment) -> bytes:
     for axis in (force, error):
         axis.grid(alpha=0.25)
         axis.set_xlim(t_s[0], t_s[-1])
-    _means(means, experiment)
+    _draw_means(means, experiment)
     figure.suptitle(
-        f"{experiment.setup.title}: {_first_of(experiment, 'trial')}",
+        f"{experiment.setup.title}: {_describe_trials(experiment, 'trial')}",
         fontsize=10.5,
     )
     figure.align_ylabels((force, error))
-    return png_of(figure)
+    return render_png(figure)
 
 
-def _means(axis: Axes, experiment: Experiment) -> None:
-    each_n = [one.figures["grf_mae_n"] for one in experiment.judged]
+def _draw_means(axis: Axes, experiment: ExperimentResult) -> None:
+    each_n = [one.figures["grf_mae_n"] for one in experiment.trials]
     over = experiment.figures["grf_mae_n"]
-    axis.axhspan(0.0, paper.GRF_N, color="#EEEEEE")
-    axis.plot(np.zeros(len(each_n)) - 0.12, each_n, "o", color=OURS, markersize=4, alpha=0.8)
+    axis.axhspan(0.0, paper.MAX_GRF_ERROR_N, color="#EEEEEE")
+    axis.plot(np.zeros(len(each_n)) - 0.12, each_n, "o", color=OUR_COLOUR, markersize=4, alpha=0.8)
     if over.interval_95 is not None:
         low_n, high_n = over.interval_95
         axis.errorbar(
@@ -252,10 +270,10 @@ def _means(axis: Axes, experiment: Experiment) -> None:
     axis.grid(alpha=0.25, axis="y")
 
 
-def _references(experiments: Sequence[Experiment]) -> bytes:
+def _draw_references(experiments: Sequence[ExperimentResult]) -> bytes:
     """Draw the difference of found and injected properties of each reference."""
-    judged = [(e, one) for e in experiments for one in e.judged]
-    figure = new_figure(9.6, 1.9 + 0.22 * len(judged))
+    judged = [(e, one) for e in experiments for one in e.trials]
+    figure = create_figure(9.6, 1.9 + 0.22 * len(judged))
     axes = figure.subplots(1, len(_QUANTITIES), sharey=True)
     for axis, (name, label) in zip(axes, _QUANTITIES, strict=True):
         in_intervals = name != "scale"
@@ -268,57 +286,64 @@ def _references(experiments: Sequence[Experiment]) -> bytes:
                 continue
             colour = _COLOURS[experiments.index(experiment) % len(_COLOURS)]
             if in_intervals:
-                axis.plot([check.off], [-row], "o", color=colour, markersize=5)
+                axis.plot([check.error_in_half_intervals], [-row], "o", color=colour, markersize=5)
                 continue
             low, high = check.found.interval_95
             at, half = 100.0 * (check.found.value - check.injected), 50.0 * (high - low)
             axis.errorbar([at], [-row], xerr=[half], fmt="o", color=colour, markersize=5)
         if in_intervals:
-            reach = max(2.0, *(abs(one.checks[name].off) for _, one in judged))
+            reach = max(2.0, *(abs(one.checks[name].error_in_half_intervals) for _, one in judged))
             axis.set_xlim(-1.1 * reach, 1.1 * reach)
         axis.set_title(label, fontsize=9.5)
         axis.set_xlabel("in half 95 % intervals" if in_intervals else "per cent, with interval")
         axis.grid(alpha=0.25, axis="x")
     axes[0].set_yticks(-np.arange(len(judged)), [one.name for _, one in judged], fontsize=8)
     figure.suptitle("What was found of the references, less what was injected", fontsize=10.5)
-    return png_of(figure)
+    return render_png(figure)
 
 
-def _off_along_x(one: Judged) -> tuple[Floats, Floats]:
+def _compute_cop_error_x(one: TrialResult) -> tuple[Floats, Floats]:
     pairs = one.comparison.pairs
-    rows = _first_roll(one) & pairs.contact & (pairs.columns["contact"] == 1) & pairs.judged
+    rows = (
+        _select_first_roll(one)
+        & pairs.reference_contact
+        & (pairs.columns["contact"] == 1)
+        & pairs.is_counted
+    )
     off_m = pairs.columns["cop_x_m"][rows] - pairs.reference_cop_m[rows, 0]
-    return np.asarray(1e3 * off_m), np.asarray(pairs.t_s[rows] - _begin_s(one))
+    return np.asarray(1e3 * off_m), np.asarray(pairs.t_s[rows] - _find_first_contact_s(one))
 
 
-def _begin_s(one: Judged) -> float:
+def _find_first_contact_s(one: TrialResult) -> float:
     """Return the time of the first common contact."""
     pairs = one.comparison.pairs
-    both = np.flatnonzero(pairs.contact & (pairs.columns["contact"] == 1))
+    both = np.flatnonzero(pairs.reference_contact & (pairs.columns["contact"] == 1))
     return float(pairs.t_s[both[0]]) if len(both) else float(pairs.t_s[0])
 
 
-def _shown(one: Judged) -> Bools:
+def _select_shown(one: TrialResult) -> Bools:
     """Select the frames from shortly before the first contact until shortly after the last."""
     pairs = one.comparison.pairs
-    touched_s = pairs.t_s[pairs.contact]
+    touched_s = pairs.t_s[pairs.reference_contact]
     end_s = float(touched_s[-1]) if len(touched_s) else float(pairs.t_s[-1])
-    return _between(one, end_s)
+    return _select_until(one, end_s)
 
 
-def _first_roll(one: Judged) -> Bools:
+def _select_first_roll(one: TrialResult) -> Bools:
     """Select the frames from shortly before the first contact until shortly after lifting."""
-    pairs, begin_s = one.comparison.pairs, _begin_s(one)
-    touched_s = pairs.t_s[pairs.contact & (pairs.t_s >= begin_s)]
-    lifted = np.flatnonzero(np.diff(touched_s) > LIFTED_S)
-    return _between(one, float(touched_s[lifted[0] if len(lifted) else -1]))
+    pairs, begin_s = one.comparison.pairs, _find_first_contact_s(one)
+    touched_s = pairs.t_s[pairs.reference_contact & (pairs.t_s >= begin_s)]
+    lifted = np.flatnonzero(np.diff(touched_s) > MIN_LIFTED_S)
+    return _select_until(one, float(touched_s[lifted[0] if len(lifted) else -1]))
 
 
-def _between(one: Judged, end_s: float) -> Bools:
+def _select_until(one: TrialResult, end_s: float) -> Bools:
     t_s = one.comparison.pairs.t_s
-    return np.asarray((t_s >= _begin_s(one) - MARGIN_S) & (t_s <= end_s + MARGIN_S))
+    return np.asarray(
+        (t_s >= _find_first_contact_s(one) - SHOWN_MARGIN_S) & (t_s <= end_s + SHOWN_MARGIN_S)
+    )
 
 
-def _first_of(experiment: Experiment, what: str) -> str:
-    trials = len(experiment.judged)
+def _describe_trials(experiment: ExperimentResult, what: str) -> str:
+    trials = len(experiment.trials)
     return f"one {what}" if trials == 1 else f"{trials} {what}s, the first one in full"

@@ -6,9 +6,13 @@ import math
 from collections.abc import Iterator, Sequence
 
 from service.offline.reproduce import paper
-from service.offline.reproduce.judge import SHOWN, Check, Judged
-from service.offline.reproduce.result import Experiment, Reproduction
+from service.offline.reproduce.result import ExperimentResult, Reproduction
 from service.offline.reproduce.setups import MUD, POPPY, POPPY_RIM, ROLLING
+from service.offline.reproduce.trial_evaluation import (
+    REPORTED_FIGURES,
+    InjectedValueCheck,
+    TrialResult,
+)
 
 ONE_FOOT = (
     "One foot is real and the other emulated: the paper's errors are those of cast domes on a "
@@ -16,7 +20,7 @@ ONE_FOOT = (
     "here says that the whole product, from bus to comparison, loses little of what such a foot "
     "could give; it says nothing of how good a real foot is."
 )
-_CHECKED: tuple[tuple[str, str, float, int], ...] = (
+_CHECKED_PROPERTIES: tuple[tuple[str, str, float, int], ...] = (
     ("lag_s", "the lag", 1e3, 2),
     ("drift_ppm", "the drift", 1.0, 0),
     ("offset_n", "the offset", 1.0, 3),
@@ -38,14 +42,14 @@ _HEADS = {
 }
 
 
-def markdown(result: Reproduction) -> str:
+def format_reproduction_report(result: Reproduction) -> str:
     """Format the report; figures are separate files."""
     lines = [
         "# The paper, end to end",
         "",
-        f"{result.software}, {result.made}, seed {result.seed}"
-        + (", a quick look only" if result.quick else "")
-        + f"; {_took(result)}.",
+        f"{result.software}, {result.run_at}, seed {result.seed}"
+        + (", a quick look only" if result.is_shortened else "")
+        + f"; {_describe_run_time(result)}.",
         "",
         f"PAPER: {paper.CITED}.",
         "",
@@ -53,32 +57,38 @@ def markdown(result: Reproduction) -> str:
         "",
         *(f"- {note}" for note in result.notes),
         *([""] if result.notes else []),
-        *_beside(result),
-        *_domes(result),
-        *(line for one in result.experiments for line in _experiment(result, one)),
-        *_references(result),
-        *_failures(result),
+        *_format_comparison_table(result),
+        *_format_domes(result),
+        *(line for one in result.experiments for line in _format_experiment(result, one)),
+        *_format_references(result),
+        *_format_failures(result),
     ]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _took(result: Reproduction) -> str:
+def _describe_run_time(result: Reproduction) -> str:
     parts = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in result.seconds.items())
     return f"it took {sum(result.seconds.values()):.0f} s ({parts})"
 
 
-def _beside(result: Reproduction) -> Iterator[str]:
+def _format_comparison_table(result: Reproduction) -> Iterator[str]:
     """Yield the table of the paper's and our values."""
     yield from ("## The paper beside this", "", "| | paper | here |", "|---|---|---|")
     rows: list[tuple[str, str, str]] = []
     if result.domes:
         means = [
-            one.pressed.tile.bench.r2_of_mean for one in result.domes if one.pressed.tile.bench
+            one.indented_tile.tile.bench.r2_of_mean
+            for one in result.domes
+            if one.indented_tile.tile.bench
         ]
-        each = [one.pressed.tile.r2 for one in result.domes if one.pressed.tile.r2 is not None]
-        rows.append(("R² of the cubic, mean over loadings", "99.99 % (eq. 2)", _span(means)))
-        rows.append(("R² of the same cubic, every loading", "not known here", _span(each)))
-        spread = result.spread
+        each = [
+            one.indented_tile.tile.r2
+            for one in result.domes
+            if one.indented_tile.tile.r2 is not None
+        ]
+        rows.append(("R² of the cubic, mean over loadings", "99.99 % (eq. 2)", _format_span(means)))
+        rows.append(("R² of the same cubic, every loading", "not known here", _format_span(each)))
+        spread = result.repeatability
         if spread is not None:
             value, (low, high) = spread
             rows.append(
@@ -88,28 +98,34 @@ def _beside(result: Reproduction) -> Iterator[str]:
                     f"{value:.3f} ({low:.3f} to {high:.3f}); emulated with 0.03",
                 )
             )
-        own = [one for one in result.domes if one.expected.basis == "paper"]
+        own = [one for one in result.domes if one.expected_range.source == "paper"]
         rows += [
             (
                 f"range of {one.dome.name}, N",
-                f"{paper.RANGE_N[0]:.0f} to {paper.RANGE_N[1]:.0f} (III-A)",
+                f"{paper.DOME_RANGE_N[0]:.0f} to {paper.DOME_RANGE_N[1]:.0f} (III-A)",
                 f"{one.full_scale_n[0]:.1f} ± {one.full_scale_n[1]:.1f}",
             )
             for one in own
         ]
-    if (rolling := result.of(ROLLING.name)) is not None:
-        rows.append(("rolling: COP error, mm", "below 4 (III)", _cop(rolling)))
+    if (rolling := result.find_experiment(ROLLING.name)) is not None:
+        rows.append(("rolling: COP error, mm", "below 4 (III)", _describe_cop(rolling)))
     for setup in (ROLLING, POPPY, POPPY_RIM, MUD):
-        if (one := result.of(setup.name)) is None:
+        if (one := result.find_experiment(setup.name)) is None:
             continue
         stated = "below 1 (III)" if setup is not MUD else "no number known here"
-        rows.append((f"{_plain(setup.title)}: GRF mean error, N", stated, _of(one, "grf_mae_n")))
-    rates = [one.rate_hz for experiment in result.experiments for one in experiment.judged]
+        rows.append(
+            (
+                f"{_lower_first_letter(setup.title)}: GRF mean error, N",
+                stated,
+                _format_figure(one, "grf_mae_n"),
+            )
+        )
+    rates = [one.rate_hz for experiment in result.experiments for one in experiment.trials]
     if rates:
         rows.append(
             (
                 "frames a second, four tiles",
-                f"{paper.RATE_HZ:.0f} (II-C)",
+                f"{paper.FRAME_RATE_HZ:.0f} (II-C)",
                 f"{min(rates):.0f} to {max(rates):.0f}, emulated in real time on this machine",
             )
         )
@@ -122,7 +138,7 @@ def _beside(result: Reproduction) -> Iterator[str]:
     )
 
 
-def _domes(result: Reproduction) -> Iterator[str]:
+def _format_domes(result: Reproduction) -> Iterator[str]:
     if not result.domes:
         return
     yield from (
@@ -142,14 +158,15 @@ def _domes(result: Reproduction) -> Iterator[str]:
         "|---|--:|--:|--:|--:|--:|--:|",
     )
     for one in result.domes:
-        tile, (full_n, half_n) = one.pressed.tile, one.full_scale_n
-        low_n, high_n = one.expected.low_n, one.expected.high_n
-        basis = "" if one.expected.basis == "paper" else " (scaled)"
+        tile, (full_n, half_n) = one.indented_tile.tile, one.full_scale_n
+        low_n, high_n = one.expected_range.low_n, one.expected_range.high_n
+        basis = "" if one.expected_range.source == "paper" else " (scaled)"
         mean = tile.bench.r2_of_mean if tile.bench is not None else math.nan
         yield (
             f"| {one.dome.name} | {one.dome.material.modulus_mpa} | {full_n:.1f} ± {half_n:.1f}"
-            f"{'' if one.reached else ', drawn out'} | {low_n:.1f} to {high_n:.1f}{basis} | "
-            f"{100 * mean:.2f} % | {100 * (tile.r2 or math.nan):.2f} % | {one.spread:.3f} |"
+            f"{'' if one.is_full_scale_reached else ', drawn out'} | "
+            f"{low_n:.1f} to {high_n:.1f}{basis} | {100 * mean:.2f} % | "
+            f"{100 * (tile.r2 or math.nan):.2f} % | {one.repeatability:.3f} |"
         )
     yield from (
         "",
@@ -159,20 +176,20 @@ def _domes(result: Reproduction) -> Iterator[str]:
     )
 
 
-def _experiment(result: Reproduction, one: Experiment) -> Iterator[str]:
+def _format_experiment(result: Reproduction, one: ExperimentResult) -> Iterator[str]:
     setup = one.setup
-    yield from (f"## {setup.title}", "", *_said_of(setup.name), "")
+    yield from (f"## {setup.title}", "", *_get_experiment_texts(setup.name), "")
     yield from (f"![{setup.title}: foot and {setup.instrument}]({setup.name}.png)", "")
-    names = [name for name in SHOWN if math.isfinite(one.figures[name].mean)]
-    yield "| figure | mean over trials | " + " | ".join(t.name for t in one.judged) + " |"
-    yield "|---|--:|" + "--:|" * len(one.judged)
+    names = [name for name in REPORTED_FIGURES if math.isfinite(one.figures[name].mean)]
+    yield "| figure | mean over trials | " + " | ".join(t.name for t in one.trials) + " |"
+    yield "|---|--:|" + "--:|" * len(one.trials)
     for name in names:
-        each = (_number(name, trial.figures[name]) for trial in one.judged)
-        yield f"| {_HEADS[name]} | {_of(one, name)} | " + " | ".join(each) + " |"
+        each = (_number(name, trial.figures[name]) for trial in one.trials)
+        yield f"| {_HEADS[name]} | {_format_figure(one, name)} | " + " | ".join(each) + " |"
     lost, missed = (
-        sum(getattr(t, name) for t in one.judged) for name in ("lost_frames", "missed_slots")
+        sum(getattr(t, name) for t in one.trials) for name in ("lost_frames", "missed_slots")
     )
-    frames = sum(trial.frames for trial in one.judged)
+    frames = sum(trial.frames for trial in one.trials)
     yield from ("", f"{frames} frames, {lost} lost; {missed} slots were missed.")
     if (rest_n := result.not_borne_n.get(setup.name)) is not None and rest_n > 0.0:
         yield (
@@ -182,7 +199,7 @@ def _experiment(result: Reproduction, one: Experiment) -> Iterator[str]:
     yield ""
 
 
-_SAID = {
+_EXPERIMENT_TEXTS = {
     ROLLING.name: (
         "The foot's arc rolls over a plate under the leg's weight; a pressure plate sees its "
         "footprint. The paper's sentence: the COP's error is below 4 mm. Where the foot stands on "
@@ -206,12 +223,12 @@ _SAID = {
 }
 
 
-def _said_of(name: str) -> Sequence[str]:
-    return _SAID.get(name, ())
+def _get_experiment_texts(name: str) -> Sequence[str]:
+    return _EXPERIMENT_TEXTS.get(name, ())
 
 
-def _references(result: Reproduction) -> Iterator[str]:
-    judged = [trial for one in result.experiments for trial in one.judged]
+def _format_references(result: Reproduction) -> Iterator[str]:
+    judged = [trial for one in result.experiments for trial in one.trials]
     if not judged:
         return
     yield from (
@@ -227,13 +244,16 @@ def _references(result: Reproduction) -> Iterator[str]:
         "|---|--:|--:|--:|--:|",
     )
     for one in judged:
-        cells = (_found(one.checks[name], factor, digits) for name, _, factor, digits in _CHECKED)
+        cells = (
+            _format_check(one.checks[name], factor, digits)
+            for name, _, factor, digits in _CHECKED_PROPERTIES
+        )
         yield f"| {one.name} | " + " | ".join(cells) + " |"
     # The scale is comparable only if the plate measures no load beside that on the domes.
-    same = [t for e in result.experiments if not result.not_borne_n[e.setup.name] for t in e.judged]
+    same = [t for e in result.experiments if not result.not_borne_n[e.setup.name] for t in e.trials]
     counts = ", ".join(
-        f"{words} in {_inside(same if name == 'scale' else judged, name)}"
-        for name, words, *_ in _CHECKED
+        f"{words} in {_count_inside(same if name == 'scale' else judged, name)}"
+        for name, words, *_ in _CHECKED_PROPERTIES
     )
     yield from (
         "",
@@ -247,11 +267,11 @@ def _references(result: Reproduction) -> Iterator[str]:
     )
 
 
-def _inside(judged: Sequence[Judged], name: str) -> str:
-    return f"{sum(one.checks[name].inside for one in judged)} of {len(judged)}"
+def _count_inside(judged: Sequence[TrialResult], name: str) -> str:
+    return f"{sum(one.checks[name].is_inside_interval for one in judged)} of {len(judged)}"
 
 
-def _found(check: Check, factor: float, digits: int) -> str:
+def _format_check(check: InjectedValueCheck, factor: float, digits: int) -> str:
     if check.found is None:
         return f"- ({factor * check.injected:.{digits}f})"
     low, high = check.found.interval_95
@@ -260,12 +280,12 @@ def _found(check: Check, factor: float, digits: int) -> str:
     return f"{value:.{digits}f} ± {half:.{digits}f} ({factor * check.injected:.{digits}f})"
 
 
-def _failures(result: Reproduction) -> Iterator[str]:
+def _format_failures(result: Reproduction) -> Iterator[str]:
     if result.failures:
         yield from ("## Not measured", "", *(f"- {k}: {v}" for k, v in result.failures.items()), "")
 
 
-def _of(one: Experiment, name: str) -> str:
+def _format_figure(one: ExperimentResult, name: str) -> str:
     over = one.figures[name]
     if over.interval_95 is None:
         return _number(name, over.mean)
@@ -276,10 +296,11 @@ def _of(one: Experiment, name: str) -> str:
     return f"{_number(name, over.mean)} ({low} to {high})"
 
 
-def _cop(rolling: Experiment) -> str:
+def _describe_cop(rolling: ExperimentResult) -> str:
     return (
-        f"mean {_of(rolling, 'cop_mean_m')}, 95th percentile {_of(rolling, 'cop_p95_m')}; "
-        f"without the mean error of placement {_of(rolling, 'cop_p95_about_mean_m')}"
+        f"mean {_format_figure(rolling, 'cop_mean_m')}, "
+        f"95th percentile {_format_figure(rolling, 'cop_p95_m')}; "
+        f"without the mean error of placement {_format_figure(rolling, 'cop_p95_about_mean_m')}"
     )
 
 
@@ -291,12 +312,12 @@ def _number(name: str, value: float) -> str:
     return f"{100 * value:.1f}" if "coverage" in name else f"{value:.3f}"
 
 
-def _span(values: Sequence[float]) -> str:
+def _format_span(values: Sequence[float]) -> str:
     if not values:
         return "-"
     low, high = 100 * min(values), 100 * max(values)
     return f"{low:.2f} to {high:.2f} %" if len(values) > 1 else f"{low:.2f} %"
 
 
-def _plain(title: str) -> str:
+def _lower_first_letter(title: str) -> str:
     return title[0].lower() + title[1:]

@@ -8,24 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.estimation.calibration import Calibration
-from service.estimation.fitting.confidence import curve_n, mean_band_n, new_loading_band_n
-from service.offline.compare.trials import OverTrials
-from service.offline.reproduce.judge import Judged, over_all
-from service.offline.reproduce.mill import DomeFound, pooled
-from service.offline.reproduce.setups import Setup
+from service.estimation.fitting.confidence import (
+    compute_curve_n,
+    compute_mean_band_n,
+    compute_new_loading_band_n,
+)
+from service.offline.compare.trials import TrialMean
+from service.offline.reproduce.indentation import DomeResult, pool_repeatability
+from service.offline.reproduce.setups import ExperimentSetup
+from service.offline.reproduce.trial_evaluation import TrialResult, average_trial_figures
 
 
 @dataclass(frozen=True)
-class Experiment:
+class ExperimentResult:
     """Evaluated trials of one setup."""
 
-    setup: Setup
-    judged: tuple[Judged, ...]
+    setup: ExperimentSetup
+    trials: tuple[TrialResult, ...]
 
     @property
-    def figures(self) -> Mapping[str, OverTrials]:
+    def figures(self) -> Mapping[str, TrialMean]:
         """Figures over trials."""
-        return over_all(self.judged)
+        return average_trial_figures(self.trials)
 
 
 @dataclass(frozen=True)
@@ -34,9 +38,9 @@ class Reproduction:
 
     Attributes:
         software: version.
-        made: time of the run, UTC.
+        run_at: time of the run, UTC.
         seed: seed of all random draws.
-        quick: True for a shortened run.
+        is_shortened: True for a shortened run.
         domes: results of the indented domes of Table I.
         calibration: calibration of the foot's tiles.
         experiments: experiments with at least one evaluated trial.
@@ -48,56 +52,58 @@ class Reproduction:
     """
 
     software: str
-    made: str
+    run_at: str
     seed: int
-    quick: bool
-    domes: tuple[DomeFound, ...]
+    is_shortened: bool
+    domes: tuple[DomeResult, ...]
     calibration: Calibration | None
-    experiments: tuple[Experiment, ...]
+    experiments: tuple[ExperimentResult, ...]
     not_borne_n: Mapping[str, float]
     failures: Mapping[str, str]
     seconds: Mapping[str, float]
     notes: Sequence[str] = ()
 
-    def of(self, name: str) -> Experiment | None:
+    def find_experiment(self, name: str) -> ExperimentResult | None:
         """Return an experiment by name; None if it has no result."""
         return next((one for one in self.experiments if one.setup.name == name), None)
 
     @property
-    def spread(self) -> tuple[float, tuple[float, float]] | None:
+    def repeatability(self) -> tuple[float, tuple[float, float]] | None:
         """Standard deviation between loadings over all domes, with its 95 % interval."""
         if not self.domes:
             return None
-        return pooled([one.spread for one in self.domes], self.domes[0].pressed.tile.repeats)
+        return pool_repeatability(
+            [one.repeatability for one in self.domes], self.domes[0].indented_tile.tile.repeats
+        )
 
     def as_dict(self) -> dict[str, object]:
         """Return the JSON representation."""
         return {
             "software": self.software,
-            "made": self.made,
+            "made": self.run_at,
             "seed": self.seed,
-            "quick": self.quick,
+            "quick": self.is_shortened,
             "seconds": self.seconds,
             "failures": self.failures,
             "notes": self.notes,
             "calibration": None if self.calibration is None else self.calibration.id,
-            "domes": [_dome(one) for one in self.domes],
-            "repeatability": self.spread,
+            "domes": [_dome_to_dict(one) for one in self.domes],
+            "repeatability": self.repeatability,
             "experiments": {
                 one.setup.name: {
                     "title": one.setup.title,
                     "instrument": one.setup.instrument,
                     "not_borne_n": self.not_borne_n.get(one.setup.name),
                     "figures": one.figures,
-                    "trials": one.judged,
+                    "trials": one.trials,
                 }
                 for one in self.experiments
             },
         }
 
 
-def _dome(found: DomeFound) -> dict[str, object]:
-    tile = found.pressed.tile
+def _dome_to_dict(found: DomeResult) -> dict[str, object]:
+    tile = found.indented_tile.tile
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], 41)
     return {
         "name": found.dome.name,
@@ -107,20 +113,20 @@ def _dome(found: DomeFound) -> dict[str, object]:
         "loadings": tile.repeats,
         "full_scale_n": found.full_scale_n[0],
         "full_scale_half_95_n": found.full_scale_n[1],
-        "pressed_to_full_scale": found.reached,
-        "expected_n": [found.expected.low_n, found.expected.high_n],
-        "expected_from": found.expected.basis,
+        "pressed_to_full_scale": found.is_full_scale_reached,
+        "expected_n": [found.expected_range.low_n, found.expected_range.high_n],
+        "expected_from": found.expected_range.source,
         "r2": tile.r2,
         "r2_of_mean": None if tile.bench is None else tile.bench.r2_of_mean,
         "rmse_n": tile.rmse_n,
-        "repeatability": found.spread,
+        "repeatability": found.repeatability,
         "coefficients": tile.coefficients,
         "p_offset_kpa": tile.p_offset_kpa,
         "p_scale_kpa": tile.p_scale_kpa,
         "curve": {
             "gauge_kpa": gauge_kpa.tolist(),
-            "force_n": curve_n(tile, gauge_kpa).tolist(),
-            "half_95_of_mean_n": mean_band_n(tile, gauge_kpa).tolist(),
-            "half_95_of_loading_n": new_loading_band_n(tile, gauge_kpa).tolist(),
+            "force_n": compute_curve_n(tile, gauge_kpa).tolist(),
+            "half_95_of_mean_n": compute_mean_band_n(tile, gauge_kpa).tolist(),
+            "half_95_of_loading_n": compute_new_loading_band_n(tile, gauge_kpa).tolist(),
         },
     }

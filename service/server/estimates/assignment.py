@@ -15,21 +15,26 @@ from typing import Any
 
 from devices.errors import CalibrationError, DamagedFileError, StorageError
 from service.estimation.calibration import Calibration
-from storage.checked_json import read_checked, write_checked
-from storage.durable import ASIDE, make_folder, put_aside, storage_errors
+from storage.checksummed_json import read_checksummed_json, write_checksummed_json
+from storage.durable_files import (
+    ASIDE_SUFFIX,
+    make_synced_folder,
+    set_aside_and_describe,
+    translate_storage_errors,
+)
 
 _LOST = "assign a calibration again, or unassign it"
 
 
 @dataclass(frozen=True)
-class Assigned:
+class AssignedCalibration:
     """Assigned calibration, and the time of the assignment, server's UTC."""
 
     calibration: Calibration
     t_ns: int
 
 
-class Assignment:
+class CalibrationAssignment:
     """Assignment for one node.
 
     Args:
@@ -38,47 +43,49 @@ class Assignment:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.present: Assigned | None = None
+        self.current: AssignedCalibration | None = None
         """None: the node's own calibration is used, unless `problem` is set."""
         self.problem: str | None = None
         """Reason why the assignment is unknown; None: it is known, or there is none."""
         try:
-            self.present = _read(path)
+            self.current = _read_assignment(path)
         except FileNotFoundError:
-            if any(path.parent.glob(path.name + ASIDE + "*")):
+            if any(path.parent.glob(path.name + ASIDE_SUFFIX + "*")):
                 self.problem = f"the calibration that was assigned is lost: {_LOST}"
         except DamagedFileError as error:
-            self.problem = f"the calibration that was assigned is lost ({put_aside(path, error)})"
+            self.problem = (
+                f"the calibration that was assigned is lost ({set_aside_and_describe(path, error)})"
+            )
             self.problem += f": {_LOST}"
         except StorageError as error:
             self.problem = f"the calibration that was assigned cannot be read: {error}"
 
-    def put(self, calibration: Calibration, t_ns: int) -> None:
+    def assign(self, calibration: Calibration, t_ns: int) -> None:
         """Assign a calibration.
 
         Raises:
             StorageError: it cannot be stored; the assignment is unchanged.
         """
-        self._keep({"id": calibration.id, **calibration.model_dump(mode="json")}, t_ns)
-        self.present, self.problem = Assigned(calibration, t_ns), None
+        self._store({"id": calibration.id, **calibration.model_dump(mode="json")}, t_ns)
+        self.current, self.problem = AssignedCalibration(calibration, t_ns), None
 
-    def take_back(self, t_ns: int) -> None:
+    def unassign(self, t_ns: int) -> None:
         """Remove the assignment: the node's own calibration is used again.
 
         Raises:
             StorageError: that cannot be stored; the assignment is unchanged.
         """
-        self._keep(None, t_ns)
-        self.present, self.problem = None, None
+        self._store(None, t_ns)
+        self.current, self.problem = None, None
 
-    def _keep(self, calibration: dict[str, Any] | None, t_ns: int) -> None:
-        with storage_errors(self._path):
-            make_folder(self._path.parent)
+    def _store(self, calibration: dict[str, Any] | None, t_ns: int) -> None:
+        with translate_storage_errors(self._path):
+            make_synced_folder(self._path.parent)
         content = {"t_ns": t_ns, "calibration": calibration}
-        write_checked(self._path, json.dumps(content).encode())
+        write_checksummed_json(self._path, json.dumps(content).encode())
 
 
-def _read(path: Path) -> Assigned | None:
+def _read_assignment(path: Path) -> AssignedCalibration | None:
     """Read the last assignment; None: it was removed.
 
     Raises:
@@ -86,14 +93,14 @@ def _read(path: Path) -> Assigned | None:
         DamagedFileError: the file is damaged.
         StorageError: it cannot be read now.
     """
-    text = read_checked(path).text
+    text = read_checksummed_json(path).text
     try:
         said = json.loads(text)
         if said["calibration"] is None:
             return None
         content = json.dumps(said["calibration"])
         calibration = Calibration.from_json(content, where=str(path))
-        return Assigned(calibration, int(said["t_ns"]))
+        return AssignedCalibration(calibration, int(said["t_ns"]))
     except (CalibrationError, ValueError, KeyError, TypeError, RecursionError) as error:
         what = " ".join(str(error).split())[:200]
         raise DamagedFileError(f"no assigned calibration: {what}", where=str(path)) from error

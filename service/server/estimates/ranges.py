@@ -14,7 +14,7 @@ from service.estimation.models.static import StaticCurves
 
 
 @dataclass(frozen=True)
-class Ranges:
+class TileRanges:
     """Ranges of an array's tiles; arrays are (tiles,), NaN for tiles that bear no load.
 
     Attributes:
@@ -30,7 +30,7 @@ class Ranges:
     slope_n_per_kpa: Floats
 
     @classmethod
-    def of(cls, info: ArrayInfo, calibration: Calibration) -> Self:
+    def from_calibration(cls, info: ArrayInfo, calibration: Calibration) -> Self:
         """Compute the ranges from the calibration's curves and mount gains.
 
         Raises:
@@ -38,8 +38,8 @@ class Ranges:
         """
         serials = info.serials
         bearing = [i for i, tile in enumerate(info.tiles) if not tile.reference]
-        curves = StaticCurves([calibration.of(serials[i]) for i in bearing])
-        gains = [calibration.gain(serials[i]) for i in bearing]
+        curves = StaticCurves([calibration.get_tile(serials[i]) for i in bearing])
+        gains = [calibration.find_mount_gain(serials[i]) for i in bearing]
         gain = np.array([1.0 if one is None else one.value for one in gains])
 
         def by_tile(values: Floats) -> Floats:
@@ -48,8 +48,10 @@ class Ranges:
             return of_all
 
         return cls(
-            entries=tuple(calibration.find(serial) for serial in serials),
-            end_kpa=by_tile(curves.high_kpa),
-            full_scale_n=by_tile(gain * curves.force(curves.high_kpa[None]).force_n[0]),
+            entries=tuple(calibration.find_tile(serial) for serial in serials),
+            end_kpa=by_tile(curves.range_high_kpa),
+            full_scale_n=by_tile(
+                gain * curves.compute_forces(curves.range_high_kpa[None]).force_n[0]
+            ),
             slope_n_per_kpa=by_tile(gain * curves.slope_at_zero_n_per_kpa),
         )

@@ -1,5 +1,5 @@
 """A node's journals: frames in memory and in flight, retention, and servers' retention requests.
 
-`journal` is all of it, `stream` one stream; the modules under them have one task each. A server has
-none of this.
+`journal` has all streams, `stream` has one; the other modules have one task each. A server uses
+none of them.
 """

@@ -16,7 +16,7 @@ class BatchQueue:
         self.size_bytes = 0
 
     @property
-    def frames(self) -> int:
+    def frame_count(self) -> int:
         """Number of frames in the queue."""
         return sum(batch.seq_last - batch.seq_first + 1 for batch in self.batches)
 
@@ -31,7 +31,7 @@ class BatchQueue:
         self.size_bytes -= len(batch.payload)
         return batch
 
-    def give_back(self, batches: Iterable[EncodedBatch]) -> None:
+    def prepend(self, batches: Iterable[EncodedBatch]) -> None:
         """Put removed batches back, before all others."""
         given = list(batches)
         self.batches.extendleft(reversed(given))

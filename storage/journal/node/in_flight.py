@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.acquisition import FrameRow, RangeFlag
+from devices.acquisition import FrameRow, RangeDetector
 from devices.errors import DamagedFileError, StorageError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
-from storage.durable import make_folder, read_whole, storage_errors
+from storage.durable_files import make_synced_folder, read_small_file, translate_storage_errors
 
 IN_FLIGHT_FILE = "in_flight"
-ROWS = 8192
+ROW_COUNT = 8192
 """Rows for 15 s at full rate, the longest wait for a slow card."""
 _MAGIC = b"FootTile in flight 1\n"
 _HEAD = struct.Struct("<21sHII36sI")
@@ -31,7 +31,7 @@ _ORDER = FrameRow._fields
 _CODES = {"uint64": "Q", "int64": "q", "int32": "i", "float32": "f", "uint16": "H", "uint8": "B"}
 
 
-class InFlight:
+class InFlightWriter:
     """Writer of one stream's frames in flight, for the acquisition process.
 
     Args:
@@ -45,13 +45,13 @@ class InFlight:
     def __init__(self, folder: Path, info: ArrayInfo) -> None:
         path = folder / IN_FLIGHT_FILE
         tiles = len(info.tiles)
-        self._row = struct.Struct(_codes(tiles))
+        self._row = struct.Struct(_row_format(tiles))
         self._size = self._row.size + 4
         description = info.model_dump_json().encode()
         self._begin = _HEAD.size + len(description)
-        length = self._begin + ROWS * self._size
-        with storage_errors(path):
-            make_folder(folder)
+        length = self._begin + ROW_COUNT * self._size
+        with translate_storage_errors(path):
+            make_synced_folder(folder)
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
             try:
                 # Reserve the room: else a write to the map ends with SIGBUS on a full disk.
@@ -62,22 +62,34 @@ class InFlight:
                 raise
             finally:
                 os.close(descriptor)
-        boot_id = (kernel_boot_id() or "").encode()
-        check = zlib.crc32(description + boot_id)
-        head = _HEAD.pack(_MAGIC, tiles, ROWS, len(description), boot_id, check)
+        stream_id = (read_kernel_boot_id() or "").encode()
+        check = zlib.crc32(description + stream_id)
+        head = _HEAD.pack(_MAGIC, tiles, ROW_COUNT, len(description), stream_id, check)
         self._map[: self._begin] = head + description
 
-    def put(self, frame: FrameRow) -> None:
+    def write_frame(self, frame: FrameRow) -> None:
         """Write one frame to its row."""
-        seq, t_mono_ns, t_ns, counts, age_us, force_n, flags, padc, tadc, offset_us, status = frame
+        (
+            seq,
+            t_mono_ns,
+            t_ns,
+            counts,
+            age_us,
+            force_n,
+            flags,
+            pressure_raw,
+            temperature_raw,
+            offset_us,
+            status,
+        ) = frame
         row = self._row.pack(
             *(seq, t_mono_ns, t_ns, counts, age_us, force_n, flags),
-            *padc,
-            *tadc,
+            *pressure_raw,
+            *temperature_raw,
             *offset_us,
             *status,
         )
-        at = self._begin + (seq % ROWS) * self._size
+        at = self._begin + (seq % ROW_COUNT) * self._size
         self._map[at : at + self._size] = row + zlib.crc32(row).to_bytes(4, "little")
 
     def close(self) -> None:
@@ -85,7 +97,7 @@ class InFlight:
         self._map.close()
 
 
-def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
+def read_in_flight_frames(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     """Read the frames that a killed process left, in order; None if no file can be trusted.
 
     After a reboot it cannot: the file was never synced. Counted back from the newest frame, the
@@ -97,28 +109,28 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     """
     path = folder / IN_FLIGHT_FILE
     try:
-        content = read_whole(path)
+        content = read_small_file(path)
     except FileNotFoundError:
         return None
-    info = _described(content, where=str(path))
+    info = _read_description(content, where=str(path))
     if info is None:
         return None
     tiles = len(info.tiles)
-    row = struct.Struct(_codes(tiles))
-    begin = len(content) - ROWS * (row.size + 4)
+    row = struct.Struct(_row_format(tiles))
+    begin = len(content) - ROW_COUNT * (row.size + 4)
     types: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = []
     for name in _ORDER:
         dtype, per_tile = FRAME_COLUMNS[name]
         code = dtype.newbyteorder("<").str
         types.append((name, code, (tiles,)) if per_tile else (name, code))
-    rows = np.frombuffer(content, np.dtype([*types, ("crc32", "<u4")]), ROWS, begin)
+    rows = np.frombuffer(content, np.dtype([*types, ("crc32", "<u4")]), ROW_COUNT, begin)
     body = memoryview(content)
     good = [
         number
-        for number in range(ROWS)
+        for number in range(ROW_COUNT)
         if zlib.crc32(body[(at := begin + number * (row.size + 4)) : at + row.size])
         == rows["crc32"][number]
-        and int(rows["seq"][number]) % ROWS == number
+        and int(rows["seq"][number]) % ROW_COUNT == number
         and rows["t_mono_ns"][number] != 0
     ]
     if not good:
@@ -131,41 +143,41 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
         name: np.ascontiguousarray(found[name], dtype=FRAME_COLUMNS[name][0]) for name in _ORDER
     }
     frames = FrameBatch(**columns)
-    RangeFlag(info.tiles).flag(frames)  # as acquisition does when a batch is whole
+    RangeDetector(info.tiles).flag_out_of_range(frames)  # as acquisition does when a batch is whole
     return info, frames
 
 
-def read_in_flight_from(folder: Path, seq: int) -> FrameBatch | None:
+def read_in_flight_frames_from(folder: Path, seq: int) -> FrameBatch | None:
     """Read the frames that a killed process left from number `seq` on; None if there are none.
 
     Raises:
         DamagedFileError: its content has changed.
         StorageError: it cannot be read now.
     """
-    left = read_in_flight(folder)
+    left = read_in_flight_frames(folder)
     frames = None if left is None else left[1]
     if frames is None or int(frames.seq[-1]) < seq:
         return None
-    return frames.rows(max(0, seq - int(frames.seq[0])), len(frames))
+    return frames.slice_rows(max(0, seq - int(frames.seq[0])), len(frames))
 
 
-def delete_in_flight(folder: Path) -> None:
+def delete_in_flight_file(folder: Path) -> None:
     """Delete the file once its frames are in the journal."""
     with suppress(OSError):
         (folder / IN_FLIGHT_FILE).unlink(missing_ok=True)
 
 
-def open_in_flight(folder: Path | None, info: ArrayInfo) -> InFlight | None:
+def create_in_flight_writer(folder: Path | None, info: ArrayInfo) -> InFlightWriter | None:
     """Create a writer of frames in flight; None without a folder, or if the disk has no room."""
     if folder is None:
         return None
     try:
-        return InFlight(folder, info)
+        return InFlightWriter(folder, info)
     except StorageError:
         return None
 
 
-def _codes(tiles: int) -> str:
+def _row_format(tiles: int) -> str:
     codes = []
     for name in _ORDER:
         dtype, per_tile = FRAME_COLUMNS[name]
@@ -173,25 +185,25 @@ def _codes(tiles: int) -> str:
     return "<" + "".join(codes)
 
 
-def _described(content: bytes, *, where: str) -> ArrayInfo | None:
+def _read_description(content: bytes, *, where: str) -> ArrayInfo | None:
     """Return the array description; None if the file is of an earlier boot, or just created."""
     if not any(content[: _HEAD.size]):
         return None
     damage = DamagedFileError("its head is not what was written", where=where)
     if len(content) < _HEAD.size:
         raise damage
-    magic, tiles, rows, length, boot_id, check = _HEAD.unpack_from(content)
+    magic, tiles, rows, length, stream_id, check = _HEAD.unpack_from(content)
     description = content[_HEAD.size : _HEAD.size + length]
-    boot_id = boot_id.rstrip(b"\0")
-    expected = _HEAD.size + length + rows * (struct.calcsize(_codes(tiles)) + 4)
+    stream_id = stream_id.rstrip(b"\0")
+    expected = _HEAD.size + length + rows * (struct.calcsize(_row_format(tiles)) + 4)
     if (
         magic != _MAGIC
-        or rows != ROWS
+        or rows != ROW_COUNT
         or len(content) != expected
-        or zlib.crc32(description + boot_id) != check
+        or zlib.crc32(description + stream_id) != check
     ):
         raise damage
-    if boot_id.decode(errors="replace") != (kernel_boot_id() or ""):
+    if stream_id.decode(errors="replace") != (read_kernel_boot_id() or ""):
         return None
     try:
         info = ArrayInfo.model_validate_json(description)
@@ -205,7 +217,7 @@ def _described(content: bytes, *, where: str) -> ArrayInfo | None:
 BOOT_ID_FILE = Path("/proc/sys/kernel/random/boot_id")
 
 
-def kernel_boot_id() -> str | None:
+def read_kernel_boot_id() -> str | None:
     """Return the kernel's id of the current boot; None where there is none."""
     try:
         return BOOT_ID_FILE.read_text(encoding="ascii").strip() or None

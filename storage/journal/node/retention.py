@@ -10,54 +10,59 @@ from contextlib import suppress
 from pathlib import Path
 
 from devices.errors import StorageError
-from storage.journal.journal import RING_NS
+from storage.journal.journal import RING_DURATION_NS
+from storage.journal.node.retention_requests import RetentionRequests
 from storage.journal.node.stream import NodeStream
-from storage.journal.node.wanted import Wanted
 
-BUDGET_BYTES = 4 << 30
+DEFAULT_BUDGET_BYTES = 4 << 30
 """Default budget: a day and a half of four tiles at full rate."""
-_WEIGH_S = 1.0
+_BUDGET_CHECK_INTERVAL_S = 1.0
 """Interval between two sums of the segments' sizes."""
-_NEVER_NS = 2**62
+_END_OF_TIME_NS = 2**62
 """Instant after every frame."""
 
 
-class Retention:
+class RetentionPolicy:
     """Deletion of frames that no session needs, oldest first.
 
     Args:
         folder: the node's journals.
-        wanted: retention requests.
+        requests: retention requests.
         budget_bytes: most bytes of all journals.
-        may_drop: False: no frame is deleted.
+        is_deletion_allowed: False: no frame is deleted.
     """
 
     def __init__(
-        self, folder: Path, wanted: Wanted, *, budget_bytes: int, may_drop: bool = True
+        self,
+        folder: Path,
+        requests: RetentionRequests,
+        *,
+        budget_bytes: int,
+        is_deletion_allowed: bool = True,
     ) -> None:
         self._folder = folder
-        self._wanted = wanted
+        self._wanted = requests
         self._budget_bytes = budget_bytes
-        self._may_drop = may_drop
+        self._may_drop = is_deletion_allowed
         self._began_s = time.monotonic()
         self._weighed_s = -math.inf
 
-    def keep_to_budget(self, streams: Sequence[NodeStream], *, at_once: bool) -> None:
+    def enforce_budget(self, streams: Sequence[NodeStream], *, is_forced: bool) -> None:
         """Delete the oldest segments while the journals exceed their budget.
 
         Args:
             streams: all streams of the node, oldest first.
-            at_once: check even if the last check was a moment ago.
+            is_forced: check even if the last check was a moment ago.
 
         Raises:
             StorageError: they exceed it, and sessions need every frame.
         """
         now_s = time.monotonic()
-        if now_s - self._weighed_s < _WEIGH_S and not at_once:
+        if now_s - self._weighed_s < _BUDGET_CHECK_INTERVAL_S and not is_forced:
             return
         self._weighed_s = now_s
         while sum(s.journal.size_bytes for s in streams if s.journal) > self._budget_bytes:
-            if not self.evict(streams):
+            if not self.delete_oldest_segment(streams):
                 raise StorageError(
                     f"the journal's {self._budget_bytes} bytes are used up, and sessions need "
                     "every frame",
@@ -65,43 +70,45 @@ class Retention:
                     errno=errno.ENOSPC,
                 )
 
-    def evict(self, streams: Sequence[NodeStream]) -> bool:
+    def delete_oldest_segment(self, streams: Sequence[NodeStream]) -> bool:
         """Delete the oldest segment that no session needs; return whether there was one."""
-        return self._may_drop and any(stream.evict(self._wanted) for stream in streams)
+        return self._may_drop and any(
+            stream.delete_oldest_segment(self._wanted) for stream in streams
+        )
 
-    def tidy(self, streams: Sequence[NodeStream]) -> list[NodeStream]:
+    def delete_expired(self, streams: Sequence[NodeStream]) -> list[NodeStream]:
         """Delete frames that are older than the ring; return the streams that are gone."""
-        return [stream for stream in streams if self._may_drop and self._tidy(stream)]
+        return [stream for stream in streams if self._may_drop and self._delete_expired_of(stream)]
 
-    def _tidy(self, stream: NodeStream) -> bool:
+    def _delete_expired_of(self, stream: NodeStream) -> bool:
         """Delete a stream's expired frames; return whether the stream is deleted completely."""
         journal = stream.journal
         if journal is None:
             return False
-        past_ring = self._is_past_ring(stream)
-        newest = stream.recent(max(0, stream.next_seq - 1))
-        if self._wanted.may_be_all:  # only a full budget deletes then
-            stream.save_losses()
+        past_ring = self._is_expired(stream)
+        newest = stream.recent_batches(max(0, stream.next_seq - 1))
+        if self._wanted.is_unknown:  # only a full budget deletes then
+            stream.save_new_losses()
             return False
         with suppress(StorageError):
             if not stream.has_ended and newest:
-                stream.prune(newest[-1].t_ns_last - RING_NS, self._wanted)
+                stream.delete_old_segments(newest[-1].t_ns_last - RING_DURATION_NS, self._wanted)
             elif stream.has_ended and past_ring:
-                stream.prune(_NEVER_NS, self._wanted)
-        is_empty = stream.is_settled and not journal.held
-        if is_empty and past_ring and not self._wanted.numbers(stream.boot_id):
-            journal.delete()
+                stream.delete_old_segments(_END_OF_TIME_NS, self._wanted)
+        is_empty = stream.is_complete_on_disk and not journal.stored
+        if is_empty and past_ring and not self._wanted.required_numbers_of(stream.stream_id):
+            journal.close_and_delete()
             return True
-        stream.save_losses()
+        stream.save_new_losses()
         return False
 
-    def _is_past_ring(self, stream: NodeStream) -> bool:
+    def _is_expired(self, stream: NodeStream) -> bool:
         """Return whether a stream ended longer ago than the ring, by uptime or file times."""
-        ring_s = RING_NS * 1e-9
+        ring_s = RING_DURATION_NS * 1e-9
         if time.monotonic() - self._began_s > ring_s:
             return True
         try:
             written_s = max(path.stat().st_mtime for path in stream.folder.iterdir())
         except (OSError, ValueError):
             return False
-        return stream.is_settled and time.time() - written_s > ring_s
+        return stream.is_complete_on_disk and time.time() - written_s > ring_s

@@ -16,16 +16,20 @@ from itertools import takewhile
 from pathlib import Path
 
 from devices.errors import DamagedFileError, StorageError
-from storage.durable import put_aside
+from storage.durable_files import set_aside_and_describe
 from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
 from storage.journal.journal import Journal
 from storage.journal.node.batch_queue import BatchQueue
-from storage.journal.node.in_flight import IN_FLIGHT_FILE, delete_in_flight, read_in_flight_from
-from storage.journal.node.wanted import Wanted
-from storage.journal.stream_notes import PROMISE_S, StreamNotes, unsynced_tail_max
-from storage.wire import EncodedBatch, messages_of
+from storage.journal.node.in_flight import (
+    IN_FLIGHT_FILE,
+    delete_in_flight_file,
+    read_in_flight_frames_from,
+)
+from storage.journal.node.retention_requests import RetentionRequests
+from storage.journal.stream_notes import MAX_UNSYNCED_S, StreamNotes, compute_max_lost_tail_frames
+from storage.wire import EncodedBatch, encode_as_messages
 
-RECENT_BYTES = 4 << 20
+MAX_RECENT_BYTES = 4 << 20
 """Memory for the newest frames, for the live picture."""
 
 
@@ -45,7 +49,7 @@ class NodeStream:
     def __init__(self, folder: Path, notes: StreamNotes, journal: Journal | None) -> None:
         self.folder = folder
         self.info = notes.array_info
-        self.boot_id = self.info.boot_id
+        self.stream_id = self.info.stream_id
         self.notes = notes
         """Notes in `stream.json`, or still to be written there."""
         self.journal = journal
@@ -54,10 +58,10 @@ class NodeStream:
         """Slots without a frame."""
         self.has_ended = notes.has_ended
         """True if no more frames will come."""
-        self.is_settled = notes.has_ended
+        self.is_complete_on_disk = notes.has_ended
         """True if all frames are on disk, with a note of where the stream ended."""
         self._lock = threading.Lock()
-        self._noted_lost = notes.lost
+        self._saved_losses = notes.lost
         self._lost = Losses(notes.lost)
         self._acked_by: dict[str, Intervals] = {}
         self._waiting = BatchQueue()
@@ -68,10 +72,10 @@ class NodeStream:
         """Arrival of the oldest batch that may not be on the disk yet."""
         self._recent = BatchQueue()
         if journal is not None:
-            self._lost.found(journal.held)
+            self._lost.remove(journal.stored)
             for reason, numbers in journal.lost.by_reason.items():
                 self._lost.add(numbers, reason)
-        last = (self.stored | self._lost.all).last
+        last = (self.stored | self._lost.numbers).last
         recovered_seq = 0 if last is None else last + 1
         self.next_seq = recovered_seq if notes.next_seq is None else notes.next_seq
         """Number of the next frame."""
@@ -93,10 +97,10 @@ class NodeStream:
     def waiting_s(self) -> float:
         """Seconds of frames that wait in memory to be written."""
         with self._lock:
-            return self._waiting.frames / self.info.nominal_rate_hz
+            return self._waiting.frame_count / self.info.nominal_rate_hz
 
     @property
-    def held(self) -> Intervals:
+    def available(self) -> Intervals:
         """Numbers that can be sent: on disk, or waiting for it."""
         with self._lock:
             waiting = Intervals((b.seq_first, b.seq_last) for b in self._waiting.batches)
@@ -105,7 +109,7 @@ class NodeStream:
     @property
     def stored(self) -> Intervals:
         """Numbers in the journal."""
-        return Intervals(self.journal.held if self.journal is not None else ())
+        return Intervals(self.journal.stored if self.journal is not None else ())
 
     @property
     def lost(self) -> Losses:
@@ -117,87 +121,91 @@ class NodeStream:
     def acked(self) -> Intervals:
         """Numbers that are on any server's disk."""
         with self._lock:
-            return self._acked()
+            return self._union_of_acked()
 
-    def undelivered(self, wanted: Wanted) -> Intervals:
+    def undelivered_numbers(self, requests: RetentionRequests) -> Intervals:
         """Return the available numbers that servers need and have not acknowledged."""
-        held = self.held
+        held = self.available
         with self._lock:
-            return held & wanted.undelivered(self.boot_id, self._acked_by)
+            return held & requests.undelivered_numbers_of(self.stream_id, self._acked_by)
 
-    def needed(self, wanted: Wanted) -> Intervals:
+    def numbers_to_retain(self, requests: RetentionRequests) -> Intervals:
         """Return the numbers that must not be deleted."""
         with self._lock:
-            return wanted.unmet(self.boot_id, self._acked_by)
+            return requests.numbers_to_retain(self.stream_id, self._acked_by)
 
     # --- frames in and out ------------------------------------------------------------------------
 
-    def put(
-        self, batch: EncodedBatch, missed_slots: int | None = None, *, gap: str = NODE_BUSY
+    def queue_batch(
+        self, batch: EncodedBatch, missed_slots: int | None = None, *, gap_reason: str = NODE_BUSY
     ) -> None:
         """Append a batch to the memory queue, in the order of acquisition.
 
         Args:
             batch: the frames.
             missed_slots: count since the stream began; None: unchanged.
-            gap: reason of loss for skipped numbers before this batch.
+            gap_reason: reason of loss for skipped numbers before this batch.
         """
         with self._lock:
             if batch.seq_first > self.next_seq:
-                self._lost.add(Intervals([(self.next_seq, batch.seq_first - 1)]), gap)
+                self._lost.add(Intervals([(self.next_seq, batch.seq_first - 1)]), gap_reason)
             if self._waiting_since_s is None:
                 self._waiting_since_s = time.monotonic()
             self._waiting.append(batch)
             self._recent.append(batch)
-            while self._recent.size_bytes > RECENT_BYTES and len(self._recent.batches) > 1:
+            while self._recent.size_bytes > MAX_RECENT_BYTES and len(self._recent.batches) > 1:
                 self._recent.popleft()
             self.next_seq = max(self.next_seq, batch.seq_last + 1)
             if missed_slots is not None:
                 self.missed_slots = missed_slots
 
-    def end(self, **known: object) -> None:
+    def mark_ended(self, **changes: object) -> None:
         """Mark the stream as ended, and update its notes."""
         with self._lock:
             self.has_ended = True
-        self.note(**known)
+        self.update_notes(**changes)
 
-    def acknowledge(self, server_id: str, seq_first: int, seq_last: int) -> None:
+    def record_acknowledgement(self, server_id: str, seq_first: int, seq_last: int) -> None:
         """Record that these frames are on a server's disk."""
         with self._lock:
             self._acked_by.setdefault(server_id, Intervals()).add(seq_first, seq_last)
-            self._lost.found(Intervals([(seq_first, seq_last)]))
+            self._lost.remove(Intervals([(seq_first, seq_last)]))
 
-    def drop_oldest(self, reason: str, wanted: Wanted, *, at_least: int = 0) -> bool:
+    def drop_oldest_waiting(
+        self, reason: str, requests: RetentionRequests, *, min_batches_left: int = 0
+    ) -> bool:
         """Drop the oldest batch that waits to be written; return whether there was one.
 
         Args:
             reason: reason of the loss.
-            wanted: retention requests.
-            at_least: number of batches that stay.
+            requests: retention requests.
+            min_batches_left: number of batches that stay.
         """
         with self._lock:
-            if len(self._waiting.batches) <= at_least:
+            if len(self._waiting.batches) <= min_batches_left:
                 return False
             oldest = self._waiting.popleft()
-        self.lose(oldest.numbers, reason, wanted)
+        self.record_loss(oldest.numbers, reason, requests)
         return True
 
-    def lose(self, numbers: Intervals, reason: str, wanted: Wanted) -> None:
+    def record_loss(self, numbers: Intervals, reason: str, requests: RetentionRequests) -> None:
         """Record the loss of frames.
 
         Frames that a server has are not lost, except frames that the node's own session needs.
         """
-        needed_here = wanted.local(self.boot_id)
+        needed_here = requests.local_numbers_of(self.stream_id)
         with self._lock:
-            self._lost.add(numbers - (self._acked() - needed_here), reason)
+            self._lost.add(numbers - (self._union_of_acked() - needed_here), reason)
 
-    def recent(self, seq: int) -> list[EncodedBatch]:
+    def recent_batches(self, from_seq: int) -> list[EncodedBatch]:
         """Return the newest batches in memory with frames from `seq` on, oldest first."""
         with self._lock:
-            found = list(takewhile(lambda b: b.seq_last >= seq, reversed(self._recent.batches)))
+            found = list(
+                takewhile(lambda b: b.seq_last >= from_seq, reversed(self._recent.batches))
+            )
         return found[::-1]
 
-    def batches(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
+    def read_batches(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
         """Yield batches with any of these frames, from disk and memory, in order.
 
         Raises:
@@ -219,21 +227,21 @@ class NodeStream:
                 yield memory[at]
                 at += 1
             if journal is not None:
-                yield from journal.messages(first, last)
+                yield from journal.read_messages(first, last)
         yield from memory[at:]
 
     # --- for the thread that writes ---------------------------------------------------------------
 
-    def note(self, **changes: object) -> None:
+    def update_notes(self, **changes: object) -> None:
         """Change the notes in memory; `save_notes` writes them."""
         with self._lock:
-            now = {"lost": self._lost.as_pairs(), "missed_slots": self.missed_slots, **changes}
+            now = {"lost": self._lost.to_pairs(), "missed_slots": self.missed_slots, **changes}
             self.notes = self.notes.model_copy(update=now)
 
-    def lose_in_flight(self) -> None:
-        """Set `unsynced_tail_max`, an upper limit of the frames that were lost in flight."""
+    def bound_lost_tail(self) -> None:
+        """Set `max_lost_tail_frames`, an upper limit of the frames that were lost in flight."""
         rate_hz, slowest_s = self.info.nominal_rate_hz, self.notes.sync_max_s
-        self.note(unsynced_tail_max=unsynced_tail_max(rate_hz, slowest_s))
+        self.update_notes(max_lost_tail_frames=compute_max_lost_tail_frames(rate_hz, slowest_s))
 
     def save_notes(self, **changes: object) -> None:
         """Change the notes and write them to disk.
@@ -241,18 +249,18 @@ class NodeStream:
         Raises:
             StorageError: the disk is full or not writable; the changes stay in memory.
         """
-        self.note(**changes)
+        self.update_notes(**changes)
         notes = self.notes
         notes.save(self.folder)
-        self._noted_lost = notes.lost
+        self._saved_losses = notes.lost
 
-    def save_losses(self) -> None:
+    def save_new_losses(self) -> None:
         """Write the notes if losses have changed; after an error the next call retries."""
-        if self.lost.as_pairs() != self._noted_lost:
+        if self.lost.to_pairs() != self._saved_losses:
             with suppress(StorageError):
                 self.save_notes()
 
-    def write_oldest(self) -> None:
+    def write_oldest_waiting(self) -> None:
         """Write the oldest waiting batch to the journal, if there is one.
 
         Raises:
@@ -267,16 +275,16 @@ class NodeStream:
         with self._lock:
             if self._waiting.batches and self._waiting.batches[0] is batch:  # not dropped meanwhile
                 self._waiting.popleft()
-            self._lost.found(batch.numbers)
+            self._lost.remove(batch.numbers)
             self._unsynced.append(batch)
 
-    def begin_journal(self) -> None:
+    def create_journal(self) -> None:
         """Create the journal, if there is none.
 
         Raises:
             StorageError: the disk refuses it.
         """
-        if self.journal is None and not self.is_settled:
+        if self.journal is None and not self.is_complete_on_disk:
             journal = Journal(self.folder, self.info)
             self.save_notes()
             with self._lock:
@@ -296,62 +304,62 @@ class NodeStream:
         except StorageError:
             refused = Intervals((b.seq_first, b.seq_last) for b in self._unsynced)
             with self._lock:
-                self._waiting.give_back(self._unsynced)
+                self._waiting.prepend(self._unsynced)
                 self._unsynced = []
                 self._waiting_since_s = since_s
-            journal.disown(refused)  # after the queue has them again, so no frame is missing
+            journal.invalidate(refused)  # after the queue has them again, so no frame is missing
             return
         with self._lock:
             self._unsynced = []
         took_s = 0.0 if since_s is None else time.monotonic() - since_s
-        if took_s > max(PROMISE_S, self.notes.sync_max_s):
+        if took_s > max(MAX_UNSYNCED_S, self.notes.sync_max_s):
             with suppress(StorageError):
                 self.save_notes(sync_max_s=took_s)
 
-    def settle(self, wanted: Wanted, problems: list[str]) -> None:
+    def try_finish_on_disk(self, requests: RetentionRequests, problems: list[str]) -> None:
         """Record the stream's end once all of it is on disk; the next call retries after an error.
 
         Args:
-            wanted: retention requests.
+            requests: retention requests.
             problems: messages of any damage are added here.
         """
-        if self.is_settled or not self.has_ended or not self.is_synced:
+        if self.is_complete_on_disk or not self.has_ended or not self.is_synced:
             return
         try:
-            if self._take_over_in_flight(problems):  # these are written first
+            if self._queue_in_flight(problems):  # these are written first
                 return
             if self.journal is not None:
                 self.journal.close()
             # A stream that ended before its first frame is kept if a server requests it.
-            if self.next_seq or wanted.numbers(self.boot_id):
+            if self.next_seq or requests.required_numbers_of(self.stream_id):
                 self.save_notes(next_seq=self.next_seq)
             elif self.folder.is_dir():
                 shutil.rmtree(self.folder, ignore_errors=True)
         except StorageError:
             return
         # Only now: until the end is noted, the frames in flight may be needed again.
-        delete_in_flight(self.folder)
+        delete_in_flight_file(self.folder)
         with self._lock:
             self._recent = BatchQueue()
-            self.is_settled = True
+            self.is_complete_on_disk = True
 
-    def disown(self, damaged: Intervals, wanted: Wanted) -> None:
+    def invalidate(self, damaged_numbers: Intervals, requests: RetentionRequests) -> None:
         """Remove frames that turned out to be damaged on disk, and record their loss."""
         if self.journal is not None:
-            self.journal.disown(damaged)
-            self.lose(damaged, CORRUPT, wanted)
+            self.journal.invalidate(damaged_numbers)
+            self.record_loss(damaged_numbers, CORRUPT, requests)
 
-    def prune(self, before_t_ns: int, wanted: Wanted) -> None:
+    def delete_old_segments(self, before_t_ns: int, requests: RetentionRequests) -> None:
         """Delete segments that end before an instant and have no needed frames.
 
         Raises:
             StorageError: a file cannot be deleted.
         """
         if self.journal is not None:
-            gone = self.journal.prune(before_t_ns, self.needed(wanted))
-            self.lose(gone, EVICTED, wanted)
+            gone = self.journal.delete_old_segments(before_t_ns, self.numbers_to_retain(requests))
+            self.record_loss(gone, EVICTED, requests)
 
-    def evict(self, wanted: Wanted) -> bool:
+    def delete_oldest_segment(self, requests: RetentionRequests) -> bool:
         """Delete the oldest segment without needed frames; return whether there was one.
 
         Raises:
@@ -359,27 +367,27 @@ class NodeStream:
         """
         gone = Intervals()
         if self.journal is not None:
-            gone = self.journal.evict(self.needed(wanted))
-            self.lose(gone, EVICTED, wanted)
+            gone = self.journal.delete_oldest_segment(self.numbers_to_retain(requests))
+            self.record_loss(gone, EVICTED, requests)
         return bool(gone)
 
-    def _take_over_in_flight(self, problems: list[str]) -> bool:
+    def _queue_in_flight(self, problems: list[str]) -> bool:
         """Queue the frames that a killed acquisition left in flight; False if there are none.
 
         Raises:
             StorageError: they cannot be read now.
         """
         try:
-            new = read_in_flight_from(self.folder, self.next_seq)
+            new = read_in_flight_frames_from(self.folder, self.next_seq)
         except DamagedFileError as error:
-            problems.append(put_aside(self.folder / IN_FLIGHT_FILE, error))
-            self.lose_in_flight()
+            problems.append(set_aside_and_describe(self.folder / IN_FLIGHT_FILE, error))
+            self.bound_lost_tail()
             return False
         if new is None:
             return False
-        for batch in messages_of(new, self.info):
-            self.put(batch)
+        for batch in encode_as_messages(new, self.info):
+            self.queue_batch(batch)
         return True
 
-    def _acked(self) -> Intervals:
+    def _union_of_acked(self) -> Intervals:
         return union(self._acked_by.values())

@@ -11,17 +11,17 @@ import numpy.typing as npt
 import pytest
 
 from devices.acquisition import Acquisition
-from devices.array.array import TileArray
-from devices.array.startup import make_ready
+from devices.array.startup import prepare_array
+from devices.array.tile_array import TileArray
 from devices.buses.i2c import open_bus
 from devices.clock import UtcAnchor, VirtualClock
-from devices.emulation.buses.gpio import EmulatedLines
+from devices.emulation.buses.gpio import EmulatedGpioLines
 from devices.emulation.world import World
 from devices.frames import FrameBatch
-from devices.recovery.recovery import GpioRecovery
-from devices.scene.emulated import FaultKind, MuxFault, TileFault
-from devices.scene.file import build_scene
-from devices.scene.hardware import ScheduleName
+from devices.recovery.bus_recovery import GpioRecovery
+from devices.scene.emulation_sections import FaultKind, MuxFault, TileFault
+from devices.scene.hardware_sections import ScheduleName
+from devices.scene.scene_file import validate_scene
 from tests.builders.witness import Verdict, Witness
 from tests.devices.rigs import FOUR, SCHEDULES, TWO_MUXES, Plugs
 
@@ -67,7 +67,7 @@ class Run:
         return float(self.within(begin_s, end_s).sum() / (end_s - begin_s))
 
     def flagged(self, tile: int, rows: Bools, bits: int) -> Bools:
-        return np.asarray((self.frames.status[rows, tile] & bits) != 0)
+        return np.asarray((self.frames.tile_flags[rows, tile] & bits) != 0)
 
 
 @cache
@@ -111,24 +111,26 @@ def run(
         "ground": {"kind": "plate"},
         "fault": [fault] if kind else [],
     }
-    scene = build_scene(content, where="test")
+    scene = validate_scene(content, where="test")
     clock = VirtualClock(5_000_000_000)
-    world = World(scene, clock, begun=False, lead_s=0.2)
-    helper = GpioRecovery(EmulatedLines(world.i2c_adapter, clock), clock) if recovery else None
+    world = World(scene, clock, begins_now=False, lead_s=0.2)
+    helper = GpioRecovery(EmulatedGpioLines(world.i2c_adapter, clock), clock) if recovery else None
     bus = open_bus("emulated", world.i2c_adapter)
-    ready = make_ready(bus, scene, clock, recovery=helper)
+    ready = prepare_array(bus, scene, clock, recovery=helper)
     witness = Witness(world)
     for _ in range(5):
-        ready.array.scan()
-    world.begin()
+        ready.array.scan_frame()
+    world.begin_scene_time()
     begin_ns = clock.now_ns()
-    stream = Acquisition(ready.array, ready.tiles, clock, UtcAnchor.of(begin_ns, 0, clock_set=True))
+    stream = Acquisition(
+        ready.array, ready.tiles, clock, UtcAnchor.from_readings(begin_ns, 0, clock_set=True)
+    )
     end_ns = begin_ns + round(seconds * 1e9)
-    frames = FrameBatch.concatenate(list(stream.run(lambda: clock.now_ns() >= end_ns)))
+    frames = FrameBatch.concatenate(list(stream.acquire_batches(lambda: clock.now_ns() >= end_ns)))
     # What the very first frame holds was converted before the witness came.
     whole = witness.judge(frames, ready.tiles)
     verdict = Verdict(whole.given[1:], whole.same[1:], whole.right[1:], whole.error_kpa[1:])
-    frames = frames.rows(1, len(frames))
+    frames = frames.slice_rows(1, len(frames))
     t_s = np.asarray((frames.t_mono_ns - begin_ns) * 1e-9, dtype=np.float64)
     return Run(frames, verdict, t_s, ready.array)
 

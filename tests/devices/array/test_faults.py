@@ -10,9 +10,9 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from devices.frames import NOT_READ, FrameStatus, TileStatus
-from devices.scene.emulated import BusFault, FaultKind, MuxFault, TileFault
-from devices.scene.hardware import ScheduleName
+from devices.frames import NOT_READ, FrameFlag, TileFlag
+from devices.scene.emulation_sections import BusFault, FaultKind, MuxFault, TileFault
+from devices.scene.hardware_sections import ScheduleName
 from tests.devices.array.fault_runs import (
     BAD,
     BEGIN_S,
@@ -46,8 +46,8 @@ def test_on_a_healthy_foot_every_sample_is_right_and_none_is_flagged(
 ) -> None:
     healthy = run(schedule, None)
     assert healthy.verdict.right.all()
-    assert (healthy.frames.status == 0).all()
-    assert (healthy.frames.frame_status == 0).all()
+    assert (healthy.frames.tile_flags == 0).all()
+    assert (healthy.frames.frame_flags == 0).all()
 
 
 # Whatever the fault
@@ -58,7 +58,7 @@ def test_before_a_fault_everything_is_right(schedule: ScheduleName, kind: FaultK
     one = run(schedule, kind)
     assert one.before.sum() > 50
     assert one.verdict.right[one.before].all()
-    assert (one.frames.status[one.before] == 0).all()
+    assert (one.frames.tile_flags[one.before] == 0).all()
 
 
 @cases([kind for kind in KINDS if kind not in ("slow", "stale", "bit_errors", "nack_storm")])
@@ -73,7 +73,7 @@ def test_a_foot_recovers_by_itself_within_1_2_s(schedule: ScheduleName, kind: Fa
     one = run(schedule, kind)
     assert one.recovered.sum() > 25
     assert one.verdict.right[one.recovered].all()
-    assert (one.frames.status[one.recovered] == 0).all()
+    assert (one.frames.tile_flags[one.recovered] == 0).all()
     assert one.rate_hz(one.recovered) >= 0.98 * one.rate_hz(one.before)
 
 
@@ -97,12 +97,12 @@ def test_a_tile_that_is_not_there_is_null_in_every_frame_and_says_why(
     schedule: ScheduleName, kind: FaultKind
 ) -> None:
     one = run(schedule, kind)
-    bits = TileStatus.NO_ANSWER | (TileStatus.IMPLAUSIBLE if kind == "all_ones" else 0)
+    bits = TileFlag.NO_ANSWER | (TileFlag.IMPLAUSIBLE if kind == "all_ones" else 0)
     if kind != "all_ones" and schedule == "sequential":
-        bits |= TileStatus.NOT_CONVERTED
+        bits |= TileFlag.NOT_CONVERTED
     assert one.flagged(BAD, one.during, bits).all()
     assert not one.verdict.given[one.during, BAD].any()
-    unread = one.frames.padc[one.during, BAD]
+    unread = one.frames.pressure_raw[one.during, BAD]
     assert set(unread.tolist()) <= ({NOT_READ, 1023} if kind == "all_ones" else {NOT_READ})
 
 
@@ -110,8 +110,8 @@ def test_a_tile_that_is_not_there_is_null_in_every_frame_and_says_why(
 def test_the_other_tiles_do_not_notice(schedule: ScheduleName, kind: FaultKind) -> None:
     one = run(schedule, kind)
     assert one.verdict.right[:, OTHERS].all()
-    assert (one.frames.status[:, OTHERS] == 0).all()
-    assert (one.frames.frame_status == 0).all()
+    assert (one.frames.tile_flags[:, OTHERS] == 0).all()
+    assert (one.frames.frame_flags == 0).all()
 
 
 @cases(["no_answer", "unplugged", "replaced", "all_ones", "over_range", "stale", "slow"])
@@ -130,8 +130,8 @@ def test_another_part_in_its_place_stays_null_until_somebody_identifies_it(
     one = run(schedule, "replaced")
     rows = one.within(BEGIN_S + EDGE_S, RUN_S)
     assert not one.verdict.given[rows, BAD].any()
-    assert (one.frames.status[one.recovered, BAD] == TileStatus.IMPLAUSIBLE).all()
-    assert one.array.replaced == ("T02",)
+    assert (one.frames.tile_flags[one.recovered, BAD] == TileFlag.IMPLAUSIBLE).all()
+    assert one.array.replaced_serials == ("T02",)
 
 
 @every_schedule
@@ -140,10 +140,10 @@ def test_a_tile_past_its_range_is_flagged_and_its_counts_are_kept(
     schedule: ScheduleName, temperature_every: int
 ) -> None:
     one = run(schedule, "over_range", temperature_every=temperature_every)
-    assert one.flagged(BAD, one.during, TileStatus.OVER_RANGE).all()
+    assert one.flagged(BAD, one.during, TileFlag.OVER_RANGE).all()
     assert one.verdict.right.all(), "the words are what the part converted"
     outside = ~one.within(BEGIN_S - EDGE_S, END_S + EDGE_S)
-    assert not one.flagged(BAD, outside, TileStatus.OVER_RANGE).any()
+    assert not one.flagged(BAD, outside, TileFlag.OVER_RANGE).any()
 
 
 @every_schedule
@@ -156,7 +156,7 @@ def test_a_part_that_stopped_converting_is_flagged_within_eleven_frames(
     rows[begun + 11 : np.flatnonzero(one.t_s < END_S - EDGE_S)[-1]] = True
     assert rows.sum() > 20
     assert not one.verdict.given[rows, BAD].any()
-    bits = TileStatus.STALE | (TileStatus.NOT_CONVERTED if schedule == "pipelined" else 0)
+    bits = TileFlag.STALE | (TileFlag.NOT_CONVERTED if schedule == "pipelined" else 0)
     assert one.flagged(BAD, rows, bits).all()
     # What was passed on before it could be known is the last conversion.
     assert one.verdict.wrong[:, BAD].sum() <= 11
@@ -203,7 +203,7 @@ def test_a_stuck_bus_is_a_fault_of_the_bus_in_every_frame(
     one = run(schedule, kind)
     assert one.during.sum() >= 10
     assert not one.verdict.given[one.during].any()
-    assert (one.frames.frame_status[one.during] & FrameStatus.BUS_FAULT).all()
+    assert (one.frames.frame_flags[one.during] & FrameFlag.BUS_FAULT).all()
 
 
 @cases(STUCK)
@@ -211,7 +211,7 @@ def test_a_stuck_bus_gives_no_number(schedule: ScheduleName, kind: FaultKind) ->
     one = run(schedule, kind)
     assert not one.verdict.given[one.during].any()
     # hardware.md 3.2: exactly 50.00 kPa is what all zeros would be
-    assert set(one.frames.padc[one.during].ravel().tolist()) <= {NOT_READ, 0}
+    assert set(one.frames.pressure_raw[one.during].ravel().tolist()) <= {NOT_READ, 0}
 
 
 @every_schedule
@@ -226,11 +226,11 @@ def test_a_slave_that_holds_sda_is_clocked_free_long_before_it_lets_go(
     schedule: ScheduleName,
 ) -> None:
     one = run(schedule, "sda_low", recovery=True)
-    assert one.array.bus.recoveries >= 1
+    assert one.array.bus_monitor.recovery_attempts >= 1
     again = one.within(BEGIN_S + 0.12, END_S)
     assert one.verdict.right[again].mean() > 0.99
     assert not one.verdict.wrong.any()
-    assert not (one.frames.frame_status[again] & FrameStatus.BUS_FAULT).any()
+    assert not (one.frames.frame_flags[again] & FrameFlag.BUS_FAULT).any()
 
 
 @every_schedule
@@ -244,7 +244,7 @@ def test_a_mux_that_was_reset_costs_a_frame_or_two(schedule: ScheduleName) -> No
 @every_schedule
 def test_a_transfer_that_timed_out_is_flagged_in_its_frame(schedule: ScheduleName) -> None:
     one = run(schedule, "adapter_timeout")
-    fault = (one.frames.frame_status & FrameStatus.BUS_FAULT) != 0
+    fault = (one.frames.frame_flags & FrameFlag.BUS_FAULT) != 0
     assert fault.sum() >= 2
     assert not fault[one.before].any()
     assert one.verdict.right.mean() > 0.95
@@ -266,7 +266,7 @@ def test_of_what_chance_disturbs_nothing_far_from_the_truth_is_passed_on(
     schedule: ScheduleName, kind: FaultKind
 ) -> None:
     one = run(schedule, kind)
-    unnoticed = one.verdict.wrong & ((one.frames.status & TileStatus.OVER_RANGE) == 0)
+    unnoticed = one.verdict.wrong & ((one.frames.tile_flags & TileFlag.OVER_RANGE) == 0)
     errors = one.verdict.error_kpa[unnoticed]
     # A turned bit and the noise may hide one another, so half a kilopascal is not sharp.
     assert not (errors > 1.0).any()
@@ -302,7 +302,7 @@ def test_tiles_of_the_other_mux_go_on_while_one_is_without_supply(
     assert not one.verdict.wrong.any()
     begun = one.within(BEGIN_S + 0.1, END_S - EDGE_S)
     assert one.verdict.right[begun][:, lit].mean() > 0.99
-    assert (one.frames.frame_status[begun] & FrameStatus.BUS_FAULT == 0).all()
+    assert (one.frames.frame_flags[begun] & FrameFlag.BUS_FAULT == 0).all()
     assert one.verdict.right[one.recovered].all()
 
 

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
-from devices.array.budget import BusTiming, frame_s
-from devices.scene.emulated import ReadDuringConversion
-from devices.scene.hardware import ScheduleName
+from devices.array.timing_budget import BusTiming, compute_frame_s
+from devices.scene.emulation_sections import ReadDuringConversion
+from devices.scene.hardware_sections import ScheduleName
 from tests.devices.rigs import (
     CONVERT,
     FOUR,
@@ -123,7 +123,7 @@ def test_no_frame_takes_longer_than_predicted(
 ) -> None:
     plugs = full(tiles)
     timing = BusTiming(scl_hz, (TYPICAL_NS * 1e-9,) * tiles, tuple(mux for mux, _ in plugs))
-    predicted_ns = frame_s(schedule, timing) * 1e9
+    predicted_ns = compute_frame_s(schedule, timing) * 1e9
     took_ns = steady_ns(schedule, plugs, scl_hz)
     assert took_ns <= predicted_ns + 1
     # hardware.md 4 counts one select a mux too many for per_mux.
@@ -210,17 +210,17 @@ C = "60<1200"
 def test_a_single_tile_needs_no_select_after_the_first(schedule: ScheduleName) -> None:
     wires, array = settled_on(ONE, schedule)
     wires.log.clear()
-    array.scan()
+    array.scan_frame()
     assert sorted(wires.log) == [R, C]
 
 
 def log_of_a_frame(schedule: ScheduleName, plugs: Plugs) -> list[str]:
     wires, array = settled_on(plugs, schedule)
     wires.log.clear()
-    array.scan()
+    array.scan_frame()
     first = list(wires.log)
     wires.log.clear()
-    array.scan()
+    array.scan_frame()
     assert wires.log == first, "frame by frame the same"
     return first
 
@@ -286,11 +286,11 @@ def test_mux_by_mux_makes_2n_and_3m_system_calls() -> None:
 
 
 def open_channels(wires: Wires) -> int:
-    return sum(mux.mask.bit_count() for mux in wires.muxes)
+    return sum(mux.connected_mask.bit_count() for mux in wires.muxes)
 
 
 def open_muxes(wires: Wires) -> int:
-    return sum(mux.mask != 0 for mux in wires.muxes)
+    return sum(mux.connected_mask != 0 for mux in wires.muxes)
 
 
 @settings(max_examples=40, deadline=None)
@@ -333,7 +333,7 @@ def test_a_broadcast_reaches_the_tiles_of_the_scene_and_no_other_channel() -> No
 
     def before(_: int, messages: tuple[i2c_msg, ...]) -> None:
         if messages[0].addr == 0x60 and len(messages) == 1:
-            masks.append({mux.address: mux.mask for mux in wires.muxes})
+            masks.append({mux.address: mux.connected_mask for mux in wires.muxes})
 
     wires.on_transaction = before
     array = array_on(wires, "simultaneous")
@@ -367,15 +367,15 @@ def test_no_read_begins_before_its_parts_conversion_is_finished(
     def before(_: int, messages: tuple[i2c_msg, ...]) -> None:
         nonlocal reads
         if len(messages) == 2:
-            (mux,) = [mux for mux in wires.muxes if mux.mask]
-            i = at[mux.address, mux.mask]
+            (mux,) = [mux for mux in wires.muxes if mux.connected_mask]
+            i = at[mux.address, mux.connected_mask]
             assert wires.clock.now_ns() >= stop_ns[i] + wires.tc_ns[i]
             reads += 1
 
     wires.on_transaction = before
     array = array_on(wires, schedule)
     for _ in range(21):  # some of them with a second look at a tile
-        array.scan()
+        array.scan_frame()
     assert reads >= 20 * len(plugs)
 
 
@@ -386,8 +386,8 @@ def test_no_conversion_is_lost_or_torn_whatever_an_early_read_would_do(
 ) -> None:
     tc_ns = [1_412_345, 1_999_999, 1_600_001, 1_723_456]
     _, array = settled_on(TWO_MUXES, schedule, mode=mode, tc_ns=tc_ns)
-    last = array.scan().padc
+    last = array.scan_frame().pressure_raw
     for _ in range(100):
-        scan = array.scan()
-        assert scan.padc == [padc + 1 for padc in last]
-        last = scan.padc
+        scan = array.scan_frame()
+        assert scan.pressure_raw == [pressure_raw + 1 for pressure_raw in last]
+        last = scan.pressure_raw

@@ -11,18 +11,18 @@ from smbus2 import i2c_msg
 
 from devices.array.self_test import (
     WireTiming,
-    find_tiles,
-    identify,
+    find_tiles_on_all_channels,
+    identify_tiles,
     measure_conversion_ns,
-    measure_wires,
+    measure_wire_timing,
 )
 from devices.buses.i2c import open_bus
 from devices.clock import VirtualClock
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
-from devices.emulation.parts import draw_chip, random_of
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
+from devices.emulation.parts import draw_chip, make_rng
 from devices.emulation.world import World
 from devices.errors import BusFaultError, TileSetupError
-from devices.scene.emulated import ReadDuringConversion
+from devices.scene.emulation_sections import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 from tests.builders.scenes import make_scene
 from tests.devices.rigs import FOUR, ONE, TWO_MUXES, Plugs, Wires, hesitating
@@ -37,7 +37,7 @@ def test_every_tile_is_identified_in_the_order_of_the_scene() -> None:
     plugs: Plugs = ((0x73, 7), (0x70, 2), (0x73, 0))
     scene = make_scene(plugs)
     wires = Wires(plugs, words={0: FORUM_CHIP, 1: DATA_SHEET_CHIP, 2: THIRD})
-    found = identify(wires.bus, scene.tile)
+    found = identify_tiles(wires.bus, scene.tile)
     assert [tile.serial for tile in found] == ["T01", "T02", "T03"]
     assert [(tile.mux, tile.channel) for tile in found] == list(plugs)
     assert [tile.coefficient_words for tile in found] == [FORUM_CHIP, DATA_SHEET_CHIP, THIRD]
@@ -45,7 +45,7 @@ def test_every_tile_is_identified_in_the_order_of_the_scene() -> None:
 
 
 def test_a_conversion_time_that_was_not_measured_is_the_data_sheets() -> None:
-    found = identify(Wires(FOUR).bus, make_scene().tile)
+    found = identify_tiles(Wires(FOUR).bus, make_scene().tile)
     # Exactly, because it is printed and kept in files.
     assert [tile.conversion_ms for tile in found] == [1.6] * 4
 
@@ -56,10 +56,12 @@ def test_coefficients_are_read_three_times_from_each_tile_alone() -> None:
 
     def before(_: int, messages: tuple[i2c_msg, ...]) -> None:
         if len(messages) == 2:
-            open_at_reads.append([(m.address, m.mask) for m in wires.muxes if m.mask])
+            open_at_reads.append(
+                [(m.address, m.connected_mask) for m in wires.muxes if m.connected_mask]
+            )
 
     wires.on_transaction = before
-    identify(wires.bus, make_scene(TWO_MUXES).tile)
+    identify_tiles(wires.bus, make_scene(TWO_MUXES).tile)
     alone = [[(mux, 1 << channel)] for mux, channel in TWO_MUXES]
     assert open_at_reads == [plug for plug in alone for _ in range(3)]
 
@@ -68,7 +70,7 @@ def test_tiles_are_told_apart_although_every_channel_was_left_open() -> None:
     wires = Wires(TWO_MUXES, words={0: FORUM_CHIP, 3: FORUM_CHIP})
     for mux in (0x70, 0x73):  # somebody else used the bus before
         wires.adapter.i2c_rdwr(i2c_msg.write(mux, [0xFF]))
-    found = identify(wires.bus, make_scene(TWO_MUXES).tile)
+    found = identify_tiles(wires.bus, make_scene(TWO_MUXES).tile)
     assert [t.coefficient_words for t in found] == [
         FORUM_CHIP,
         DATA_SHEET_CHIP,
@@ -80,7 +82,7 @@ def test_tiles_are_told_apart_although_every_channel_was_left_open() -> None:
 def test_a_tile_that_is_absent_at_start_up_is_named_with_its_plug() -> None:
     wires = Wires(TWO_MUXES)
     with wires.fault("no_answer", "T03"), pytest.raises(TileSetupError) as caught:
-        identify(wires.bus, make_scene(TWO_MUXES).tile)
+        identify_tiles(wires.bus, make_scene(TWO_MUXES).tile)
     assert caught.value.where == "tile T03 (mux 0x73 channel 0)"
     assert "does not answer" in caught.value.what
     assert "Plug it in" in caught.value.remedy
@@ -88,7 +90,7 @@ def test_a_tile_that_is_absent_at_start_up_is_named_with_its_plug() -> None:
 
 def test_a_mux_that_is_absent_at_start_up_is_named_with_the_tile_behind_it() -> None:
     with pytest.raises(TileSetupError) as caught:
-        identify(Wires(FOUR).bus, make_scene(((0x74, 6),)).tile)
+        identify_tiles(Wires(FOUR).bus, make_scene(((0x74, 6),)).tile)
     assert caught.value.where == "tile T01 (mux 0x74 channel 6)"
     assert "0x74" in caught.value.what
 
@@ -96,7 +98,7 @@ def test_a_mux_that_is_absent_at_start_up_is_named_with_the_tile_behind_it() -> 
 def test_a_part_without_coefficients_is_refused_and_named() -> None:
     wires = Wires(FOUR, words={3: (0, 0, 0, 0)})
     with pytest.raises(TileSetupError, match="no MPL115A2") as caught:
-        identify(wires.bus, make_scene().tile)
+        identify_tiles(wires.bus, make_scene().tile)
     assert caught.value.where == "tile T04 (mux 0x70 channel 3)"
 
 
@@ -112,14 +114,14 @@ def test_coefficients_that_differ_from_read_to_read_are_refused() -> None:
 
     wires.on_transaction = disturb
     with pytest.raises(TileSetupError, match="differ") as caught:
-        identify(wires.bus, make_scene(ONE).tile)
+        identify_tiles(wires.bus, make_scene(ONE).tile)
     assert "100 kHz" in caught.value.remedy
 
 
 def test_a_bus_that_fails_at_start_up_is_no_fault_of_a_tile() -> None:
     wires = Wires(FOUR)
     with wires.fault("scl_low"), pytest.raises(BusFaultError):
-        identify(wires.bus, make_scene().tile)
+        identify_tiles(wires.bus, make_scene().tile)
 
 
 # What is there, whatever a scene says
@@ -128,7 +130,7 @@ def test_a_bus_that_fails_at_start_up_is_no_fault_of_a_tile() -> None:
 def test_every_plug_of_every_mux_is_looked_behind() -> None:
     plugs: Plugs = ((0x70, 1), (0x72, 0), (0x72, 7), (0x77, 3))
     wires = Wires(plugs, words={1: FORUM_CHIP, 2: THIRD})
-    found = find_tiles(wires.bus)
+    found = find_tiles_on_all_channels(wires.bus)
     assert [(plug.mux, plug.channel) for plug in found] == list(plugs)
     assert [plug.coefficient_words for plug in found] == [
         DATA_SHEET_CHIP,
@@ -140,7 +142,7 @@ def test_every_plug_of_every_mux_is_looked_behind() -> None:
 
 
 def test_a_plug_behind_which_something_else_answers_says_so() -> None:
-    found = find_tiles(Wires(FOUR[:2], words={1: (0, 0, 0, 0)}).bus)
+    found = find_tiles_on_all_channels(Wires(FOUR[:2], words={1: (0, 0, 0, 0)}).bus)
     assert found[1].coefficient_words is None
     assert "no MPL115A2" in found[1].problem
 
@@ -148,14 +150,14 @@ def test_a_plug_behind_which_something_else_answers_says_so() -> None:
 def test_a_bus_without_anybody_is_empty_and_no_error() -> None:
     wires = Wires(FOUR)
     with wires.fault("sda_high"):
-        assert find_tiles(wires.bus) == ()
+        assert find_tiles_on_all_channels(wires.bus) == ()
 
 
 def test_a_stuck_sda_is_not_taken_for_eight_muxes() -> None:
     # hardware.md 3.2: it looks like success at every address
     wires = Wires(FOUR)
     with wires.fault("sda_low"), pytest.raises(BusFaultError, match="8 multiplexers") as caught:
-        find_tiles(wires.bus)
+        find_tiles_on_all_channels(wires.bus)
     assert "SDA is stuck low" in caught.value.remedy
 
 
@@ -165,9 +167,9 @@ def test_a_stuck_sda_is_not_taken_for_eight_muxes() -> None:
 @pytest.mark.parametrize("scl_hz", [100_000, 250_000, 400_000])
 def test_the_bus_clock_is_measured_within_a_hundredth(scl_hz: int) -> None:
     wires = Wires(FOUR, scl_hz)
-    found = measure_wires(wires.bus, wires.clock, wires.infos[2])
+    found = measure_wire_timing(wires.bus, wires.clock, wires.infos[2])
     assert found.scl_hz == pytest.approx(scl_hz, rel=0.01)
-    assert found.transaction_s == pytest.approx(0.0, abs=1e-6)
+    assert found.transaction_overhead_s == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("asked_hz", "real_hz"), [(400_000, 250_000), (100_000, 62_500)])
@@ -175,7 +177,7 @@ def test_the_250_khz_trap_of_the_raspberry_pi_is_measured(asked_hz: float, real_
     scene = make_scene(ONE, array={"scl_hz": asked_hz}, emulation={"scl_part": 0.625})
     clock = VirtualClock()
     bus = open_bus("emulated", World(scene, clock).i2c_adapter)
-    found = measure_wires(bus, clock, identify(bus, scene.tile)[0])
+    found = measure_wire_timing(bus, clock, identify_tiles(bus, scene.tile)[0])
     assert found.scl_hz == pytest.approx(real_hz, rel=0.01)
 
 
@@ -183,7 +185,7 @@ def test_the_250_khz_trap_of_the_raspberry_pi_is_measured(asked_hz: float, real_
 @pytest.mark.parametrize("scl_hz", [100_000, 400_000])
 def test_the_overhead_of_a_transaction_is_told_from_its_bits(scl_hz: int, overhead_us: int) -> None:
     wires = Wires(ONE, scl_hz)
-    noise = random_of("overhead")
+    noise = make_rng("overhead")
 
     def take_time(_: int, __: tuple[i2c_msg, ...]) -> None:
         # Now and then the host is busy with something else.
@@ -191,9 +193,9 @@ def test_the_overhead_of_a_transaction_is_told_from_its_bits(scl_hz: int, overhe
         wires.clock.sleep_until_ns(wires.clock.now_ns() + (overhead_us + late_us) * 1000)
 
     wires.on_transaction = take_time
-    found = measure_wires(wires.bus, wires.clock, wires.infos[0])
+    found = measure_wire_timing(wires.bus, wires.clock, wires.infos[0])
     assert found.scl_hz == pytest.approx(scl_hz, rel=0.01)
-    assert found.transaction_s == pytest.approx(overhead_us * 1e-6, abs=5e-6)
+    assert found.transaction_overhead_s == pytest.approx(overhead_us * 1e-6, abs=5e-6)
 
 
 # How long a part converts
@@ -201,7 +203,7 @@ def test_the_overhead_of_a_transaction_is_told_from_its_bits(scl_hz: int, overhe
 
 def noisy(label: str) -> Callable[[int], tuple[int, int]]:
     """A healthy part's words: one in nine readings is equal to the one before (hardware.md 1.3)."""
-    rng = random_of(label)
+    rng = make_rng(label)
     return lambda _: (
         round(410 + 1.3 * rng.standard_normal()),
         round(507.3 + 0.5 * rng.standard_normal()),
@@ -212,10 +214,10 @@ def part_with(
     tc_ns: int, mode: ReadDuringConversion, sense: Callable[[int], tuple[int, int]], scl_hz: int
 ) -> Wires:
     wires = Wires(ONE, scl_hz)
-    part = EmulatedMpl115a2(Silicon(DATA_SHEET_CHIP, tc_ns, sense), mode)
+    part = EmulatedMpl115a2(EmulatedPart(DATA_SHEET_CHIP, tc_ns, sense), mode)
     wires.tiles[0] = part
     wires.muxes[0]._channels[0] = part
-    wires.adapter._wires.clear()
+    wires.adapter._devices_by_routing.clear()
     return wires
 
 
@@ -253,8 +255,8 @@ def test_a_read_that_would_abort_a_conversion_never_comes_twice_and_never_in_a_p
 def test_drawn_parts_are_measured_as_they_are(mode: ReadDuringConversion, tile: int) -> None:
     scene = make_scene(emulation={"noise_kpa": 0.165, "read_during_conversion": mode})
     clock = VirtualClock()
-    bus = open_bus("emulated", World(scene, clock, begun=False).i2c_adapter)
-    info = identify(bus, scene.tile)[tile]
+    bus = open_bus("emulated", World(scene, clock, begins_now=False).i2c_adapter)
+    info = identify_tiles(bus, scene.tile)[tile]
     found = measure_conversion_ns(bus, clock, info, WireTiming(400_000, 0.0))
     true_ns = draw_chip(info.serial, 0).conversion_ns
     assert found is not None
@@ -265,7 +267,7 @@ def test_a_tile_is_measured_alone_whatever_another_mux_was_left_with() -> None:
     wires = Wires(TWO_MUXES, tc_ns=[1_400_000, 1_500_000, 2_400_000, 2_300_000])
     for tile, label in zip(wires.tiles, "abcd", strict=True):
         silicon = tile._silicon
-        tile._silicon = Silicon(DATA_SHEET_CHIP, silicon.conversion_ns, noisy(label))
+        tile._silicon = EmulatedPart(DATA_SHEET_CHIP, silicon.conversion_ns, noisy(label))
     for order in ((0, 2, 1, 3), (3, 0, 2, 1)):
         for i in order:
             wires.adapter.i2c_rdwr(i2c_msg.write(0x70, [0xFF]))
@@ -282,7 +284,7 @@ def test_a_tile_is_identified_alone_whatever_a_mux_without_tiles_of_the_scene_wa
 ):
     wires = Wires(TWO_MUXES, words={0: FORUM_CHIP})
     wires.adapter.i2c_rdwr(i2c_msg.write(0x73, [0xFF]))
-    found = identify(wires.bus, make_scene(ONE).tile)
+    found = identify_tiles(wires.bus, make_scene(ONE).tile)
     assert found[0].coefficient_words == FORUM_CHIP
 
 

@@ -6,11 +6,11 @@ import statistics
 
 import numpy as np
 
-from devices.array.startup import make_ready
+from devices.array.startup import prepare_array
 from devices.buses.i2c import i2c_msg, open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World
-from devices.scene.file import load_scene
+from devices.scene.scene_file import load_scene
 
 
 class Slow:
@@ -29,19 +29,19 @@ class Slow:
 
         vars(world.i2c_adapter)["i2c_rdwr"] = late
         bus = open_bus("emulated", world.i2c_adapter)
-        self.array = make_ready(bus, scene, self.clock, schedule="pipelined").array
+        self.array = prepare_array(bus, scene, self.clock, schedule="pipelined").array
 
     def period_ns(self, frames: int = 60) -> float:
         """Of most frames: in a few a reading is asked for twice."""
         ends_ns = []
         for _ in range(frames):
-            self.array.scan()
+            self.array.scan_frame()
             ends_ns.append(self.clock.now_ns())
         return statistics.median(np.diff(ends_ns).tolist())
 
     def skew_ns(self) -> int:
         """Between the first and the last tile of the next frame."""
-        stops_ns = self.array.scan().convert_stop_ns
+        stops_ns = self.array.scan_frame().convert_stop_ns
         return max(stops_ns) - min(stops_ns)
 
 

@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from smbus2 import SMBus, i2c_msg
 
-from devices.array.health import is_impossible
-from devices.buses.i2c import I2cBus, PatientBus, open_bus
+from devices.array.tile_health import classify_impossible_counts
+from devices.buses.i2c import I2cBus, RetryingBus, open_bus
 from devices.chips.mpl115a2 import Mpl115a2
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter, Line
+from devices.emulation.buses.i2c import EmulatedI2cAdapter, FaultyWires
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
-from devices.emulation.faults import Faults
+from devices.emulation.fault_timing import SceneFaults
 from devices.errors import (
     BusFaultError,
     BusLostError,
@@ -32,7 +32,7 @@ from devices.errors import (
     TileSetupError,
     UsageError,
 )
-from devices.frames import TileStatus
+from devices.frames import TileFlag
 from tests.devices.adapters import Adapter
 from tests.waiting import until
 
@@ -204,7 +204,7 @@ def test_bytes_of_an_earlier_read_do_not_pass_as_a_reading(stale: bytes) -> None
 
 def test_a_buffer_that_no_adapter_filled_is_never_a_plausible_reading() -> None:
     chip = Mpl115a2(I2cBus(FakeAdapter(), "/dev/i2c-7"))
-    assert is_impossible(*chip.read_counts()) == TileStatus.IMPLAUSIBLE
+    assert classify_impossible_counts(*chip.read_counts()) == TileFlag.IMPLAUSIBLE
     with pytest.raises(TileSetupError):
         chip.read_coefficient_words(where="tile A17")
 
@@ -270,10 +270,10 @@ def test_an_emulated_bus_sits_on_the_adapter_it_is_given() -> None:
 
 def test_a_wedged_transfer_costs_30_ms_and_not_a_second() -> None:
     # Without the ioctl the i2c core waits for its second: 330 frames (hardware.md 3.2).
-    clock, faults = VirtualClock(), Faults(())
+    clock, faults = VirtualClock(), SceneFaults(())
     mux = EmulatedTca9548a(0x70, {})
-    adapter = EmulatedI2cAdapter([mux], clock, 400_000, Line(faults, "test"))
-    with faults.injected("scl_low", "bus"):
+    adapter = EmulatedI2cAdapter([mux], clock, 400_000, FaultyWires(faults, "test"))
+    with faults.inject("scl_low", "bus"):
         with pytest.raises(OSError):  # noqa: PT011  # any of the bus's
             adapter.i2c_rdwr(i2c_msg.write(0x70, [1]))
         assert clock.now_ns() == 1_000_000_000
@@ -281,7 +281,7 @@ def test_a_wedged_transfer_costs_30_ms_and_not_a_second() -> None:
         with pytest.raises(BusFaultError, match="ETIMEDOUT"):
             bus.transfer(i2c_msg.write(0x70, [1]))
     assert clock.now_ns() == 1_030_000_000
-    assert mux.mask == 0, "nothing got through"
+    assert mux.connected_mask == 0, "nothing got through"
 
 
 def test_an_adapter_that_knows_no_time_out_is_closed_again(
@@ -309,7 +309,7 @@ def test_a_lost_adapter_is_closed_at_once_and_opened_again_by_its_path(pi: Pi) -
         bus.transfer(message)
     assert (pi.closed, len(pi.transactions)) == (1, 0)
     pi.error = None
-    assert until(lambda: bus.reopen(0))
+    assert until(lambda: bus.ensure_open(0))
     bus.transfer(message)
     assert pi.opened == ["/dev/i2c-1"] * 2
     assert len(pi.transactions) == 1
@@ -329,8 +329,8 @@ def test_why_an_adapter_cannot_be_opened_again_is_said(
 
     with monkeypatch.context() as patch:
         patch.setattr(SMBus, "open", denied)
-        assert until(lambda: not bus.reopen(0) and bus.problem != "")
-    assert "group i2c" in bus.problem
+        assert until(lambda: not bus.ensure_open(0) and bus.reopen_error != "")
+    assert "group i2c" in bus.reopen_error
 
 
 # A patient bus
@@ -352,15 +352,15 @@ class Hesitant(BrokenAdapter):
 
 @pytest.mark.parametrize("deaf", range(4))
 def test_a_patient_bus_asks_up_to_four_times_and_counts_what_then_went_well(deaf: int) -> None:
-    bus = PatientBus(I2cBus(adapter := Hesitant(deaf), "emulated"))
+    bus = RetryingBus(I2cBus(adapter := Hesitant(deaf), "emulated"))
     bus.transfer(i2c_msg.write(0x70, [0]))
-    assert (adapter.asked, bus.repeated) == (deaf + 1, int(deaf > 0))
+    assert (adapter.asked, bus.retried_transfers) == (deaf + 1, int(deaf > 0))
     bus.transfer(i2c_msg.write(0x70, [0]))
-    assert (adapter.asked, bus.repeated) == (deaf + 2, int(deaf > 0))
+    assert (adapter.asked, bus.retried_transfers) == (deaf + 2, int(deaf > 0))
 
 
 def test_who_is_not_there_is_no_disturbance() -> None:
-    bus = PatientBus(I2cBus(adapter := Hesitant(100), "emulated"))
+    bus = RetryingBus(I2cBus(adapter := Hesitant(100), "emulated"))
     with pytest.raises(NoAcknowledgeError):
         bus.transfer(i2c_msg.write(0x77, [0]))
-    assert (adapter.asked, bus.repeated) == (4, 0)
+    assert (adapter.asked, bus.retried_transfers) == (4, 0)

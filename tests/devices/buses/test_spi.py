@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from devices.buses.reopening import PERIOD_NS
+from devices.buses.device_reopener import ATTEMPT_INTERVAL_NS
 from devices.buses.spi import SpiDevice, open_spi
 from devices.errors import MissingExtraError, SpiSetupError, UsageError
 from tests.waiting import until
@@ -91,7 +91,7 @@ def test_a_device_that_went_away_is_closed_and_opened_again_by_its_path(
         patch.setattr(FakeSpiDev, "failure", OSError(errno.EACCES, "Permission denied"))
         assert until(lambda: "group spi" in why_not(opened))
     assert [device.closed for device in devices] == [True, True]
-    now_ns = PERIOD_NS
+    now_ns = ATTEMPT_INTERVAL_NS
     until(lambda: not why_not(opened))
     assert opened.xfer2([1, 2, 3]) == [1, 2, 3]
     assert (len(devices), devices[2].path) == (3, "/dev/spidev0.0")

@@ -16,10 +16,16 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.buses.i2c import I2cBus, open_bus
-from devices.chips.mpl115a2 import Coefficients, Mpl115a2, compensate_kpa, kpa_per_padc, padc_of_kpa
+from devices.chips.mpl115a2 import (
+    Coefficients,
+    Mpl115a2,
+    compensate_kpa,
+    compute_kpa_per_padc,
+    compute_padc,
+)
 from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.errors import NoAcknowledgeError, TileSetupError
 from tests.devices.adapters import Adapter
@@ -49,7 +55,7 @@ def kpa_of(part: Coefficients, padc: int, tadc: int) -> float:
 def connected(registers: bytes, padc: int, tadc: int) -> tuple[Mpl115a2, VirtualClock]:
     """The driver of one emulated part that always measures the same."""
     clock = VirtualClock()
-    chip = EmulatedMpl115a2(Silicon(words_of(registers), 1_600_000, lambda _: (padc, tadc)))
+    chip = EmulatedMpl115a2(EmulatedPart(words_of(registers), 1_600_000, lambda _: (padc, tadc)))
     mux = EmulatedTca9548a(0x70, {2: chip})
     bus = open_bus("emulated", EmulatedI2cAdapter([mux], clock, 400_000))
     bus.transfer(i2c_msg.write(0x70, [0b100]))
@@ -66,7 +72,7 @@ def test_a_published_part_gives_its_pressure_through_driver_bus_and_chip(
 ) -> None:
     driver, clock = connected(registers, padc, tadc)
     part = Coefficients.from_words(driver.read_coefficient_words(where="test"))
-    driver.convert()
+    driver.start_conversion()
     clock.sleep_until_ns(clock.now_ns() + 1_600_000)
     assert driver.read_counts() == (padc, tadc)
     assert kpa_of(part, *driver.read_counts()) == pytest.approx(kpa, abs=1e-3)
@@ -77,7 +83,7 @@ def test_a_published_part_gives_its_pressure_through_driver_bus_and_chip(
 @pytest.mark.parametrize(("padc", "tadc"), [(512, 512), (1023, 1023), (600, 900), (0, 1023)])
 def test_counts_above_511_are_unsigned(padc: int, tadc: int) -> None:
     driver, clock = connected(DATA_SHEET, padc, tadc)
-    driver.convert()
+    driver.start_conversion()
     clock.sleep_until_ns(clock.now_ns() + 1_600_000)
     assert driver.read_counts() == (padc, tadc)
 
@@ -90,7 +96,7 @@ def test_before_the_first_conversion_the_counts_are_zero() -> None:
 def test_a_part_that_is_not_there_does_not_acknowledge() -> None:
     bus = open_bus("emulated", EmulatedI2cAdapter([], VirtualClock(), 400_000))
     with pytest.raises(NoAcknowledgeError):
-        Mpl115a2(bus).convert()
+        Mpl115a2(bus).start_conversion()
     with pytest.raises(NoAcknowledgeError):
         Mpl115a2(bus).read_counts()
     with pytest.raises(NoAcknowledgeError):
@@ -128,7 +134,7 @@ def scripted(*transactions: tuple[str, str]) -> tuple[Mpl115a2, Script]:
 
 def test_convert_is_paired_with_a_zero() -> None:
     driver, script = scripted(("W60 12 00", ""))
-    driver.convert()
+    driver.start_conversion()
     assert not script.left
 
 
@@ -241,14 +247,14 @@ def test_a_coefficient_that_no_register_holds_is_refused(wrong: dict[str, float]
 
 @pytest.mark.parametrize("registers", [DATA_SHEET, FORUM], ids=["data sheet", "forum"])
 def test_the_coefficients_of_published_parts_are_plausible(registers: bytes) -> None:
-    assert part_of(registers).implausibility() == ""
+    assert part_of(registers).find_implausibility() == ""
 
 
 @pytest.mark.parametrize("name", ["a0", "b1", "b2", "c12"])
 def test_a_coefficient_of_the_wrong_sign_is_implausible_and_named(name: str) -> None:
     part = part_of(DATA_SHEET)
-    assert name in replace(part, **{name: -getattr(part, name)}).implausibility()
-    assert name in replace(part, **{name: 0.0}).implausibility()
+    assert name in replace(part, **{name: -getattr(part, name)}).find_implausibility()
+    assert name in replace(part, **{name: 0.0}).find_implausibility()
 
 
 # Compensation
@@ -279,7 +285,7 @@ def test_nothing_is_clipped_to_the_specified_range(
 )
 def test_pressure_falls_with_every_count(registers: bytes, tadc: int, kpa: float) -> None:
     part = part_of(registers)
-    assert float(kpa_per_padc(tadc, part.b1, part.c12)) == pytest.approx(kpa, abs=5e-5)
+    assert float(compute_kpa_per_padc(tadc, part.b1, part.c12)) == pytest.approx(kpa, abs=5e-5)
     step = kpa_of(part, 301, tadc) - kpa_of(part, 300, tadc)
     assert step == pytest.approx(kpa, abs=5e-5)
 
@@ -291,14 +297,14 @@ def test_one_count_of_temperature_is_worth_what_hardware_md_says() -> None:
 
 
 def test_the_inverse_finds_the_counts_of_the_data_sheet() -> None:
-    assert float(padc_of_kpa(96.587326, 507, part_of(DATA_SHEET))) == pytest.approx(410, abs=1e-4)
+    assert float(compute_padc(96.587326, 507, part_of(DATA_SHEET))) == pytest.approx(410, abs=1e-4)
 
 
 @pytest.mark.parametrize(("registers", "tadc", "padc"), [(DATA_SHEET, 507, 263), (FORUM, 521, 135)])
 def test_115_kpa_is_the_end_of_the_range_and_no_end_of_the_counts(
     registers: bytes, tadc: int, padc: int
 ) -> None:
-    assert float(padc_of_kpa(115.0, tadc, part_of(registers))) == pytest.approx(padc, abs=0.5)
+    assert float(compute_padc(115.0, tadc, part_of(registers))) == pytest.approx(padc, abs=0.5)
 
 
 parts = st.builds(
@@ -312,7 +318,7 @@ parts = st.builds(
 
 @given(part=parts, kpa=st.floats(0, 300), tadc=st.integers(0, 1023))
 def test_compensation_undoes_its_inverse(part: Coefficients, kpa: float, tadc: int) -> None:
-    padc = padc_of_kpa(kpa, tadc, part)
+    padc = compute_padc(kpa, tadc, part)
     again = compensate_kpa(padc, tadc, part.a0, part.b1, part.b2, part.c12)
     assert float(again) == pytest.approx(kpa, abs=1e-9)
 
@@ -321,7 +327,9 @@ def test_compensation_undoes_its_inverse(part: Coefficients, kpa: float, tadc: i
 def test_the_inverse_undoes_compensation(part: Coefficients, padc: int, tadc: int) -> None:
     # A part whose b1 is all but cancelled by the temperature measures nothing.
     assume(part.b1 + part.c12 * tadc < -0.1)
-    assert float(padc_of_kpa(kpa_of(part, padc, tadc), tadc, part)) == pytest.approx(padc, abs=1e-8)
+    assert float(compute_padc(kpa_of(part, padc, tadc), tadc, part)) == pytest.approx(
+        padc, abs=1e-8
+    )
 
 
 def test_columns_of_frames_meet_one_coefficient_per_tile() -> None:

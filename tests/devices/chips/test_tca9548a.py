@@ -56,7 +56,7 @@ class Protocol(Adapter):
     def connects(self, muxes: MuxRouter, address: int, channel: int, *steps: str) -> None:
         """To connect one channel takes exactly these transactions."""
         with self.exchanged(*steps):
-            muxes.connect_only(address, channel)
+            muxes.connect_single_channel(address, channel)
 
 
 @pytest.fixture
@@ -123,26 +123,26 @@ def test_the_mux_that_is_left_is_closed_before_another_one_opens(protocol: Proto
 def test_a_broadcast_opens_all_that_is_asked_for_and_is_closed_again(protocol: Protocol) -> None:
     muxes = router(protocol, 0x70, 0x71, 0x72)
     with protocol.exchanged("72<00", "70<0f", "71<f0"):
-        muxes.connect({0x70: 0x0F, 0x71: 0xF0})
+        muxes.connect_channels({0x70: 0x0F, 0x71: 0xF0})
     with protocol.exchanged():
-        muxes.connect({0x70: 0x0F, 0x71: 0xF0})
+        muxes.connect_channels({0x70: 0x0F, 0x71: 0xF0})
     protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
 
 
 def test_a_mask_of_zero_closes_a_mux_once(protocol: Protocol) -> None:
     muxes = router(protocol)
     with protocol.exchanged("70<00", "71<00"):
-        muxes.connect({})
+        muxes.connect_channels({})
     with protocol.exchanged("70<01"):
-        muxes.connect({0x70: 1, 0x71: 0})
+        muxes.connect_channels({0x70: 1, 0x71: 0})
     with protocol.exchanged("70<00"):
-        muxes.connect({0x70: 0, 0x71: 0})
+        muxes.connect_channels({0x70: 0, 0x71: 0})
 
 
 def test_a_forgotten_routing_is_written_afresh(protocol: Protocol) -> None:
     muxes = router(protocol)
     protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
-    muxes.forget()
+    muxes.invalidate_cache()
     protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
 
 
@@ -156,17 +156,17 @@ def test_what_a_mux_connects_after_a_failed_write_is_not_taken_as_known(
     muxes = router(protocol, 0x70, 0x71, 0x72)
     protocol.connects(muxes, 0x70, 0, "71<00", "72<00", "70<01")
     with protocol.exchanged(f"70<02 {number}"), pytest.raises(kind):
-        muxes.connect_only(0x70, 1)
+        muxes.connect_single_channel(0x70, 1)
     # It may have heard it or not; the others were not spoken to.
     protocol.connects(muxes, 0x70, 0, "70<01")
-    muxes.forget()  # what a user of the bus does after a fault of the bus itself
+    muxes.invalidate_cache()  # what a user of the bus does after a fault of the bus itself
     protocol.connects(muxes, 0x70, 0, "71<00", "72<00", "70<01")
 
 
 def test_one_mux_alone_can_be_forgotten(protocol: Protocol) -> None:
     muxes = router(protocol, 0x70, 0x71, 0x72)
     protocol.connects(muxes, 0x70, 0, "71<00", "72<00", "70<01")
-    muxes.forget(0x72)
+    muxes.invalidate_cache(0x72)
     protocol.connects(muxes, 0x70, 0, "72<00")
 
 
@@ -174,7 +174,7 @@ def test_a_mux_that_does_not_close_keeps_the_others_shut(protocol: Protocol) -> 
     muxes = router(protocol)
     protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
     with protocol.exchanged(f"70<00 {NACK}"), pytest.raises(NoAcknowledgeError):
-        muxes.connect_only(0x71, 0)
+        muxes.connect_single_channel(0x71, 0)
     protocol.connects(muxes, 0x71, 0, "70<00", "71<01")
 
 
@@ -184,14 +184,14 @@ def test_a_mux_that_refuses_to_be_closed_twice_in_a_row_is_silent_and_in_nobodys
     muxes = router(protocol)
     protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
     with protocol.exchanged(f"70<00 {NACK}"), pytest.raises(NoAcknowledgeError):
-        muxes.connect_only(0x71, 0)
-    assert muxes.silent == set()
+        muxes.connect_single_channel(0x71, 0)
+    assert muxes.silent_addresses == set()
     protocol.connects(muxes, 0x71, 0, f"70<00 {NACK}", "71<01")
-    assert muxes.silent == {0x70}
+    assert muxes.silent_addresses == {0x70}
     with protocol.exchanged("71<02"):  # nor is it asked any more
-        muxes.connect_only(0x71, 1)
+        muxes.connect_single_channel(0x71, 1)
     protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
-    assert muxes.silent == set(), "it has answered"
+    assert muxes.silent_addresses == set(), "it has answered"
 
 
 def test_a_mux_that_fails_with_the_bus_is_not_silent(protocol: Protocol) -> None:
@@ -199,8 +199,8 @@ def test_a_mux_that_fails_with_the_bus_is_not_silent(protocol: Protocol) -> None
     protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
     for _ in range(3):
         with protocol.exchanged(f"70<00 {TIMEOUT}"), pytest.raises(BusFaultError):
-            muxes.connect_only(0x71, 0)
-    assert muxes.silent == set()
+            muxes.connect_single_channel(0x71, 0)
+    assert muxes.silent_addresses == set()
 
 
 # Are they what they should be?
@@ -210,10 +210,10 @@ def test_an_audit_reads_back_every_mux_of_which_something_is_known(protocol: Pro
     muxes = router(protocol, 0x70, 0x71, 0x72)
     protocol.connects(muxes, 0x70, 2, "71<00", "72<00", "70<04")
     with protocol.exchanged("70>04", "71>00", "72>00"):
-        assert muxes.audit()
-    muxes.forget(0x71)
+        assert muxes.verify_masks()
+    muxes.invalidate_cache(0x71)
     with protocol.exchanged("70>04", "72>00"):
-        assert muxes.audit()
+        assert muxes.verify_masks()
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_a_mux_that_was_reset_or_opened_behind_our_back_is_found_by_an_audit(
     muxes = router(protocol)
     protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
     with protocol.exchanged(*read):
-        assert not muxes.audit()
+        assert not muxes.verify_masks()
     protocol.connects(muxes, 0x70, 2, mended)
 
 
@@ -235,16 +235,16 @@ def test_a_mux_that_does_not_answer_an_audit_is_not_taken_as_known(protocol: Pro
     muxes = router(protocol)
     protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
     with protocol.exchanged(f"70>04 {NACK}", "71>00"):
-        assert not muxes.audit()
+        assert not muxes.verify_masks()
     protocol.connects(muxes, 0x70, 2, "70<04")
     with protocol.exchanged(f"70>04 {TIMEOUT}"), pytest.raises(BusFaultError):
-        muxes.audit()
+        muxes.verify_masks()
 
 
 def test_one_mux_that_keeps_what_is_written_proves_that_the_wires_move(protocol: Protocol) -> None:
     muxes = router(protocol, 0x70, 0x71, 0x72)
     with protocol.exchanged(f"70<01 {NACK}", "71<01", "71>01"):
-        assert muxes.echoes()
+        assert muxes.check_any_mux_works()
     # It was only a trial: nothing is taken as known afterwards.
     protocol.connects(muxes, 0x70, 0, "71<00", "72<00", "70<01")
 
@@ -252,15 +252,15 @@ def test_one_mux_that_keeps_what_is_written_proves_that_the_wires_move(protocol:
 def test_a_bus_on_which_everything_reads_as_zero_does_not_move(protocol: Protocol) -> None:
     muxes = router(protocol)
     with protocol.exchanged("70<01", "70>00", "71<01", "71>00"):
-        assert not muxes.echoes()
+        assert not muxes.check_any_mux_works()
 
 
 def test_a_bus_on_which_nobody_answers_does_not_move(protocol: Protocol) -> None:
     muxes = router(protocol)
     with protocol.exchanged(f"70<01 {NACK}", f"71<01 {NACK}"):
-        assert not muxes.echoes()
+        assert not muxes.check_any_mux_works()
     with protocol.exchanged(f"70<01 {TIMEOUT}"), pytest.raises(BusFaultError):
-        muxes.echoes()
+        muxes.check_any_mux_works()
 
 
 class Watch(Adapter):
@@ -277,12 +277,12 @@ class Watch(Adapter):
         if outcome == "lost":
             raise OSError(NACK, "the mux never heard it")
         self.adapter.i2c_rdwr(*i2c_msgs)
-        self.most_open = max(self.most_open, sum(mux.mask != 0 for mux in self.muxes))
+        self.most_open = max(self.most_open, sum(mux.connected_mask != 0 for mux in self.muxes))
         if outcome == "late":
             raise OSError(TIMEOUT, "the mux heard it, but we were not told")
 
     def routing(self) -> dict[int, int]:
-        return {mux.address: mux.mask for mux in self.muxes if mux.mask}
+        return {mux.address: mux.connected_mask for mux in self.muxes if mux.connected_mask}
 
 
 three = st.sampled_from([0x70, 0x71, 0x76])
@@ -298,17 +298,17 @@ def test_never_is_more_than_one_mux_open_whatever_fails(
     muxes = MuxRouter(I2cBus(watch, "watched"), [0x70, 0x71, 0x76])
     for address, channel in selects:
         try:
-            muxes.connect_only(address, channel)
+            muxes.connect_single_channel(address, channel)
         except I2cError:
-            if muxes.silent:
+            if muxes.silent_addresses:
                 return
             continue
         connected = watch.routing()
         # One that refused twice in a row is taken to be without supply.
-        assert {a: m for a, m in connected.items() if a not in muxes.silent} == {
+        assert {a: m for a, m in connected.items() if a not in muxes.silent_addresses} == {
             address: 1 << channel
         }
-        if muxes.silent:
+        if muxes.silent_addresses:
             return
     assert watch.most_open <= 1
 
@@ -325,9 +325,9 @@ def test_after_a_success_exactly_what_was_asked_for_is_connected(
     muxes = MuxRouter(I2cBus(watch, "watched"), [0x70, 0x71, 0x76])
     for routing in wanted:
         try:
-            muxes.connect(routing)
+            muxes.connect_channels(routing)
         except I2cError:
             continue
-        if muxes.silent:
+        if muxes.silent_addresses:
             return
         assert watch.routing() == {address: mask for address, mask in routing.items() if mask}

@@ -9,15 +9,15 @@ import numpy as np
 import numpy.typing as npt
 from hypothesis import strategies as st
 
-from devices.emulation.dome import GRID_S, Domes
-from devices.emulation.parts import DomePart
+from devices.emulation.dome_physics import GRID_S, Domes
+from devices.emulation.parts import DomeProperties
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulated import EmulationScene
+from devices.scene.emulation_sections import EmulationSection
 
 Floats = npt.NDArray[np.float64]
 Force = Callable[[Floats], Floats]
 
-PART = DomePart(
+PART = DomeProperties(
     seal_kpa=100.0,
     knee_n=10.0,
     stiffening=0.085,
@@ -48,13 +48,13 @@ def nothing(t_s: Floats) -> Floats:
 
 def domes_of(
     force: Force = nothing,
-    *parts: DomePart,
+    *parts: DomeProperties,
     label: str = "test",
     in_real_time: bool = False,
     **effects: Any,
 ) -> Domes:
     """Domes under a force, with only the named effects on."""
-    scene = EmulationScene(**({"gas": False, "rubber": False, "hysteresis": False} | effects))
+    scene = EmulationSection(**({"gas": False, "rubber": False, "hysteresis": False} | effects))
     parts = parts or (PART,)
     serials = [f"S{i}" for i in range(len(parts))]
     load = Pressing(force, len(parts))
@@ -63,7 +63,7 @@ def domes_of(
 
 
 def kpa_at(domes: Domes, t_s: npt.ArrayLike, dome: int = 0) -> Floats:
-    return np.array([domes.pressure_kpa(dome, float(t)) for t in np.asarray(t_s)])
+    return np.array([domes.compute_pressure_kpa(dome, float(t)) for t in np.asarray(t_s)])
 
 
 def grid(begin_s: float, end_s: float, every: int = 1) -> Floats:
@@ -72,12 +72,12 @@ def grid(begin_s: float, end_s: float, every: int = 1) -> Floats:
     return np.asarray(steps * GRID_S, dtype=np.float64)
 
 
-def lost(force_n: npt.ArrayLike, part: DomePart = PART) -> Floats:
+def lost(force_n: npt.ArrayLike, part: DomeProperties = PART) -> Floats:
     """Part of the bubble's volume that a slow force takes."""
     return np.asarray(part.stiffening * np.log1p(np.asarray(force_n) / part.knee_n))
 
 
-def static_kpa(force_n: npt.ArrayLike, part: DomePart = PART) -> Floats:
+def static_kpa(force_n: npt.ArrayLike, part: DomeProperties = PART) -> Floats:
     """Positive root of p (1 + c (p - seal)) (1 - lost) = seal."""
     c, seal = part.wall_per_kpa, part.seal_kpa
     v = 1 - lost(force_n, part)
@@ -85,7 +85,7 @@ def static_kpa(force_n: npt.ArrayLike, part: DomePart = PART) -> Floats:
     return np.asarray((-b + np.sqrt(b * b + 4 * c * seal / v)) / (2 * c))
 
 
-def felt_n(kpa: Floats, part: DomePart = PART) -> Floats:
+def felt_n(kpa: Floats, part: DomeProperties = PART) -> Floats:
     """The static force that would give this pressure."""
     v = part.seal_kpa / (kpa * (1 + part.wall_per_kpa * (kpa - part.seal_kpa)))
     return np.asarray(part.knee_n * np.expm1((1 - v) / part.stiffening))
@@ -96,7 +96,7 @@ def ramp(begin_s: float, end_s: float, to_n: float) -> Force:
 
 
 parts = st.builds(
-    DomePart,
+    DomeProperties,
     seal_kpa=st.floats(95, 105),
     knee_n=st.floats(5, 15),
     stiffening=st.floats(0.05, 0.1),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from devices.emulation.parts import draw_chip, draw_dome
-from devices.scene.file import load_scene
+from devices.scene.scene_file import load_scene
 from tests.devices.feet import foot
 
 SHELVES = [(serial, seed) for seed in range(5) for serial in ("T01", "T02", "T07", "S-3")]
@@ -64,5 +64,5 @@ def test_its_counts_are_bit_for_bit_what_they_were(
     name: str, seconds: float, expected: str
 ) -> None:
     frames = foot(load_scene(name)).run_for(seconds)
-    read = np.stack([frames.padc, frames.tadc]).astype("<u2")
+    read = np.stack([frames.pressure_raw, frames.temperature_raw]).astype("<u2")
     assert hashlib.sha256(read.tobytes()).hexdigest()[:16] == expected

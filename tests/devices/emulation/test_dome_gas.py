@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from devices.emulation.dome import GRID_S
+from devices.emulation.dome_physics import GRID_S
 from tests.devices.emulation.domes import (
     PART,
     Floats,

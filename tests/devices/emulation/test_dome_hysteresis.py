@@ -29,7 +29,7 @@ def test_a_gain_that_drifted_since_the_bench_is_another_one_for_each_dome() -> N
         domes = domes_of(
             np.ones_like, *[PART] * 40, label=label, gain_drift=gain_drift, hysteresis=False
         )
-        kpa = [domes.pressure_kpa(dome, 0.1) for dome in range(40)]
+        kpa = [domes.compute_pressure_kpa(dome, 0.1) for dome in range(40)]
         volume = 100.0 / (np.array(kpa) * (1 + PART.wall_per_kpa * (np.array(kpa) - 100.0)))
         return np.asarray((1 - volume) / lost(1.0))
 
@@ -61,7 +61,7 @@ def loop(half_s: float, loads_n: Floats, peak_n: float = 30.0) -> tuple[Floats, 
 
 def test_the_loop_closes_at_zero_load() -> None:
     domes = domes_of(triangle, hysteresis=True)
-    assert domes.pressure_kpa(0, 0.0) == pytest.approx(100.0, abs=1e-12)
+    assert domes.compute_pressure_kpa(0, 0.0) == pytest.approx(100.0, abs=1e-12)
     np.testing.assert_allclose(kpa_at(domes, grid(4.0, 5.0, every=100)), 100.0, atol=1e-9)
 
 
@@ -211,4 +211,4 @@ def test_gains_come_with_the_label_and_the_serial() -> None:
     np.testing.assert_array_equal(first, peaks(5, repeatability=0.03, label="one"))
     assert (np.abs(first - peaks(5, repeatability=0.03, label="two")) > 1e-6).all()
     both = domes_of(pulses, PART, PART, repeatability=0.03)
-    assert abs(both.pressure_kpa(0, 0.5) - both.pressure_kpa(1, 0.5)) > 1e-6
+    assert abs(both.compute_pressure_kpa(0, 0.5) - both.compute_pressure_kpa(1, 0.5)) > 1e-6

@@ -7,9 +7,9 @@ import pytest
 from smbus2 import i2c_msg
 
 from devices.buses.i2c import I2cBus
-from devices.chips.mpl115a2 import Coefficients, padc_of_kpa
+from devices.chips.mpl115a2 import Coefficients, compute_padc
 from devices.emulation.parts import draw_chip, draw_dome
-from devices.scene.file import Scene
+from devices.scene.scene_file import Scene
 from tests.builders.scenes import make_scene
 from tests.devices.emulation.worlds import TWO, counts, identified, moved_to, switched_on
 from tests.devices.rigs import ONE, Plugs
@@ -33,13 +33,13 @@ def test_drawn_chips_are_such_as_are_known() -> None:
     for serial in SERIALS:
         chip = draw_chip(serial, 0)
         c = chip.coefficients
-        assert c.implausibility() == ""
+        assert c.find_implausibility() == ""
         # hardware.md 1.6: what brackets the three known parts
         assert 1699 < c.a0 < 2201
         assert -2.501 < c.b1 < -1.899
         assert -1.001 < c.b2 < -0.849
         assert 0.000649 < c.c12 < 0.000881
-        assert 250 <= float(padc_of_kpa(100.0, 500, c)) <= 500
+        assert 250 <= float(compute_padc(100.0, 500, c)) <= 500
         # hardware.md 1.4, 1.6: 1.4 to 2.0 ms, never above 3
         assert 1_400_000 <= chip.conversion_ns <= 2_000_000
         # hardware.md 1.3: two published scales, 472 and 498 at 25 degC

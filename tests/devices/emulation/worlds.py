@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.array.array import TileArray
-from devices.array.budget import BusTiming
-from devices.array.self_test import identify
+from devices.array.self_test import identify_tiles
+from devices.array.tile_array import TileArray
+from devices.array.timing_budget import BusTiming
 from devices.buses.i2c import open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World
 from devices.frames import TileInfo
-from devices.scene.file import Scene
+from devices.scene.scene_file import Scene
 from tests.devices.rigs import Plugs
 
 TWO: Plugs = ((0x70, 0), (0x70, 1))
@@ -26,7 +26,7 @@ def switched_on(scene: Scene, **options: Any) -> tuple[World, TileArray, Virtual
     clock = VirtualClock(EPOCH_NS)
     world = World(scene, clock, **options)
     bus = open_bus("emulated", world.i2c_adapter)
-    tiles = identify(bus, scene.tile)
+    tiles = identify_tiles(bus, scene.tile)
     timing = BusTiming(400_000, (3.0e-3,) * len(tiles), tuple(tile.mux for tile in tiles))
     array = TileArray(
         bus, tiles, clock, schedule="simultaneous", timing=timing, broadcast_channels=64
@@ -41,9 +41,9 @@ def identified(scene: Scene, **options: Any) -> tuple[TileInfo, ...]:
 def counts(scene: Scene, frames: int = 30, **options: Any) -> npt.NDArray[np.int64]:
     """`padc` and `tadc`, (frames, 2, tiles), as the driver reads them."""
     _, array, _ = switched_on(scene, **options)
-    scans = [array.scan() for _ in range(frames)]
-    assert all(scan.status == [0] * len(scene.tile) for scan in scans)
-    return np.array([(scan.padc, scan.tadc) for scan in scans])
+    scans = [array.scan_frame() for _ in range(frames)]
+    assert all(scan.tile_flags == [0] * len(scene.tile) for scan in scans)
+    return np.array([(scan.pressure_raw, scan.temperature_raw) for scan in scans])
 
 
 def moved_to(scene: Scene, tile: int, **changes: Any) -> Scene:

@@ -12,9 +12,9 @@ import pytest
 
 from devices.clock import VirtualClock
 from devices.errors import BusSetupError, MissingExtraError
+from devices.recovery.bus_recovery import GpioRecovery, open_gpio_recovery
 from devices.recovery.gpio import GpioLines
-from devices.recovery.recovery import GpioRecovery, open_recovery
-from devices.scene.hardware import RecoveryScene
+from devices.scene.hardware_sections import RecoverySection
 
 pytestmark = pytest.mark.process
 
@@ -89,7 +89,7 @@ def pi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pi:
 
 
 def test_the_lines_are_open_drain_and_let_go_from_the_first_moment(pi: Pi) -> None:
-    with GpioLines(RecoveryScene(gpiochip="/dev/gpiochip4")).bus():
+    with GpioLines(RecoverySection(gpiochip="/dev/gpiochip4")).request_scl_sda():
         pass
     ((path, consumer, settings),) = pi.asked
     assert (path, consumer) == ("/dev/gpiochip4", "foottile")
@@ -101,32 +101,32 @@ def test_the_lines_are_open_drain_and_let_go_from_the_first_moment(pi: Pi) -> No
 
 
 def test_a_line_is_pulled_low_let_go_and_read(pi: Pi) -> None:
-    with GpioLines(RecoveryScene(scl_line=23, sda_line=22)).bus() as (scl, sda):
+    with GpioLines(RecoverySection(scl_line=23, sda_line=22)).request_scl_sda() as (scl, sda):
         scl.drive(low=True)
-        assert not scl.high()
-        assert sda.high()
+        assert not scl.is_high()
+        assert sda.is_high()
         scl.drive(low=False)
         sda.drive(low=True)
-        assert scl.high()
-        assert not sda.high()
+        assert scl.is_high()
+        assert not sda.is_high()
     assert pi.requests[0].moves == [(23, INACTIVE), (23, ACTIVE), (22, INACTIVE)]
 
 
 def test_the_pins_are_given_back_to_the_controller_after_they_are_released(pi: Pi) -> None:
-    with GpioLines(RecoveryScene()).bus():
+    with GpioLines(RecoverySection()).request_scl_sda():
         assert pi.said == []
     assert not pi.requests[0].held
     assert pi.said == ["pinctrl set 2,3 a0"]
 
 
 def test_on_a_pi_5_the_function_has_another_number(pi: Pi) -> None:
-    with GpioLines(RecoveryScene(i2c_function="a3")).bus():
+    with GpioLines(RecoverySection(i2c_function="a3")).request_scl_sda():
         pass
     assert pi.said == ["pinctrl set 2,3 a3"]
 
 
 def test_the_pins_are_given_back_whatever_happens(pi: Pi) -> None:
-    with pytest.raises(ZeroDivisionError), GpioLines(RecoveryScene()).bus():
+    with pytest.raises(ZeroDivisionError), GpioLines(RecoverySection()).request_scl_sda():
         _ = 1 / 0
     assert not pi.requests[0].held
     assert pi.said == ["pinctrl set 2,3 a0"]
@@ -134,10 +134,10 @@ def test_the_pins_are_given_back_whatever_happens(pi: Pi) -> None:
 
 def test_an_older_system_has_an_older_tool(pi: Pi) -> None:
     pi.install("raspi-gpio")
-    with GpioLines(RecoveryScene()).bus():
+    with GpioLines(RecoverySection()).request_scl_sda():
         pass
     (pi.folder / "pinctrl").unlink()
-    with GpioLines(RecoveryScene()).bus():
+    with GpioLines(RecoverySection()).request_scl_sda():
         pass
     assert pi.said == ["pinctrl set 2,3 a0", "raspi-gpio set 2,3 a0"]
 
@@ -145,7 +145,7 @@ def test_an_older_system_has_an_older_tool(pi: Pi) -> None:
 def test_without_a_tool_to_give_them_back_the_pins_are_not_taken(pi: Pi) -> None:
     (pi.folder / "pinctrl").unlink()
     with pytest.raises(BusSetupError, match="no tool to give SDA and SCL back") as caught:
-        open_recovery(RecoveryScene(), VirtualClock())
+        open_gpio_recovery(RecoverySection(), VirtualClock())
     assert "pinctrl or raspi-gpio" in caught.value.expected
     assert pi.requests == []
 
@@ -153,14 +153,14 @@ def test_without_a_tool_to_give_them_back_the_pins_are_not_taken(pi: Pi) -> None
 def test_pins_that_are_not_given_back_are_said_with_the_command_to_do_it(pi: Pi) -> None:
     pi.install("pinctrl", "echo 'Failed to open gpiomem' >&2; exit 1")
     with pytest.raises(BusSetupError, match=r"still GPIO.*Failed to open gpiomem") as caught:
-        open_recovery(RecoveryScene(), VirtualClock())
+        open_gpio_recovery(RecoverySection(), VirtualClock())
     assert f"sudo {pi.folder}/pinctrl set 2,3 a0" in caught.value.remedy
 
 
 def test_lines_that_cannot_be_had_are_said(pi: Pi) -> None:
     pi.refusal = OSError(errno.EBUSY, os.strerror(errno.EBUSY))
     with pytest.raises(BusSetupError, match="Device or resource busy") as caught:
-        open_recovery(RecoveryScene(), VirtualClock())
+        open_gpio_recovery(RecoverySection(), VirtualClock())
     assert caught.value.where == "/dev/gpiochip0, lines 3, 2"
     assert caught.value.errno == errno.EBUSY
     assert pi.said == ["pinctrl set 2,3 a0"], "it may have been taken before it failed"
@@ -170,7 +170,7 @@ def test_a_line_that_fails_while_it_is_moved_is_said(pi: Pi) -> None:
     failure = OSError(errno.ENODEV, os.strerror(errno.ENODEV))
     pi.failure = failure
     with pytest.raises(BusSetupError, match="No such device") as caught:
-        GpioRecovery(GpioLines(RecoveryScene()), VirtualClock()).clock_out()
+        GpioRecovery(GpioLines(RecoverySection()), VirtualClock()).send_recovery_clocks()
     assert caught.value.__cause__ is failure
     assert pi.said == ["pinctrl set 2,3 a0"]
 
@@ -178,7 +178,7 @@ def test_a_line_that_fails_while_it_is_moved_is_said(pi: Pi) -> None:
 def test_without_the_library_the_extra_is_named(pi: Pi, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", None)
     with pytest.raises(MissingExtraError, match=r"'foottile\[gpio\]'"):
-        open_recovery(RecoveryScene(), VirtualClock())
+        open_gpio_recovery(RecoverySection(), VirtualClock())
 
 
 def test_a_chip_that_is_not_there_is_said_by_the_real_library(
@@ -187,19 +187,19 @@ def test_a_chip_that_is_not_there_is_said_by_the_real_library(
     Pi(tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BusSetupError, match="No such file") as caught:
-        open_recovery(RecoveryScene(gpiochip=str(tmp_path / "gpiochip9")), VirtualClock())
+        open_gpio_recovery(RecoverySection(gpiochip=str(tmp_path / "gpiochip9")), VirtualClock())
     assert caught.value.errno == errno.ENOENT
 
 
 def test_opening_tries_every_line_once_and_moves_none(pi: Pi) -> None:
-    recovery = open_recovery(RecoveryScene(reset_line=17), VirtualClock())
+    recovery = open_gpio_recovery(RecoverySection(reset_line=17), VirtualClock())
     assert recovery is not None
     assert [request.lines for request in pi.requests] == [(3, 2), (17,)]
     assert all(request.moves == [] and not request.held for request in pi.requests)
 
 
 def test_the_reset_line_is_pulsed_and_the_bus_left_alone(pi: Pi) -> None:
-    recovery = GpioRecovery(GpioLines(RecoveryScene(reset_line=17)), VirtualClock())
+    recovery = GpioRecovery(GpioLines(RecoverySection(reset_line=17)), VirtualClock())
     assert recovery.reset_muxes()
     (request,) = pi.requests
     assert request.moves == [(17, INACTIVE), (17, ACTIVE)]
@@ -207,10 +207,10 @@ def test_the_reset_line_is_pulsed_and_the_bus_left_alone(pi: Pi) -> None:
 
 
 def test_a_reset_line_that_is_not_wired_is_not_moved(pi: Pi) -> None:
-    assert not GpioRecovery(GpioLines(RecoveryScene()), VirtualClock()).reset_muxes()
+    assert not GpioRecovery(GpioLines(RecoverySection()), VirtualClock()).reset_muxes()
     assert pi.requests == []
 
 
 def test_a_free_bus_is_clocked_out_through_the_lines(pi: Pi) -> None:
-    assert GpioRecovery(GpioLines(RecoveryScene()), VirtualClock()).clock_out()
+    assert GpioRecovery(GpioLines(RecoverySection()), VirtualClock()).send_recovery_clocks()
     assert pi.requests[0].moves == [(3, INACTIVE), (2, INACTIVE), (3, ACTIVE), (2, ACTIVE)]

@@ -9,8 +9,8 @@ from typing import get_args
 import pytest
 
 from devices.errors import SceneError
-from devices.scene.emulated import FaultKind, ServoFault
-from devices.scene.file import load_scene, parse_scene
+from devices.scene.emulation_sections import FaultKind, ServoFault
+from devices.scene.scene_file import load_scene, parse_scene
 from tests.devices.scene.texts import refused, scene, tile
 
 

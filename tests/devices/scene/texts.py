@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devices.errors import SceneError
-from devices.scene.file import Scene, parse_scene
+from devices.scene.scene_file import Scene, parse_scene
 
 TILE = """
 [[tile]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.api.doors import Bounds
+from service.api.connection_limits import LimitSettings
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, ServeWith
@@ -13,7 +13,7 @@ from tests.service.running import Running, ServeWith
 @pytest.fixture
 def strict(serve_with: ServeWith) -> Running:
     """A server that is soon out of patience and of places."""
-    bounds = Bounds(
+    bounds = LimitSettings(
         max_connections=3,
         max_header_bytes=4096,
         header_timeout_s=0.3,

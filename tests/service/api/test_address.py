@@ -12,7 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import LinkError, UsageError
-from service.api.address import advertised_url, listen, own_names, urls_of
+from service.api.address import (
+    list_own_names,
+    list_urls,
+    open_listening_socket,
+    parse_advertised_url,
+)
 from service.api.interfaces import InterfaceAddress, sort_addresses
 
 
@@ -45,7 +50,7 @@ def test_a_machine_goes_by_its_own_name_and_no_other(
     name: str, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(socket, "gethostname", lambda: name)
-    assert own_names() == names
+    assert list_own_names() == names
 
 
 def addresses(*listed: str) -> list[str]:
@@ -99,7 +104,7 @@ def test_no_bridge_comes_before_a_network(listed: list[str]) -> None:
     ],
 )
 def test_an_address_to_show_is_a_host_a_port_too_or_all_of_it(advertised: str, url: str) -> None:
-    assert advertised_url(advertised, 8000) == url
+    assert parse_advertised_url(advertised, 8000) == url
 
 
 @pytest.mark.parametrize(
@@ -107,7 +112,7 @@ def test_an_address_to_show_is_a_host_a_port_too_or_all_of_it(advertised: str, u
 )
 def test_what_is_no_address_to_show_is_refused(wrong: str) -> None:
     with pytest.raises(UsageError, match="--advertise"):
-        advertised_url(wrong, 8000)
+        parse_advertised_url(wrong, 8000)
 
 
 def test_localhost_is_shown_as_the_address_that_is_listened_on(
@@ -120,15 +125,15 @@ def test_localhost_is_shown_as_the_address_that_is_listened_on(
         return [*real("::1", port, **options), *real("127.0.0.1", port, **options)]
 
     monkeypatch.setattr(socket, "getaddrinfo", both)
-    with listen("localhost", 0) as listening:
+    with open_listening_socket("localhost", 0) as listening:
         port = listening.getsockname()[1]
-        assert urls_of(listening, "localhost") == [f"http://127.0.0.1:{port}"]
+        assert list_urls(listening, "localhost") == [f"http://127.0.0.1:{port}"]
 
 
 def test_everywhere_is_ipv4_too() -> None:
-    with listen("::", 0) as listening:
+    with open_listening_socket("::", 0) as listening:
         port = listening.getsockname()[1]
-        assert urls_of(listening, "::")[-1] == f"http://127.0.0.1:{port}"
+        assert list_urls(listening, "::")[-1] == f"http://127.0.0.1:{port}"
         for host in ("127.0.0.1", "::1"):
             socket.create_connection((host, port), timeout=5.0).close()
 
@@ -138,4 +143,4 @@ def test_everywhere_is_ipv4_too() -> None:
 )
 def test_an_address_that_is_not_this_machines_is_said(host: str, word: str) -> None:
     with pytest.raises(LinkError, match=word):
-        listen(host, 0)
+        open_listening_socket(host, 0)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from devices.frames import FrameBatch
-from service.server.estimates.live import LiveEstimates
+from service.server.broadcast.views import NodeView
+from service.server.estimates.live_estimator import LiveEstimator
 from service.server.node import ServerNode
-from service.server.screens.views import NodeView
-from storage.verify.journal import verify_stream
+from storage.verify.journal import verify_journal
 from tests.builders.frames import with_columns
 from tests.builders.odd_values import with_value
 from tests.service.fake_node import FakeNode, NodeOf
@@ -92,12 +92,12 @@ def test_a_node_that_could_not_be_taken_in_is_not_known_and_its_name_is_free(
         raise kind("as a bug would")
 
     with monkeypatch.context() as patch:
-        patch.setattr(ServerNode, "attach", failing)
+        patch.setattr(ServerNode, "on_hello", failing)
         node.open_with_hello()
         assert closed(node.socket)[0] == 1011
     assert running.http.get("/nodes/bench").status_code == 404
     with monkeypatch.context() as patch:
-        patch.setattr(ServerNode, "lacks", failing)
+        patch.setattr(ServerNode, "missing_ranges", failing)
         node.open_with_hello()
         assert closed(node.socket)[0] == 1011
     until(lambda: not running.node()["connected"])
@@ -114,9 +114,9 @@ def test_a_bug_in_one_nodes_estimates_costs_it_its_estimates_and_no_more(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    feed = LiveEstimates.feed
+    feed = LiveEstimator.feed_frames
 
-    def failing(self: LiveEstimates, frames: FrameBatch) -> Any:
+    def failing(self: LiveEstimator, frames: FrameBatch) -> Any:
         if self._info.node == "bench" and self._calibration is not None:
             raise ZeroDivisionError("as a bug would")
         return feed(self, frames)
@@ -124,7 +124,7 @@ def test_a_bug_in_one_nodes_estimates_costs_it_its_estimates_and_no_more(
     node.connect()
     node.deliver(20)
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(LiveEstimates, "feed", failing)
+        patch.setattr(LiveEstimator, "feed_frames", failing)
         node.deliver(100)
         assert_goes_on(screen, other)
     assert len([r for r in caplog.records if "this is a bug" in r.getMessage()]) == 1
@@ -142,7 +142,7 @@ def test_a_node_that_cannot_be_shown_is_left_out_of_the_screens_and_said_once(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    of = NodeView.of
+    of = NodeView.from_node
 
     def failing(known: ServerNode, *rest: Any) -> NodeView:
         if known.name == "bench":
@@ -150,7 +150,7 @@ def test_a_node_that_cannot_be_shown_is_left_out_of_the_screens_and_said_once(
         return of(known, *rest)
 
     node.connect()
-    monkeypatch.setattr(NodeView, "of", failing)
+    monkeypatch.setattr(NodeView, "from_node", failing)
     with caplog.at_level(logging.ERROR), running.socket(LIVE) as live:
         hello = json.loads(live.recv(timeout=PATIENCE_S))
         assert [shown["node"] for shown in hello["nodes"]] == ["other"]
@@ -173,13 +173,13 @@ def test_frames_whose_time_runs_back_are_refused_lost_and_not_asked_for_again(
     assert node.connect() == [(30, None)]
     node.deliver(20)
     assert running.node()["lost"] == {"refused": 10}
-    assert not node.acked.within(20, 29)
+    assert not node.acked.restricted_to(20, 29)
     running.restart()
     assert node.connect() == [(50, None)]
     running.stop()
-    report = verify_stream(running.data / "journal" / "bench" / node.boot_id)
+    report = verify_journal(running.data / "journal" / "bench" / node.stream_id)
     assert report.problems == []
-    assert report.lost.as_pairs() == {"refused": ((20, 29),)}
+    assert report.lost.to_pairs() == {"refused": ((20, 29),)}
 
 
 def test_what_comes_from_behind_has_to_fit_what_is_there(running: Running, node: FakeNode) -> None:
@@ -188,11 +188,11 @@ def test_what_comes_from_behind_has_to_fit_what_is_there(running: Running, node:
     node.deliver(20)
     first = node.sent[0]
     shifted = with_columns(first, t_mono_ns=first.t_mono_ns + 60_000_000)
-    node.socket.send(node.payload(shifted.rows(40, 50)))
+    node.socket.send(node.payload(shifted.slice_rows(40, 50)))
     code, reason = closed(node.socket)
     assert (code, "40 to 49" in reason) == (4001, True)
     node.connect()
-    node.send_again(first.rows(0, 40))
+    node.send_again(first.slice_rows(0, 40))
     node.acknowledged(39)
 
 

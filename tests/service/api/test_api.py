@@ -17,7 +17,7 @@ from service.api.app import make_app
 from service.api.guard import BODY_BYTES_MAX
 from service.api.logins import Logins
 from service.server.server import Server
-from storage.sessions.folder import Part, Session, new_session_id
+from storage.sessions.folder import Part, Session, make_session_id
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
 from tests.storage.faulty_disk import refusing
@@ -68,11 +68,11 @@ WRONG: tuple[tuple[str, str, bytes | None, int], ...] = (
     ("PATCH", f"/sessions/{UNKNOWN_ID}", b'{"name":"x"}', 404),
     (
         "POST",
-        f"/sessions/{UNKNOWN_ID}/events",
+        f"/sessions/{UNKNOWN_ID}/markers",
         b'{"label":"x","t_ns":9223372036854775808}',
         422,
     ),
-    ("POST", f"/sessions/{UNKNOWN_ID}/events", b'{"label":"x","t_ns":1.5}', 422),
+    ("POST", f"/sessions/{UNKNOWN_ID}/markers", b'{"label":"x","t_ns":1.5}', 422),
     ("GET", "/sessions?limit=0", None, 422),
     ("GET", "/sessions?limit=501", None, 422),
     ("GET", "/sessions?limit=many", None, 422),
@@ -127,7 +127,7 @@ def test_a_body_in_chunks_that_is_too_long_is_a_problem(running: Running) -> Non
 def test_a_mistake_of_the_server_is_a_problem_without_its_inside(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(running.server, "check_storage", refusing(ZeroDivisionError, "secret"))
+    monkeypatch.setattr(running.server, "check_writable", refusing(ZeroDivisionError, "secret"))
     answer = running.http.get("/ready")
     assert_problem(answer, 500, "/api/v1/ready")
     assert "secret" not in answer.text
@@ -137,7 +137,7 @@ def test_a_recording_that_a_full_disk_did_not_take_was_never_begun(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as context:
-        context.setattr("storage.checked_json.write_whole", refusing(StorageError, "no space"))
+        context.setattr("storage.checksummed_json.write_whole", refusing(StorageError, "no space"))
         answer = running.http.post("/sessions", json={"node": "bench", "name": "trial"})
         assert_problem(answer, 507, "/api/v1/sessions")
     assert running.sessions() == []
@@ -150,7 +150,7 @@ def test_a_full_disk_is_a_problem_that_says_so(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = refusing(StorageError, "No space left on device", remedy="Free space")
-    monkeypatch.setattr(running.server, "check_storage", full)
+    monkeypatch.setattr(running.server, "check_writable", full)
     assert_problem(running.http.get("/ready"), 507, "/api/v1/ready")
 
 
@@ -163,19 +163,19 @@ def many(running: Running, node: FakeNode) -> list[str]:
     begin_ns = time.time_ns()
     sessions = [
         Session(
-            id=new_session_id(datetime(2026, 1, 1, tzinfo=UTC)),
+            id=make_session_id(datetime(2026, 1, 1, tzinfo=UTC)),
             name=f"{'mud' if i % 3 else 'Sand'} {i}",
             node="bench" if i % 2 else "other",
             tags=("Odd", "third") if i % 3 else ("odd",),
             state="recording",
             started_t_ns=begin_ns + i // 4,
-            parts=(Part(boot_id=node.boot_id, seq_first=0, seq_last=0),),
+            parts=(Part(stream_id=node.stream_id, seq_first=0, seq_last=0),),
             scene="test",
         )
         for i in range(23)
     ]
     for session in sessions:
-        running.call(partial(running.server.sessions.keep, session))
+        running.call(partial(running.server.sessions.save, session))
     sessions.sort(key=lambda s: (s.started_t_ns, s.id), reverse=True)
     return [session.id for session in sessions]
 
@@ -248,7 +248,7 @@ def test_every_operation_is_described(tmp_path: Path) -> None:
     try:
         schema = make_app(server, logins=Logins(SHARED_TOKEN)).openapi()
     finally:
-        server.folder.close()
+        server.data_folder.close()
     ids = []
     for path, operations in schema["paths"].items():
         for method, operation in operations.items():
@@ -279,7 +279,7 @@ def test_the_history_of_tares_says_why_and_where_the_baselines_are_going(
     answer = running.http.post("/nodes/bench/tare", json={"reason": "  new shoe "})
     assert answer.status_code == 201, answer.text
     assert answer.json()["reason"] == "new shoe"
-    assert answer.json()["tadc_counts"] == [480.0, 480.0]
+    assert answer.json()["temperature_raw_counts"] == [480.0, 480.0]
     page = running.http.get("/nodes/bench/tares").json()
     said = [(tare["source"], tare["reason"]) for tare in page["items"]]
     assert said == [("unloaded", "new shoe"), ("lead", "unloaded lead of the emulation")]
@@ -346,7 +346,7 @@ def test_no_get_changes_anything(running: Running, node: FakeNode) -> None:
     [
         ("/sessions", {"GET", "HEAD", "POST"}),
         ("/sessions/20200101T000000Z-000000", {"GET", "HEAD", "PATCH", "DELETE"}),
-        ("/sessions/20200101T000000Z-000000/events", {"GET", "HEAD", "POST"}),
+        ("/sessions/20200101T000000Z-000000/markers", {"GET", "HEAD", "POST"}),
         ("/sessions/20200101T000000Z-000000/data", {"GET", "HEAD"}),
         ("/sessions/20200101T000000Z-000000/stop", {"POST"}),
         ("/trash", {"GET", "HEAD", "DELETE"}),
@@ -365,10 +365,10 @@ def test_an_instant_is_a_number_and_nothing_like_it(
     running: Running, tared: FakeNode, wrong: object
 ) -> None:
     recording = tared.record()
-    answer = running.http.post(f"{recording.url}/events", json={"label": "x", "t_ns": wrong})
+    answer = running.http.post(f"{recording.url}/markers", json={"label": "x", "t_ns": wrong})
     assert answer.status_code == 422, answer.text
     assert recording.now()["id"] == recording.id
-    assert running.http.get(f"{recording.url}/events").json()["items"] == []
+    assert running.http.get(f"{recording.url}/markers").json()["items"] == []
 
 
 @pytest.mark.parametrize("wrong", [True, "1", [1], -1, 601, None])

@@ -17,8 +17,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from service.api.doors import Bounds
-from service.link import INGEST_PATH, LIVE_PATH
+from service.api.connection_limits import LimitSettings
+from service.protocol import INGEST_PATH, LIVE_PATH
 from tests.service.fake_node import NodeOf
 from tests.service.running import Running, ServeWith, assert_refused
 from tests.tokens import SHARED_BEARER
@@ -126,7 +126,7 @@ def tls(tmp_path: Path) -> ssl.SSLContext:
 @pytest.fixture
 def behind(serve_with: ServeWith) -> Running:
     """A server that trusts the proxy on its own machine, as the document has it started."""
-    return serve_with(bounds=Bounds.model_validate({"trusted_proxy": ["127.0.0.1"]}))
+    return serve_with(bounds=LimitSettings.model_validate({"trusted_proxy": ["127.0.0.1"]}))
 
 
 @pytest.fixture
@@ -177,7 +177,7 @@ def test_as_documented_a_client_cannot_choose_its_own_address(
     serve_with: ServeWith, nginx: Proxy, tls: ssl.SSLContext, tmp_path: Path
 ) -> None:
     one = {"max_connections_per_address": 1, "trusted_proxy": ["127.0.0.1"]}
-    running, port = serve_with(bounds=Bounds.model_validate(one)), free_port()
+    running, port = serve_with(bounds=LimitSettings.model_validate(one)), free_port()
     nginx(documented(tmp_path, listen=port, port=running.port), port)
     address = f"wss://127.0.0.1:{port}{LIVE_PATH}"
     with connect(address, ssl=tls, proxy=None) as live:

@@ -10,11 +10,11 @@ import httpx
 import numpy as np
 import pytest
 
-from service.estimation.calibration import UNPROVEN, Calibration
+from service.estimation.calibration import UNPROVEN_SUFFIX, Calibration
 from service.server import calibrations as book
-from service.sessions.calibration_file import calibration_of, content_of
-from service.sessions.restore import restore
-from storage.sessions.folder import SessionFolder
+from service.sessions.calibration_file import encode_calibration, parse_calibration
+from service.sessions.session_rebuild import rebuild_session
+from storage.sessions.folder import SessionsFolder
 from tests.builders.calibrations import make_calibration
 from tests.service import benches
 from tests.service.fake_node import FakeNode, NodeOf
@@ -33,7 +33,7 @@ def stiffer(*serials: str, name: str = "stiffer") -> Calibration:
 
 
 def upload(running: Running, content: bytes | Calibration) -> httpx.Response:
-    sent = content_of(content) if isinstance(content, Calibration) else content
+    sent = encode_calibration(content) if isinstance(content, Calibration) else content
     headers = {"Content-Type": "application/json"}
     return running.http.post("/calibrations", content=sent, headers=headers)
 
@@ -61,8 +61,8 @@ def test_a_file_is_uploaded_listed_and_downloaded_as_it_was_also_after_a_restart
     running.restart()
     assert listed(running) == [said]
     got = running.http.get(url)
-    assert got.content == content_of(calibration)
-    assert calibration_of(got.content, where="here") == calibration
+    assert got.content == encode_calibration(calibration)
+    assert parse_calibration(got.content, where="here") == calibration
     matching = {"If-None-Match": got.headers["etag"]}
     assert running.http.get(url, headers=matching).status_code == 304
     assert running.http.delete(url).status_code == 204
@@ -73,11 +73,11 @@ def test_a_file_is_uploaded_listed_and_downloaded_as_it_was_also_after_a_restart
 
 def test_one_that_was_written_by_hand_is_called_unproven(running: Running) -> None:
     content = json.dumps(stiffer("T01").model_dump(mode="json")).encode()
-    assert upload(running, content).json()["name"] == "stiffer" + UNPROVEN
+    assert upload(running, content).json()["name"] == "stiffer" + UNPROVEN_SUFFIX
 
 
 def broken() -> dict[str, bytes]:
-    whole = content_of(stiffer("T01"))
+    whole = encode_calibration(stiffer("T01"))
     plain = stiffer("T01").model_dump(mode="json")
     tile = plain["tiles"][0]
     return {
@@ -177,7 +177,7 @@ def test_what_is_assigned_counts_from_then_on_and_what_is_being_recorded_keeps_i
 def restore_of(running: Running, session: Recording) -> dict[str, Any]:
     """What is made again of it from its sealed file alone."""
     (session.folder / "session.json").unlink()
-    made = restore(SessionFolder(running.data / "sessions"), session.id)
+    made = rebuild_session(SessionsFolder(running.data / "sessions"), session.id)
     assert made is not None
     return made.model_dump()
 
@@ -306,14 +306,14 @@ def test_a_bench_session_is_fitted_here_and_what_cannot_be_says_why(with_bench: 
     assert_refused(fit(running), 409, "left, =leg", "being fitted")
     done = ended(running, begun)
     assert (done["state"], done["problem"]) == ("done", None), done
-    assert any(line.startswith("tile T01, 1 of 1: curve to") for line in done["said"])
+    assert any(line.startswith("tile T01, 1 of 1: curve to") for line in done["log"])
     (kept,) = listed(running)
     assert (kept["id"], kept["name"]) == (done["calibration_id"], "left, =leg")
     assert (kept["reference"], kept["serials"]) == ("the mill", ["T01"])
 
-    session = running.http.get(f"/sessions/{benches.SESSION_ID}/events").json()["items"]
+    session = running.http.get(f"/sessions/{benches.SESSION_ID}/markers").json()["items"]
     step = next(mark for mark in session if mark["label"] == "T01 load")
-    url = f"/sessions/{benches.SESSION_ID}/events/{step['id']}"
+    url = f"/sessions/{benches.SESSION_ID}/markers/{step['id']}"
     running.http.patch(url, json={"label": "T01 laod"})
     failed = ended(running, fit(running))
     assert failed["state"] == "failed"
@@ -354,6 +354,6 @@ def test_what_cannot_be_fitted_is_refused_at_once(
     )
     for wrong in wrongs:
         assert fit(running, **wrong).status_code == 422, wrong
-    monkeypatch.setattr("service.server.fits.FRAMES_MAX", 10)
+    monkeypatch.setattr("service.server.calibration_jobs.FRAMES_MAX", 10)
     assert_refused(fit(running), 422, "at most 10 in one fit")
     assert running.http.get("/calibrations/fits").json()["items"] == []

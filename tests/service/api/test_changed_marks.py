@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from storage.sessions.beside import read_events
+from storage.sessions.sidecars import read_markers
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -18,13 +18,13 @@ def session(tared: FakeNode) -> Recording:
     tared.deliver(200, [20.0, 60.0], alive=True)
     tared.finish(session)
     for label in ("a stone", "mud"):
-        answer = session.running.http.post(f"{session.url}/events", json={"label": label})
+        answer = session.running.http.post(f"{session.url}/markers", json={"label": label})
         assert answer.status_code == 201
     return session
 
 
 def marks(session: Recording) -> dict[str, dict[str, object]]:
-    items = session.running.http.get(f"{session.url}/events").json()["items"]
+    items = session.running.http.get(f"{session.url}/markers").json()["items"]
     return {item["label"]: item for item in items}
 
 
@@ -32,10 +32,10 @@ def test_a_mark_is_renamed_and_moved_also_in_the_table_beside_and_in_downloads(
     session: Recording,
 ) -> None:
     http, before = session.running.http, marks(session)
-    url = f"{session.url}/events/{before['a stone']['id']}"
+    url = f"{session.url}/markers/{before['a stone']['id']}"
     renamed = http.patch(url, json={"label": "a boulder"}).json()
     assert renamed["t_ns"] == before["a stone"]["t_ns"]
-    assert renamed["said"] != before["a stone"]["said"]
+    assert renamed["revision"] != before["a stone"]["revision"]
     clock = session.clock()["streams"][0]["stretches"][0]
     t_ns = int(session.column("t_ns")[50]) + clock["offset_ns"]
     moved = http.patch(url, json={"t_ns": t_ns}).json()
@@ -44,7 +44,7 @@ def test_a_mark_is_renamed_and_moved_also_in_the_table_beside_and_in_downloads(
         "a boulder": t_ns,
         "mud": before["mud"]["t_ns"],
     }
-    stored = read_events(session.folder / "events.parquet").events
+    stored = read_markers(session.folder / "markers.parquet").markers
     assert {(event.label, event.t_ns) for event in stored} >= {("a boulder", t_ns)}
     assert verify_session(session.folder).problems == []
     content = session.data(format="csv").content
@@ -54,48 +54,50 @@ def test_a_mark_is_renamed_and_moved_also_in_the_table_beside_and_in_downloads(
 
 def test_a_mark_is_removed(session: Recording) -> None:
     http, before = session.running.http, marks(session)
-    url = f"{session.url}/events/{before['mud']['id']}"
+    url = f"{session.url}/markers/{before['mud']['id']}"
     assert http.delete(url).status_code == 204
     assert list(marks(session)) == ["a stone"]
-    assert session.now()["marks"] == 1
+    assert session.now()["marker_count"] == 1
     assert_refused(http.delete(url), 404, "no mark")
     assert_refused(http.patch(url, json={"label": "x"}), 404, "no mark")
-    assert http.delete("/sessions/none/events/0").status_code == 404
+    assert http.delete("/sessions/none/markers/0").status_code == 404
     for wrong in ({"label": ""}, {"t_ns": -1}, {"t_ns": 1.5}, {"name": "x"}):
-        url = f"{session.url}/events/{before['a stone']['id']}"
+        url = f"{session.url}/markers/{before['a stone']['id']}"
         assert http.patch(url, json=wrong).status_code == 422, wrong
 
 
 def test_who_changes_what_somebody_else_has_changed_meanwhile_is_told(session: Recording) -> None:
     http, mark = session.running.http, marks(session)["mud"]
-    url = f"{session.url}/events/{mark['id']}"
-    mine = {"If-Match": f'"{mark["said"]}"'}
+    url = f"{session.url}/markers/{mark['id']}"
+    mine = {"If-Match": f'"{mark["revision"]}"'}
     assert http.patch(url, json={"label": "water"}, headers=mine).status_code == 200
     late = http.patch(url, json={"label": "sand"}, headers=mine)
     assert_refused(late, 412, "changed by another client")
     assert_refused(http.delete(url, headers=mine), 412, "changed by another client")
     assert set(marks(session)) == {"a stone", "water"}
 
-    said = {"If-Match": session.now()["said"]}
+    said = {"If-Match": session.now()["revision"]}
     assert http.patch(session.url, json={"notes": "mine"}, headers=said).status_code == 200
     late = http.patch(session.url, json={"notes": "yours"}, headers=said)
     assert_refused(late, 412, "changed by another client")
     assert session.now()["notes"] == "mine"
     # A mark is another thing, and who does not care says nothing.
-    now = {"If-Match": session.now()["said"]}
-    http.post(f"{session.url}/events", json={"label": "a third"})
+    now = {"If-Match": session.now()["revision"]}
+    http.post(f"{session.url}/markers", json={"label": "a third"})
     assert http.patch(session.url, json={"tags": ["wet"]}, headers=now).status_code == 200
     for headers in ({}, {"If-Match": "*"}):
         assert http.patch(session.url, json={"name": "x"}, headers=headers).status_code == 200
 
 
 def test_a_session_that_somebody_else_has_renamed_is_not_deleted(session: Recording) -> None:
-    http, seen = session.running.http, session.now()["said"]
+    http, seen = session.running.http, session.now()["revision"]
     http.patch(session.url, json={"name": "the best one"})
     answer = http.delete(session.url, headers={"If-Match": f'"{seen}"'})
     assert_refused(answer, 412, "changed by another client")
     assert session.now()["name"] == "the best one"
-    assert http.delete(session.url, headers={"If-Match": session.now()["said"]}).status_code == 204
+    assert (
+        http.delete(session.url, headers={"If-Match": session.now()["revision"]}).status_code == 204
+    )
 
 
 def test_a_tare_that_another_one_has_followed_is_neither_replaced_nor_undone_unseen(

@@ -17,9 +17,9 @@ import pytest
 
 import foottile
 from service import server_clock
-from service.pull import pull
-from storage.checked_table import write_table
+from service.pull import pull_session
 from storage.clock.log import ClockLog
+from storage.hashed_table import write_hashed_table
 from tests.service.command import command
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
@@ -111,7 +111,7 @@ def test_the_tag_of_a_download_depends_on_the_clock(running: Running, node: Fake
     assert running.http.get(url, params=query, headers=seen).status_code == 304
     path = session.folder / "clock.parquet"
     table = pq.read_table(path)
-    write_table(path, table.slice(0, 1))
+    write_hashed_table(path, table.slice(0, 1))
     assert running.http.get(url, params=query, headers=seen).status_code == 200
     pq.write_table(table, path)  # by another program: its hash is gone
     refused = running.http.get(url, params=query, headers=seen)
@@ -159,14 +159,14 @@ def test_a_node_that_was_switched_on_anew_has_a_clock_for_each_start(
     session = node.record()
     node.send(50)
     node.taken_in()
-    first = node.boot_id
+    first = node.stream_id
     node.restart()
     begun(node, HOUR_NS)
     node.send(50)
     node.taken_in()
     node.finish(session)
     streams = session.clock()["streams"]
-    assert [stream["boot_id"] for stream in streams] == [first, node.boot_id]
+    assert [stream["stream_id"] for stream in streams] == [first, node.stream_id]
     assert [stream["stretches"][0]["offset_ns"] for stream in streams] == [0, HOUR_NS]
     begins = [stream["stretches"][0]["begin_t_ns"] for stream in streams]
     assert begins[0] - begins[1] > HOUR_NS / 2
@@ -185,7 +185,7 @@ def test_a_node_nobody_measured_has_no_servers_time(
     session = recorded(node, None)
     (stream,) = session.clock()["streams"]
     assert stream == {
-        "boot_id": node.boot_id,
+        "stream_id": node.stream_id,
         "state": state,
         "rows": 0,
         "stretches": [],
@@ -235,12 +235,12 @@ def test_a_pulled_session_is_exported_with_the_servers_time_and_a_lone_file_is_n
     begun(node, HOUR_NS)
     session = recorded(node, HOUR_NS)
     with foottile.connect(running.url) as server:
-        pull(server, session.id, tmp_path)
+        pull_session(server, session.id, tmp_path)
     folder = tmp_path / session.id
     out = tmp_path / "out.parquet"
     options = ("--format", "parquet", "--clock", "server", "--out", out)
     assert command(monkeypatch, "export", folder, *options) == 0
-    served = session.data(clock="server", marks="true").content
+    served = session.data(clock="server", markers="true").content
     assert pq.read_table(out).equals(pq.read_table(io.BytesIO(served)))
     out.unlink()
     lone = tmp_path / "lone.parquet"
@@ -269,7 +269,7 @@ def test_a_table_that_was_taken_away_is_said_to_be(
     answer = running.http.get(f"{session.url}/data?clock=server")
     assert_refused(answer, 422, "clock.parquet")
     with foottile.connect(running.url) as server:
-        pull(server, session.id, tmp_path)
+        pull_session(server, session.id, tmp_path)
     assert not (tmp_path / session.id / "clock.parquet").exists()
     assert running.http.get("/sessions/20200101T000000Z-000000/clock").status_code == 404
 
@@ -282,7 +282,7 @@ def test_numbers_that_no_clock_has_are_refused_and_the_raw_data_stays(
     path = session.folder / "clock.parquet"
     table = pq.read_table(path)
     offsets = pa.array([2**63 - 1] * len(table), pa.int64())
-    write_table(path, table.set_column(2, table.schema.field(2), offsets))
+    write_hashed_table(path, table.set_column(2, table.schema.field(2), offsets))
     assert session.data(format="csv").status_code == 200
     answer = running.http.get(f"{session.url}/data?clock=server")
     assert_refused(answer, 500, "server_minus_node_ns")
@@ -312,7 +312,7 @@ def test_two_nodes_that_saw_the_same_event_are_put_on_one_axis(
         node.taken_in()
         node.finish(session)
         table = parquet_of(session.data(clock="server"))
-        hop = int(np.argmin(table["padc_0"].to_numpy()))
+        hop = int(np.argmin(table["pressure_raw_0"].to_numpy()))
         seen[name] = [
             table[column][hop].as_py() for column in ("t_server_ns", "t_server_uncertainty_ns")
         ]
@@ -333,7 +333,9 @@ def test_a_measurement_that_has_the_servers_clock_elsewhere_is_not_kept(
     node.say_clock(0, t_mono_ns=now_ns - HOUR_NS)
     measured(node, 5)
     assert running.node()["clock"]["server_minus_node_ns"] == 5
-    rows = running.call(lambda: list(running.server.nodes.get("bench").present.clock_rows))
+    rows = running.call(
+        lambda: list(running.server.nodes.get("bench").present_stream.clock_offsets)
+    )
     assert [row.server_minus_node_ns for row in rows] == [0, 5]
 
 
@@ -346,7 +348,7 @@ def test_a_node_that_connects_again_costs_no_reading_of_what_its_sessions_have(
         tared.say_clock(0)
     tared.deliver(10)
     with monkeypatch.context() as patched:
-        patched.setattr(ClockLog, "rows", refusing(AssertionError, "the log is read"))
+        patched.setattr(ClockLog, "read_rows", refusing(AssertionError, "the log is read"))
         tared.leave()
         tared.connect()
     assert tared.finish(recording)["complete"] is True

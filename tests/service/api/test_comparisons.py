@@ -56,7 +56,7 @@ def asked(session: Recording, path: str = "", **query: Any) -> Any:
 
 def test_figures_intervals_limits_and_the_reference_at_any_zoom(compared: Recording) -> None:
     (item,) = asked(compared)["items"]
-    assert (item["name"], item["problem"], item["is_of_these_frames"]) == (NAME, None, True)
+    assert (item["name"], item["problem"], item["matches_current_data"]) == (NAME, None, True)
     assert len(item["missed"]) == 1
     assert "grf_r2" in item["missed"][0]
     found = asked(compared, f"/{NAME}")
@@ -159,7 +159,7 @@ def test_a_comparison_with_other_frames_says_so_and_one_without_a_hash_is_not_pr
     content["session"]["file_sha256"] = "0" * 64
     path.write_text(json.dumps(content))
     found = asked(compared, f"/{NAME}")
-    assert (found["is_proven"], found["is_of_these_frames"]) == (False, False)
+    assert (found["is_proven"], found["matches_current_data"]) == (False, False)
 
 
 def test_a_session_that_was_compared_with_nothing_has_none(tared: FakeNode) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection
 
-from service.link import SILENCE_S
+from service.protocol import LINK_TIMEOUT_S
 from tests.faults.proxy import Proxy
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
@@ -39,7 +39,7 @@ class Through:
 @pytest.fixture
 def silence_s() -> float:
     """As in a server that people use."""
-    return SILENCE_S
+    return LINK_TIMEOUT_S
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def far(running: Running, link: Proxy) -> Iterator[FakeNode]:
 
 def away_after_s(running: Running, begin_s: float) -> float:
     """Seconds from an instant on until the node is said to be away."""
-    until(lambda: not running.node()["connected"], 2 * SILENCE_S)
+    until(lambda: not running.node()["connected"], 2 * LINK_TIMEOUT_S)
     return time.monotonic() - begin_s
 
 
@@ -72,7 +72,7 @@ def test_a_node_out_of_reach_is_away_five_seconds_after_its_last_word(
     far.send(10)
     far.taken_in()
     link.black_hole()
-    assert SILENCE_S <= away_after_s(running, begin_s) < SILENCE_S + LOOKING_S
+    assert LINK_TIMEOUT_S <= away_after_s(running, begin_s) < LINK_TIMEOUT_S + LOOKING_S
     node = running.node()
     assert node["rate_hz"] is None
     refused = running.http.post("/sessions", json={"node": "bench", "name": "late"})
@@ -85,9 +85,9 @@ def test_a_node_that_takes_nothing_in_is_away_as_soon(
 ) -> None:
     # What the server owes it does not get through either: closing must not be waited for.
     far.send(200)
-    running.call(lambda: running.server.links["bench"].acknowledge("0" * 32, far.acked))
+    running.call(lambda: running.server.links["bench"].queue_ack("0" * 32, far.acked))
     link.black_hole()
-    assert away_after_s(running, time.monotonic()) < SILENCE_S + LOOKING_S
+    assert away_after_s(running, time.monotonic()) < LINK_TIMEOUT_S + LOOKING_S
 
 
 def test_a_node_whose_process_is_killed_is_away_at_once(

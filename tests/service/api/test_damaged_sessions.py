@@ -29,8 +29,8 @@ def test_of_an_open_one_it_is_named_and_all_frames_are_kept(
     assert listed["items"] == []
     assert list(listed["unreadable"]) == [session.id]
     assert_refused(running.http.get(session.url), 409, "cannot be read", "foottile verify")
-    needed = running.call(lambda: running.server.recorder.needed("bench"))
-    assert needed == {node.boot_id: Intervals([(0, NO_END)])}
+    needed = running.call(lambda: running.server.recorder.needed_frames("bench"))
+    assert needed == {node.stream_id: Intervals([(0, NO_END)])}
     assert (running.data / "sessions" / session.id / "session.json").is_file()
 
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import foottile
-from service.pull import pull_made
+from service.pull import pull_export
 from storage.formats.load_trace import read_load_trace
 from storage.formats.slice import Slice
-from storage.formats.written.registry import format_named
+from storage.formats.writers.registry import get_format
 from tests.builders.arrays import PERIOD_NS
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -126,10 +126,10 @@ def test_a_mark_is_at_a_frame_of_its_own_part(
     rows = table(sealed.data(**query))
     row = int(np.argmin(np.abs(np.array(rows["time_s"], float) - at_s)))
     mark = {"label": "here", "t_ns": int(rows["t_server_ns"][row])}
-    assert running.http.post(f"{sealed.url}/events", json=mark).status_code == 201
+    assert running.http.post(f"{sealed.url}/markers", json=mark).status_code == 201
     part = {"start_s": max(0.0, at_s - 0.05), "end_s": at_s + 0.05}
     marked = table(sealed.data(format="csv", columns="part,time_s,event", **part))
-    (event,) = [i for i, label in enumerate(marked["event"]) if label]
+    (event,) = [i for i, label in enumerate(marked["marker"]) if label]
     assert marked["part"][event] == rows["part"][row]
     assert float(marked["time_s"][event]) == pytest.approx(float(rows["time_s"][row]), abs=1e-6)
 
@@ -155,7 +155,7 @@ def test_the_client_and_pull_give_both_clocks(
         later = server.session(sealed.id).open("part", start_s=BEGIN_S - 1, clock="server")
         assert set(later["part"]) == {1}
         part = Slice(BEGIN_S - 1, None, ("time_s", "t_server_ns"))
-        pulled = pull_made(server, sealed.id, tmp_path, part, format_named("csv"), clock="server")
+        pulled = pull_export(server, sealed.id, tmp_path, part, get_format("csv"), clock="server")
     with Path(pulled["path"]).open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == SECOND

@@ -150,9 +150,9 @@ def test_head_of_what_is_made_says_what_get_would(sealed: Sealed) -> None:
 @pytest.mark.parametrize("to", ["parquet", "arrow", "csv"])
 def test_a_slice_has_the_rows_and_columns_asked_for(sealed: Sealed, to: str) -> None:
     whole = pq.read_table(io.BytesIO(sealed.content))
-    answer = sealed.made(format=to, start_s=0.1, end_s=0.2, columns="seq,force_n, padc_1")
+    answer = sealed.made(format=to, start_s=0.1, end_s=0.2, columns="seq,force_n, pressure_raw_1")
     found = table_of(answer, to)
-    assert found.column_names == ["seq", "force_n_0", "force_n_1", "padc_1"]
+    assert found.column_names == ["seq", "force_n_0", "force_n_1", "pressure_raw_1"]
     assert found["seq"].to_pylist() == list(range(70 + 50, 70 + 100))
     for name in found.column_names:
         np.testing.assert_allclose(
@@ -166,9 +166,9 @@ def test_a_slice_has_the_rows_and_columns_asked_for(sealed: Sealed, to: str) -> 
 def test_another_format_of_the_whole_has_the_same_values(sealed: Sealed, to: str) -> None:
     whole = pq.read_table(io.BytesIO(sealed.content))
     found = table_of(sealed.made(format=to), to)
-    made = ["event", "time_s", "time_utc", *(["about"] if to == "csv" else [])]
+    made = ["marker", "time_s", "time_utc", *(["about"] if to == "csv" else [])]
     assert sorted(found.column_names) == sorted([*whole.column_names, *made])
-    for name in ("seq", "t_ns", "padc_0", "part", "force_n_1", "grf_n"):
+    for name in ("seq", "t_ns", "pressure_raw_0", "part", "force_n_1", "grf_n"):
         np.testing.assert_allclose(
             found[name].to_numpy(), whole[name].to_numpy(), rtol=1e-6, err_msg=name
         )
@@ -208,7 +208,9 @@ def test_parquet_of_a_recording_session_is_not_there_yet(sealed: Sealed) -> None
 def test_a_file_is_named_after_the_trial_and_its_seconds(sealed: Sealed) -> None:
     changed = {"name": "Ünder/..\\ 3rd trial\r\n"}
     answer = sealed.session.running.http.patch(
-        sealed.session.url, json=changed, headers={"If-Match": f'"{sealed.session.now()["said"]}"'}
+        sealed.session.url,
+        json=changed,
+        headers={"If-Match": f'"{sealed.session.now()["revision"]}"'},
     )
     assert answer.status_code == 200, answer.text
     made = sealed.made(sealed.session, format="csv", start_s=0.25, columns="grf_n")
@@ -278,7 +280,7 @@ def test_an_odd_id_is_not_found(sealed: Sealed) -> None:
         "x" * 5000,
         "%ff",
     ):
-        for rest in ("", "/data", "/events", "/ledger"):
+        for rest in ("", "/data", "/markers", "/ledger"):
             answer = sealed.running.http.get(f"/sessions/{odd}{rest}")
             assert answer.status_code in (400, 404), odd
             assert answer.headers["content-type"] == "application/problem+json"

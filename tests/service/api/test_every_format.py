@@ -9,12 +9,12 @@ from dataclasses import replace
 import pytest
 
 from storage.formats.export import Export
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.registry import FORMATS
 from tests.service.api.sealed import Sealed
 from tests.service.fake_node import NodeOf
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
-from tests.storage.formats.written.readers import said_in
+from tests.storage.formats.writers.readers import said_in
 from tests.waiting import until
 
 
@@ -54,11 +54,11 @@ def test_a_lossy_session_is_lossy_and_one_without_curve_is_counts_in_each(
     for node in (raw, lossy):
         node.finish(sessions[node.name])
     for to, known in FORMATS.items():
-        answer = sessions["lossy"].data(format=to, marks=True)
+        answer = sessions["lossy"].data(format=to, markers=True)
         assert answer.headers["foottile-complete"] == "lossy"
         assert complete_in(to, answer.content).startswith("lossy")
         url = f"{sessions['raw'].url}/data"
-        answer = running.http.get(url, params={"format": to, "marks": "true"})
+        answer = running.http.get(url, params={"format": to, "markers": "true"})
         if known.needs_forces:
             assert_refused(answer, 422, "this session has none", "ask for its counts")
         else:
@@ -78,7 +78,7 @@ def test_who_goes_away_in_between_ends_the_making_of_it(
         finally:
             ended.set()
 
-    monkeypatch.setitem(FORMATS, to, replace(FORMATS[to], write=endless))
+    monkeypatch.setitem(FORMATS, to, replace(FORMATS[to], encoder=endless))
     query = {"format": to, "start_s": "0.1"}
     with sealed.running.http.stream("GET", f"{sealed.session.url}/data", params=query) as answer:
         pieces = answer.iter_bytes()  # once it is let go, so is the connection

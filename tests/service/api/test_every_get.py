@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 import service.api.routes.downloads.zips as zips
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.registry import FORMATS
 from tests.service.api.sealed import Sealed
 from tests.service.running import Running
 from tests.tokens import SHARED_BEARER
@@ -90,7 +90,7 @@ def test_head_does_not_make_what_it_does_not_send(
     sealed: Sealed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     state = [0, 0]
-    monkeypatch.setattr(zips, "zipped", lambda _: endless(state))
+    monkeypatch.setattr(zips, "stream_zip", lambda _: endless(state))
     answer = asked(sealed.running, "HEAD", f"/api/v1/sessions/zip?ids={sealed.id}")
     assert answer.headers["content-type"] == "application/zip"
     until(lambda: state[1])
@@ -153,7 +153,7 @@ def broken(_: object) -> Iterator[bytes]:
 def test_to_an_old_client_an_answer_that_breaks_off_is_no_whole_one(
     sealed: Sealed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(zips, "zipped", broken)
+    monkeypatch.setattr(zips, "stream_zip", broken)
     with pytest.raises(ConnectionResetError):
         got_by_old(sealed.running, f"/api/v1/sessions/zip?ids={sealed.id}")
 

@@ -19,7 +19,7 @@ import pytest
 import storage.sessions.folder
 from devices.errors import FolderGoneError, StorageError
 from service.server.data_folder import DataFolder
-from storage.durable import LOCK_NAME
+from storage.durable_files import LOCK_NAME
 from storage.intervals import Intervals
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf, Play
@@ -105,7 +105,7 @@ def test_while_the_folder_is_away_nothing_is_promised_or_written_in_its_place(
     node.acknowledged(node.seq - 1)
     assert running.node()["storage_problem"] is None
     assert running.http.get("/ready").status_code == 200
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
 
 
 def test_a_recording_is_complete_although_the_folder_was_away_in_the_middle(
@@ -164,17 +164,17 @@ def test_a_copy_with_the_same_id_is_the_folder(running: Running, tared: FakeNode
     tared.send(30, 20.0)
     tared.acknowledged(int(tared.sent[-1].seq[-1]))
     assert files_in(running.data) > files_in(away) - {".writable"}
-    assert_same_bits(running.held(tared.boot_id), tared.all_sent())
+    assert_same_bits(running.held(tared.stream_id), tared.all_sent())
 
 
 def test_a_copy_that_took_its_place_between_sync_and_acknowledgement_is_promised_nothing(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Frames are on the disk in the old folder, and not in the copy, which was made before.
-    data, folder = running.data, running.server.folder
+    data, folder = running.data, running.server.data_folder
     copy, away = data.with_name("copy"), data.with_name("away")
     shutil.copytree(data, copy)
-    node, check = running.server.nodes.get("bench"), folder.check
+    node, check = running.server.nodes.get("bench"), folder.check_in_place
 
     def swap_and_check() -> None:
         if node.last_seq == 99 and copy.exists():
@@ -190,7 +190,7 @@ def test_a_copy_that_took_its_place_between_sync_and_acknowledgement_is_promised
     assert tared.connect() == [(70, None)]
     tared.send_again(sent)
     tared.acknowledged(99)
-    assert_same_bits(running.held(tared.boot_id), tared.all_sent())
+    assert_same_bits(running.held(tared.stream_id), tared.all_sent())
     assert open_below(away) == set()
 
 
@@ -207,8 +207,8 @@ def test_nothing_stays_open_in_a_folder_whose_copy_is_used(
     other.deliver(10)
     with monkeypatch.context() as patched:
         full = refusing(StorageError, "No space left on device")
-        patched.setattr(running.server.nodes.get("other").present, "sync", full)
-        patched.setattr(running.server, "check_storage", full)
+        patched.setattr(running.server.nodes.get("other").present_stream, "sync", full)
+        patched.setattr(running.server, "check_writable", full)
         other.send(10)
         until(lambda: running.node("other")["storage_problem"])
     away = running.data.with_name("away")
@@ -228,9 +228,9 @@ def test_a_folder_is_not_used_before_what_is_open_in_the_one_before_is_closed(
     shutil.copytree(away, data)
     for _ in range(2):
         with pytest.raises(FolderGoneError, match="not used yet"):
-            folder.check()
-    folder.take_again()
-    folder.check()
+            folder.check_in_place()
+    folder.reopen()
+    folder.check_in_place()
     folder.close()
 
 
@@ -243,8 +243,8 @@ def test_a_copy_that_another_server_has_is_not_taken_from_it(tmp_path: Path) -> 
     with (data / LOCK_NAME).open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(StorageError, match="another foottile server"):
-            folder.take_again()
-    folder.take_again()
+            folder.reopen()
+    folder.reopen()
     folder.close()
 
 
@@ -269,7 +269,7 @@ def test_a_place_that_cannot_be_seen_is_a_folder_that_is_gone(
 def test_a_bug_on_the_way_to_the_disk_costs_no_frame(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stream = running.server.nodes.get("bench").present
+    stream = running.server.nodes.get("bench").present_stream
     monkeypatch.setattr(stream, "sync", failing_once(stream.sync, ZeroDivisionError, "a bug"))
     sent = tared.send(30, 20.0)
     assert closed(tared.socket)[0] == 1012
@@ -277,7 +277,7 @@ def test_a_bug_on_the_way_to_the_disk_costs_no_frame(
     assert tared.connect() == [(70, None)]
     tared.send_again(sent)
     tared.acknowledged(99)
-    assert_same_bits(running.held(tared.boot_id), tared.all_sent())
+    assert_same_bits(running.held(tared.stream_id), tared.all_sent())
 
 
 def test_the_log_says_it_once(
@@ -320,7 +320,7 @@ def test_a_start_that_a_full_disk_refuses_leaves_nothing(
 ) -> None:
     full = refusing(StorageError, "No space left on device")
     with monkeypatch.context() as patched:
-        patched.setattr(storage.sessions.folder, "write_checked", full)
+        patched.setattr(storage.sessions.folder, "write_checksummed_json", full)
         assert_refused(running.http.post("/sessions", json={"node": "bench", "name": "x"}), 507)
     assert list((running.data / "sessions").iterdir()) == []
     assert running.sessions() == []

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from service.api.address import token_for
-from service.link import INGEST_PATH
+from service.api.address import load_or_create_token
+from service.protocol import INGEST_PATH
 from tests.service.fake_node import NodeOf
 from tests.service.running import Running, ServeWith
 from tests.waiting import PATIENCE_S
@@ -145,7 +145,7 @@ CHANGES = (
     ("POST", "/sessions"),
     ("POST", "/sessions/20200101T000000Z-000000/stop"),
     ("PATCH", "/sessions/20200101T000000Z-000000"),
-    ("POST", "/sessions/20200101T000000Z-000000/events"),
+    ("POST", "/sessions/20200101T000000Z-000000/markers"),
     ("POST", "/nodes/bench/tare"),
     ("DELETE", "/nodes/bench/tares/1"),
 )
@@ -216,22 +216,22 @@ def test_reading_and_watching_need_no_token(serve_with: ServeWith) -> None:
 
 def test_a_token_is_made_once_and_only_its_owner_may_read_it(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    token = token_for(None, data)
+    token = load_or_create_token(None, data)
     assert len(token) >= 20
     assert stat.S_IMODE((data / "token").stat().st_mode) == 0o600
-    assert token_for(None, data) == token
-    assert token_for("given", data) == "given"
+    assert load_or_create_token(None, data) == token
+    assert load_or_create_token("given", data) == "given"
 
 
 def test_an_empty_token_is_none(tmp_path: Path) -> None:
     # FOOTTILE_TOKEN= in the environment must not open the server to everybody.
-    assert token_for("", tmp_path)
+    assert load_or_create_token("", tmp_path)
 
 
 def test_a_token_file_that_is_empty_is_no_token(tmp_path: Path) -> None:
     # As after a cut of power between its creation and its writing.
     (tmp_path / "token").touch(mode=0o600)
-    assert token_for(None, tmp_path)
+    assert load_or_create_token(None, tmp_path)
 
 
 @pytest.mark.parametrize("path", ["/api/v1/ingest%0A", "/api/v1/ingest/", "/api/v1//ingest", "/x"])

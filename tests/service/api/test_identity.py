@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from service.identity import fingerprint_of
+from service.node_identity import compute_fingerprint
 from storage.secret_file import SECRETS_NAME, read_secrets
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import Earlier, FakeNode, NodeOf
@@ -62,7 +62,7 @@ def test_a_stream_id_is_no_proof_and_the_node_goes_on_recording(
     running_stream = Earlier(tared.info, tared.seq, tared.sent[-1:])
     changes: dict[str, Any] = {"earlier": (running_stream.said(),)}
     if claim == "present":
-        stranger.boot_id, stranger.utc_offset_ns = tared.boot_id, tared.utc_offset_ns
+        stranger.stream_id, stranger.utc_offset_ns = tared.stream_id, tared.utc_offset_ns
         changes = {}
     stranger.open_with_hello(**changes)
     code, reason = closed(stranger.socket)
@@ -70,7 +70,7 @@ def test_a_stream_id_is_no_proof_and_the_node_goes_on_recording(
     sent = tared.deliver(50)
     sealed = tared.finish(session)
     assert (sealed["complete"], sealed["frames"]) == (True, 70)
-    assert_same_bits(running.held(tared.boot_id).rows(90, 140), sent)
+    assert_same_bits(running.held(tared.stream_id).slice_rows(90, 140), sent)
 
 
 def test_an_answer_that_was_overheard_is_worth_nothing_on_another_connection(
@@ -104,7 +104,7 @@ def test_a_machine_without_a_secret_is_let_in_under_a_free_name_and_displaces_no
     node.secret = stranger.secret = None
     node.connect()
     node.deliver(10)
-    stranger.boot_id, stranger.utc_offset_ns = node.boot_id, node.utc_offset_ns
+    stranger.stream_id, stranger.utc_offset_ns = node.stream_id, node.utc_offset_ns
     stranger.open_with_hello()
     assert closed(stranger.socket)[0] == 4009
     node.deliver(10)
@@ -134,7 +134,7 @@ def test_a_person_accepts_another_machine_which_then_is_the_node(
     asking = replacement(running)
     assert asking is not None
     assert stranger.secret is not None
-    assert asking["fingerprint"] == fingerprint_of(stranger.secret)
+    assert asking["fingerprint"] == compute_fingerprint(stranger.secret)
     assert asking["address"] == "127.0.0.1"
     assert abs(asking["asked_t_ns"] - before_t_ns) < 60e9
     assert_refused(accept(running, "0000-0000-0000-0000"), 412, asking["fingerprint"])
@@ -182,7 +182,7 @@ async def test_a_real_publisher_is_refused_says_what_it_is_and_is_let_in_once_ac
     node.connect()
     node.leave()
     assert stranger.secret is not None
-    fingerprint = fingerprint_of(stranger.secret)
+    fingerprint = compute_fingerprint(stranger.secret)
     async with Publishing(stranger, running.url) as publishing:
         await publishing.until(lambda: replacement(running))
         assert any(
@@ -210,10 +210,10 @@ def test_frames_dated_ahead_are_refused_over_an_open_link_and_true_ones_go_on(
     tared.sent.pop()
     tared.seq = seq
     sent = tared.deliver(50)
-    assert tared.acked == tared.acked.within(0, tared.seq - 1)
-    (warning,) = running.node()["troubles"]
+    assert tared.acked == tared.acked.restricted_to(0, tared.seq - 1)
+    (warning,) = running.node()["warnings"]
     assert "30 frames were refused" in warning
-    assert_same_bits(running.held(tared.boot_id), tared.all_sent())
+    assert_same_bits(running.held(tared.stream_id), tared.all_sent())
     sealed = tared.finish(session)
     assert (sealed["complete"], sealed["frames"]) == (True, 70)
     assert len(sent) == 50

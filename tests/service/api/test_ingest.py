@@ -33,14 +33,14 @@ def test_a_new_node_is_asked_for_everything(node: FakeNode) -> None:
 
 
 def test_a_new_node_is_not_asked_for_what_it_has_forgotten(node: FakeNode) -> None:
-    assert node.connect(held=((500, 899),), next_seq=900) == [(500, None)]
+    assert node.connect(stored=((500, 899),), next_seq=900) == [(500, None)]
 
 
 def test_what_is_acknowledged_is_readable_from_disk(running: Running, node: FakeNode) -> None:
     node.connect()
     sent = node.deliver(300)
     assert node.acked == Intervals([(0, 299)])
-    assert_same_bits(running.held(node.boot_id), sent)
+    assert_same_bits(running.held(node.stream_id), sent)
 
 
 def test_a_node_that_comes_back_goes_on_where_the_server_is(
@@ -53,7 +53,7 @@ def test_a_node_that_comes_back_goes_on_where_the_server_is(
     assert node.connect() == [(100, None)]
     node.send_again(node.sent[1])
     node.deliver(30)
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
     assert running.node()["lost_frames"] == 0
 
 
@@ -63,9 +63,9 @@ def test_frames_that_are_sent_twice_are_held_once_and_acknowledged_again(
     node.connect()
     sent = node.deliver(100)
     node.acked = Intervals()
-    node.send_again(sent.rows(55, 100))
+    node.send_again(sent.slice_rows(55, 100))
     node.acknowledged(99, first=55)
-    assert_same_bits(running.held(node.boot_id), sent)
+    assert_same_bits(running.held(node.stream_id), sent)
 
 
 def test_a_gap_is_asked_for_at_the_next_connection(running: Running, node: FakeNode) -> None:
@@ -78,7 +78,7 @@ def test_a_gap_is_asked_for_at_the_next_connection(running: Running, node: FakeN
     assert node.connect() == [(40, 64), (100, None)]
     node.send_again(gap)
     node.acknowledged(99)
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
 
 
 def test_after_a_restart_the_server_lacks_exactly_the_rest(
@@ -87,10 +87,10 @@ def test_after_a_restart_the_server_lacks_exactly_the_rest(
     node.connect()
     node.deliver(200)
     running.restart()
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
     assert node.connect() == [(200, None)]
     node.deliver(50)
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
 
 
 def test_a_server_that_goes_down_says_so_to_its_nodes(running: Running, node: FakeNode) -> None:
@@ -129,13 +129,13 @@ def test_a_killed_server_has_every_frame_that_it_acknowledged(
                 pass
     assert process.ended(5.0) == -signal.SIGKILL
     copy = tmp_path / "copy"
-    shutil.copytree(data / "journal" / "bench" / node.boot_id, copy)
+    shutil.copytree(data / "journal" / "bench" / node.stream_id, copy)
     journal = Journal.open(copy)
-    assert not (node.acked - journal.held)
-    held = journal.held.last
+    assert not (node.acked - journal.stored)
+    held = journal.stored.last
     assert held is not None
-    found = FrameBatch.concatenate(list(journal.read(0, held)))
-    assert_same_bits(found, node.all_sent().rows(0, held + 1))
+    found = FrameBatch.concatenate(list(journal.read_frames(0, held)))
+    assert_same_bits(found, node.all_sent().slice_rows(0, held + 1))
     # What it held is what it does not ask for when it runs again.
     running.port = 0
     running.data = data
@@ -180,7 +180,7 @@ def test_a_node_that_has_left_may_come_back_with_another_boot(
     node.deliver(10)
     node.restart()
     assert node.connect() == [(0, None)]
-    assert running.node()["boot_id"] == node.boot_id
+    assert running.node()["stream_id"] == node.stream_id
     node.deliver(10)
 
 
@@ -188,7 +188,7 @@ def test_a_node_that_has_left_may_come_back_with_another_boot(
 def test_a_node_that_says_nothing_is_let_go(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, greeted: bool
 ) -> None:
-    monkeypatch.setattr(service.api.routes.sockets.ingest, "SILENCE_S", 0.3)
+    monkeypatch.setattr(service.api.routes.sockets.ingest, "LINK_TIMEOUT_S", 0.3)
     if greeted:
         node.connect()
     else:
@@ -222,7 +222,7 @@ def test_what_was_held_and_not_acknowledged_is_so_at_the_next_connection(
     until(lambda: running.node()["last_seq"] == 29)
     node.socket.socket.shutdown(2)
     until(lambda: not running.node()["connected"])
-    assert not node.acked.within(20, 29)
+    assert not node.acked.restricted_to(20, 29)
     for first, _ in node.connect():
         if first == 20:
             node.send_again(node.sent[-1])
@@ -239,7 +239,7 @@ def test_what_was_held_at_a_restart_is_acknowledged_at_the_next_connection(
     running.start()
     [(first, _)] = node.connect()
     if first < 20:
-        node.send_again(node.sent[-1].rows(first, 20))
+        node.send_again(node.sent[-1].slice_rows(first, 20))
     node.deliver(10)
 
 
@@ -276,9 +276,9 @@ def test_frames_of_an_earlier_stream_are_held_to_its_own_description(
     node.send(10)
     node.send_earlier(before, 0, 19)
     node.deliver(10)
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
-    assert_same_bits(running.held(before.boot_id), before.sent[0])
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
+    assert_same_bits(running.held(before.stream_id), before.sent[0])
     assert running.node()["last_seq"] == 19
-    node.socket.send(json.dumps({"type": "stream", "boot_id": before.boot_id}))
+    node.socket.send(json.dumps({"type": "stream", "stream_id": before.stream_id}))
     node.socket.send(node.payload(node.frames(10)))  # of three tiles
     assert closed(node.socket)[0] == 4001

@@ -84,10 +84,10 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
 ) -> None:
     full = threading.Event()
     segment, is_full = storage.journal.segment_writer, lambda *_: full.is_set()
-    writes = failing_if(is_full, segment.write_all, *NO_SPACE)
-    check = failing_if(is_full, running.server.check_storage, *STORAGE_FULL)
-    monkeypatch.setattr(segment, "write_all", writes)
-    monkeypatch.setattr(running.server, "check_storage", check)
+    writes = failing_if(is_full, segment.write_all_or_none, *NO_SPACE)
+    check = failing_if(is_full, running.server.check_writable, *STORAGE_FULL)
+    monkeypatch.setattr(segment, "write_all_or_none", writes)
+    monkeypatch.setattr(running.server, "check_writable", check)
     node.connect()
     node.tared()
     node.acknowledged(69)
@@ -104,7 +104,7 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
         node.socket.send('{"type":"probe","id":1}')
         node.receive("probe")
         assert node.acked == Intervals([(0, 69)])
-        assert running.journal(node.boot_id).held == Intervals([(0, 69)])
+        assert running.journal(node.stream_id).stored == Intervals([(0, 69)])
     full.clear()
     assert closed(node.socket)[0] == 1012
     until(lambda: not running.node()["connected"])
@@ -112,7 +112,7 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
     node.send_again(lost)
     node.deliver(10, 20.0)
     assert running.node()["storage_problem"] is None
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
 
 
 def test_a_disk_that_is_full_between_two_syncs_has_refused_nothing(
@@ -120,13 +120,13 @@ def test_a_disk_that_is_full_between_two_syncs_has_refused_nothing(
 ) -> None:
     # Who takes messages in never writes: they wait in memory for the next sync.
     full, segment = threading.Event(), storage.journal.segment_writer
-    writes = failing_if(lambda *_: full.is_set(), segment.write_all, *NO_SPACE)
+    writes = failing_if(lambda *_: full.is_set(), segment.write_all_or_none, *NO_SPACE)
     node.connect()
     node.deliver(10)
     monkeypatch.setattr(service.server.server, "TICK_S", 0.5)
     node.send(10)
     node.acknowledged(19)  # the next tick is half a second away
-    monkeypatch.setattr(segment, "write_all", writes)
+    monkeypatch.setattr(segment, "write_all_or_none", writes)
     full.set()
     node.send(20)
     until(lambda: running.node()["last_seq"] == 39)
@@ -138,14 +138,14 @@ def test_a_disk_that_is_full_between_two_syncs_has_refused_nothing(
 def test_what_a_node_says_is_written_down_in_another_thread_before_its_frames_are_promised(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun, may_go_on, keep = threading.Event(), threading.Event(), ServerNode.keep
+    begun, may_go_on, keep = threading.Event(), threading.Event(), ServerNode.save
 
     def slow(self: ServerNode) -> None:
         begun.set()
         assert may_go_on.wait(PATIENCE_S)
         keep(self)
 
-    monkeypatch.setattr(ServerNode, "keep", slow)
+    monkeypatch.setattr(ServerNode, "save", slow)
     try:
         node.connect()
         node.send(10)
@@ -171,9 +171,9 @@ def test_a_disk_that_refuses_to_sync_acknowledges_nothing(
     # Whatever it is asked for now, in the end everything has to be acknowledged.
     for first, last in node.connect():
         if last is None:
-            node.send_again(node.all_sent().rows(first, 20)) if first < 20 else None
+            node.send_again(node.all_sent().slice_rows(first, 20)) if first < 20 else None
     node.deliver(10)
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
 
 
 def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
@@ -184,7 +184,7 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     node.restart()
     node.tiles += 1
     with monkeypatch.context() as patch:
-        patch.setattr(service.server.node.ServerNode, "keep", refusing(*STORAGE_FULL))
+        patch.setattr(service.server.node.ServerNode, "save", refusing(*STORAGE_FULL))
         node.connect()
     shown = running.node()
     assert len(shown["tiles"]) == node.tiles
@@ -205,7 +205,7 @@ def test_what_could_not_be_synced_is_sent_again(
     node.send_again(lost)
     node.acknowledged(19)
     running.restart()
-    assert_same_bits(running.held(node.boot_id), node.all_sent())
+    assert_same_bits(running.held(node.stream_id), node.all_sent())
 
 
 def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
@@ -213,11 +213,11 @@ def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
 ) -> None:
     refuse = refusing(*STORAGE_FULL)
     monkeypatch.setattr(service.server.streams, "Journal", refuse)  # not even a folder
-    monkeypatch.setattr(running.server, "check_storage", refuse)
+    monkeypatch.setattr(running.server, "check_writable", refuse)
     node.connect()
     node.send(10)
     until(lambda: running.node()["storage_problem"] is not None)
     monkeypatch.setattr(service.server.streams, "Journal", Journal)
-    monkeypatch.setattr(running.server, "check_storage", lambda: None)
+    monkeypatch.setattr(running.server, "check_writable", lambda: None)
     assert closed(node.socket)[0] == 1012
     assert node.connect() == [(0, None)]

@@ -13,7 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from devices.frames import FrameBatch
-from service.link import INGEST_PATH, MESSAGE_BYTES_MAX, PROTOCOL
+from service.protocol import INGEST_PATH, MESSAGE_BYTES_MAX, PROTOCOL
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, closed
 
@@ -107,9 +107,9 @@ def test_no_step_of_the_handshake_can_be_left_out(healthy: FakeNode, node: FakeN
 @pytest.mark.parametrize(
     "change",
     [
-        {"held": [[-1, 5]]},
-        {"held": [[0, 2**62]]},
-        {"held": [[0]]},
+        {"stored": [[-1, 5]]},
+        {"stored": [[0, 2**62]]},
+        {"stored": [[0]]},
         {"lost": {"Evicted!": [[0, 1]]}},
         {"earlier": [{}]},
         {"next_seq": 1.5},
@@ -146,11 +146,11 @@ def test_a_name_that_is_no_folders_name_is_refused(
     assert not (running.data / "nodes").exists()
 
 
-@pytest.mark.parametrize("boot_id", ["../x", "", "0" * 31, "G" * 32, "0" * 32 + "/.."])
-def test_a_boot_id_that_is_no_folders_name_is_refused(
-    running: Running, node: FakeNode, boot_id: str
+@pytest.mark.parametrize("stream_id", ["../x", "", "0" * 31, "G" * 32, "0" * 32 + "/.."])
+def test_a_stream_id_that_is_no_folders_name_is_refused(
+    running: Running, node: FakeNode, stream_id: str
 ) -> None:
-    info = node.info.model_copy(update={"boot_id": boot_id})
+    info = node.info.model_copy(update={"stream_id": stream_id})
     node.open_with_hello(array_info=info)
     assert closed(node.socket)[0] == 4001
     assert running.http.get("/nodes").json()["items"] == []
@@ -167,7 +167,9 @@ def test_a_node_without_tiles_is_refused(running: Running, node: FakeNode) -> No
 
 def _backwards(node: FakeNode, payload: bytes) -> bytes:
     batch = node.sent[-1]
-    return bytes(node.payload(FrameBatch.concatenate([batch.rows(5, 10), batch.rows(0, 5)])))
+    return bytes(
+        node.payload(FrameBatch.concatenate([batch.slice_rows(5, 10), batch.slice_rows(0, 5)]))
+    )
 
 
 def _endless(_: FakeNode, payload: bytes) -> bytes:
@@ -260,7 +262,7 @@ def test_a_name_that_is_in_use_is_refused_by_name(
     assert code == 4009
     assert "'bench'" in reason
     assert "--name" in reason
-    assert running.node()["boot_id"] == node.boot_id
+    assert running.node()["stream_id"] == node.stream_id
     assert_goes_on(node)
 
 
@@ -280,10 +282,10 @@ def test_what_another_version_wrote_of_a_node_does_not_keep_the_server_from_star
 @pytest.mark.parametrize(
     "message",
     [
-        {"type": "stream", "boot_id": "f" * 32},
-        {"type": "stream", "boot_id": "../x"},
-        {"type": "lost", "boot_id": "f" * 32, "lost": {}},
-        {"type": "lost", "boot_id": None, "lost": {"evicted": [[5, 4]]}},
+        {"type": "stream", "stream_id": "f" * 32},
+        {"type": "stream", "stream_id": "../x"},
+        {"type": "lost", "stream_id": "f" * 32, "lost": {}},
+        {"type": "lost", "stream_id": None, "lost": {"evicted": [[5, 4]]}},
     ],
     ids=str,
 )
@@ -291,12 +293,12 @@ def test_a_stream_that_was_not_announced_is_refused(
     healthy: FakeNode, node: FakeNode, message: dict[str, Any]
 ) -> None:
     node.connect()
-    boot_id = message["boot_id"] or node.boot_id
-    node.socket.send(json.dumps(message | {"boot_id": boot_id}))
+    stream_id = message["stream_id"] or node.stream_id
+    node.socket.send(json.dumps(message | {"stream_id": stream_id}))
     assert let_go(node, healthy)[0] == 4001
 
 
-@pytest.mark.parametrize("what", ["name", "tiles", "twice", "held"])
+@pytest.mark.parametrize("what", ["name", "tiles", "twice", "stored"])
 def test_earlier_streams_that_cannot_be_are_refused(
     healthy: FakeNode, node: FakeNode, what: str
 ) -> None:
@@ -305,11 +307,11 @@ def test_earlier_streams_that_cannot_be_are_refused(
     changes: dict[str, dict[str, Any]] = {
         "name": {"node": "other"},
         "tiles": {"tiles": ()},
-        "twice": {"boot_id": node.boot_id},
-        "held": {},
+        "twice": {"stream_id": node.stream_id},
+        "stored": {},
     }
     said = before.said(array_info=before.info.model_copy(update=changes[what]))
-    if what == "held":
-        said = said.model_copy(update={"held": ((5, 4),)})
+    if what == "stored":
+        said = said.model_copy(update={"stored": ((5, 4),)})
     node.open_with_hello(earlier=(said,))
     assert let_go(node, healthy)[0] == 4001

@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
 import service.api.routes.sockets.live_frames
-import service.server.full_rate.memory
+import service.server.live_feed.buffer
 from tests.service.api.test_calibrations import assign, stiffer
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, closed
@@ -30,7 +30,7 @@ class Taken:
     said: list[dict[str, Any]] = field(default_factory=list)
     batches: list[tuple[str, Any]] = field(default_factory=list)
     """With the stream each is of."""
-    boot_id: str = ""
+    stream_id: str = ""
     schema: Any = None
 
     def next(self) -> Any:
@@ -38,20 +38,20 @@ class Taken:
         if isinstance(message, str):
             self.said.append(json.loads(message))
             if self.said[-1]["type"] == "stream":
-                self.boot_id, self.schema = self.said[-1]["boot_id"], None
+                self.stream_id, self.schema = self.said[-1]["stream_id"], None
             return self.said[-1]
         if self.schema is None:
             self.schema = pa.ipc.read_schema(pa.py_buffer(message))
             return self.next()
         batch = pa.ipc.read_record_batch(pa.py_buffer(message), self.schema)
-        self.batches.append((self.boot_id, batch))
+        self.batches.append((self.stream_id, batch))
         return batch
 
-    def until(self, seq: int, boot_id: str | None = None) -> Taken:
+    def until(self, seq: int, stream_id: str | None = None) -> Taken:
         """Take until this frame has come."""
         while not (
             self.batches
-            and boot_id in (None, self.batches[-1][0])
+            and stream_id in (None, self.batches[-1][0])
             and self.batches[-1][1]["seq"][-1].as_py() >= seq
         ):
             self.next()
@@ -63,8 +63,8 @@ class Taken:
             if isinstance(message, dict) and message["type"] == kind:
                 return message
 
-    def table(self, boot_id: str | None = None) -> Any:
-        return pa.Table.from_batches([b for of, b in self.batches if boot_id in (None, of)])
+    def table(self, stream_id: str | None = None) -> Any:
+        return pa.Table.from_batches([b for of, b in self.batches if stream_id in (None, of)])
 
     @property
     def seqs(self) -> list[int]:
@@ -102,10 +102,10 @@ def test_every_frame_comes_once_with_its_estimates(running: Running, tared: Fake
     assert np.median(rows["force_n_1"].to_numpy()) == pytest.approx(60.0, abs=0.05)
     assert np.median(rows["grf_n"].to_numpy()) == pytest.approx(80.0, abs=0.1)
     at = np.asarray(rows["seq"]) - int(sent.seq[0])
-    assert rows["padc_0"].to_pylist() == sent.padc[at.astype(int), 0].tolist()
+    assert rows["pressure_raw_0"].to_pylist() == sent.pressure_raw[at.astype(int), 0].tolist()
     assert rows.schema.field("grf_n").metadata[b"unit"] == b"N"
     info = json.loads(rows.schema.metadata[b"foottile.array_info"])
-    assert info["boot_id"] == tared.boot_id
+    assert info["stream_id"] == tared.stream_id
 
 
 def test_only_columns_that_were_asked_for_come(running: Running, tared: FakeNode) -> None:
@@ -142,8 +142,8 @@ def test_messages_of_a_stream_behind_each_other_are_an_arrow_stream(
         ("&columns=force_n_2", "'force_n_2'"),
         ("&policy=all", "policy='all'"),
         ("&policy=", "policy=''"),
-        ("&boot_id=x", "32 hex digits"),
-        ("&boot_id=" + "0" * 32, "no stream"),
+        ("&stream_id=x", "32 hex digits"),
+        ("&stream_id=" + "0" * 32, "no stream"),
         ("&from_seq=-1", "from_seq='-1'"),
         ("&from_seq=1e3", "from_seq='1e3'"),
         ("&from_seq=" + "9" * 400, "from_seq="),
@@ -157,7 +157,7 @@ def test_a_query_that_is_none_closes_with_the_reason(
 ) -> None:
     with running.socket(LIVE + query) as live:
         code, reason = closed(live)
-    assert code == (4011 if "boot_id=0" in query else 1008)
+    assert code == (4011 if "stream_id=0" in query else 1008)
     assert said in reason
 
 
@@ -187,11 +187,11 @@ def test_a_cut_and_a_resume_anywhere_give_the_same_bits_as_no_cut(
     parts = [cut.table()]
     at = cut.seqs[-1] + 1
     for n in (1, 7, 30, 33):  # in the middle of a piece, and at its edge
-        with running.socket(f"{LIVE}&boot_id={tared.boot_id}&from_seq={at}") as socket:
+        with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={at}") as socket:
             taken = Taken(socket).until(at + n - 1)
         parts.append(taken.table().slice(0, n))
         at += n
-    with running.socket(f"{LIVE}&boot_id={tared.boot_id}&from_seq={at}") as socket:
+    with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={at}") as socket:
         parts.append(Taken(socket).until(last).table())
     table = pa.concat_tables(parts)
     assert table["seq"].to_pylist()[: last - first + 1] == whole.seqs
@@ -204,14 +204,14 @@ def test_what_memory_has_not_any_more_is_recomputed_to_the_same_bits(
     with running.socket(LIVE) as socket:
         whole = Taken(socket)
         whole.until_said("hello")
-        memory = running.server.frames.of("bench")
+        memory = running.server.live_feeds.get_or_create("bench")
         tared.send(300, [20.0, 60.0], alive=True)
         whole.until(tared.seq - 10)
         monkeypatch.setattr(memory, "_bytes_max", 20_000)
         tared.send(300, [50.0, 10.0], alive=True)
         whole.until(tared.seq - 10)
     first = whole.seqs[0]
-    with running.socket(f"{LIVE}&boot_id={tared.boot_id}&from_seq={first}") as socket:
+    with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={first}") as socket:
         again = Taken(socket).until(whole.seqs[-1])
     assert again.seqs[: len(whole.seqs)] == whole.seqs
     table = again.table().slice(0, len(whole.seqs))
@@ -234,11 +234,11 @@ def test_tare_and_calibration_are_in_force_from_the_frame_on_from_which_they_wer
         assert assign(running, stiffer(*tared.info.serials)).status_code == 200
         tared.send(100, 20.0, alive=True)
         whole.until(tared.seq - 10)
-    monkeypatch.setattr(running.server.frames.of("bench"), "_bytes_max", 1)
+    monkeypatch.setattr(running.server.live_feeds.get_or_create("bench"), "_bytes_max", 1)
     tared.send(10)
     tared.taken_in()
     first, last = whole.seqs[0], whole.seqs[-1]
-    with running.socket(f"{LIVE}&boot_id={tared.boot_id}&from_seq={first}") as socket:
+    with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={first}") as socket:
         again = Taken(socket).until(last)
     table = again.table().slice(0, len(whole.seqs))
     assert all(table["recomputed"].to_pylist())
@@ -257,7 +257,7 @@ def test_over_a_restart_of_the_server_no_frame_is_missing_and_none_comes_twice(
     tared.connect()
     tared.send(50, 20.0)
     at = before.seqs[-1] + 1
-    with running.socket(f"{LIVE}&boot_id={tared.boot_id}&from_seq={at}") as socket:
+    with running.socket(f"{LIVE}&stream_id={tared.stream_id}&from_seq={at}") as socket:
         after = Taken(socket).until(tared.seq - 10)
     seqs = before.seqs + after.seqs
     assert seqs == list(range(seqs[0], seqs[-1] + 1))
@@ -298,7 +298,7 @@ def test_frames_that_will_not_come_are_said_to_be_lost_with_the_reason(
         taken.until(tared.seq - 10)
     assert lost == {
         "type": "lost",
-        "boot_id": tared.boot_id,
+        "stream_id": tared.stream_id,
         "from_seq": first,
         "to_seq": first + 49,
         "reason": "disk_full",
@@ -313,14 +313,17 @@ def test_a_node_that_is_switched_on_again_goes_on_with_its_new_stream(
         taken = Taken(socket)
         taken.until_said("hello")
         tared.deliver(45, 20.0)
-        before, last = tared.boot_id, tared.seq - 1
+        before, last = tared.stream_id, tared.seq - 1
         tared.restart()
         tared.come_back()
         tared.send(60, 20.0)
-        taken.until(tared.seq - 10, tared.boot_id)
-    assert [s["boot_id"] for s in taken.said if s["type"] == "stream"] == [before, tared.boot_id]
+        taken.until(tared.seq - 10, tared.stream_id)
+    assert [s["stream_id"] for s in taken.said if s["type"] == "stream"] == [
+        before,
+        tared.stream_id,
+    ]
     assert taken.table(before)["seq"][-1].as_py() == last  # its last 10 ms as well
-    assert taken.table(tared.boot_id)["seq"][0].as_py() == 0
+    assert taken.table(tared.stream_id)["seq"][0].as_py() == 0
     assert not [s for s in taken.said if s["type"] == "lost"]
 
 
@@ -332,7 +335,7 @@ def test_a_lossless_client_that_does_not_read_is_told_from_where_to_resume(
     wide.connect()
     wide.tared()
     with running.socket(LIVE, small=True, max_queue=1) as stalled:
-        until(lambda: running.server.frames.of("bench").watchers)
+        until(lambda: running.server.live_feeds.get_or_create("bench").reader_count)
         for _ in range(8):
             wide.send(500)
         wide.taken_in()
@@ -343,7 +346,7 @@ def test_a_lossless_client_that_does_not_read_is_told_from_where_to_resume(
         code, reason = _taken_until_closed(taken)
     assert code == 4008
     assert taken.seqs == list(range(taken.seqs[0], taken.seqs[-1] + 1))
-    assert f"resume with boot_id={wide.boot_id}&from_seq={taken.seqs[-1] + 1}" in reason
+    assert f"resume with stream_id={wide.stream_id}&from_seq={taken.seqs[-1] + 1}" in reason
 
 
 def _taken_until_closed(taken: Taken) -> tuple[int, str]:

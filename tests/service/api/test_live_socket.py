@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-import service.server.screens.fan_out
+import service.server.broadcast.broadcaster
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, closed
 from tests.waiting import PATIENCE_S, until
@@ -60,21 +60,21 @@ def test_a_frame_has_what_the_contract_says(running: Running, tared: FakeNode) -
             "force_sigma_n",
             "grf_n",
             "grf_sigma_n",
-            "grf_at_least_n",
+            "grf_lower_bound_n",
             "grf_min_n",
             "grf_max_n",
             "cop_x_m",
             "cop_y_m",
         ),
-        *("cop_sigma_x_m", "cop_sigma_y_m", "angle_rad", "servo_age_us", "status"),
-        *("frame_status", "estimate_status", "saturated", "contact", "age_ms"),
+        *("cop_sigma_x_m", "cop_sigma_y_m", "angle_rad", "servo_age_us", "tile_flags"),
+        *("frame_flags", "estimate_flags", "saturated", "contact", "age_ms"),
     }
     assert frame["force_n"] == pytest.approx([20.0, 60.0], abs=0.05)
     assert frame["grf_n"] == pytest.approx(80.0, abs=0.1)
     assert frame["cop_x_m"] == pytest.approx(0.014 * 0.75, abs=1e-4)
     assert frame["cop_y_m"] is frame["cop_sigma_y_m"] is None  # both tiles are in one row
     assert frame["gauge_kpa"] == pytest.approx([20 * 130 / 1023, 60 * 130 / 1023], abs=0.01)
-    assert frame["status"] == [0, 0]
+    assert frame["tile_flags"] == [0, 0]
     assert frame["contact"] is True
     assert frame["saturated"] == [False, False]
     assert frame["age_ms"] > 0
@@ -214,7 +214,7 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     too_slow_s = 3.0
-    monkeypatch.setattr(service.server.screens.fan_out, "TOO_SLOW_S", too_slow_s)
+    monkeypatch.setattr(service.server.broadcast.broadcaster, "TOO_SLOW_S", too_slow_s)
     slow = sockets.socket()
     slow.setsockopt(sockets.SOL_SOCKET, sockets.SO_RCVBUF, 2048)
     slow.connect(("127.0.0.1", running.port))
@@ -224,14 +224,14 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
     )
     with slow, running.socket(f"{LIVE}?rate_hz=60") as live, Play(tared, 10.0) as playing:
-        until(lambda: running.server.hub.subscribers == 2)
+        until(lambda: running.server.broadcaster.subscriber_count == 2)
         # Buffers of the kernel and of the server fill first: give it more to say.
         notice = {"type": "node", "node": {"padding": "x" * 200_000}}
         end_s = time.monotonic() + 15.0
         told_s = []
-        while running.server.hub.subscribers == 2:
+        while running.server.broadcaster.subscriber_count == 2:
             assert time.monotonic() < end_s, "it is never let go"
-            running.call(lambda: running.server.hub.notice(notice))
+            running.call(lambda: running.server.broadcaster.send_notice(notice))
             next_of(live, "frame")
             told_s.append(time.monotonic())
         # Who waited for it would have told nothing while it was waited for. One long gap says
@@ -301,7 +301,7 @@ def test_without_a_tare_a_frame_has_its_status_and_no_forces(
     assert frame["force_n"] == [None, None]
     assert frame["grf_n"] is None
     assert frame["contact"] is None
-    assert frame["status"] == [0, 0]
+    assert frame["tile_flags"] == [0, 0]
 
 
 def test_a_server_that_ends_lets_its_screens_go(running: Running) -> None:

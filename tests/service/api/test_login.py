@@ -12,7 +12,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from service.api.logins import TICKET_S
-from service.link import INGEST_PATH, LIVE_PATH
+from service.protocol import INGEST_PATH, LIVE_PATH
 from tests.service.api.test_guard import CHANGES, TOKEN
 from tests.service.running import Running, ServeWith, assert_refused
 from tests.waiting import PATIENCE_S

@@ -14,9 +14,9 @@ import pytest
 
 import foottile
 from devices.errors import StorageError
-from service.pull import pull
-from storage.sessions.beside import read_events, write_events
+from service.pull import pull_session
 from storage.sessions.folder import Session
+from storage.sessions.sidecars import read_markers, write_markers
 from tests.service.command import command
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -46,7 +46,7 @@ def mark(session: Recording, label: str, *, frame: int = MARKED, **body: Any) ->
     """Mark the instant of a frame, in the server's time."""
     t_ns = int(session.column("t_ns")[frame]) + HOUR_NS
     answer = session.running.http.post(
-        f"{session.url}/events", json={"label": label, "t_ns": t_ns} | body
+        f"{session.url}/markers", json={"label": label, "t_ns": t_ns} | body
     )
     assert answer.status_code == 201, answer.text
     event: dict[str, Any] = answer.json()
@@ -54,7 +54,7 @@ def mark(session: Recording, label: str, *, frame: int = MARKED, **body: Any) ->
 
 
 def labels(table: pa.Table) -> dict[int, str]:
-    return {i: label for i, label in enumerate(table["event"].to_pylist()) if label is not None}
+    return {i: label for i, label in enumerate(table["marker"].to_pylist()) if label is not None}
 
 
 def test_a_mark_made_after_sealing_is_at_its_frame_in_every_format(session: Recording) -> None:
@@ -62,10 +62,10 @@ def test_a_mark_made_after_sealing_is_at_its_frame_in_every_format(session: Reco
     mark(session, "a stone")
     arrow = session.data(format="arrow")
     assert labels(pa.ipc.open_file(arrow.content).read_all()) == {MARKED: "a stone"}
-    parquet = session.data(marks="true")
+    parquet = session.data(markers="true")
     assert labels(pq.read_table(io.BytesIO(parquet.content))) == {MARKED: "a stone"}
     rows = list(csv.DictReader(io.StringIO(session.data(format="csv").text)))
-    assert {i: row["event"] for i, row in enumerate(rows) if row["event"]} == {MARKED: "a stone"}
+    assert {i: row["marker"] for i, row in enumerate(rows) if row["marker"]} == {MARKED: "a stone"}
     for answer in (arrow, parquet):
         assert answer.headers["foottile-marks"] == "placed=1, left-out=0"
     assert session.data().content == sealed  # as it was sealed, with the hash that it had
@@ -73,20 +73,24 @@ def test_a_mark_made_after_sealing_is_at_its_frame_in_every_format(session: Reco
 
 def test_marks_can_be_left_out_and_parquet_has_them_on_request_only(session: Recording) -> None:
     mark(session, "a stone")
-    for query in ({}, {"format": "csv", "marks": "false"}, {"format": "arrow", "marks": "false"}):
+    for query in (
+        {},
+        {"format": "csv", "markers": "false"},
+        {"format": "arrow", "markers": "false"},
+    ):
         answer = session.data(**query)
         assert "foottile-marks" not in answer.headers
-        assert b"event" not in answer.content[:1000]
+        assert b"marker" not in answer.content[:1000]
     refused = session.running.http.get(
-        f"{session.url}/data", params={"columns": "event", "format": "parquet"}
+        f"{session.url}/data", params={"columns": "marker", "format": "parquet"}
     )
-    assert_refused(refused, 422, "event", "marks")
+    assert_refused(refused, 422, "marker", "markers")
 
 
 def test_all_other_columns_have_the_bits_of_the_sealed_file(session: Recording) -> None:
     mark(session, "a stone")
-    whole = session.data(marks="true", format="parquet")
-    table = pq.read_table(io.BytesIO(whole.content)).drop_columns(["event", "time_s", "time_utc"])
+    whole = session.data(markers="true", format="parquet")
+    table = pq.read_table(io.BytesIO(whole.content)).drop_columns(["marker", "time_s", "time_utc"])
     assert table.equals(
         pq.read_table(io.BytesIO(session.data().content)).select(table.column_names)
     )
@@ -94,7 +98,7 @@ def test_all_other_columns_have_the_bits_of_the_sealed_file(session: Recording) 
 
 def test_the_tag_changes_with_every_mark_and_not_without_one(session: Recording) -> None:
     url = f"{session.url}/data"
-    for query in ({"format": "csv"}, {"format": "arrow"}, {"marks": "true"}):
+    for query in ({"format": "csv"}, {"format": "arrow"}, {"markers": "true"}):
         tag = session.data(**query).headers["etag"]
         assert tag.startswith('"')
         seen = {"If-None-Match": tag}
@@ -104,7 +108,7 @@ def test_the_tag_changes_with_every_mark_and_not_without_one(session: Recording)
         assert again.status_code == 200
         assert again.headers["etag"] != tag
     assert session.data().headers["etag"] == f'"{session.now()["sha256"]}"'
-    plain = {"format": "csv", "marks": "false"}
+    plain = {"format": "csv", "markers": "false"}
     tag = session.data(**plain).headers["etag"]
     mark(session, "of no concern")
     assert session.data(**plain).headers["etag"] == tag
@@ -112,13 +116,13 @@ def test_the_tag_changes_with_every_mark_and_not_without_one(session: Recording)
 
 def test_what_has_marks_has_no_ranges_and_is_never_pieced_together(session: Recording) -> None:
     mark(session, "a stone")
-    whole = session.data(marks="true")
+    whole = session.data(markers="true")
     assert whole.headers["accept-ranges"] == "none"
     sealed = session.now()["sha256"]
     for tag in (whole.headers["etag"], f'"{sealed}"'):
         answer = session.running.http.get(
             f"{session.url}/data",
-            params={"marks": "true"},
+            params={"markers": "true"},
             headers={"Range": "bytes=0-9", "If-Range": tag},
         )
         assert answer.status_code == 200
@@ -152,7 +156,7 @@ def test_a_session_that_is_still_recorded_has_its_marks_at_their_frames(
     assert labels(before) == {}
     t_ns = int(before["t_ns"][7].as_py()) + HOUR_NS
     answer = node.running.http.post(
-        f"{recording.url}/events", json={"label": "a stone", "t_ns": t_ns}
+        f"{recording.url}/markers", json={"label": "a stone", "t_ns": t_ns}
     )
     assert answer.status_code == 201
     after = recording.data(format="arrow")
@@ -173,7 +177,7 @@ def test_a_session_says_how_many_marks_it_has(session: Recording) -> None:
 def test_a_label_that_is_no_text_is_refused(session: Recording, label: str) -> None:
     content = json.dumps({"label": label})
     answer = session.running.http.post(
-        f"{session.url}/events", content=content, headers={"Content-Type": "application/json"}
+        f"{session.url}/markers", content=content, headers={"Content-Type": "application/json"}
     )
     assert_refused(answer, 422, "label")
     assert session.now()["marks"] == 0
@@ -187,21 +191,21 @@ def test_a_mark_that_is_sent_again_after_a_full_disk_is_in_the_table_too(
     def write(changed: Session, folder: Path) -> None:
         if full[0]:
             raise StorageError("cannot be written: no space", where=str(folder))
-        write_events(changed, folder)
+        write_markers(changed, folder)
 
-    monkeypatch.setattr("service.server.book.write_events", write)
+    monkeypatch.setattr("service.server.session_store.write_events", write)
     body = {"label": "a stone", "id": "0123456789ab"}
-    assert session.running.http.post(f"{session.url}/events", json=body).status_code == 507
+    assert session.running.http.post(f"{session.url}/markers", json=body).status_code == 507
     full[0] = False
-    assert session.running.http.post(f"{session.url}/events", json=body).status_code == 201
-    stored = read_events(session.folder / "events.parquet")
-    assert [event.label for event in stored.events] == ["a stone"]
+    assert session.running.http.post(f"{session.url}/markers", json=body).status_code == 201
+    stored = read_markers(session.folder / "markers.parquet")
+    assert [event.label for event in stored.markers] == ["a stone"]
 
 
 def test_the_table_of_events_is_given_as_it_is_stored(session: Recording, node: FakeNode) -> None:
     mark(session, "a stone")
-    answer = session.running.http.get(f"{session.url}/events", params={"format": "parquet"})
-    assert answer.content == (session.folder / "events.parquet").read_bytes()
+    answer = session.running.http.get(f"{session.url}/markers", params={"format": "parquet"})
+    assert answer.content == (session.folder / "markers.parquet").read_bytes()
     recording = node.record()
     for table in ("events", "clock"):
         refused = session.running.http.get(f"{recording.url}/{table}?format=parquet")
@@ -217,7 +221,7 @@ def pulled(session: Recording, tmp_path: Path) -> Path:
     mark(session, "a stone")
     mark(session, "years ago", t_ns=5)
     with foottile.connect(session.running.url) as server:
-        pull(server, session.id, tmp_path / "out")
+        pull_session(server, session.id, tmp_path / "out")
     return tmp_path / "out" / session.id
 
 
@@ -233,7 +237,7 @@ def test_an_export_of_a_pulled_session_has_the_marks_and_names_those_it_has_not(
     out = tmp_path / f"out.{to}"
     assert command(monkeypatch, "export", pulled, "--format", to, "--out", out) == 0
     assert "'years ago' is not in it: no frame within a second" in capsys.readouterr().err
-    asked = {} if to == "arrow" else {"marks": "true"}
+    asked = {} if to == "arrow" else {"markers": "true"}
     assert out.read_bytes() == session.data(format=to, **asked).content
     bare = tmp_path / f"bare.{to}"
     assert command(monkeypatch, "export", pulled, "--format", to, "--no-marks", "--out", bare) == 0
@@ -252,7 +256,7 @@ def test_an_export_of_a_file_without_its_folder_says_that_it_has_no_marks(
     assert command(monkeypatch, "export", *arguments) == 0
     assert "without marks" in capsys.readouterr().err
     assert command(monkeypatch, "export", *arguments, "--marks") == 2
-    assert "events.parquet" in capsys.readouterr().err
+    assert "markers.parquet" in capsys.readouterr().err
 
 
 def test_marks_without_a_clock_table_are_at_no_frame_and_that_is_said(
@@ -275,11 +279,11 @@ def test_a_damaged_table_of_events_is_an_error_and_marks_can_be_left_out(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    path = pulled / "events.parquet"
+    path = pulled / "markers.parquet"
     path.write_bytes(path.read_bytes()[:-9])
     arguments = (pulled, "--format", "csv", "--out", tmp_path / "out.csv")
     assert command(monkeypatch, "export", *arguments) == 1
-    assert "events.parquet" in capsys.readouterr().err
+    assert "markers.parquet" in capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
     assert command(monkeypatch, "export", *arguments, "--no-marks") == 0
 
@@ -310,7 +314,7 @@ def test_a_text_that_cannot_be_seen_is_refused_wherever_it_is_set(
     for method, bodies in SET.items():
         for body in bodies:
             content = json.dumps(body).replace('"{}"', json.dumps(wrong))
-            url = f"{path}/events" if method == "POST" else path
+            url = f"{path}/markers" if method == "POST" else path
             answer = session.running.http.request(
                 method, url, content=content, headers={"Content-Type": "application/json"}
             )
@@ -322,6 +326,6 @@ def test_a_line_break_is_for_notes_only(session: Recording) -> None:
     assert http.patch(path, json={"notes": "one\n\ttwo"}).json()["notes"] == "one\n\ttwo"
     for body in ({"name": "one\ntwo"}, {"subject": "one\ttwo"}, {"tags": ["one\ntwo"]}):
         assert_refused(http.patch(path, json=body), 422, "line break or tab")
-    assert_refused(http.post(f"{path}/events", json={"label": "one\ntwo"}), 422, "line break")
+    assert_refused(http.post(f"{path}/markers", json={"label": "one\ntwo"}), 422, "line break")
     words = "\u0645\u06cc\u200c\u062e \U0001f469\u200d\U0001f52c"  # with joiners
     assert http.patch(path, json={"name": words}).json()["name"] == words

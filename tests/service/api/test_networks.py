@@ -13,10 +13,10 @@ pytestmark = needs_networks
 
 URLS = """
 import json
-from service.api.address import listen, urls_of
+from service.api.address import open_listening_socket, list_urls
 host, advertised = %r, %r
-with listen(host, 8000) as listening:
-    print(json.dumps(urls_of(listening, host, advertised)))
+with open_listening_socket(host, 8000) as listening:
+    print(json.dumps(list_urls(listening, host, advertised)))
 """
 
 
@@ -64,7 +64,7 @@ def test_what_is_advertised_is_shown_instead() -> None:
 SERVED = """
 import asyncio, os, subprocess, sys
 import foottile
-from service.node.dial import dial, ingest_url
+from service.node.tcp_connect import connect_tcp, make_ingest_url
 
 os.environ.pop("FOOTTILE_TOKEN", None)
 words = [sys.executable, "-c", "from service.cli.main import main; main()"]
@@ -83,7 +83,7 @@ try:
                 next(server.live("nobody"))
             except foottile.UsageError as error:
                 print("no node" if "nobody" in str(error) else error)
-        asyncio.run(dial(ingest_url(url))).close()
+        asyncio.run(connect_tcp(make_ingest_url(url))).close()
     ticket = subprocess.run(
         [*words, "invite", "--data", os.environ["DATA"]], capture_output=True, text=True
     )

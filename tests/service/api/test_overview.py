@@ -42,7 +42,7 @@ def asked(session: Recording, **query: Any) -> Any:
 
 def frames(session: Recording, *names: str) -> dict[str, Any]:
     with session.reader() as file:
-        pieces = list(file.columns(*names))
+        pieces = list(file.read_columns(*names))
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
 
@@ -168,6 +168,6 @@ def test_a_session_without_estimates_shows_its_counts(running: Running, node_of:
     raw.deliver(100, [0.0, 0.0])
     raw.finish(session)
     columns = asked(session, points=8000)["columns"]
-    counts = frames(session, "padc")["padc"]
-    assert columns["padc_0_max"] == counts[:, 0].tolist()
+    counts = frames(session, "pressure_raw")["pressure_raw"]
+    assert columns["pressure_raw_0_max"] == counts[:, 0].tolist()
     assert "grf_n_max" not in columns

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.api.address import token_for
-from storage.durable import set_aside
-from storage.private import keep_private
+from service.api.address import load_or_create_token
+from storage.durable_files import set_aside_damaged
+from storage.permissions import restrict_to_owner
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
 
@@ -25,15 +25,15 @@ def _umask() -> Iterator[None]:
 def test_a_folder_that_a_server_has_used_is_closed_to_others(
     running: Running, tared: FakeNode
 ) -> None:
-    token_for(None, running.data)
+    load_or_create_token(None, running.data)
     deleted = tared.record()
     tared.deliver(10)
     tared.finish(deleted)
     assert running.http.delete(deleted.url).status_code == 204
     assert running.http.get("/ready").status_code == 200
     running.stop()
-    set_aside(running.data / "server_id")
+    set_aside_damaged(running.data / "server_id")
     running.start()
     running.data.chmod(0o755)
-    keep_private(running.data)
+    restrict_to_owner(running.data)
     assert stat.S_IMODE(running.data.stat().st_mode) == 0o700, os.listdir(running.data)

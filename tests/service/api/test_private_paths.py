@@ -8,8 +8,8 @@ import httpx
 import pytest
 
 from devices.errors import FootTileError
-from service.link import close_reason
-from service.private_paths import register_folder, without_folders
+from service.private_paths import register_private_folder, strip_private_folders
+from service.protocol import format_close_reason
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
@@ -52,7 +52,7 @@ def test_no_answer_names_the_data_folder(
             calibration_id="x",
             fit_id="x",
             take_id="x",
-            event_id="x",
+            marker_id="x",
         )
         for query in ("", "?format=csv", "?ids=" + damaged.id):
             try:
@@ -75,10 +75,10 @@ def test_no_answer_names_the_data_folder(
 def test_only_the_folder_goes_and_a_reason_that_is_cut_has_no_part_of_it(tmp_path: Path) -> None:
     folder = tmp_path / ("long" * 40) / "data"
     folder.mkdir(parents=True)
-    register_folder(folder)
+    register_private_folder(folder)
     error = FootTileError("cannot be read", where=str(folder / "sessions" / "x.parquet"))
-    assert without_folders(str(error)) == "sessions/x.parquet: cannot be read"
-    assert close_reason(str(error)) == "sessions/x.parquet: cannot be read"
-    assert without_folders(f"{folder}: gone") == "the data folder: gone"
+    assert strip_private_folders(str(error)) == "sessions/x.parquet: cannot be read"
+    assert format_close_reason(str(error)) == "sessions/x.parquet: cannot be read"
+    assert strip_private_folders(f"{folder}: gone") == "the data folder: gone"
     assert str(folder) in str(error)
-    assert without_folders("nothing of it") == "nothing of it"
+    assert strip_private_folders("nothing of it") == "nothing of it"

@@ -8,9 +8,9 @@ import httpx
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from service.api.doors import Bounds
+from service.api.connection_limits import LimitSettings
 from service.api.settings import load_settings
-from service.link import LIVE_PATH
+from service.protocol import LIVE_PATH
 from tests.service.running import Running, ServeWith, assert_refused
 from tests.tokens import SHARED_BEARER
 from tests.waiting import PATIENCE_S
@@ -27,7 +27,7 @@ def is_trusted(request: pytest.FixtureRequest) -> bool:
 def running(serve_with: ServeWith, monkeypatch: pytest.MonkeyPatch, *, is_trusted: bool) -> Running:
     """A server to which the test is a proxy."""
     monkeypatch.setenv("FORWARDED_ALLOW_IPS", "*")  # uvicorn's own setting
-    bounds = Bounds.model_validate(
+    bounds = LimitSettings.model_validate(
         {"max_connections_per_address": 1, "trusted_proxy": TRUSTED if is_trusted else ()}
     )
     return serve_with(bounds=bounds)
@@ -101,7 +101,7 @@ def test_no_forwarded_header_is_a_right(running: Running, header: str, value: st
 
 
 def test_an_ipv4_proxy_is_trusted_at_a_socket_of_ipv6() -> None:
-    bounds = Bounds.model_validate({"trusted_proxy": ["172.18.0.0/16", "127.0.0.1", "::1"]})
+    bounds = LimitSettings.model_validate({"trusted_proxy": ["172.18.0.0/16", "127.0.0.1", "::1"]})
     assert bounds.trusted_peers == [
         *("172.18.0.0/16", "127.0.0.1/32", "::1/128"),
         *("::ffff:172.18.0.0/112", "::ffff:127.0.0.1/128"),

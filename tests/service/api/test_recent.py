@@ -21,7 +21,7 @@ def test_a_peak_that_nobody_watched_is_in_it(running: Running, tared: FakeNode) 
         tared.send(1 if isinstance(force_n, list) else 200, force_n)
     until(lambda: running.http.get(RECENT).json()["seq"][-1] > tared.seq - 12)
     recent = running.http.get(RECENT).json()
-    assert (recent["node"], recent["boot_id"]) == ("bench", tared.boot_id)
+    assert (recent["node"], recent["stream_id"]) == ("bench", tared.stream_id)
     assert recent["seq_first"][0] == 0
     assert sum(recent["n"]) == recent["seq"][-1] + 1
     assert np.array_equal(np.array(recent["seq_first"][1:]), np.array(recent["seq"][:-1]) + 1)
@@ -83,7 +83,7 @@ def test_another_stream_is_another_story(running: Running, tared: FakeNode) -> N
     tared.restart()
     tared.connect()
     recent = running.http.get(RECENT).json()
-    assert (recent["boot_id"], recent["seq"], recent["age_ms"]) == (tared.boot_id, [], None)
+    assert (recent["stream_id"], recent["seq"], recent["age_ms"]) == (tared.stream_id, [], None)
     tared.send(20)
     until(lambda: running.http.get(RECENT).json()["seq"])
 

@@ -22,7 +22,7 @@ def test_a_session_has_exactly_the_frames_between_start_and_stop(
     tared.deliver(400, [20.0, 60.0], noise=1)
     assert running.node()["recording"] == [session.id]
     assert session.now()["frames"] == 400
-    marked = running.http.post(f"{session.url}/events", json={"label": "stone"})
+    marked = running.http.post(f"{session.url}/markers", json={"label": "stone"})
     assert marked.status_code == 201
     stopped = session.stop()
     assert stopped["state"] == "pending"
@@ -31,8 +31,8 @@ def test_a_session_has_exactly_the_frames_between_start_and_stop(
     assert sealed["complete"] is True
     assert sealed["frames"] == 400
     assert sealed["problem"] is None
-    assert sealed["parts"] == [{"boot_id": tared.boot_id, "seq_first": 70, "seq_last": 469}]
-    assert_same_bits(session.frames(), tared.all_sent().rows(70, 470))
+    assert sealed["parts"] == [{"stream_id": tared.stream_id, "seq_first": 70, "seq_last": 469}]
+    assert_same_bits(session.frames(), tared.all_sent().slice_rows(70, 470))
     assert set(session.column("part")) == {0}
     assert running.node()["recording"] == []
     assert sealed["duration_s"] == pytest.approx(399 * 0.002)
@@ -45,7 +45,7 @@ def test_a_stop_answers_sealed_while_the_node_streams(
     tared: FakeNode,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(service.api.routes.recordings.sessions, "SETTLE_S", PATIENCE_S)
+    monkeypatch.setattr(service.api.routes.recordings.sessions, "SEAL_TIMEOUT_S", PATIENCE_S)
     with Play(tared, 10.0):
         until(lambda: running.node()["last_seq"] > 100)
         session = tared.record()
@@ -56,7 +56,7 @@ def test_a_stop_answers_sealed_while_the_node_streams(
     found = session.frames()
     np.testing.assert_array_equal(np.diff(found.seq), 1)
     first, last = int(found.seq[0]), int(found.seq[-1])
-    assert_same_bits(found, tared.all_sent().rows(first, last + 1))
+    assert_same_bits(found, tared.all_sent().slice_rows(first, last + 1))
     assert int(found.t_ns[-1]) <= stopped["stopped_t_ns"]
     assert int(tared.all_sent().t_ns[last + 1]) > stopped["stopped_t_ns"]
 
@@ -105,7 +105,7 @@ def test_a_session_that_is_stopped_while_the_node_is_away_completes_when_it_is_b
         tared.send_again(batch)
     sealed = session.sealed()
     assert sealed["complete"] is True
-    assert_same_bits(session.frames(), tared.all_sent().rows(70, 200))
+    assert_same_bits(session.frames(), tared.all_sent().slice_rows(70, 200))
 
 
 def test_a_gap_within_a_session_is_waited_for(tared: FakeNode) -> None:
@@ -122,7 +122,7 @@ def test_a_gap_within_a_session_is_waited_for(tared: FakeNode) -> None:
     tared.send_again(gap)
     sealed = session.sealed()
     assert sealed["complete"] is True
-    assert_same_bits(session.frames(), tared.all_sent().rows(70, 200))
+    assert_same_bits(session.frames(), tared.all_sent().slice_rows(70, 200))
 
 
 def test_frames_that_the_node_has_evicted_are_lost_and_said_to_be(tared: FakeNode) -> None:
@@ -144,19 +144,19 @@ def test_frames_that_the_node_has_evicted_are_lost_and_said_to_be(tared: FakeNod
 def test_a_node_that_is_switched_on_anew_goes_on_in_a_second_part(tared: FakeNode) -> None:
     session = tared.record()
     first = tared.deliver(100, 10.0)
-    first_boot_id = tared.boot_id
+    first_stream_id = tared.stream_id
     tared.restart()
     assert tared.connect() == [(0, None)]
     second = tared.deliver(60, 10.0)
     sealed = tared.finish(session)
     assert sealed["complete"] == "lossy"
-    assert [part["boot_id"] for part in sealed["parts"]] == [first_boot_id, tared.boot_id]
+    assert [part["stream_id"] for part in sealed["parts"]] == [first_stream_id, tared.stream_id]
     found = session.frames()
     assert_same_bits(found, FrameBatch.concatenate([first, second]))
     np.testing.assert_array_equal(session.column("part"), [0] * 100 + [1] * 60)
     ledger = session.ledger()
     assert [part["recorded"] for part in ledger["parts"]] == [100, 60]
-    assert ledger["parts"][0]["unsynced_tail_max"] >= 1
+    assert ledger["parts"][0]["max_lost_tail_frames"] >= 1
     assert ledger["lossy"] is True
 
 
@@ -189,7 +189,7 @@ def test_another_session_takes_up_a_recording_whose_node_came_back_with_other_ti
     assert {name: taken_up[name] for name in kept} == kept
     other.taken_in()
     assert other.finish(taken_up)["complete"] is True
-    assert_same_bits(taken_up.frames().rows(0, 30), new)
+    assert_same_bits(taken_up.frames().slice_rows(0, 30), new)
 
 
 def test_a_stream_that_ended_in_order_leaves_no_doubt_about_its_end(
@@ -200,7 +200,7 @@ def test_a_stream_that_ended_in_order_leaves_no_doubt_about_its_end(
     tared.leave()
     other = node_of(running, tiles=3, secret=tared.secret)
     tared.reboot()
-    other.connect(earlier=(tared.before[0].said(held=()),))
+    other.connect(earlier=(tared.before[0].said(stored=()),))
     sealed = session.sealed()
     assert sealed["parts"][0]["seq_last"] == 169
     assert sealed["complete"] is True, "nothing can be missing behind an end that was told"
@@ -220,7 +220,7 @@ def test_a_recording_goes_on_over_a_restart_of_the_server(
     tared.deliver(30, 10.0)
     sealed = tared.finish(session)
     assert sealed["complete"] is True
-    assert_same_bits(session.frames(), tared.all_sent().rows(70, 170))
+    assert_same_bits(session.frames(), tared.all_sent().slice_rows(70, 170))
     assert len(running.sessions()) == 1
     assert session.column("force_n_0")[30:70] == pytest.approx(np.full(40, 10.0), abs=0.1)
 
@@ -247,7 +247,7 @@ def test_a_pre_roll_begins_earlier(tared: FakeNode) -> None:
     tared.deliver(50)
     sealed = tared.finish(session)
     assert sealed["complete"] is True
-    assert_same_bits(session.frames(), tared.all_sent().rows(first, 620))
+    assert_same_bits(session.frames(), tared.all_sent().slice_rows(first, 620))
 
 
 def test_a_pre_roll_reaches_no_further_than_what_is_held(tared: FakeNode) -> None:
@@ -283,6 +283,6 @@ def test_a_part_without_frames_has_lost_none(tared: FakeNode) -> None:
 def test_a_node_that_is_still_catching_up_is_not_recorded(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 2.0)
+    monkeypatch.setattr(service.server.recorder, "MAX_DELAY_S", 2.0)
     answer = running.http.post("/sessions", json={"node": "bench", "name": "too early"})
     assert_refused(answer, 409, "behind")

@@ -12,9 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import service.api.routes.recordings.sessions
-import service.server.settling
+import service.server.sealer
 from devices.errors import StorageError
-from service.sessions.sealing import seal
+from service.sessions.sealing import seal_session
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf
@@ -208,11 +208,11 @@ def test_a_renamed_session_keeps_its_data(running: Running, tared: FakeNode) -> 
 
 def test_an_event_after_sealing_is_in_the_events_file(running: Running, tared: FakeNode) -> None:
     session = tared.record()
-    url = f"{session.url}/events"
+    url = f"{session.url}/markers"
     running.http.post(url, json={"label": "before", "t_ns": 2})
     tared.deliver(20)
     tared.finish(session)
-    path = session.folder / "events.parquet"
+    path = session.folder / "markers.parquet"
     assert pq.read_table(path)["label"].to_pylist() == ["before"]
     running.http.post(url, json={"label": "after", "t_ns": 1})
     assert sorted(map(str, pq.read_table(path)["label"].to_pylist())) == ["after", "before"]
@@ -231,7 +231,7 @@ def test_clock_measurements_are_kept_beside_the_session(tared: FakeNode) -> None
     assert at_connecting["server_minus_node_ns"] == 0
     assert [later] == [
         {
-            "boot_id": tared.boot_id,
+            "stream_id": tared.stream_id,
             "t_mono_ns": t_mono_ns,
             "server_minus_node_ns": 1000,
             "uncertainty_ns": 7,
@@ -279,7 +279,7 @@ def test_a_session_without_calibration_is_sealed_raw_and_says_why(
     assert sealed["calibration_id"] is None
     assert sealed["absolute_scale"] is None
     assert "no estimates" in sealed["problem"]
-    assert_same_bits(session.frames(), node.all_sent().rows(10, 60))
+    assert_same_bits(session.frames(), node.all_sent().slice_rows(10, 60))
     path = session.folder / "frames.parquet"
     assert not any(name.startswith("force_n") for name in pq.read_schema(path).names)
     with session.reader() as file:
@@ -314,21 +314,21 @@ def test_what_people_write_comes_back_as_it_is(
 ) -> None:
     session = tared.record(name=text, notes=text)
     url = session.url
-    running.http.post(f"{url}/events", json={"label": text})
+    running.http.post(f"{url}/markers", json={"label": text})
     answer = running.http.get(url)
     assert answer.headers["content-type"] == "application/json"
     assert answer.headers["x-content-type-options"] == "nosniff"
     assert answer.json()["name"] == answer.json()["notes"] == text
-    assert running.http.get(f"{url}/events").json()["items"][0]["label"] == text
+    assert running.http.get(f"{url}/markers").json()["items"][0]["label"] == text
     assert running.http.get("/sessions", params={"q": text}).json()["items"]
 
 
 def test_a_session_is_sealed_again_when_the_disk_was_full(
     tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refusing = failing_once(seal, StorageError, "No space left on device")
-    monkeypatch.setattr(service.server.settling, "seal", refusing)
-    monkeypatch.setattr(service.server.settling, "_SEAL_AGAIN_S", 0.2)
+    refusing = failing_once(seal_session, StorageError, "No space left on device")
+    monkeypatch.setattr(service.server.sealer, "seal_session", refusing)
+    monkeypatch.setattr(service.server.sealer, "_RETRY_S", 0.2)
     session = tared.record()
     tared.deliver(20)
     session.stop()

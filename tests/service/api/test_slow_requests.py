@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from service.api.doors import Bounds
+from service.api.connection_limits import LimitSettings
 from tests.service.running import Running, ServeWith
 from tests.tokens import SHARED_TOKEN
 from tests.waiting import PATIENCE_S
@@ -122,7 +122,7 @@ CHUNKED = head("POST /api/v1/sessions", SHOWN, "Transfer-Encoding: chunked")
 def test_what_is_neither_request_nor_body_has_an_end(
     serve_with: ServeWith, begun: bytes, piece: bytes, token: str | None
 ) -> None:
-    running = serve_with(bounds=Bounds(max_header_bytes=4096), token=token)
+    running = serve_with(bounds=LimitSettings(max_header_bytes=4096), token=token)
     with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as raw:
         raw.sendall(begun)
         if token is not None:
@@ -147,7 +147,7 @@ def test_a_token_behind_the_body_opens_nothing(serve_with: ServeWith) -> None:
 def test_a_request_that_does_not_come_waits_for_the_answer_to_the_one_before(
     strict: Running, raw: socket.socket, behind: bytes, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr(strict.server, "check_storage", lambda: time.sleep(1.0))
+    monkeypatch.setattr(strict.server, "check_writable", lambda: time.sleep(1.0))
     raw.sendall(head("GET /api/v1/ready") + behind)
     first, _, second = all_of(raw).partition(b"HTTP/1.1 408 ")
     assert first.startswith(b"HTTP/1.1 200 ")

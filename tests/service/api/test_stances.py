@@ -13,8 +13,8 @@ import pytest
 import service.sessions.stance_overlay
 import service.sessions.stances
 from devices.errors import StorageError
-from service.estimation.stances import GATHERED, Stances, stances_of
-from service.sessions.stances import stances_of_session
+from service.estimation.stances import STANCE_INPUT_COLUMNS, StanceDetector, compute_stances
+from service.sessions.stances import load_stances
 from storage.sessions.stances import read_stances
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode, NodeOf
@@ -42,15 +42,15 @@ def stances_over_rest(session: Recording, **headers: str) -> Any:
 
 def from_its_frames(session: Recording) -> list[dict[str, Any]]:
     """By the definition, from the columns of the sealed file all at once."""
-    names = ("seq", "t_ns", "part", *GATHERED)
+    names = ("seq", "t_ns", "part", *STANCE_INPUT_COLUMNS)
     with session.reader() as file:
-        pieces = list(file.columns(*names))
+        pieces = list(file.read_columns(*names))
     assert len(pieces) == 1
     columns = {
         name: values.astype(float) if values.dtype == "f4" else values
         for name, values in pieces[0].items()
     }
-    found = stances_of(columns["seq"], columns["t_ns"], columns)
+    found = compute_stances(columns["seq"], columns["t_ns"], columns)
     return [
         {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in row.items()}
         for row in (stance.as_dict() for stance in found)
@@ -86,14 +86,14 @@ def test_stances_that_are_gone_or_damaged_are_made_again_to_the_byte(tared: Fake
     assert stances_over_rest(session).json() == rows
     assert not path.exists()  # no GET writes
     assert verify_session(session.folder).problems == []
-    stances_of_session(session.folder, keep=True)
+    load_stances(session.folder, store=True)
     assert path.read_bytes() == whole
     damaged = whole[:100] + bytes([whole[100] ^ 1]) + whole[101:]
     path.write_bytes(damaged)
     assert stances_over_rest(session).json() == rows
     (said,) = verify_session(session.folder).problems
     assert said.startswith("stances.parquet: ")
-    stances_of_session(session.folder, keep=True)
+    load_stances(session.folder, store=True)
     assert path.read_bytes() == whole
 
 
@@ -106,7 +106,7 @@ def test_stances_of_other_frames_are_not_read(tared: FakeNode) -> None:
     report = verify_session(one.folder)
     assert report.problems == []
     assert report.unproven == ["stances.parquet: it is of other frames, and nobody reads it"]
-    stances_of_session(one.folder, keep=True)
+    load_stances(one.folder, store=True)
     assert path.read_bytes() == whole
 
 
@@ -129,7 +129,7 @@ def test_what_fails_while_stances_are_gathered_holds_no_session_up(
 ) -> None:
     with monkeypatch.context() as patch:
         fails = refusing(ZeroDivisionError, "a bug")
-        patch.setattr(Stances, "feed", fails)
+        patch.setattr(StanceDetector, "add_frames", fails)
         session = hopped(tared)
     assert session.now()["state"] == "sealed"
     assert "a bug" in session.now()["problem"]

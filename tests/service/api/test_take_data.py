@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 import foottile
-from service.pull import pull_take
+from service.pull import pull_take_export
 from storage.formats.slice import Slice
-from storage.formats.written.registry import FORMATS, SEVERAL, format_named
+from storage.formats.writers.registry import FORMATS, MULTI_SESSION_FORMATS, get_format
 from tests.service.fake_node import NodeOf
 from tests.service.running import Running, assert_refused
 from tests.service.takes import Take, frames_of_long_ago
-from tests.storage.formats.written.readers import said_in
+from tests.storage.formats.writers.readers import said_in
 
 NOBODY = "0123456789ab"
 
@@ -32,14 +32,14 @@ def take(running: Running, node_of: NodeOf) -> Take:
 def test_every_format_that_holds_several_has_all_sessions_in_the_order_of_their_nodes(
     take: Take,
 ) -> None:
-    take.running.http.post(f"{take.sessions[0].url}/events", json={"label": "tap"})
+    take.running.http.post(f"{take.sessions[0].url}/markers", json={"label": "tap"})
     listed = {
         each["name"]
         for each in take.running.http.get("/formats").json()["items"]
         if each["holds_several"]
     }
-    assert listed == set(SEVERAL)
-    for to in SEVERAL:
+    assert listed == set(MULTI_SESSION_FORMATS)
+    for to in MULTI_SESSION_FORMATS:
         answer = take.get(to)
         assert answer.status_code == 200, answer.text
         said = said_in(to, answer.content)
@@ -60,7 +60,7 @@ def test_it_is_the_same_until_somebody_marks_something(take: Take) -> None:
     head = http.head(take.url, params=asked)
     assert (head.status_code, head.content) == (200, b"")
     assert head.headers["etag"] == first.headers["etag"]
-    http.post(f"{take.sessions[1].url}/events", json={"label": "tap"})
+    http.post(f"{take.sessions[1].url}/markers", json={"label": "tap"})
     assert http.get(take.url, params=asked, headers=tag).status_code == 200
     other = http.get(take.url, params={**asked, "end_s": 0.1}, headers=tag)
     assert len(other.content) < len(first.content)
@@ -74,9 +74,9 @@ def test_what_cannot_be_one_file_is_refused_with_the_session_and_what_to_do(
     answer = both.get("mcap")
     assert_refused(answer, 409, "session", "is recording", "Stop it")
     both.sealed()
-    for to in set(FORMATS) - set(SEVERAL):
-        assert_refused(both.get(to), 422, f"{to} holds one session only", *SEVERAL)
-    for to in SEVERAL:
+    for to in set(FORMATS) - set(MULTI_SESSION_FORMATS):
+        assert_refused(both.get(to), 422, f"{to} holds one session only", *MULTI_SESSION_FORMATS)
+    for to in MULTI_SESSION_FORMATS:
         answer = both.get(to)
         if FORMATS[to].needs_forces:
             assert_refused(answer, 422, "of raw", "this session has none")
@@ -91,12 +91,12 @@ def test_what_cannot_be_one_file_is_refused_with_the_session_and_what_to_do(
 def test_both_clients_download_it_whole_or_not_at_all(take: Take, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with foottile.connect(take.running.url) as server:
-        pulled = pull_take(server, take.id, out, Slice(0.0, 0.1), format_named("mcap"))
+        pulled = pull_take_export(server, take.id, out, Slice(0.0, 0.1), get_format("mcap"))
         path = Path(pulled["path"])
         assert path.name == f"take-{take.id}_0s-0.1s.mcap"
         assert len(said_in("mcap", path.read_bytes())) == 2
         with pytest.raises(foottile.UsageError, match="csv holds one session only"):
-            pull_take(server, take.id, out, Slice(), format_named("csv"))
+            pull_take_export(server, take.id, out, Slice(), get_format("csv"))
     assert [*out.iterdir()] == [path]
 
     with foottile.connect(take.running.url) as server:

@@ -11,8 +11,8 @@ import pytest
 import service.api.routes.recordings.sessions
 import service.server.recorder
 from devices.errors import StorageError
-from service.sessions.restore import restore
-from storage.sessions.folder import SessionFolder
+from service.sessions.session_rebuild import rebuild_session
+from storage.sessions.folder import SessionsFolder
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, assert_refused
 from tests.waiting import until
@@ -22,8 +22,8 @@ NOBODY = "20200101T000000Z-000000"
 
 @pytest.fixture(autouse=True)
 def _frames_of_long_ago(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)
-    monkeypatch.setattr(service.api.routes.recordings.sessions, "SETTLE_S", 0.2)
+    monkeypatch.setattr(service.server.recorder, "MAX_DELAY_S", 1e9)
+    monkeypatch.setattr(service.api.routes.recordings.sessions, "SEAL_TIMEOUT_S", 0.2)
 
 
 @pytest.fixture
@@ -96,14 +96,14 @@ def test_a_node_that_cannot_be_recorded_says_why_and_the_others_are_recorded(
 def test_a_disk_that_takes_one_session_and_not_the_other_is_said_of_that_node(
     running: Running, feet: dict[str, FakeNode], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keep = running.server.sessions.keep
+    keep = running.server.sessions.save
 
     def full_for_right(session: Any) -> Any:
         if session.node == "right":
             raise StorageError("the disk is full", errno=errno.ENOSPC)
         return keep(session)
 
-    monkeypatch.setattr(running.server.sessions, "keep", full_for_right)
+    monkeypatch.setattr(running.server.sessions, "save", full_for_right)
     made = take(running, nodes=["left", "right", "spare"])
     assert nodes_of(made) == ["left", "spare"]
     assert "full" in made["failed"]["right"]
@@ -128,15 +128,15 @@ def test_marking_a_take_marks_all_of_it_at_one_instant_and_once(
     made = take(running)
     event = {"label": "a stone", "t_ns": 10**18, "id": "0123456789ab"}
     for _ in range(2):  # the answer was lost
-        answer = running.http.post(f"/takes/{made['id']}/events", json=event)
+        answer = running.http.post(f"/takes/{made['id']}/markers", json=event)
         assert answer.status_code == 201
         assert nodes_of(answer.json()) == ["left", "right", "spare"]
     for session in made["sessions"]:
-        marks = running.http.get(f"/sessions/{session['id']}/events").json()["items"]
+        marks = running.http.get(f"/sessions/{session['id']}/markers").json()["items"]
         assert [{name: mark[name] for name in event} for mark in marks] == [event]
-    now = running.http.post(f"/takes/{made['id']}/events", json={"label": "now"}).json()
+    now = running.http.post(f"/takes/{made['id']}/markers", json={"label": "now"}).json()
     instants = {
-        running.http.get(f"/sessions/{session['id']}/events").json()["items"][-1]["t_ns"]
+        running.http.get(f"/sessions/{session['id']}/markers").json()["items"][-1]["t_ns"]
         for session in now["sessions"]
     }
     assert len(instants) == 1
@@ -150,7 +150,7 @@ def test_a_node_that_is_lost_in_between_is_marked_and_stopped_with_the_others(
     feet["right"].deliver(50)
     feet["right"].leave()
     until(lambda: not running.node("right")["connected"])
-    marked = running.http.post(f"/takes/{made['id']}/events", json={"label": "gone"}).json()
+    marked = running.http.post(f"/takes/{made['id']}/markers", json={"label": "gone"}).json()
     assert nodes_of(marked) == ["left", "right"]
     stopped = running.http.post(f"/takes/{made['id']}/stop").json()
     assert stopped["failed"] == {}
@@ -169,13 +169,13 @@ def test_what_was_stopped_alone_is_not_marked_with_its_take_and_stays_as_it_was_
 ) -> None:
     made = take(running, nodes=["left", "right"])
     alone = running.session(made["sessions"][0]["id"]).stop()
-    marked = running.http.post(f"/takes/{made['id']}/events", json={"label": "x"}).json()
+    marked = running.http.post(f"/takes/{made['id']}/markers", json={"label": "x"}).json()
     assert nodes_of(marked) == ["right"]
     stopped = running.http.post(f"/takes/{made['id']}/stop").json()
     assert nodes_of(stopped) == ["left", "right"]
     assert stopped["sessions"][0]["stopped_t_ns"] == alone["stopped_t_ns"]
     assert nodes_of(running.http.get(f"/takes/{made['id']}").json()) == ["left", "right"]
-    answer = running.http.post(f"/takes/{made['id']}/events", json={"label": "late"})
+    answer = running.http.post(f"/takes/{made['id']}/markers", json={"label": "late"})
     assert_refused(answer, 409, "stopped already")
 
 
@@ -197,7 +197,7 @@ def test_a_take_that_there_is_not_is_not_found(running: Running, take_id: str) -
     for method, path, body in (
         ("GET", "", None),
         ("POST", "/stop", None),
-        ("POST", "/events", {"label": "x"}),
+        ("POST", "/markers", {"label": "x"}),
     ):
         answer = running.http.request(method, f"/takes/{take_id}{path}", json=body)
         is_index = answer.url.path == "/api/v1"  # of two dots a client makes that
@@ -226,6 +226,6 @@ def test_a_session_that_is_made_again_from_its_file_is_still_of_its_take(
     recording = running.session(made["sessions"][0]["id"])
     recording.sealed()
     (recording.folder / "session.json").unlink()
-    again = restore(SessionFolder(recording.folder.parent), recording.id)
+    again = rebuild_session(SessionsFolder(recording.folder.parent), recording.id)
     assert again is not None
     assert again.take == made["id"]

@@ -20,7 +20,7 @@ def test_between_two_messages_of_a_node_others_have_their_turn(
 ) -> None:
     node.connect()
     node.deliver(10)
-    turns, take = 0, ServerNode.take
+    turns, take = 0, ServerNode.receive_frames
     taken_at: list[int] = []
 
     async def count() -> None:
@@ -33,11 +33,11 @@ def test_between_two_messages_of_a_node_others_have_their_turn(
         taken_at.append(turns)
         return take(self, *given)
 
-    monkeypatch.setattr(ServerNode, "take", noted)
+    monkeypatch.setattr(ServerNode, "receive_frames", noted)
     counting = running.call(lambda: asyncio.ensure_future(count()))
     # As one piece: the server reads so many messages at once.
     sent = node.frames(10 * MESSAGES)
-    payloads = [node.payload(sent.rows(i, i + 10)) for i in range(0, len(sent), 10)]
+    payloads = [node.payload(sent.slice_rows(i, i + 10)) for i in range(0, len(sent), 10)]
     for payload in payloads:
         node.socket.send(payload)
     until(lambda: len(taken_at) == MESSAGES)

@@ -24,12 +24,12 @@ def test_a_whole_session_is_said_to_be_whole(sealed: Recording) -> None:
     answer = sealed.running.http.get(f"{sealed.url}/verification")
     assert answer.status_code == 200
     found = answer.json()
-    assert found == verify_session(sealed.folder).as_dict()
+    assert found == verify_session(sealed.folder).to_json_dict()
     assert (found["problems"], found["unproven"], found["complete"]) == ([], [], True)
     assert found["sha256"] == sealed.now()["sha256"]
 
 
-@pytest.mark.parametrize("name", ["frames.parquet", "events.parquet", "clock.parquet"])
+@pytest.mark.parametrize("name", ["frames.parquet", "markers.parquet", "clock.parquet"])
 def test_a_byte_that_changed_is_named_and_nothing_is_written(sealed: Recording, name: str) -> None:
     path = sealed.folder / name
     content = bytearray(path.read_bytes())

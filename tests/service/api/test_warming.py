@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 from websockets.sync.client import connect
 
-import service.api.serve
-from service.estimation.warm import WARMING, is_warming
+import service.api.runner
+from service.estimation.compilation import COMPILING_NOTE, is_compiling
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import ServeWith
 from tests.waiting import PATIENCE_S, until
@@ -25,8 +25,10 @@ def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file; another process "compiles" until it is there."""
     there = tmp_path / "compiled"
     waits = f"while not p.Path({str(there)!r}).exists(): t.sleep(0.02)"
-    monkeypatch.setattr(service.api.serve, "load_kept", lambda: False)
-    monkeypatch.setattr(service.api.serve, "_COMPILES", f"import pathlib as p, time as t\n{waits}")
+    monkeypatch.setattr(service.api.runner, "load_cached_code", lambda: False)
+    monkeypatch.setattr(
+        service.api.runner, "_COMPILE_CODE", f"import pathlib as p, time as t\n{waits}"
+    )
     return there
 
 
@@ -48,7 +50,7 @@ def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
     node = node_of(running)
     node.connect()
     node.tared()
-    assert running.node()["troubles"] == [WARMING]
+    assert running.node()["warnings"] == [COMPILING_NOTE]
     session = node.record()
     node.deliver(300, [20.0, 60.0])
     so_far = running.http.get(f"/sessions/{session.id}/overview")
@@ -60,8 +62,8 @@ def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
     assert before["gauge_kpa"] == pytest.approx([0.0, 0.0], abs=1.0)
     assert session.now()["state"] != "sealed"
     compiled.touch()
-    until(lambda: not is_warming())
-    until(lambda: running.node()["troubles"] == [])
+    until(lambda: not is_compiling())
+    until(lambda: running.node()["warnings"] == [])
     until(lambda: shown(node)["grf_n"] is not None)
     until(lambda: session.now()["state"] == "sealed")
     assert "grf_n" in pq.read_schema(session.folder / "frames.parquet").names
@@ -71,7 +73,7 @@ def test_a_server_that_ends_meanwhile_ends_the_other_process(
     compiled: Path, serve_with: ServeWith, tmp_path: Path
 ) -> None:
     serve_with()
-    assert is_warming()
+    assert is_compiling()
     # `serve_with` ends it, and fails if a task is left over.
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from service.estimation.weights import parse_weight
+from service.estimation.dead_weights import parse_weight
 from service.server import weighing, weighings
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, ServeWith, assert_refused
@@ -45,7 +45,7 @@ def is_closed(running: Running) -> bool:
 
 
 def labels(running: Running, session_id: str) -> list[str]:
-    items = running.http.get(f"/sessions/{session_id}/events").json()["items"]
+    items = running.http.get(f"/sessions/{session_id}/markers").json()["items"]
     return [item["label"] for item in items]
 
 
@@ -230,7 +230,7 @@ def test_markers_have_the_instants_of_frames_that_come_late(
     tared.next_t_mono_ns = time.monotonic_ns() - 1_500_000_000
     tared.deliver(20, alive=True)
     id_ = started(running)["session_id"]
-    while not (events := running.http.get(f"/sessions/{id_}/events").json()["items"]):
+    while not (events := running.http.get(f"/sessions/{id_}/markers").json()["items"]):
         tared.deliver(20, alive=True)
     assert events[0]["t_ns"] <= running.node()["last_t_ns"]
 

@@ -15,10 +15,10 @@ from typing import Any
 import httpx
 import pytest
 
-import storage.formats.zipped
-from service.api.routes.access import file_answer
-from storage.file_hash import sha256_of
-from storage.formats.zipped import Sealed, zipped
+import storage.formats.zip_stream
+from service.api.routes.common import file_response
+from storage.formats.zip_stream import SealedSession, stream_zip
+from storage.parquet_hash import compute_sha256
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -67,9 +67,9 @@ def test_a_zip_is_whole_whatever_the_date_of_a_file(
     folder.mkdir()
     for name in FILES:
         (folder / name).write_bytes(name.encode())
-    sealed = Sealed(folder, sha256_of(folder / "frames.parquet"))
+    sealed = SealedSession(folder, compute_sha256(folder / "frames.parquet"))
     date_files(monkeypatch, dated_s)
-    content = b"".join(zipped([sealed]))
+    content = b"".join(stream_zip([sealed]))
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         assert file.testzip() is None
         for entry in file.infolist():
@@ -86,7 +86,7 @@ def test_a_stored_file_is_sent_whatever_its_date(
     path = tmp_path / "frames.parquet"
     path.write_bytes(b"PAR1")
     date_files(monkeypatch, dated_s)
-    answer = file_answer(path)
+    answer = file_response(path)
     assert answer.headers["content-length"] == "4"
     said = parsedate_to_datetime(answer.headers["last-modified"])
     assert (said.year < 1970) == (dated_s < 0)
@@ -164,7 +164,7 @@ def test_of_a_session_that_is_deleted_on_the_way_there_is_no_zip_that_opens(
     two: list[Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = two[0].running
-    real, begun, deleted = storage.formats.zipped._put, threading.Event(), threading.Event()
+    real, begun, deleted = storage.formats.zip_stream._put, threading.Event(), threading.Event()
 
     def slow(*args: Any) -> Any:
         if args[2].parent.name == two[1].id:
@@ -172,7 +172,7 @@ def test_of_a_session_that_is_deleted_on_the_way_there_is_no_zip_that_opens(
             assert deleted.wait(30)
         return real(*args)
 
-    monkeypatch.setattr(storage.formats.zipped, "_put", slow)
+    monkeypatch.setattr(storage.formats.zip_stream, "_write_bytes", slow)
 
     def delete() -> None:
         assert begun.wait(30)
@@ -194,10 +194,10 @@ def test_its_memory_does_not_grow_with_the_files(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "frames.parquet").write_bytes(b"\0" * (40 << 20))
     (folder / "session.json").write_text("{}")
-    sha256 = sha256_of(folder / "frames.parquet")
+    sha256 = compute_sha256(folder / "frames.parquet")
     tracemalloc.start()
     try:
-        sent = sum(len(piece) for piece in zipped([Sealed(folder, sha256)]))
+        sent = sum(len(piece) for piece in stream_zip([SealedSession(folder, sha256)]))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

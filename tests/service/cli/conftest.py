@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from service.cli.main import main
-from service.version import SOFTWARE
+from service.version import SOFTWARE_VERSION
 from tests.service.cli.outcome import Outcome, Run
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -45,7 +45,7 @@ def run(
 @pytest.fixture
 def bench(run: Run, bench_cache: Path) -> bytes:
     """A recording of tiles T01 and T02 under the mill, which takes seconds: made once."""
-    kept = bench_cache / f"{SOFTWARE}-T01,T02.parquet"
+    kept = bench_cache / f"{SOFTWARE_VERSION}-T01,T02.parquet"
     if not kept.exists():
         made = f"{os.getpid()}.parquet"
         pressed = ("--tiles", "T01,T02", "--out", made)

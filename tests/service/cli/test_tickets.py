@@ -11,7 +11,7 @@ import pytest
 import segno
 
 from service.api import interfaces
-from service.api.logins import Logins, Right
+from service.api.logins import Logins, Role
 from service.cli.commands.serve import announce
 from service.cli.tickets import qr_lines, remark_reach
 from tests.service.cli.outcome import Run
@@ -54,7 +54,7 @@ def announced(
 
 
 def tickets_of(logins: Logins) -> int:
-    return len(logins.tickets._given)
+    return len(logins.tickets._grants)
 
 
 def test_a_server_that_phones_reach_shows_a_code_on_a_terminal(
@@ -81,9 +81,9 @@ def test_a_demo_gives_its_log_a_link_that_logs_in_once_and_no_token(
     shown, logins = announced(tmp_path, capsys, AWAY, is_demo=True)
     link, _, ticket = shown.strip().partition("#ticket=")
     assert link == f"FootTile is at {AWAY}/"
-    given = logins.tickets.take(ticket)
+    given = logins.tickets.redeem(ticket)
     assert given is not None
-    assert given.right is Right.PRESS
+    assert given.role is Role.OPERATOR
     assert TOKEN not in shown
 
 
@@ -118,7 +118,7 @@ def test_what_keeps_others_away_is_remarked(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(interfaces, "list_addresses", lambda *, has_ipv6: addresses)
+    monkeypatch.setattr(interfaces, "list_addresses", lambda *, include_ipv6: addresses)
     remark_reach([url], host)
     said = capsys.readouterr().err
     assert word in said

@@ -35,16 +35,18 @@ def wild_frames(rows: int, tiles: int, seed: int) -> FrameBatch:
     newest = np.clip(np.searchsorted(sampled_ns, since_ns) - 1, 0, None)
     counts = np.cumsum(rng.choice([-700, -1, 0, 3, 900, 3000], len(sampled_ns)))
     age_us = np.clip((since_ns - sampled_ns[newest]) // 1000, 0, None)
-    status = frames.status | np.where(
+    status = frames.tile_flags | np.where(
         rng.random((rows, tiles)) < 0.05, 2 ** rng.integers(0, 6, (rows, tiles)), 0
     )
     return with_columns(
         frames,
         seq=np.cumsum(rng.choice([1] * 20 + [2, 900], rows)),
         t_mono_ns=t_mono_ns,
-        tadc=np.where(frames.tadc == NOT_READ, NOT_READ, rng.integers(440, 560, (rows, tiles))),
-        status=status,
-        frame_status=np.where(rng.random(rows) < 0.1, rng.integers(0, 32, rows), 0),
+        temperature_raw=np.where(
+            frames.temperature_raw == NOT_READ, NOT_READ, rng.integers(440, 560, (rows, tiles))
+        ),
+        tile_flags=status,
+        frame_flags=np.where(rng.random(rows) < 0.1, rng.integers(0, 32, rows), 0),
         servo_counts=np.where(rng.random(rows) < 0.05, NO_SERVO_COUNTS, counts[newest]),
         servo_age_us=np.where(rng.random(rows) < 0.05, rng.integers(-1, 3000, rows), age_us),
         reference_force_n=rng.choice([np.nan, np.inf, 3.0], rows),

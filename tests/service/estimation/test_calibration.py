@@ -16,7 +16,7 @@ from service.estimation.calibration import (
     Calibration,
     TileCalibration,
     is_monotonic,
-    paper_eq2_shape,
+    make_paper_eq2_preset,
 )
 from service.estimation.models.static import StaticCurves
 from tests.builders.calibrations import make_calibration, newton_tile
@@ -25,7 +25,7 @@ numbers = st.floats(-100, 100)
 
 
 def force_n(tile: TileCalibration, gauge_kpa: float) -> float:
-    return float(StaticCurves([tile]).force(np.array([[gauge_kpa]])).force_n[0, 0])
+    return float(StaticCurves([tile]).compute_forces(np.array([[gauge_kpa]])).force_n[0, 0])
 
 
 def leaves(value: object, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
@@ -175,7 +175,7 @@ def test_a_contradictory_entry_cannot_be_made(changes: dict[str, object]) -> Non
 def test_a_missing_serial_is_named_with_what_there_is_and_the_remedy() -> None:
     calibration = make_calibration(newton_tile("T01"), newton_tile("T02"))
     with pytest.raises(CalibrationError) as caught:
-        calibration.of("T07")
+        calibration.get_tile("T07")
     text = str(caught.value)
     assert "T07" in text
     assert "T01, T02" in text
@@ -217,13 +217,13 @@ def test_monotony_is_judged_at_both_ends_and_in_between(
 
 
 def test_the_papers_preset_is_zero_at_zero_and_30_n_at_15_kpa() -> None:
-    tile = PRESETS["paper-eq2-shape"]().of("any serial at all")
+    tile = PRESETS["paper-eq2-shape"]().get_tile("any serial at all")
     assert force_n(tile, 0.0) == 0.0
     assert force_n(tile, 15.0) == pytest.approx(30.0, abs=1e-12)
 
 
 def test_the_papers_preset_has_the_papers_shape_at_41_45_n_per_unit() -> None:
-    tile = paper_eq2_shape().of("T01")
+    tile = make_paper_eq2_preset().get_tile("T01")
     assert tile.f_scale_n == pytest.approx(41.45, abs=0.005)
     for gauge_kpa in np.linspace(0.0, 15.0, 61).tolist():
         p = gauge_kpa / 15.0
@@ -232,9 +232,9 @@ def test_the_papers_preset_has_the_papers_shape_at_41_45_n_per_unit() -> None:
 
 
 def test_the_papers_preset_says_that_its_scale_is_assumed_and_doubts_it_by_a_tenth() -> None:
-    tile = paper_eq2_shape().of("T01")
+    tile = make_paper_eq2_preset().get_tile("T01")
     assert tile.absolute_scale == "assumed"
     assert tile.relative_misfit == 0.1
     assert tile.monotonic
     assert tile.range_kpa == (0.0, 15.0)
-    assert "assumed" in paper_eq2_shape().reference
+    assert "assumed" in make_paper_eq2_preset().reference

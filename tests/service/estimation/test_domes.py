@@ -11,37 +11,45 @@ from service.estimation.domes import (
     VYTAFLEX_40,
     VYTAFLEX_60,
     Dome,
-    dome_for,
-    external_share,
-    fast_share,
-    give_per_kpa,
-    range_of,
-    ranges,
-    volume_left,
+    compute_ambient_transmission,
+    compute_fast_load_ratio,
+    compute_saturation_load,
+    compute_volume_ratio,
+    compute_wall_compliance_per_kpa,
+    list_saturation_loads,
+    select_dome_for_load,
 )
 
 
 def test_a_slow_load_takes_thirteen_percent_of_the_volume_to_115_kpa() -> None:
-    assert volume_left() == pytest.approx(0.8696, abs=5e-5)
+    assert compute_volume_ratio() == pytest.approx(0.8696, abs=5e-5)
 
 
 def test_a_fast_load_is_at_full_scale_earlier() -> None:
-    assert volume_left(exponent=ADIABATIC) == pytest.approx(0.9050, abs=5e-5)
-    assert fast_share() == pytest.approx(0.095 / 0.1304, abs=0.001)
+    assert compute_volume_ratio(exponent=ADIABATIC) == pytest.approx(0.9050, abs=5e-5)
+    assert compute_fast_load_ratio() == pytest.approx(0.095 / 0.1304, abs=0.001)
 
 
 def test_a_polytropic_load_lies_between_slow_and_fast() -> None:
-    assert volume_left() < volume_left(exponent=1.2) < volume_left(exponent=ADIABATIC)
+    assert (
+        compute_volume_ratio()
+        < compute_volume_ratio(exponent=1.2)
+        < compute_volume_ratio(exponent=ADIABATIC)
+    )
 
 
 def test_the_wall_gives_way_as_a_thick_sphere() -> None:
-    assert give_per_kpa(Dome(VYTAFLEX_60, 11.0)) == pytest.approx(0.00124, abs=5e-6)
-    assert give_per_kpa(Dome(VYTAFLEX_40, 11.0)) == pytest.approx(0.00389, abs=5e-6)
+    assert compute_wall_compliance_per_kpa(Dome(VYTAFLEX_60, 11.0)) == pytest.approx(
+        0.00124, abs=5e-6
+    )
+    assert compute_wall_compliance_per_kpa(Dome(VYTAFLEX_40, 11.0)) == pytest.approx(
+        0.00389, abs=5e-6
+    )
 
 
 def test_a_bubble_sees_11_or_28_percent_of_the_outer_pressure() -> None:
-    assert external_share(Dome(VYTAFLEX_60, 11.0)) == pytest.approx(0.11, abs=0.005)
-    assert external_share(Dome(VYTAFLEX_40, 11.0)) == pytest.approx(0.28, abs=0.005)
+    assert compute_ambient_transmission(Dome(VYTAFLEX_60, 11.0)) == pytest.approx(0.11, abs=0.005)
+    assert compute_ambient_transmission(Dome(VYTAFLEX_40, 11.0)) == pytest.approx(0.28, abs=0.005)
 
 
 def test_table_i_has_three_diameters_of_two_materials() -> None:
@@ -52,34 +60,40 @@ def test_table_i_has_three_diameters_of_two_materials() -> None:
 
 
 def test_only_the_papers_own_dome_has_the_papers_range() -> None:
-    found = range_of(PAPER_DOME)
-    assert (found.low_n, found.high_n, found.basis) == (25.0, 35.0, "paper")
-    assert {range_of(dome).basis for dome in DOMES if dome != PAPER_DOME} == {"estimate"}
+    found = compute_saturation_load(PAPER_DOME)
+    assert (found.low_n, found.high_n, found.source) == (25.0, 35.0, "paper")
+    assert {compute_saturation_load(dome).source for dome in DOMES if dome != PAPER_DOME} == {
+        "estimate"
+    }
 
 
 def test_others_scale_with_modulus_and_area() -> None:
-    softer = range_of(Dome(VYTAFLEX_40, 11.0))
+    softer = compute_saturation_load(Dome(VYTAFLEX_40, 11.0))
     assert softer.low_n == pytest.approx(25.0 * 0.69 / 2.17)
-    larger = range_of(Dome(VYTAFLEX_60, 12.0))
+    larger = compute_saturation_load(Dome(VYTAFLEX_60, 12.0))
     assert larger.high_n == pytest.approx(35.0 * (12 / 11) ** 2)
 
 
 def test_the_weakest_dome_that_covers_a_load_is_named() -> None:
-    names = {load_n: found.dome.name for load_n in (5, 12, 24, 28) if (found := dome_for(load_n))}
+    names = {
+        load_n: found.dome.name
+        for load_n in (5, 12, 24, 28)
+        if (found := select_dome_for_load(load_n))
+    }
     assert names == {5: "v40-10", 12: "v60-10", 24: "v60-11", 28: "v60-12"}
 
 
 def test_a_load_within_the_papers_spread_is_only_perhaps_covered() -> None:
-    found = dome_for(32.0)
+    found = select_dome_for_load(32.0)
     assert found is not None
-    assert (found.dome.name, found.verdict(32.0)) == ("v60-11", "perhaps")
+    assert (found.dome.name, found.judge_load(32.0)) == ("v60-11", "perhaps")
 
 
 def test_a_load_beyond_every_dome_has_none() -> None:
-    assert dome_for(50.0) is None
-    assert all(found.verdict(50.0) == "saturates" for found in ranges())
+    assert select_dome_for_load(50.0) is None
+    assert all(found.judge_load(50.0) == "saturates" for found in list_saturation_loads())
 
 
 def test_no_load_is_refused() -> None:
     with pytest.raises(ValueError, match="no load"):
-        dome_for(0.0)
+        select_dome_for_load(0.0)

@@ -97,7 +97,7 @@ def test_effects_survive_a_calibration_file_to_the_bit() -> None:
     effects = make_effects(refused={"ambient": "for a test"})
     calibration = make_calibration(newton_tile("T01", effects=effects))
     again = Calibration.from_json(calibration.to_json(), where="a file")
-    assert again.of("T01").effects == effects
+    assert again.get_tile("T01").effects == effects
     assert again.id == calibration.id
 
 
@@ -112,5 +112,5 @@ def test_a_branch_that_flows_survives_a_calibration_file() -> None:
     loop = HysteresisEffect(part=(p(0.1), p(0.1), p(0.1)), flow=flow)
     calibration = make_calibration(newton_tile("T01", effects=make_effects(hysteresis=loop)))
     again = Calibration.from_json(calibration.to_json(), where="a file")
-    assert again.of("T01").effects.hysteresis == loop
+    assert again.get_tile("T01").effects.hysteresis == loop
     assert again.id == calibration.id

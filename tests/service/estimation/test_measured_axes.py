@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.estimates import Estimates, EstimateStatus
+from service.estimation.estimates import EstimateFlag, Estimates
 from tests.builders.arrays import array_at, make_servo
 from tests.builders.estimates import estimate, newton_plan
 from tests.builders.frames import cut_up, loaded_frames
@@ -40,7 +40,7 @@ def test_only_what_the_tiles_measure_is_a_number(
     loads_n = [30.0] * len(positions_m) + [0.0]
     e = estimate(newton_plan(info), loaded_frames(held(loads_n), servo_counts=counts))
     assert e.contact[-1] == 1
-    assert e.estimate_status[-1] == 0  # a frame in contact is not masked
+    assert e.estimate_flags[-1] == 0  # a frame in contact is not masked
     for axis, names in ALONG.items():
         for name in names:
             values = getattr(e, name)
@@ -88,7 +88,7 @@ def test_whatever_the_layout_all_that_is_measured_keeps_its_bits(
             assert np.isnan(values).all(), field.name
         else:
             assert values.tobytes() == getattr(with_row, field.name).tobytes(), field.name
-    masked = (found.estimate_status & EstimateStatus.COP_MASKED) != 0
+    masked = (found.estimate_flags & EstimateFlag.COP_MASKED) != 0
     for axis, names in ALONG.items():
         if names[0] not in unmeasured:
             assert (np.isnan(getattr(found, f"cop_{axis}_m")) == masked).all()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from devices.arrays import Floats, Ints
-from devices.compiled import compiled
+from devices.jit import jit_cached
 from service.estimation.records import KernelRecord, RecordArray
 
 
@@ -28,7 +28,7 @@ class Outer(KernelRecord):
     limits: Annotated[Ints, (2,)]
 
 
-@compiled
+@jit_cached
 def _add_up(records: RecordArray[Outer]) -> float:
     total = 0.0
     for i in range(len(records)):

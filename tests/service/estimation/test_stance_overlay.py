@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from service.estimation.stance_overlay import (
-    OVERLAID,
+    OVERLAY_COLUMNS,
     Overlay,
-    StanceOverlay,
-    evenly,
-    normalised,
+    StanceOverlayBuilder,
+    resample_stance,
+    select_evenly,
 )
 
 NAN = float("nan")
@@ -36,7 +36,7 @@ def test_a_curve_begins_and_ends_with_its_frames_and_never_leaves_what_they_span
 ) -> None:
     t_ns = instants(steps_ns)
     force_n = data.draw(hnp.arrays(np.float64, len(t_ns), elements=FORCES))
-    curve_n = normalised(t_ns, force_n, points)
+    curve_n = resample_stance(t_ns, force_n, points)
     assert curve_n.shape == (points,)
     assert (curve_n[0], curve_n[-1]) == (force_n[0], force_n[-1])
     slack_n = 1e-12 * np.abs(force_n).max()
@@ -50,7 +50,7 @@ def test_a_straight_line_stays_one_however_the_frames_lie(
 ) -> None:
     t_ns = instants(steps_ns)
     share = (t_ns - t_ns[0]) / (t_ns[-1] - t_ns[0])
-    curve_n = normalised(t_ns, first_n + share * (last_n - first_n), points)
+    curve_n = resample_stance(t_ns, first_n + share * (last_n - first_n), points)
     assert curve_n == pytest.approx(np.linspace(first_n, last_n, points), abs=1e-9)
 
 
@@ -61,13 +61,13 @@ def test_how_long_a_stance_lasts_does_not_matter(
     t_ns = instants(steps_ns)
     force_n = data.draw(hnp.arrays(np.float64, len(t_ns), elements=FORCES))
     slower = t_ns[0] + times * (t_ns - t_ns[0])
-    one, other = (normalised(t, force_n, 101) for t in (t_ns, slower))
+    one, other = (resample_stance(t, force_n, 101) for t in (t_ns, slower))
     assert one == pytest.approx(other, abs=1e-6)
 
 
 def test_what_is_not_known_is_not_known_between_its_neighbours_and_nowhere_else() -> None:
     t_ns = instants([1_000_000] * 4)
-    curve = normalised(t_ns, np.array([1.0, 2.0, NAN, 4.0, 5.0]), 9)
+    curve = resample_stance(t_ns, np.array([1.0, 2.0, NAN, 4.0, 5.0]), 9)
     assert curve.tolist()[:3] == [1.0, 1.5, 2.0]
     assert np.isnan(curve[3:6]).all()
     assert curve.tolist()[6:] == [4.0, 4.5, 5.0]
@@ -100,7 +100,7 @@ def overlaid(
     t_ns: Any, columns: Any, rows: list[tuple[int, int]], *, cuts: Sequence[int] = (), **how: Any
 ) -> Overlay:
     first, last = (np.array(each) for each in zip(*rows, strict=True))
-    gathered = StanceOverlay(
+    gathered = StanceOverlayBuilder(
         columns["part"][first],
         t_ns[first],
         t_ns[last],
@@ -109,8 +109,8 @@ def overlaid(
     )
     edges = [0, *sorted(cut % len(t_ns) for cut in cuts), len(t_ns)]
     for begin, end in pairwise(edges):
-        gathered.feed(t_ns[begin:end], {name: v[begin:end] for name, v in columns.items()})
-    return gathered.finish()
+        gathered.add_frames(t_ns[begin:end], {name: v[begin:end] for name, v in columns.items()})
+    return gathered.build_overlay()
 
 
 STANCES = st.lists(
@@ -126,8 +126,8 @@ def test_mean_and_spread_are_those_of_the_curves(
 ) -> None:
     found = overlaid(*recording(stances))
     assert found.rows.tolist() == list(range(len(stances)))
-    for name in OVERLAID:
-        curves, spread = found.curves[name], found.spread[name]
+    for name in OVERLAY_COLUMNS:
+        curves, spread = found.curves[name], found.statistics[name]
         known = np.isfinite(curves)
         assert (spread.count == known.sum(axis=0)).all()
         for i in range(101):
@@ -144,10 +144,10 @@ def test_batches_do_not_matter_to_the_bit(
 ) -> None:
     frames = recording(stances, list(range(len(stances))) if several else None)
     whole, pieces = overlaid(*frames), overlaid(*frames, cuts=cuts)
-    for name in OVERLAID:
+    for name in OVERLAY_COLUMNS:
         assert whole.curves[name].tobytes() == pieces.curves[name].tobytes()
         for field in ("mean", "sd", "count"):
-            one, other = (getattr(o.spread[name], field) for o in (whole, pieces))
+            one, other = (getattr(o.statistics[name], field) for o in (whole, pieces))
             assert one.tobytes() == other.tobytes()
 
 
@@ -156,21 +156,23 @@ def test_mean_and_spread_are_of_stances_that_are_not_kept_as_well() -> None:
     found = overlaid(*recording(stances), kept=[1])
     assert found.rows.tolist() == [1]
     assert found.curves["grf_n"].shape == (1, 101)
-    assert found.spread["grf_n"].mean == pytest.approx(np.full(101, 35.0))
-    assert found.spread["grf_n"].sd == pytest.approx(np.full(101, np.std([10, 20, 30, 80], ddof=1)))
+    assert found.statistics["grf_n"].mean == pytest.approx(np.full(101, 35.0))
+    assert found.statistics["grf_n"].sd == pytest.approx(
+        np.full(101, np.std([10, 20, 30, 80], ddof=1))
+    )
 
 
 def test_of_one_stance_there_is_no_spread_and_of_none_no_mean() -> None:
     found = overlaid(*recording([np.full(10, 5.0)]))
-    assert (found.spread["grf_n"].mean == 5.0).all()
-    assert np.isnan(found.spread["grf_n"].sd).all()
-    assert np.isnan(found.spread["cop_x_m"].mean).all()
-    assert not found.spread["cop_x_m"].count.any()
+    assert (found.statistics["grf_n"].mean == 5.0).all()
+    assert np.isnan(found.statistics["grf_n"].sd).all()
+    assert np.isnan(found.statistics["cop_x_m"].mean).all()
+    assert not found.statistics["cop_x_m"].count.any()
 
 
 @given(st.integers(0, 5000), st.integers(1, 200))
 def test_rows_that_are_kept_lie_evenly_from_the_first_to_the_last(count: int, most: int) -> None:
-    rows = evenly(count, most).tolist()
+    rows = select_evenly(count, most).tolist()
     assert len(rows) == len(set(rows)) == min(count, most)
     assert rows == sorted(rows)
     if most > 1 and count:

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.estimates import EstimateStatus
-from service.estimation.foot import UNKNOWN
-from service.estimation.stances import Stance, Stances, stances_of
+from service.estimation.estimates import EstimateFlag
+from service.estimation.foot import CONTACT_UNKNOWN
+from service.estimation.stances import Stance, StanceDetector, compute_stances
 
 STEP_NS = 2_000_000
 NAN = float("nan")
-SATURATED = int(EstimateStatus.SATURATED)
+SATURATED = int(EstimateFlag.SATURATED)
 
 Columns = dict[str, npt.NDArray[Any]]
 
@@ -29,7 +29,7 @@ def recording(
     seq: list[int] | None = None,
     t_ms: list[float] | None = None,
     part: list[int] | None = None,
-    status: list[int] | None = None,
+    estimate_flags: list[int] | None = None,
     cop_x_m: list[float] | None = None,
 ) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.int64], Columns]:
     """Frames 2 ms apart, numbered from 100, unless said otherwise; sigma is a tenth of the GRF."""
@@ -44,7 +44,7 @@ def recording(
         "grf_sigma_n": np.array(grf_n, dtype=np.float64) / 10,
         "cop_x_m": np.array(cop_x_m or [NAN] * n, dtype=np.float64),
         "cop_sigma_x_m": np.abs(np.array(cop_x_m or [NAN] * n, dtype=np.float64)) / 10,
-        "estimate_status": np.array(status or [0] * n, dtype=np.uint16),
+        "estimate_flags": np.array(estimate_flags or [0] * n, dtype=np.uint16),
     }
     if part is not None:
         columns["part"] = np.array(part, dtype=np.uint16)
@@ -52,12 +52,12 @@ def recording(
 
 
 def test_a_stance_has_peak_impulse_and_travel_of_its_frames() -> None:
-    (one,) = stances_of(
+    (one,) = compute_stances(
         *recording(
             [0, 1, 5, 3, 1, 0],
             [0, 1, 1, 1, 1, 0],
             cop_x_m=[NAN, NAN, -0.01, 0.02, 0.015, NAN],
-            status=[128, 16, 4, 0, 0, 16],
+            estimate_flags=[128, 16, 4, 0, 0, 16],
         )
     )
     assert (one.number, one.begin_t_ns, one.end_t_ns) == (1, STEP_NS, 4 * STEP_NS)
@@ -69,7 +69,7 @@ def test_a_stance_has_peak_impulse_and_travel_of_its_frames() -> None:
     assert one.cop_x_range_sigma_m == pytest.approx(np.hypot(0.001, 0.002))
     assert one.duration_s == pytest.approx(0.006)
     assert (one.frames, one.unknown_frames, one.missing_frames) == (4, 0, 0)
-    assert one.estimate_status == 16 | 4
+    assert one.estimate_flags == 16 | 4
     assert one.is_whole
 
 
@@ -77,14 +77,14 @@ def test_a_doubtful_frame_may_have_gone_furthest() -> None:
     x_m = [NAN, 0, 10, 9, NAN]
     numbers, t_ns, columns = recording([0, 5, 5, 5, 0], [0, 1, 1, 1, 0], cop_x_m=x_m)
     columns["cop_sigma_x_m"] = np.array([NAN, 0.0, 0.5, 2.0, NAN])
-    (one,) = stances_of(numbers, t_ns, columns)
+    (one,) = compute_stances(numbers, t_ns, columns)
     assert one.cop_x_range_m == 10.0
     greatest_high, greatest_low = 9 + 1.96 * 2.0, 10 - 1.96 * 0.5
     assert one.cop_x_range_sigma_m == pytest.approx((greatest_high - greatest_low) / (2 * 1.96))
 
 
 def test_the_trapezoids_are_as_wide_as_the_frames_are_apart() -> None:
-    (one,) = stances_of(*recording([0, 2, 2, 4, 0], [0, 1, 1, 1, 0], t_ms=[0, 2, 12, 14, 16]))
+    (one,) = compute_stances(*recording([0, 2, 2, 4, 0], [0, 1, 1, 1, 0], t_ms=[0, 2, 12, 14, 16]))
     assert one.impulse_n_s == pytest.approx(2 * 0.010 + 3 * 0.002, rel=1e-15)
     assert one.is_whole
 
@@ -94,7 +94,7 @@ RAMP_N = [0.0, *(10.0 * k for k in range(1, 11)), *(10.0 * k for k in range(10, 
 
 def test_a_duration_is_as_uncertain_as_its_two_gaps_and_the_force_at_its_edges() -> None:
     t_ms = [0.0, *(6.0 + 2 * k for k in range(20)), 48.0]
-    (one,) = stances_of(*recording(RAMP_N, [0, *[1] * 20, 0], t_ms=t_ms))
+    (one,) = compute_stances(*recording(RAMP_N, [0, *[1] * 20, 0], t_ms=t_ms))
     # 6 ms before it and 4 ms behind it, and 1 N of sigma at 10 N. From the frame beside it to 10 ms
     # within, 60 N come in 16 ms and go in 14 ms.
     missing_s, spread_s = 0.5 * (6e-3 + 4e-3), np.hypot(6e-3, 4e-3) / np.sqrt(12.0)
@@ -104,48 +104,51 @@ def test_a_duration_is_as_uncertain_as_its_two_gaps_and_the_force_at_its_edges()
 
 
 @pytest.mark.parametrize(
-    "contact", [[1, 1, *[1] * 19, 0], [UNKNOWN, *[1] * 20, 0], [0, *[1] * 20, UNKNOWN]]
+    "contact",
+    [[1, 1, *[1] * 19, 0], [CONTACT_UNKNOWN, *[1] * 20, 0], [0, *[1] * 20, CONTACT_UNKNOWN]],
 )
 def test_of_an_edge_that_was_not_seen_no_uncertainty_is_stated(contact: list[int]) -> None:
-    (one,) = stances_of(*recording(RAMP_N, contact))
+    (one,) = compute_stances(*recording(RAMP_N, contact))
     assert np.isnan(one.duration_sigma_s)
 
 
 def test_of_a_force_that_rises_too_slowly_no_uncertainty_is_stated() -> None:
     slowly_n = [9.0, *(10.0 + 0.1 * k for k in range(20)), *RAMP_N[11:]]
-    (one,) = stances_of(*recording(slowly_n, [0, *[1] * (len(slowly_n) - 2), 0]))
+    (one,) = compute_stances(*recording(slowly_n, [0, *[1] * (len(slowly_n) - 2), 0]))
     assert np.isnan(one.duration_sigma_s)
 
 
 def test_errors_of_the_force_that_are_the_same_in_all_frames_add_up_in_the_impulse() -> None:
-    (one,) = stances_of(*recording(RAMP_N, [0, *[1] * 20, 0]))
+    (one,) = compute_stances(*recording(RAMP_N, [0, *[1] * 20, 0]))
     edges_n_s = 0.5 * (10.0 + 10.0) * 2e-3  # 10 N first and last, 2 ms before and behind
     assert one.impulse_sigma_n_s == pytest.approx(np.hypot(one.impulse_n_s / 10, edges_n_s))
-    (cut,) = stances_of(*recording(RAMP_N[1:-1], [1] * 20))
+    (cut,) = compute_stances(*recording(RAMP_N[1:-1], [1] * 20))
     assert cut.impulse_sigma_n_s == pytest.approx(cut.impulse_n_s / 10)  # of what is there
-    gone = stances_of(*recording(RAMP_N, [0, *[1] * 20, 0], seq=[*range(15), *range(16, 23)]))
+    gone = compute_stances(*recording(RAMP_N, [0, *[1] * 20, 0], seq=[*range(15), *range(16, 23)]))
     assert np.isnan(gone[0].impulse_sigma_n_s)
 
 
 def test_stances_at_the_ends_of_a_recording_say_that_they_are_cut() -> None:
-    first, last = stances_of(*recording([4, 4, 0, 4, 4], [1, 1, 0, 1, 1]))
+    first, last = compute_stances(*recording([4, 4, 0, 4, 4], [1, 1, 0, 1, 1]))
     assert (first.number, first.begun, first.ended, first.is_whole) == (1, False, True, False)
     assert (last.number, last.begun, last.ended, last.is_whole) == (2, True, False, False)
 
 
 def test_no_line_is_drawn_across_frames_without_a_force() -> None:
-    contact = [0, 1, UNKNOWN, UNKNOWN, 1, 0]
-    (one,) = stances_of(*recording([0, 2, NAN, NAN, 8, 0], contact, status=[0, 0, 32, 32, 0, 0]))
+    contact = [0, 1, CONTACT_UNKNOWN, CONTACT_UNKNOWN, 1, 0]
+    (one,) = compute_stances(
+        *recording([0, 2, NAN, NAN, 8, 0], contact, estimate_flags=[0, 0, 32, 32, 0, 0])
+    )
     assert (one.frames, one.unknown_frames, one.missing_frames) == (4, 2, 0)
     assert np.isnan(one.impulse_n_s)
     assert one.peak_grf_n == 8.0
-    assert one.estimate_status == 32
+    assert one.estimate_flags == 32
     assert (one.begun, one.ended, one.is_whole) == (True, True, False)
 
 
 def test_frames_that_are_missing_are_counted_and_leave_no_impulse() -> None:
     frames = recording([0, 2, 3, 8, 0], [0, 1, 1, 1, 0], seq=[100, 101, 102, 106, 107])
-    (one,) = stances_of(*frames)
+    (one,) = compute_stances(*frames)
     assert (one.frames, one.missing_frames, one.unknown_frames) == (3, 3, 0)
     assert np.isnan(one.impulse_n_s)
     assert (one.begun, one.ended, one.is_whole) == (True, True, False)
@@ -156,23 +159,27 @@ def test_frames_that_are_missing_are_counted_and_leave_no_impulse() -> None:
     [
         ([0, 1, 1, 0], [100, 102, 103, 104], False, True),
         ([0, 1, 1, 0], [100, 101, 102, 104], True, False),
-        ([UNKNOWN, 1, 1, 0], [100, 101, 102, 103], False, True),
-        ([0, 1, 1, UNKNOWN], [100, 101, 102, 103], True, False),
+        ([CONTACT_UNKNOWN, 1, 1, 0], [100, 101, 102, 103], False, True),
+        ([0, 1, 1, CONTACT_UNKNOWN], [100, 101, 102, 103], True, False),
     ],
 )
 def test_an_edge_that_was_not_seen_is_no_beginning_and_no_end(
     contact: list[int], seq: list[int], begun: bool, ended: bool
 ) -> None:
-    (one,) = stances_of(*recording([0, 5, 5, 0], contact, seq=seq))
+    (one,) = compute_stances(*recording([0, 5, 5, 0], contact, seq=seq))
     assert (one.frames, one.missing_frames) == (2, 0)
     assert (one.begun, one.ended, one.is_whole) == (begun, ended, False)
 
 
 def test_frames_of_unknown_contact_at_an_edge_belong_to_no_stance() -> None:
-    frames = recording([NAN, 5, 5, NAN, 0], [UNKNOWN, 1, 1, UNKNOWN, 0], status=[32, 0, 0, 32, 0])
-    (one,) = stances_of(*frames)
+    frames = recording(
+        [NAN, 5, 5, NAN, 0],
+        [CONTACT_UNKNOWN, 1, 1, CONTACT_UNKNOWN, 0],
+        estimate_flags=[32, 0, 0, 32, 0],
+    )
+    (one,) = compute_stances(*frames)
     assert (one.begin_t_ns, one.end_t_ns, one.frames) == (STEP_NS, 2 * STEP_NS, 2)
-    assert one.estimate_status == 0
+    assert one.estimate_flags == 0
     assert one.impulse_n_s == pytest.approx(5 * 0.002)
 
 
@@ -181,8 +188,8 @@ def test_a_foot_that_was_not_seen_for_longer_than_50_ms_may_have_been_lifted(
     t_ms: float, expected: int
 ) -> None:
     # Known at 4 ms and at t_ms; what is in between, or missing, does not tell.
-    contact, grf_n = [0, 1, 1, UNKNOWN, 1, 0], [0, 5, 5, NAN, 7, 0]
-    found = stances_of(*recording(grf_n, contact, t_ms=[0, 2, 4, 6, t_ms, t_ms + 2]))
+    contact, grf_n = [0, 1, 1, CONTACT_UNKNOWN, 1, 0], [0, 5, 5, NAN, 7, 0]
+    found = compute_stances(*recording(grf_n, contact, t_ms=[0, 2, 4, 6, t_ms, t_ms + 2]))
     assert len(found) == expected
     assert [s.number for s in found] == list(range(1, expected + 1))
     assert found[0].begun
@@ -191,7 +198,7 @@ def test_a_foot_that_was_not_seen_for_longer_than_50_ms_may_have_been_lifted(
 
 
 def test_a_stance_does_not_go_on_across_a_restart_of_the_node() -> None:
-    before, after = stances_of(
+    before, after = compute_stances(
         *recording(
             [0, 5, 5, 6, 6, 0],
             [0, 1, 1, 1, 1, 0],
@@ -204,7 +211,7 @@ def test_a_stance_does_not_go_on_across_a_restart_of_the_node() -> None:
 
 
 def test_a_stance_of_which_no_force_is_known_has_no_peak() -> None:
-    (one,) = stances_of(*recording([0, NAN, 0], [0, 1, 0]))
+    (one,) = compute_stances(*recording([0, NAN, 0], [0, 1, 0]))
     assert np.isnan([one.peak_grf_n, one.peak_sigma_n, one.impulse_n_s, one.cop_x_range_m]).all()
     assert (one.peak_t_ns, one.is_whole) == (None, False)
 
@@ -213,23 +220,25 @@ def test_a_stance_in_which_a_tile_was_saturated_has_neither_peak_nor_impulse_and
     None
 ):
     grf_n, contact = [0, 3, NAN, 4, 0, 5, 0], [0, 1, 1, 1, 0, 1, 0]
-    hidden, whole = stances_of(*recording(grf_n, contact, status=[0, 0, SATURATED, 0, 0, 0, 0]))
+    hidden, whole = compute_stances(
+        *recording(grf_n, contact, estimate_flags=[0, 0, SATURATED, 0, 0, 0, 0])
+    )
     assert np.isnan([hidden.peak_grf_n, hidden.impulse_n_s]).all()
     assert (hidden.peak_t_ns, hidden.unknown_frames) == (None, 1)
     assert (whole.number, whole.peak_grf_n, whole.is_whole) == (2, 5.0, True)
 
 
 def test_a_foot_in_the_air_has_no_stance() -> None:
-    assert stances_of(*recording([0.0] * 5, [0] * 5)) == []
-    assert stances_of(*recording([], [])) == []
-    assert stances_of(*recording([NAN] * 3, [UNKNOWN] * 3)) == []
+    assert compute_stances(*recording([0.0] * 5, [0] * 5)) == []
+    assert compute_stances(*recording([], [])) == []
+    assert compute_stances(*recording([NAN] * 3, [CONTACT_UNKNOWN] * 3)) == []
 
 
 def test_a_stance_is_told_as_soon_as_it_is_over() -> None:
     seq, t_ns, columns = recording([0, 4, 0, 0], [0, 1, 0, 0])
-    gathered = Stances()
+    gathered = StanceDetector()
     fed = [
-        gathered.feed(
+        gathered.add_frames(
             seq[i : i + 1], t_ns[i : i + 1], {k: v[i : i + 1] for k, v in columns.items()}
         )
         for i in range(4)
@@ -241,33 +250,37 @@ def test_a_stance_is_told_as_soon_as_it_is_over() -> None:
 @st.composite
 def recordings(draw: st.DrawFn) -> tuple[Any, ...]:
     n = draw(st.integers(1, 40))
-    contact = draw(st.lists(st.sampled_from([0, 1, 1, UNKNOWN]), min_size=n, max_size=n))
+    contact = draw(st.lists(st.sampled_from([0, 1, 1, CONTACT_UNKNOWN]), min_size=n, max_size=n))
     steps = draw(st.lists(st.sampled_from([1, 1, 1, 1, 3, 30]), min_size=n, max_size=n))
     part = np.cumsum(draw(st.lists(st.sampled_from([0] * 9 + [1]), min_size=n, max_size=n)))
     rng = np.random.default_rng(draw(st.integers(0, 9)))
     forces = [float(f) for f in np.where(rng.random(n) < 0.1, NAN, rng.uniform(0, 20, n))]
-    status = [int(s) for s in rng.choice([0, 0, 0, 1, 32], n)]
+    estimate_flags = [int(s) for s in rng.choice([0, 0, 0, 1, 32], n)]
     cop_x_m = [float(x) for x in np.where(rng.random(n) < 0.3, NAN, rng.normal(0, 0.02, n))]
     seq = [100 + int(s) for s in np.cumsum(steps)]
     parts = [int(p) for p in part]
-    return recording(forces, contact, seq=seq, part=parts, status=status, cop_x_m=cop_x_m)
+    return recording(
+        forces, contact, seq=seq, part=parts, estimate_flags=estimate_flags, cop_x_m=cop_x_m
+    )
 
 
 @given(frames=recordings(), cuts=st.sets(st.integers(0, 40), max_size=6))
 def test_any_batches_give_the_same_stances(frames: Any, cuts: set[int]) -> None:
     seq, t_ns, columns = frames
-    gathered, found = Stances(), list[Stance]()
+    gathered, found = StanceDetector(), list[Stance]()
     for rows in np.split(np.arange(len(seq)), sorted(c for c in cuts if c <= len(seq))):
-        found += gathered.feed(seq[rows], t_ns[rows], {k: v[rows] for k, v in columns.items()})
+        found += gathered.add_frames(
+            seq[rows], t_ns[rows], {k: v[rows] for k, v in columns.items()}
+        )
     found += gathered.finish()
     # By its digits: NaN is not equal to itself.
-    assert repr(found) == repr(stances_of(seq, t_ns, columns))
+    assert repr(found) == repr(compute_stances(seq, t_ns, columns))
 
 
 @given(frames=recordings())
 def test_stances_do_not_overlap_and_hold_every_frame_of_contact_once(frames: Any) -> None:
     seq, t_ns, columns = frames
-    found = stances_of(seq, t_ns, columns)
+    found = compute_stances(seq, t_ns, columns)
     assert [s.number for s in found] == list(range(1, len(found) + 1))
     assert all(a.end_t_ns < b.begin_t_ns for a, b in pairwise(found))
     inside = [(s.begin_t_ns <= t_ns) & (t_ns <= s.end_t_ns) for s in found]
@@ -276,4 +289,4 @@ def test_stances_do_not_overlap_and_hold_every_frame_of_contact_once(frames: Any
     for stance, rows in zip(found, inside, strict=True):
         assert stance.frames == rows.sum()
         assert not (columns["contact"][rows] == 0).any()
-        assert stance.estimate_status == np.bitwise_or.reduce(columns["estimate_status"][rows])
+        assert stance.estimate_flags == np.bitwise_or.reduce(columns["estimate_flags"][rows])

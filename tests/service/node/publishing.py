@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from service.link import (
+from service.node.frame_sender import NodeCallbacks
+from service.node.publisher import Publisher
+from service.protocol import (
     EarlierStream,
     Hello,
-    Status,
-    Wanted,
+    NodeStatus,
+    RetentionMessage,
 )
-from service.node.publisher import Publisher
-from service.node.sending import Source
 from storage.intervals import Intervals
 from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
@@ -42,28 +42,28 @@ class Publishing:
         self.stream = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
         self.earlier = tuple(earlier)
         self.reports: list[str] = []
-        self.wanted: list[tuple[str, Wanted, tuple[str, ...]]] = []
+        self.wanted: list[tuple[str, RetentionMessage, tuple[str, ...]]] = []
         self.behind: list[int] = []
         self.damaged: list[Intervals] = []
         self.publisher = Publisher(
             server,
-            Source(
-                present=lambda: self.stream,
-                streams=lambda: {s.boot_id: s for s in (*self.earlier, self.stream)},
-                hello=self._hello,
-                secret=lambda server_id: node.secret,
-                status=self._status,
-                wanted=lambda *said: self.wanted.append(said),
-                damaged=lambda stream, numbers: self.damaged.append(numbers),
+            NodeCallbacks(
+                get_present_stream=lambda: self.stream,
+                get_streams=lambda: {s.stream_id: s for s in (*self.earlier, self.stream)},
+                make_hello=self._hello,
+                get_secret=lambda server_id: node.secret,
+                make_status=self._status,
+                on_retention_request=lambda *said: self.wanted.append(said),
+                on_damaged_frames=lambda stream, numbers: self.damaged.append(numbers),
             ),
             token=token,
             report=self.reports.append,
-            ca=ca,
+            ca_path=ca,
         )
 
     async def __aenter__(self) -> Publishing:
         self._before = asyncio.all_tasks()
-        self._task = asyncio.create_task(self.publisher.run())
+        self._task = asyncio.create_task(self.publisher.publish_forever())
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -74,8 +74,8 @@ class Publishing:
 
     def take(self, n: int) -> None:
         for batch in batches(self.node, n):
-            self.stream.put(batch, 0)
-        self.publisher.notify()
+            self.stream.queue_batch(batch, 0)
+        self.publisher.notify_new_frames()
 
     async def until(self, condition: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
         end_s = time.monotonic() + timeout_s
@@ -88,29 +88,29 @@ class Publishing:
 
     def _hello(self) -> Hello:
         hello: Hello = self.node.hello(
-            held=tuple(self.stream.held),
+            stored=tuple(self.stream.available),
             next_seq=self.stream.next_seq,
-            lost=self.stream.lost.as_pairs(),
+            lost=self.stream.lost.to_pairs(),
             earlier=tuple(
-                EarlierStream(array_info=s.info, held=tuple(s.held), next_seq=s.next_seq)
+                EarlierStream(array_info=s.info, stored=tuple(s.available), next_seq=s.next_seq)
                 for s in self.earlier
             ),
         )
         return hello
 
-    def _status(self, behind: int) -> Status:
+    def _status(self, behind: int) -> NodeStatus:
         self.behind.append(behind)
-        return Status(missed_slots=0, backlog_frames=behind)
+        return NodeStatus(missed_slots=0, backlog_frames=behind)
 
 
 def batches(node: FakeNode, n: int) -> list[EncodedBatch]:
     frames = node.frames(n)
     return [
-        EncodedBatch.of(rows, node.payload(rows))
-        for rows in (frames.rows(begin, begin + 10) for begin in range(0, n, 10))
+        EncodedBatch.from_frames_and_payload(rows, node.payload(rows))
+        for rows in (frames.slice_rows(begin, begin + 10) for begin in range(0, n, 10))
     ]
 
 
 def assert_all_arrived(running: Running, node: FakeNode) -> None:
-    found = np.concatenate([b.seq for b in running.journal(node.boot_id).read(0, 2**61)])
+    found = np.concatenate([b.seq for b in running.journal(node.stream_id).read_frames(0, 2**61)])
     np.testing.assert_array_equal(found, np.arange(node.seq))

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-import service.node.acquisition
+import service.node.acquisition_process
 from devices.errors import (
     BusFaultError,
     BusMisuseError,
@@ -25,8 +25,8 @@ from devices.errors import (
     ServoSetupError,
     TileSetupError,
 )
-from devices.scene.file import load_scene
-from service.node.acquisition import Waiting
+from devices.scene.scene_file import load_scene
+from service.node.acquisition_process import WaitingForArray
 from service.rig.options import RigOptions
 from tests.builders.scenes import ONE_TILE_FILE, make_scene
 from tests.service.process import Process, Start, acquisition_of
@@ -55,18 +55,18 @@ def test_acquisition_that_is_held_up_is_said_everywhere_and_goes_on_in_the_same_
     os.kill(child, signal.SIGSTOP)
     try:
         process.said("acquisition is held up")
-        until(lambda: running.node("leg")["troubles"])
+        until(lambda: running.node("leg")["warnings"])
         held_up = running.node("leg")
     finally:
         os.kill(child, signal.SIGCONT)
     assert held_up["connected"], "the node itself is heard of"
-    assert "no frames for" in held_up["troubles"][0]
+    assert "no frames for" in held_up["warnings"][0]
     assert held_up["rate_hz"] == 0.0
     until(lambda: running.node("leg")["last_seq"] > held_up["last_seq"] + 100)
     process.said("no longer: acquisition is held up")
-    until(lambda: not running.node("leg")["troubles"])
+    until(lambda: not running.node("leg")["warnings"])
     after = running.node("leg")
-    assert after["boot_id"] == before["boot_id"]
+    assert after["stream_id"] == before["stream_id"]
     assert after["missed_slots"] > before["missed_slots"], "what was missed is counted"
 
 
@@ -104,9 +104,9 @@ def test_a_bug_in_acquisition_is_said_before_anything_is_closed_that_may_hang(
         stack.callback(lambda: said_when_closed.append(len(connection.got)))
         raise ValueError("dome pressure was asked for too late")
 
-    monkeypatch.setattr(service.node.acquisition, "Rig", broken)
+    monkeypatch.setattr(service.node.acquisition_process, "Rig", broken)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    service.node.acquisition._run(
+    service.node.acquisition_process._run_child(
         RigOptions(load_scene("standing"), "leg"),
         connection,  # type: ignore[arg-type]  # that much of it is used
     )
@@ -158,20 +158,20 @@ def opened_after(
         connection.send((rig, list(closed)))
         stop.set()
 
-    monkeypatch.setattr(service.node.acquisition, "Rig", rig)
-    monkeypatch.setattr(service.node.acquisition, "_stream", streams)
-    monkeypatch.setattr(service.node.acquisition, "OPEN_AGAIN_S", 0.0)
-    monkeypatch.setattr(service.node.acquisition, "_await_stop", lambda *_: None)
+    monkeypatch.setattr(service.node.acquisition_process, "Rig", rig)
+    monkeypatch.setattr(service.node.acquisition_process, "_acquire_stream", streams)
+    monkeypatch.setattr(service.node.acquisition_process, "REOPEN_INTERVAL_S", 0.0)
+    monkeypatch.setattr(service.node.acquisition_process, "_await_stop", lambda *_: None)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     scene = make_scene(array={"bus": bus})
-    service.node.acquisition._run(RigOptions(scene, "leg"), connection)  # type: ignore[arg-type]
+    service.node.acquisition_process._run_child(RigOptions(scene, "leg"), connection)  # type: ignore[arg-type]
     return connection.got, closed
 
 
 def test_an_array_that_is_not_there_yet_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     got, closed = opened_after([*NOT_YET], monkeypatch)
     n = len(NOT_YET)
-    assert got[:n] == [Waiting(str(error)) for error in NOT_YET]
+    assert got[:n] == [WaitingForArray(str(error)) for error in NOT_YET]
     # What an attempt opened is closed before the next; what is used, at the end.
     assert got[n] == (f"attempt {n}", [f"attempt {i}" for i in range(n)])
     assert got[n + 1].error is None
@@ -213,7 +213,7 @@ def test_a_parent_that_has_died_is_no_bug(monkeypatch: pytest.MonkeyPatch) -> No
     def streams(rig: object, connection: Any, stop: threading.Event) -> None:
         connection.send("frames")
 
-    monkeypatch.setattr(service.node.acquisition, "Rig", lambda options, stack: None)
-    monkeypatch.setattr(service.node.acquisition, "_stream", streams)
+    monkeypatch.setattr(service.node.acquisition_process, "Rig", lambda options, stack: None)
+    monkeypatch.setattr(service.node.acquisition_process, "_acquire_stream", streams)
     with ours:
-        service.node.acquisition._run(RigOptions(load_scene("standing"), "leg"), ours)
+        service.node.acquisition_process._run_child(RigOptions(load_scene("standing"), "leg"), ours)

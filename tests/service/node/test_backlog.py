@@ -8,7 +8,7 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.node.sending import Backlog
+from service.node.frame_sender import Backlog
 from storage.intervals import Intervals
 from tests.waiting import until
 
@@ -20,9 +20,9 @@ pairs = st.lists(
 def sent(backlog: Backlog, frames_max: int) -> list[tuple[str, int, int]]:
     """Everything it gives, in order, until there is no more."""
     found = []
-    while (wanted := backlog.next(frames_max)) is not None:
+    while (wanted := backlog.get_next_range(frames_max)) is not None:
         found.append(wanted)
-        backlog.done(*wanted)
+        backlog.remove_frames(*wanted)
     return found
 
 
@@ -33,35 +33,35 @@ def sent(backlog: Backlog, frames_max: int) -> list[tuple[str, int, int]]:
 def test_everything_that_lacks_is_given_once_in_pieces(
     lacks: list[tuple[str, list[tuple[int, int]]]], frames_max: int
 ) -> None:
-    backlog = Backlog((boot_id, Intervals(numbers)) for boot_id, numbers in lacks)
+    backlog = Backlog((stream_id, Intervals(numbers)) for stream_id, numbers in lacks)
     expected = {
-        boot_id: Intervals(pair for b, numbers in lacks if b == boot_id for pair in numbers)
-        for boot_id in "ab"
+        stream_id: Intervals(pair for b, numbers in lacks if b == stream_id for pair in numbers)
+        for stream_id in "ab"
     }
-    assert backlog.count == sum(numbers.count for numbers in expected.values())
+    assert backlog.frame_count == sum(numbers.count for numbers in expected.values())
     given_ = {"a": Intervals(), "b": Intervals()}
     total = 0
-    for boot_id, first, last in sent(backlog, frames_max):
+    for stream_id, first, last in sent(backlog, frames_max):
         assert 0 < last - first + 1 <= frames_max
-        given_[boot_id].add(first, last)
+        given_[stream_id].add(first, last)
         total += last - first + 1
     assert given_ == expected
     assert total == sum(numbers.count for numbers in expected.values())
-    assert backlog.count == 0
+    assert backlog.frame_count == 0
 
 
 def test_what_comes_first_in_the_list_goes_first() -> None:
     """A server names what sessions need before what is only for pre-roll."""
     backlog = Backlog([("a", Intervals([(50, 59)])), ("b", Intervals([(0, 4)]))])
-    backlog.add("a", 0, 9)
+    backlog.add_frames("a", 0, 9)
     assert sent(backlog, 100) == [("a", 0, 9), ("a", 50, 59), ("b", 0, 4)]
 
 
 def test_a_stream_that_nobody_lacked_anything_of_can_fall_behind() -> None:
     backlog = Backlog()
-    assert backlog.next(10) is None
-    backlog.add("a", 5, 9)
-    assert backlog.next(3) == ("a", 5, 7)
+    assert backlog.get_next_range(10) is None
+    backlog.add_frames("a", 5, 9)
+    assert backlog.get_next_range(3) == ("a", 5, 7)
 
 
 class Meanwhile(Intervals):
@@ -79,7 +79,7 @@ class Meanwhile(Intervals):
 
 def test_what_is_added_while_a_thread_takes_off_what_is_done_is_not_forgotten() -> None:
     backlog = Backlog([("a", Meanwhile([(0, 5)]))])
-    Meanwhile.overtake = staticmethod(lambda: backlog.add("a", 8, 9))
-    backlog.done("a", 0, 3)
-    until(lambda: backlog.count == 4)
+    Meanwhile.overtake = staticmethod(lambda: backlog.add_frames("a", 8, 9))
+    backlog.remove_frames("a", 0, 3)
+    until(lambda: backlog.frame_count == 4)
     assert sent(backlog, 10) == [("a", 4, 5), ("a", 8, 9)]

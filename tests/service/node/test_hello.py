@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from devices.errors import CalibrationError
-from service.link import Status
-from service.node.connection import hello_of
 from service.node.options import NodeOptions
+from service.node.server_connection import make_hello
+from service.protocol import NodeStatus
 from service.rig.options import RigOptions
 from storage.journal.node.journal import NodeJournal
 from tests.builders.arrays import make_array
@@ -19,12 +19,16 @@ from tests.storage.journal.journals import filled
 
 def test_a_stream_that_begins_while_a_node_greets_is_not_said_to_have_ended(tmp_path: Path) -> None:
     journal = NodeJournal(tmp_path, "leg")
-    before, present, newer = (journal.begin(make_array(boot_id=name * 32)) for name in "abc")
-    options = NodeOptions(rig=RigOptions(make_scene(), "leg"), journal=tmp_path, server=None)
-    hello = hello_of(options, journal, present)
+    before, present, newer = (
+        journal.begin_stream(make_array(stream_id=name * 32)) for name in "abc"
+    )
+    options = NodeOptions(
+        rig_options=RigOptions(make_scene(), "leg"), node_folder=tmp_path, server_url=None
+    )
+    hello = make_hello(options, journal, present)
     journal.close()
     assert not newer.has_ended
-    assert [each.array_info.boot_id for each in hello.earlier] == [before.boot_id]
+    assert [each.array_info.stream_id for each in hello.earlier] == [before.stream_id]
     assert not hello.has_more
 
 
@@ -33,18 +37,21 @@ def test_whatever_its_files_are_called_a_server_can_be_told_of_them(
     tmp_path: Path, odd: str
 ) -> None:
     journal = NodeJournal(tmp_path, "leg")
-    stream = journal.begin(make_array())
+    stream = journal.begin_stream(make_array())
     journal.close()
     filled(stream.folder, (0, 9)).close()
     (stream.folder / f"{odd}.arrows").mkdir()
     again = NodeJournal(tmp_path, "leg")
     why = str(CalibrationError("cannot be read", where=f"{odd}.toml"))
     options = NodeOptions(
-        RigOptions(make_scene(), "leg"), journal=tmp_path, server=None, calibration_problem=why
+        RigOptions(make_scene(), "leg"),
+        node_folder=tmp_path,
+        server_url=None,
+        calibration_problem=why,
     )
-    said = Status(missed_slots=0, troubles=tuple(again.problems))
-    hello = hello_of(options, again, again.begin(make_array(boot_id="b" * 32)))
+    said = NodeStatus(missed_slots=0, warnings=tuple(again.problems))
+    hello = make_hello(options, again, again.begin_stream(make_array(stream_id="b" * 32)))
     again.close()
-    assert "it is not a file" in " ".join(said.troubles)
+    assert "it is not a file" in " ".join(said.warnings)
     for message in (said, hello):
         assert type(message).model_validate_json(message.model_dump_json()) == message

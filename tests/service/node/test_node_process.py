@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.frames import NO_SERVO_COUNTS, FrameStatus, TileStatus
+from devices.frames import NO_SERVO_COUNTS, FrameFlag, TileFlag
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.node.in_flight import read_in_flight
+from storage.journal.node.in_flight import read_in_flight_frames
 from storage.journal.stream_notes import StreamNotes
 from tests.service.cli.outcome import static_only
 from tests.service.process import Start
@@ -71,7 +71,9 @@ def test_an_emulated_node_streams_tares_and_ends_without_loss(
     assert not any("wait on this disk" in line for line in process.err)
     until(lambda: not running.node("demo")["connected"])
     node = running.node("demo")
-    seqs = np.concatenate([b.seq for b in running.journal(node["boot_id"], "demo").read(0, 2**61)])
+    seqs = np.concatenate(
+        [b.seq for b in running.journal(node["stream_id"], "demo").read_frames(0, 2**61)]
+    )
     np.testing.assert_array_equal(seqs, np.arange(node["last_seq"] + 1))
 
 
@@ -92,9 +94,9 @@ def test_a_servo_that_is_silent_from_the_start_is_said_and_the_tiles_stream(
     finally:
         os.close(master)
         os.close(slave)
-    boot_id = running.node("mute")["boot_id"]
-    batches = list(running.journal(boot_id, "mute").read(0, 2**61))
-    assert all((b.frame_status & FrameStatus.SERVO_STALE).all() for b in batches)
+    stream_id = running.node("mute")["stream_id"]
+    batches = list(running.journal(stream_id, "mute").read_frames(0, 2**61))
+    assert all((b.frame_flags & FrameFlag.SERVO_STALE).all() for b in batches)
     assert all((b.servo_counts == NO_SERVO_COUNTS).all() for b in batches)
 
 
@@ -155,7 +157,7 @@ def test_a_node_without_a_server_keeps_its_frames(
     notes = StreamNotes.load(folder)
     assert notes is not None
     with closing(Journal.open(folder)) as journal:
-        assert journal.held == Intervals([(0, (notes.next_seq or 0) - 1)])
+        assert journal.stored == Intervals([(0, (notes.next_seq or 0) - 1)])
 
 
 @pytest.fixture
@@ -191,7 +193,7 @@ def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
     process.process.kill()
     until(lambda: not running.node("leg")["connected"])
     again = leg()
-    until(lambda: running.node("leg")["boot_id"] != before["boot_id"])
+    until(lambda: running.node("leg")["stream_id"] != before["stream_id"])
     streaming(running)
     session.stop()
     found = session.sealed(40.0)
@@ -214,8 +216,8 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     process.ended(5.0)
     until(lambda: not running.node("leg")["connected"])
     arrived = running.node("leg")["last_seq"]
-    stream = own / before["boot_id"]
-    left = read_in_flight(stream)
+    stream = own / before["stream_id"]
+    left = read_in_flight_frames(stream)
     assert left is not None
     assert left[1] is not None
     taken = int(left[1].seq[-1])
@@ -226,9 +228,9 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     again = leg()
     for name in ("wanted.json", "stream.json", "in_flight"):
         again.said(f"{name}.damaged-1", 30.0)
-    until(lambda: running.node("leg")["boot_id"] != before["boot_id"])
+    until(lambda: running.node("leg")["stream_id"] != before["stream_id"])
     streaming(running)
-    until(lambda: "wanted.json" in " ".join(running.node("leg")["troubles"]))
+    until(lambda: "wanted.json" in " ".join(running.node("leg")["warnings"]))
     session.stop()
     found = session.sealed(40.0)
     first, second = session.ledger()["parts"]
@@ -236,8 +238,10 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
         assert (part["recorded"], part["lost"]) == (part["seq_last"] - part["seq_first"] + 1, {})
     # What was in flight only is lost, and how much that may be is said.
     assert taken >= first["seq_last"] >= arrived
-    assert taken - first["seq_last"] <= first["unsynced_tail_max"] == found["tail_frames_max"]
-    assert second["unsynced_tail_max"] == 0
+    assert (
+        taken - first["seq_last"] <= first["max_lost_tail_frames"] == found["max_lost_tail_frames"]
+    )
+    assert second["max_lost_tail_frames"] == 0
     again.process.send_signal(signal.SIGTERM)
     assert again.ended(12.0) == 0, again.err
 
@@ -250,7 +254,7 @@ def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
     session = running.record("leg", name="apart")
     # A server that is stopped before it has told the node leaves it with frames that nobody wants.
     told = tmp_path / "node" / "journal" / "leg" / "wanted.json"
-    until(lambda: told.exists() and running.node("leg")["boot_id"] in told.read_text())
+    until(lambda: told.exists() and running.node("leg")["stream_id"] in told.read_text())
     running.stop()
     process.said("not connected to")
     process.process.send_signal(signal.SIGINT)
@@ -297,18 +301,18 @@ def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old
     assert sealed["complete"] is True
     assert "other tiles" in sealed["problem"]
     first = session.frames()
-    tile = first.status[-20:, 1]
-    assert (tile & TileStatus.UNUSABLE != 0).all(), "of the other part nothing was believed"
-    assert (first.status[:, 0] & TileStatus.UNUSABLE == 0).all()
+    tile = first.tile_flags[-20:, 1]
+    assert (tile & TileFlag.UNUSABLE != 0).all(), "of the other part nothing was believed"
+    assert (first.tile_flags[:, 0] & TileFlag.UNUSABLE == 0).all()
     until(lambda: (running.node("demo")["last_seq"] or 0) > 200)
     second = running.only_session(but=session)
     assert (second["name"], second["state"]) == ("swap (2)", "recording")
     second.stop()
     second.sealed()
     again = second.frames()
-    assert again.frame_status[0] & FrameStatus.NEW_ARRAY_INFO
-    assert not (again.frame_status[1:] & FrameStatus.NEW_ARRAY_INFO).any()
-    assert (again.status[20:, 1] & TileStatus.UNUSABLE == 0).mean() > 0.99
+    assert again.frame_flags[0] & FrameFlag.NEW_ARRAY_INFO
+    assert not (again.frame_flags[1:] & FrameFlag.NEW_ARRAY_INFO).any()
+    assert (again.tile_flags[20:, 1] & TileFlag.UNUSABLE == 0).mean() > 0.99
 
 
 def test_a_tile_that_dies_is_named_on_the_terminal_and_by_the_server_and_so_is_its_return(
@@ -319,10 +323,10 @@ def test_a_tile_that_dies_is_named_on_the_terminal_and_by_the_server_and_so_is_i
     process = foottile("node", "--scene", scene, "--server", running.url)
     process.said("tile T03 (mux 0x70 channel 2) does not answer", 25.0)
     (name,) = [node["node"] for node in running.http.get("/nodes").json()["items"]]
-    until(lambda: running.node(name)["troubles"])
-    assert running.node(name)["troubles"] == ["tile T03 (mux 0x70 channel 2) does not answer"]
+    until(lambda: running.node(name)["warnings"])
+    assert running.node(name)["warnings"] == ["tile T03 (mux 0x70 channel 2) does not answer"]
     process.said("no longer: tile T03", 15.0)
-    until(lambda: not running.node(name)["troubles"])
+    until(lambda: not running.node(name)["warnings"])
     counts = running.node(name)["fault_counts"]
     assert counts["T03"]["no_answer"] > 100
     process.process.send_signal(signal.SIGTERM)

@@ -13,36 +13,36 @@ from typing import Any
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
-import service.node.sending
+import service.node.frame_sender
 import service.server
 from devices.errors import UsageError
-from service.identity import fingerprint_of, make_proof
-from service.link import (
+from service.node.tcp_connect import make_ingest_url
+from service.node_identity import compute_fingerprint, make_proof
+from service.protocol import (
+    NODE_MESSAGES,
     PROTOCOL,
     SUBPROTOCOL,
     Ack,
     Challenge,
-    Close,
-    FramesOf,
-    FromNode,
     Hello,
     Identify,
-    Lost,
+    LinkCloseCode,
+    LossReport,
     Proof,
+    RetentionMessage,
     StreamNumbers,
-    Wanted,
+    StreamSelect,
     Welcome,
-    checked,
-    heard,
-    say,
+    encode_message,
+    strip_binary_crc,
+    strip_text_crc,
 )
-from service.node.dial import ingest_url
 from storage.intervals import Intervals
+from storage.journal.node.retention_requests import RetentionRequests as NodeWanted
 from storage.journal.node.stream import NodeStream
-from storage.journal.node.wanted import Wanted as NodeWanted
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema
-from storage.wire import decode
+from storage.wire import decode_message
 from tests.faults.proxy import Proxy
 from tests.service.fake_node import FakeNode
 from tests.service.node.publishing import Publishing, batches
@@ -61,7 +61,7 @@ class Script:
         """Stream, first and last number of each message of frames."""
         self.said: list[Any] = []
         self.lacks: tuple[StreamNumbers, ...] = ()
-        self.wanted = Wanted(streams=(), recording=False)
+        self.wanted = RetentionMessage(streams=(), recording=False)
         self.acknowledges = True
         self.reads = asyncio.Event()
         self.reads.set()
@@ -74,38 +74,40 @@ class Script:
 
     async def serve(self, connection: ServerConnection) -> None:
         self.connection = connection
-        assert isinstance(FromNode.validate_json(heard(await connection.recv())), Identify)
+        assert isinstance(
+            NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv())), Identify
+        )
         challenge = Challenge(
             protocol=PROTOCOL, server_id="played", nonce="0" * 64, is_known=self.is_known
         )
-        await connection.send(say(challenge))
-        proof = FromNode.validate_json(heard(await connection.recv()))
+        await connection.send(encode_message(challenge))
+        proof = NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
         assert isinstance(proof, Proof)
         self.proofs.append(proof)
-        hello = FromNode.validate_json(heard(await connection.recv()))
+        hello = NODE_MESSAGES.validate_json(strip_text_crc(await connection.recv()))
         assert isinstance(hello, Hello)
         self.hellos.append(hello)
         lacks = self.lacks or (
-            StreamNumbers(boot_id=hello.array_info.boot_id, numbers=((0, None),)),
+            StreamNumbers(stream_id=hello.array_info.stream_id, numbers=((0, None),)),
         )
-        welcome = Welcome(protocol=PROTOCOL, lacks=lacks, wanted=self.wanted)
-        await connection.send(say(welcome))
-        boot_id = hello.array_info.boot_id
+        welcome = Welcome(protocol=PROTOCOL, missing=lacks, retention=self.wanted)
+        await connection.send(encode_message(welcome))
+        stream_id = hello.array_info.stream_id
         schema = wire_schema(hello.array_info)
         async for message in connection:
             await self.reads.wait()
             if isinstance(message, bytes):
-                seq = decode(checked(message), schema).seq
+                seq = decode_message(strip_binary_crc(message), schema).seq
                 first, last = int(seq[0]), int(seq[-1])
-                self.came.append((boot_id, first, last))
+                self.came.append((stream_id, first, last))
                 if self.acknowledges:
-                    ack = Ack(boot_id=boot_id, seq_first=first, seq_last=last)
-                    await connection.send(say(ack))
+                    ack = Ack(stream_id=stream_id, seq_first=first, seq_last=last)
+                    await connection.send(encode_message(ack))
                 continue
-            said = FromNode.validate_json(heard(message))
+            said = NODE_MESSAGES.validate_json(strip_text_crc(message))
             self.said.append(said)
-            if isinstance(said, FramesOf):
-                boot_id = said.boot_id
+            if isinstance(said, StreamSelect):
+                stream_id = said.stream_id
 
 
 @asynccontextmanager
@@ -133,13 +135,13 @@ async def test_a_node_shows_its_secret_only_where_it_is_not_known_or_was_refused
         async with Publishing(node, script.url) as publishing:
             await publishing.until(lambda: publishing.publisher.is_connected)
             script.is_known = True
-            publishing.publisher.renew()
+            publishing.publisher.reconnect_for_new_stream()
             await publishing.until(lambda: len(script.hellos) == 2)
             assert script.connection is not None
-            await script.connection.close(Close.WRONG_IDENTITY, "accept it")
+            await script.connection.close(LinkCloseCode.WRONG_IDENTITY, "accept it")
             await publishing.until(lambda: len(script.hellos) == 3)
         assert node.secret is not None
-        fingerprint = fingerprint_of(node.secret)
+        fingerprint = compute_fingerprint(node.secret)
         assert any("accept it" in said and fingerprint in said for said in publishing.reports)
     first, second, third = script.proofs
     assert first == third == Proof(secret=node.secret)
@@ -171,14 +173,14 @@ async def test_earlier_streams_are_named_before_their_frames(node: FakeNode) -> 
     async with played() as script:
         old = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
         for batch in batches(node, 50):
-            old.put(batch, 0)
-        old_id = node.boot_id
+            old.queue_batch(batch, 0)
+        old_id = node.stream_id
         node.reboot()
         publishing = Publishing(node, script.url, earlier=[old])
         publishing.take(20)
         script.lacks = (
-            StreamNumbers(boot_id=old_id, numbers=((15, 34),)),
-            StreamNumbers(boot_id=node.boot_id, numbers=((0, None),)),
+            StreamNumbers(stream_id=old_id, numbers=((15, 34),)),
+            StreamNumbers(stream_id=node.stream_id, numbers=((0, None),)),
         )
         async with publishing:
             publishing.take(10)
@@ -201,29 +203,29 @@ async def test_earlier_streams_are_named_before_their_frames(node: FakeNode) -> 
 @in_a_loop
 async def test_what_a_server_wants_is_told_with_the_streams_it_had_heard_of(node: FakeNode) -> None:
     async with played() as script:
-        wanted = Wanted(
-            streams=(StreamNumbers(boot_id=node.boot_id, numbers=((5, None),)),), recording=True
+        wanted = RetentionMessage(
+            streams=(StreamNumbers(stream_id=node.stream_id, numbers=((5, None),)),), recording=True
         )
         script.wanted = wanted
         async with Publishing(node, script.url) as publishing:
             await publishing.until(lambda: publishing.wanted)
             assert script.connection is not None
-            nothing = Wanted(streams=(), recording=False)
-            await script.connection.send(say(nothing))
+            nothing = RetentionMessage(streams=(), recording=False)
+            await script.connection.send(encode_message(nothing))
             await publishing.until(lambda: len(publishing.wanted) == 2)
-        assert publishing.wanted[0] == ("played", wanted, (node.boot_id,))
-        assert publishing.wanted[1] == ("played", nothing, (node.boot_id,))
+        assert publishing.wanted[0] == ("played", wanted, (node.stream_id,))
+        assert publishing.wanted[1] == ("played", nothing, (node.stream_id,))
 
 
 @in_a_loop
 async def test_losses_are_said_whenever_they_change(node: FakeNode) -> None:
     async with played() as script, Publishing(node, script.url) as publishing:
         await publishing.until(lambda: script.said)
-        publishing.stream.lose(Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere")))
-        await publishing.until(lambda: any(isinstance(m, Lost) for m in script.said))
+        publishing.stream.record_loss(Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere")))
+        await publishing.until(lambda: any(isinstance(m, LossReport) for m in script.said))
         await asyncio.sleep(0.1)
-    [lost] = [message for message in script.said if isinstance(message, Lost)]
-    assert lost == Lost(boot_id=node.boot_id, lost={"disk_full": ((3, 9),)})
+    [lost] = [message for message in script.said if isinstance(message, LossReport)]
+    assert lost == LossReport(stream_id=node.stream_id, lost={"disk_full": ((3, 9),)})
 
 
 @in_a_loop
@@ -235,11 +237,11 @@ async def test_a_new_stream_is_announced_by_a_new_hello(node: FakeNode) -> None:
         node.reboot()
         publishing.earlier = (before,)
         publishing.stream = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
-        publishing.publisher.renew()
+        publishing.publisher.reconnect_for_new_stream()
         publishing.take(10)
         await publishing.emptied()
     first, second = script.hellos
-    assert [s.array_info.boot_id for s in second.earlier] == [first.array_info.boot_id]
+    assert [s.array_info.stream_id for s in second.earlier] == [first.array_info.stream_id]
 
 
 @in_a_loop
@@ -247,8 +249,8 @@ async def test_a_link_that_is_half_open_is_noticed_and_dialled_again(
     node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server that reads nothing, and closes nothing: its machine has gone."""
-    monkeypatch.setattr(service.node.sending, "_NO_ANSWER_S", 0.3)
-    monkeypatch.setattr(service.node.sending, "_ASK_EVERY_S", 0.05)
+    monkeypatch.setattr(service.node.frame_sender, "_PING_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(service.node.frame_sender, "_PING_INTERVAL_S", 0.05)
     async with played() as script:
         with Proxy(script.port) as proxy:
             async with Publishing(node, f"http://127.0.0.1:{proxy.port}") as publishing:
@@ -334,7 +336,7 @@ async def test_a_server_that_is_not_ours_is_reported_once(
     ],
 )
 def test_the_ingest_of_a_server_is_found_by_its_address(server: str, expected: str) -> None:
-    assert ingest_url(server) == expected
+    assert make_ingest_url(server) == expected
 
 
 @pytest.mark.parametrize(
@@ -347,7 +349,7 @@ def test_the_ingest_of_a_server_is_found_by_its_address(server: str, expected: s
 )
 def test_what_is_no_address_is_refused(server: str) -> None:
     with pytest.raises(UsageError, match="no server address"):
-        ingest_url(server)
+        make_ingest_url(server)
 
 
 @in_a_loop

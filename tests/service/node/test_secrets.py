@@ -27,11 +27,11 @@ def secrets(tmp_path: Path, reports: list[str]) -> ServerSecrets:
 def test_each_server_has_a_secret_of_its_own_that_is_on_the_disk(
     tmp_path: Path, secrets: ServerSecrets, reports: list[str]
 ) -> None:
-    shared = {server: secrets.share(server) for server in (ONE, OTHER)}
+    shared = {server: secrets.get_or_create_secret(server) for server in (ONE, OTHER)}
     assert read_secrets(tmp_path / SECRETS_NAME) == shared
     assert shared[ONE] != shared[OTHER]
     again = ServerSecrets(tmp_path, reports.append)
-    assert {server: again.share(server) for server in shared} == shared
+    assert {server: again.get_or_create_secret(server) for server in shared} == shared
     assert reports == []
 
 
@@ -43,29 +43,29 @@ def test_a_disk_that_takes_nothing_keeps_no_secret_and_none_is_shared(
 ) -> None:
     with monkeypatch.context() as full:
         full.setattr(os, "fsync", refusing(*NO_SPACE))
-        assert secrets.share(ONE) is None
-        assert secrets.share(ONE) is None
+        assert secrets.get_or_create_secret(ONE) is None
+        assert secrets.get_or_create_secret(ONE) is None
         assert len(reports) == 1, "said once"
         assert not (tmp_path / SECRETS_NAME).exists()
-    assert secrets.share(ONE) is not None
+    assert secrets.get_or_create_secret(ONE) is not None
 
 
 def test_a_file_that_cannot_be_read_now_is_not_replaced(
     secrets: ServerSecrets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    known = secrets.share(ONE)
+    known = secrets.get_or_create_secret(ONE)
     with monkeypatch.context() as unreadable:
-        unreadable.setattr("storage.durable.open", refusing(PermissionError), raising=False)
-        assert secrets.share(ONE) is None
-    assert secrets.share(ONE) == known
+        unreadable.setattr("storage.durable_files.open", refusing(PermissionError), raising=False)
+        assert secrets.get_or_create_secret(ONE) is None
+    assert secrets.get_or_create_secret(ONE) == known
 
 
 def test_a_damaged_file_is_set_aside_and_another_secret_is_made(
     tmp_path: Path, secrets: ServerSecrets, reports: list[str]
 ) -> None:
-    known = secrets.share(ONE)
+    known = secrets.get_or_create_secret(ONE)
     (tmp_path / SECRETS_NAME).write_bytes(b"{}")
-    assert secrets.share(ONE) not in (None, known)
+    assert secrets.get_or_create_secret(ONE) not in (None, known)
     assert (tmp_path / f"{SECRETS_NAME}.damaged-1").exists()
     assert "until a person accepts it" in " ".join(reports)
 
@@ -74,5 +74,5 @@ def test_ever_new_servers_do_not_fill_the_disk_and_the_newest_are_kept(
     tmp_path: Path, secrets: ServerSecrets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.node.secrets._SERVERS_MAX", 3)
-    shared = {server: secrets.share(server) for server in "abcde"}
+    shared = {server: secrets.get_or_create_secret(server) for server in "abcde"}
     assert read_secrets(tmp_path / SECRETS_NAME) == {s: shared[s] for s in "cde"}

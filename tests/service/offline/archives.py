@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from service.sessions.sealing import seal
-from service.sessions.sources import Sources
+from service.sessions.inputs import SessionInputs
+from service.sessions.sealing import seal_session
 from storage.journal.journal import Journal
-from storage.sessions.file import SessionWriter
-from storage.sessions.folder import Event, Part, Session, SessionFolder
-from storage.sessions.ledger import StreamState, ledger_of
+from storage.sessions.folder import Marker, Part, Session, SessionsFolder
+from storage.sessions.ledger import StreamState, compute_ledger
+from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, UTC_NS
 from tests.service.sessions.pieces import array, calibration, frames, hopping
 
@@ -38,7 +38,7 @@ def session_of(number: int, scene: str, state: str = "sealing", **facts: object)
             "state": state,
             "started_t_ns": UTC_NS,
             "stopped_t_ns": UTC_NS + 10**9,
-            "parts": (Part(boot_id=str(number) * 32, seq_first=0, seq_last=None),),
+            "parts": (Part(stream_id=str(number) * 32, seq_first=0, seq_last=None),),
             "scene": scene,
             **facts,
         }
@@ -52,41 +52,43 @@ def sealed(
     loads_n = hops_n(*peaks_n)
     batch = frames(loads_n, lead=200)
     info = array(1e9 / PERIOD_NS).model_copy(
-        update={"boot_id": str(number) * 32, "models": ("static",), "scene": scene}
+        update={"stream_id": str(number) * 32, "models": ("static",), "scene": scene}
     )
-    journal = Journal(data / "journal" / "bench" / info.boot_id, info)
-    journal.append(batch)
+    journal = Journal(data / "journal" / "bench" / info.stream_id, info)
+    journal.append_new_frames(batch)
     journal.close()
-    part = Part(boot_id=info.boot_id, seq_first=0, seq_last=len(batch) - 1)
-    event = Event(id=f"e{number}", label="=off", t_ns=UTC_NS)
-    begun = session_of(number, scene, parts=(part,), events=(event,))
-    folder = SessionFolder(data / "sessions")
+    part = Part(stream_id=info.stream_id, seq_first=0, seq_last=len(batch) - 1)
+    event = Marker(id=f"e{number}", label="=off", t_ns=UTC_NS)
+    begun = session_of(number, scene, parts=(part,), markers=(event,))
+    folder = SessionsFolder(data / "sessions")
     folder.save(begun)
-    sources = Sources(
+    sources = SessionInputs(
         session=begun,
         info=info,
-        journals={info.boot_id: journal},
+        journals={info.stream_id: journal},
         calibration=calibration(*info.serials) if is_calibrated else None,
         problem=None if is_calibrated else "the node had no calibration",
         tares=(),
         notes={},
     )
-    held = {info.boot_id: StreamState(held=journal.held)}
-    done = seal(sources, folder.path(begun.id), ledger_of(begun.parts, held, finished=True))
+    held = {info.stream_id: StreamState(stored=journal.stored)}
+    done = seal_session(
+        sources, folder.get_path(begun.id), compute_ledger(begun.parts, held, is_finished=True)
+    )
     folder.save(done)
-    return folder.path(begun.id)
+    return folder.get_path(begun.id)
 
 
 def recording(data: Path, number: int) -> Path:
     """A session that is being recorded."""
-    folder = SessionFolder(data / "sessions")
+    folder = SessionsFolder(data / "sessions")
     folder.save(session_of(number, "mud", "recording"))
-    return folder.path(IDS[number])
+    return folder.get_path(IDS[number])
 
 
 def long_session(path: Path) -> Path:
     """A file of three row groups, a minute each, with a lead."""
     batch = frames(hopping(9000, loaded_from=200), lead=200, period_ns=20_000_000)
-    with SessionWriter(path, array(50.0), {}) as writer:
-        writer.append(batch, {})
+    with SealedFileWriter(path, array(50.0), {}) as writer:
+        writer.append_frames(batch, {})
     return path

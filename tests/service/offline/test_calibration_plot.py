@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.scene.file import build_scene, load_scene
+from devices.scene.scene_file import load_scene, validate_scene
 from service.estimation.calibration import Calibration
-from service.estimation.fitting.bench.indentation import Indentation
-from service.estimation.fitting.effects_fit import fit_effects, replays
-from service.offline.calibrate import calibrate_recordings, read_recordings
-from service.offline.calibrations import with_tiles
-from service.offline.simulate import SimulateOptions, simulate
+from service.estimation.fitting.effects_fit import extract_replays, fit_effects
+from service.estimation.fitting.rig.indentation import Indentation
+from service.offline.calibration_fit import fit_calibration, read_indentations
+from service.offline.calibration_lookup import replace_tiles
+from service.offline.simulation import SimulationOptions, run_simulation
 
 pytestmark = pytest.mark.slow
 
@@ -26,17 +26,17 @@ Bench = tuple[Calibration, dict[str, list[Indentation]]]
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     """One tile of the emulated bench."""
     path = Path(tmp_path_factory.mktemp("bench")) / "bench.parquet"
-    scene = with_tiles(load_scene("indentation"), ["T01"])
+    scene = replace_tiles(load_scene("indentation"), ["T01"])
     quick = scene.model_dump() | {"ground": scene.ground.model_dump() | {"stroke_s": 2.0}}
-    simulate(SimulateOptions(build_scene(quick, where="quick")), path, None)
-    pressed = read_recordings([path])
-    calibration = calibrate_recordings(pressed, name="bench", reference="mill")
+    run_simulation(SimulationOptions(validate_scene(quick, where="quick")), path, None)
+    pressed = read_indentations([path])
+    calibration = fit_calibration(pressed, name="bench", reference_name="mill")
     return calibration, {"T01": [one.indentation for one in pressed["T01"]]}
 
 
 def test_a_release_and_a_tap_are_replayed_better_with_effects_than_without(bench: Bench) -> None:
     calibration, recordings = bench
-    found = replays(recordings["T01"], calibration.of("T01"))
+    found = extract_replays(recordings["T01"], calibration.get_tile("T01"))
     assert set(found) == {"release", "tap"}
     for replay in found.values():
         known = np.isfinite(replay.measured_kpa)
@@ -57,7 +57,7 @@ def test_a_recording_without_fast_loads_has_nothing_to_replay(bench: Bench) -> N
         n: v[:last] for n, v in vars(recording).items() if isinstance(v, np.ndarray)
     }
     only_slow = replace(recording, **columns)
-    assert replays([only_slow], calibration.of("T01")) == {}
+    assert extract_replays([only_slow], calibration.get_tile("T01")) == {}
 
 
 def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> None:
@@ -72,7 +72,7 @@ def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> N
             }
         )
 
-    tile = calibration.of("T01")
+    tile = calibration.get_tile("T01")
     without = fit_effects([part(~soaks)], tile)
     assert without.temperature is None
     apart = fit_effects([part(~soaks), part(soaks)], tile)
@@ -89,7 +89,7 @@ def test_a_picture_holds_any_number_of_tiles(bench: Bench, tiles: int) -> None:
     from service.offline.calibration_plot import plot_calibration
 
     calibration, recordings = bench
-    entry = calibration.of("T01")
+    entry = calibration.get_tile("T01")
     serials = [f"T{i:02}" for i in range(tiles)]
     many = calibration.model_copy(
         update={"tiles": tuple(entry.model_copy(update={"serial": s}) for s in serials)}

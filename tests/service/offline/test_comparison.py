@@ -8,34 +8,34 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError
-from service.offline.compare.report import markdown
+from service.offline.compare.report import format_comparison_report
 from service.offline.comparison import CompareOptions, compare_session
-from storage.clock.file import write_clock
+from storage.clock.file import write_clock_file
 from storage.clock.log import ClockOffset
-from storage.formats.reference import Stated
-from storage.sessions.beside import write_events
-from storage.sessions.file import SessionWriter
-from storage.sessions.folder import Event, Part, Session
+from storage.formats.reference import ReferenceOptions
+from storage.sessions.folder import Marker, Part, Session
+from storage.sessions.sidecars import write_markers
+from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 from tests.service.offline.compare.gaits import Gait
 
 PERIOD_NS = 2_000_000
 SECONDS = 20.0
-OWN = CompareOptions(Stated())
+OWN = CompareOptions(ReferenceOptions())
 
 
 def seal(
     folder: Path,
     *,
-    boot_id: str = "one",
+    stream_id: str = "one",
     later_s: float = 0.0,
     bias_n: float = 0.0,
     server_minus_node_s: float = 0.0,
 ) -> Path:
     """A session of an irregular gait, `later_s` behind another's clock."""
     n = round(SECONDS * 1e9 / PERIOD_NS)
-    info = make_array(2, boot_id=boot_id)
+    info = make_array(2, stream_id=stream_id)
     frames = make_frames(n, 2, period_ns=PERIOD_NS)
     gait = Gait(np.random.default_rng(0), SECONDS)
     true_n = gait.at(np.linspace(0.0, SECONDS, n, endpoint=False) - later_s)
@@ -48,24 +48,24 @@ def seal(
         "grf_n": grf_n,
         "grf_sigma_n": np.full(n, 0.05),
         "contact": loaded.astype(np.uint8),
-        "estimate_status": np.zeros(n, dtype=np.uint16),
+        "estimate_flags": np.zeros(n, dtype=np.uint16),
         **cop,
         **sigmas,
     }
     folder.mkdir()
     path = folder / "frames.parquet"
-    with SessionWriter(path, info, {}) as writer:
-        writer.append(frames, columns)
+    with SealedFileWriter(path, info, {}) as writer:
+        writer.append_frames(frames, columns)
     clock = [
         ClockOffset(
-            boot_id=boot_id,
+            stream_id=stream_id,
             t_mono_ns=t_ns,
             server_minus_node_ns=round(server_minus_node_s * 1e9),
             uncertainty_ns=500_000,
         )
         for t_ns in range(0, round(SECONDS * 1e9), 10 * 10**9)
     ]
-    write_clock(folder / "clock.parquet", clock, [])
+    write_clock_file(folder / "clock.parquet", clock, [])
     return path
 
 
@@ -78,14 +78,14 @@ def mark(folder: Path, **labels: float) -> None:
         node="n",
         state="sealed",
         started_t_ns=begin_ns,
-        parts=(Part(boot_id="one", seq_first=0, seq_last=1),),
+        parts=(Part(stream_id="one", seq_first=0, seq_last=1),),
         scene="s",
-        events=tuple(
-            Event(id=label, label=label, t_ns=begin_ns + round(at_s * 1e9))
+        markers=tuple(
+            Marker(id=label, label=label, t_ns=begin_ns + round(at_s * 1e9))
             for label, at_s in labels.items()
         ),
     )
-    write_events(session, folder)
+    write_markers(session, folder)
 
 
 def test_marks_of_the_session_are_its_trials(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_marks_of_the_session_are_its_trials(tmp_path: Path) -> None:
     other = seal(tmp_path / "theirs")
     mark(tmp_path / "ours", walk=2.0, turn=11.0, gone=500.0)
     found = compare_session(path, other, OWN)
-    assert found.trials_are == "from mark to mark"
+    assert found.trial_definition == "from mark to mark"
     assert [trial.name for trial in found.errors.trials] == ["1: walk", "2: turn"]
     for trial in found.errors.trials:
         assert trial.figures["grf_bias_n"] == pytest.approx(0.3, abs=0.02)
@@ -106,7 +106,7 @@ def test_another_session_is_compared_by_its_own_clock(tmp_path: Path) -> None:
     path, other = seal(tmp_path / "ours"), seal(tmp_path / "theirs", later_s=0.25)
     found = compare_session(path, other, OWN)
     assert found.alignment.lag_s.value == pytest.approx(0.25, abs=2e-3)
-    assert found.trials_are == "each contiguous recording"
+    assert found.trial_definition == "each contiguous recording"
     assert found.errors.figures["grf_mae_n"].mean < 0.1
 
 
@@ -119,16 +119,16 @@ def test_the_lag_by_forces_stands_beside_that_by_the_clock_tables_of_one_server(
     found = compare_session(path, other, OWN)
     assert found.clock_lag is not None
     assert found.clock_lag.lag_s == pytest.approx(0.25, abs=1e-6)
-    assert found.clock_lag.within_s == pytest.approx(0.001, abs=2e-4)
+    assert found.clock_lag.error_bound_s == pytest.approx(0.001, abs=2e-4)
     assert found.alignment.lag_s.value == pytest.approx(found.clock_lag.lag_s, abs=2e-3)
     assert not any("the clocks say" in note for note in found.notes)
-    said = markdown(
+    said = format_comparison_report(
         "ours",
         found.alignment,
         found.clock_lag,
         found.pairs,
         found.errors,
-        found.trials_are,
+        found.trial_definition,
         found.notes,
     )
     assert "| the same lag by the clock tables, and its bounds, ms | 250.0" in said
@@ -150,11 +150,13 @@ def test_without_a_clock_table_beside_one_of_them_no_lag_is_known_by_clocks(tmp_
 def test_forces_of_the_tiles_stand_beside_the_frames_that_are_compared(tmp_path: Path) -> None:
     path, other = seal(tmp_path / "ours"), seal(tmp_path / "theirs")
     found = compare_session(path, other, OWN)
-    np.testing.assert_allclose(found.force_n.sum(axis=1), found.pairs.columns["grf_n"], atol=1e-5)
+    np.testing.assert_allclose(
+        found.tile_force_n.sum(axis=1), found.pairs.columns["grf_n"], atol=1e-5
+    )
 
 
 def test_a_column_that_a_session_has_not_is_refused(tmp_path: Path) -> None:
     path = seal(tmp_path / "ours")
-    options = CompareOptions(Stated({"grf_n": "true_grf_n"}))
+    options = CompareOptions(ReferenceOptions({"grf_n": "true_grf_n"}))
     with pytest.raises(FileFormatError, match="no column 'true_grf_n'"):
         compare_session(path, path, options)

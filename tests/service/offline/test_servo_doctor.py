@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from devices.buses.serial_line import open_line
+from devices.buses.serial_line import open_serial_line
 from devices.clock import VirtualClock
-from devices.scene.file import load_scene
+from devices.scene.scene_file import load_scene
 from service.offline import servo_doctor
 from service.offline.servo_doctor import diagnose_servo
 from tests.builders.servo import FaultyServo
@@ -51,7 +51,7 @@ def test_a_port_that_is_not_there_is_a_finding_and_no_failure_of_the_doctor(tmp_
 def test_who_holds_a_busy_port_is_named() -> None:
     with (
         FaultyServo(lambda _: 0, VirtualClock()) as servo,
-        contextlib.closing(open_line(servo.port, 57_600, 0.02)),
+        contextlib.closing(open_serial_line(servo.port, 57_600, 0.02)),
     ):
         diagnosis = diagnose_servo(servo.port, VirtualClock(), None)
     assert not diagnosis.is_well

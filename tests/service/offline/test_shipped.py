@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from devices.scene.file import builtin_scenes, load_scene
+from devices.scene.scene_file import list_builtin_scenes, load_scene
 from service.estimation.calibration import Calibration, TileCalibration
-from service.offline import calibrations
-from service.offline.calibrations import EMULATED_RIG, SHIPPED, find_calibration
+from service.offline import calibration_lookup
+from service.offline.calibration_lookup import EMULATED_RIG, SHIPPED_FOLDER, find_calibration
 
 TILES = sorted(
     {
         tile.serial
-        for name in builtin_scenes()
+        for name in list_builtin_scenes()
         if (scene := load_scene(name)).calibration == EMULATED_RIG
         for tile in scene.tile
         if not tile.reference
@@ -33,23 +33,23 @@ def refuse(message: str) -> None:
 
 def pressed(serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calibration:
     """A tile on the bench, as if none had come with the program."""
-    monkeypatch.setattr(calibrations, "SHIPPED", tmp_path / "nothing")
-    return find_calibration(EMULATED_RIG, [serial], cache=tmp_path / "cache")
+    monkeypatch.setattr(calibration_lookup, "SHIPPED_FOLDER", tmp_path / "nothing")
+    return find_calibration(EMULATED_RIG, [serial], cache_folder=tmp_path / "cache")
 
 
 @pytest.mark.skipif("FOOTTILE_WRITE_RIG" not in os.environ, reason="writes them")
 def test_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for serial in TILES:
         pressed(serial, tmp_path, monkeypatch)
-    shutil.rmtree(SHIPPED, ignore_errors=True)
-    shutil.copytree(tmp_path / "cache", SHIPPED)
+    shutil.rmtree(SHIPPED_FOLDER, ignore_errors=True)
+    shutil.copytree(tmp_path / "cache", SHIPPED_FOLDER)
 
 
 def test_no_built_in_scene_waits_for_the_mill(tmp_path: Path) -> None:
     assert [f"T0{number}" for number in range(1, 9)] == TILES
-    find_calibration(EMULATED_RIG, TILES, cache=tmp_path, progress=refuse)
+    find_calibration(EMULATED_RIG, TILES, cache_folder=tmp_path, on_progress=refuse)
     assert list(tmp_path.iterdir()) == []
-    assert len(list(SHIPPED.iterdir())) == len(TILES)  # none is left of a version before
+    assert len(list(SHIPPED_FOLDER.iterdir())) == len(TILES)  # none is left of a version before
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_no_built_in_scene_waits_for_the_mill(tmp_path: Path) -> None:
 def test_pressed_anew_a_tile_is_as_it_was(
     serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shipped = find_calibration(EMULATED_RIG, [serial], cache=tmp_path / "empty").tiles[0]
+    shipped = find_calibration(EMULATED_RIG, [serial], cache_folder=tmp_path / "empty").tiles[0]
     (anew,) = pressed(serial, tmp_path, monkeypatch).tiles
     (numbers, words), (as_numbers, as_words) = map(told, (shipped, anew))
     assert as_words == words

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.estimation.estimates import EstimateStatus
+from service.estimation.estimates import EstimateFlag
 from service.sessions.tares import TareHistory
-from storage.checked_json import read_checked
+from storage.checksummed_json import read_checksummed_json
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S, until
 
-LOST = int(EstimateStatus.TARE_LOST)
+LOST = int(EstimateFlag.TARE_LOST)
 
 
 def flip(path: Path, before: bytes, after: bytes) -> None:
@@ -66,14 +66,14 @@ def test_while_a_tare_is_lost_no_force_is_known_and_everybody_says_so(
     assert message["gauge_kpa"] == message["force_n"] == [None, None]
     assert message["grf_n"] is None
     assert message["contact"] is None
-    assert message["estimate_status"] & LOST
+    assert message["estimate_flags"] & LOST
     recording = lost.record()
     lost.deliver(100, 3.0, now=True)
     sealed = lost.finish(recording)
     assert sealed["complete"] is True
     assert "a tare is damaged and lost" in sealed["problem"]
     assert np.isnan(recording.column("grf_n").astype(float)).all()
-    assert (recording.column("estimate_status") & LOST).all()
+    assert (recording.column("estimate_flags") & LOST).all()
     with recording.reader() as reader:
         assert [tare["source"] for tare in reader.notes["tares"]] == ["lost"]
 
@@ -89,9 +89,9 @@ def test_a_tare_by_hand_ends_that_in_the_middle_of_a_session(
     assert running.node()["tare_problem"] is None
     message = shown(running, lost)
     assert message["force_n"] == pytest.approx([3.0, 3.0], abs=0.05)
-    assert not message["estimate_status"] & LOST
+    assert not message["estimate_flags"] & LOST
     lost.finish(recording)
-    is_lost = (recording.column("estimate_status") & LOST) != 0
+    is_lost = (recording.column("estimate_flags") & LOST) != 0
     assert is_lost[:300].all()
     assert not is_lost[300:360].any()
     assert recording.column("grf_n")[300:360] == pytest.approx(6.0, abs=0.1)
@@ -121,17 +121,17 @@ def test_a_session_has_forces_if_a_proven_tare_was_taken_between_it_and_a_lost_o
     tared.next_t_mono_ns = later_ns
     running.stop()
     path = running.data / "nodes" / "bench" / "tares.json"
-    info, by_lead = tared.info, TareHistory(path).all[0].tare
+    info, by_lead = tared.info, TareHistory(path).tares[0].tare
     for later_s in (100, 200) if is_one_between else (200,):
         t_ns = by_lead.t_ns + later_s * 10**9
-        TareHistory(path).add(replace(by_lead, t_ns=t_ns, source="unloaded"), info)
+        TareHistory(path).add_tare(replace(by_lead, t_ns=t_ns, source="unloaded"), info)
     flip(path, b'"undone": false', b'"undone": true ')
     running.start()
     assert "1 tare is lost" in problems(running)
     tared.connect()
     tared.send(10, now=True)
     problem = pending.sealed()["problem"]
-    is_lost = (pending.column("estimate_status") & LOST) != 0
+    is_lost = (pending.column("estimate_flags") & LOST) != 0
     grf_n = pending.column("grf_n").astype(float)
     assert len(grf_n) == 100
     if is_one_between:
@@ -180,7 +180,7 @@ def test_a_node_whose_hello_is_damaged_is_known_again_when_it_connects(
     assert (sealed["frames"], sealed["complete"], sealed["problem"]) == (100, True, None)
     assert pending.clock() != {}
     assert running.node()["tare"] is not None
-    assert read_checked(path).is_proven
+    assert read_checksummed_json(path).has_checksum
 
 
 def test_files_of_an_older_version_are_read_and_written_anew_with_a_hash(
@@ -200,9 +200,9 @@ def test_files_of_an_older_version_are_read_and_written_anew_with_a_hash(
     assert (running.data / "server_id").read_text().split() == stated
     assert running.node()["tare"] is not None
     assert "unproven" in problems(running)
-    assert read_checked(folder / "tares.json").is_proven
+    assert read_checksummed_json(folder / "tares.json").has_checksum
     tared.connect()
-    until(lambda: read_checked(folder / "hello.json").is_proven)
+    until(lambda: read_checksummed_json(folder / "hello.json").has_checksum)
 
 
 def test_a_lock_or_probe_that_is_no_file_keeps_nobody_from_starting(
@@ -222,7 +222,7 @@ def test_whatever_a_file_is_called_everybody_can_be_told_of_it(
     running: Running, tared: FakeNode, odd: str
 ) -> None:
     running.stop()
-    journal = running.data / "journal" / "bench" / tared.boot_id
+    journal = running.data / "journal" / "bench" / tared.stream_id
     (journal / f"{odd}.arrows").mkdir()
     (running.data / "nodes" / odd).mkdir()
     (running.data / "nodes" / odd / "hello.json").write_text("{}")

@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import ChangedError, StateError, StorageError
-from service.identity import fingerprint_of, make_proof, make_secret
-from service.link import Close, HangUp, Proof
 from service.node.secrets import ServerSecrets
-from service.server.identities import Claim, NodeIdentities
+from service.node_identity import compute_fingerprint, generate_secret, make_proof
+from service.protocol import CloseConnection, LinkCloseCode, Proof
+from service.server.identities import IdentityClaim, NodeIdentities
 from storage.secret_file import SECRETS_NAME
 from tests.storage.faulty_disk import NO_SPACE, refusing
 
@@ -37,22 +37,22 @@ class Machine:
 
     def connect(self, server: NodeIdentities, *, dies_after: str = "") -> bool:
         """Connect once; return whether the server welcomes it. A step may be its last one."""
-        challenge = server.challenge(NODE, SERVER)
-        secret = ServerSecrets(self.folder, lambda _: None).share(SERVER)
+        challenge = server.make_challenge(NODE, SERVER)
+        secret = ServerSecrets(self.folder, lambda _: None).get_or_create_secret(SERVER)
         if dies_after == "share":
             raise _Killed
         if secret is not None and challenge.is_known and not self.is_refused:
             answer = Proof(proof=make_proof(secret, challenge, NODE))
         else:
             answer = Proof(secret=secret)
-        claim = Claim(NODE, challenge, answer, ADDRESS)
+        claim = IdentityClaim(NODE, challenge, answer, ADDRESS)
         try:
-            is_proven = server.is_proven(claim, NOW_T_NS)
-        except HangUp as end:
-            self.is_refused = end.code == Close.WRONG_IDENTITY
+            is_proven = server.verify_claim(claim, NOW_T_NS)
+        except CloseConnection as end:
+            self.is_refused = end.code == LinkCloseCode.WRONG_IDENTITY
             return False
         if not is_proven:
-            server.keep_first(claim)
+            server.store_first_secret(claim)
         if dies_after == "keep":
             raise _Killed
         self.is_refused = False
@@ -60,9 +60,9 @@ class Machine:
 
     @property
     def fingerprint(self) -> str:
-        secret = ServerSecrets(self.folder, lambda _: None).share(SERVER)
+        secret = ServerSecrets(self.folder, lambda _: None).get_or_create_secret(SERVER)
         assert secret is not None
-        return fingerprint_of(secret)
+        return compute_fingerprint(secret)
 
 
 @pytest.fixture
@@ -128,14 +128,14 @@ def test_a_person_decides_and_from_then_on_the_machine_before_is_refused(
     assert not stranger.connect(server)
     # It proved that it has a secret, and now shows it: else nobody could accept it.
     assert not stranger.connect(server)
-    asking = server.replacements[NODE]
+    asking = server.refused_machines[NODE]
     assert (asking.fingerprint, asking.address) == (stranger.fingerprint, ADDRESS)
-    server.accept(NODE, stranger.fingerprint)
+    server.accept_replacement(NODE, stranger.fingerprint)
     assert stranger.connect(server)
     assert not machine.connect(server)
-    assert NODE not in server.replacements, "it has shown a proof only"
+    assert NODE not in server.refused_machines, "it has shown a proof only"
     assert not machine.connect(server)
-    assert server.replacements[NODE].fingerprint == machine.fingerprint
+    assert server.refused_machines[NODE].fingerprint == machine.fingerprint
     assert stranger.connect(NodeIdentities(server._nodes.parent))
 
 
@@ -143,13 +143,13 @@ def test_only_the_machine_that_was_looked_at_is_accepted(
     server: NodeIdentities, machine: Machine, stranger: Machine, tmp_path: Path
 ) -> None:
     with pytest.raises(StateError, match="no other machine"):
-        server.accept(NODE, "0000-0000-0000-0000")
+        server.accept_replacement(NODE, "0000-0000-0000-0000")
     assert machine.connect(server)
     third = Machine(tmp_path / "third")
     for other in (stranger, stranger, third, third):
         assert not other.connect(server)
     with pytest.raises(ChangedError, match=third.fingerprint):
-        server.accept(NODE, stranger.fingerprint)
+        server.accept_replacement(NODE, stranger.fingerprint)
     assert machine.connect(server)
 
 
@@ -166,9 +166,9 @@ def test_a_disk_that_takes_nothing_leaves_the_machine_before_in_force(
     with monkeypatch.context() as full:
         full.setattr(os, "fsync", refusing(*NO_SPACE))
         with pytest.raises(StorageError):
-            server.accept(NODE, fingerprint)
+            server.accept_replacement(NODE, fingerprint)
     assert machine.connect(server)
-    assert server.replacements[NODE].fingerprint == fingerprint
+    assert server.refused_machines[NODE].fingerprint == fingerprint
 
 
 def test_a_secret_that_was_damaged_is_named_and_the_node_is_let_in(
@@ -187,20 +187,20 @@ def test_a_secret_that_cannot_be_read_now_lets_nobody_in(
 ) -> None:
     assert machine.connect(server)
     with monkeypatch.context() as unreadable:
-        unreadable.setattr("storage.durable.open", refusing(PermissionError), raising=False)
+        unreadable.setattr("storage.durable_files.open", refusing(PermissionError), raising=False)
         with pytest.raises(StorageError):
-            server.challenge(NODE, SERVER)
+            server.make_challenge(NODE, SERVER)
     assert machine.connect(server)
 
 
 @pytest.mark.parametrize(
     "answer",
-    [Proof, lambda: Proof(proof=make_secret()), lambda: Proof(secret=make_secret())],
+    [Proof, lambda: Proof(proof=generate_secret()), lambda: Proof(secret=generate_secret())],
 )
 def test_no_answer_but_the_right_one_is_that_of_the_node(
     server: NodeIdentities, machine: Machine, answer: Callable[[], Proof]
 ) -> None:
     assert machine.connect(server)
-    claim = Claim(NODE, server.challenge(NODE, SERVER), answer(), ADDRESS)
-    with pytest.raises(HangUp, match="foottile accept-node leg"):
-        server.is_proven(claim, NOW_T_NS)
+    claim = IdentityClaim(NODE, server.make_challenge(NODE, SERVER), answer(), ADDRESS)
+    with pytest.raises(CloseConnection, match="foottile accept-node leg"):
+        server.verify_claim(claim, NOW_T_NS)

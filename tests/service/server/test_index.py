@@ -7,14 +7,14 @@ from typing import get_args
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.server.index import SessionIndex, age_of
-from storage.sessions.folder import Part, Session, State
+from service.server.index import SessionIndex, start_key
+from storage.sessions.folder import Part, Session, SessionState
 
 NODES = ("left", "right")
 
 
-def session(number: int, started_t_ns: int, node: str, state: State) -> Session:
-    part = Part(boot_id="0" * 32, seq_first=0)
+def session(number: int, started_t_ns: int, node: str, state: SessionState) -> Session:
+    part = Part(stream_id="0" * 32, seq_first=0)
     return Session(
         id=f"20261122T000000Z-{number:06x}",
         name="walk",
@@ -31,7 +31,7 @@ sessions = st.builds(
     st.integers(0, 6),
     st.integers(0, 3),  # started at one instant, or once more at another: restored by hand
     st.sampled_from(NODES),
-    st.sampled_from(get_args(State)),
+    st.sampled_from(get_args(SessionState)),
 )
 changes = st.lists(st.tuples(st.booleans(), sessions), max_size=30)
 
@@ -46,13 +46,15 @@ def test_whatever_comes_and_goes_the_index_tells_what_a_walk_over_all_sessions_w
             index.put(each)
             known[each.id] = each
         elif each.id in known:
-            assert index.take(each.id) == known.pop(each.id)
-        newest_first = sorted(known.values(), key=age_of, reverse=True)
-        assert list(index.newest_first()) == newest_first
-        before = age_of(each)
-        assert list(index.newest_first(before)) == [s for s in newest_first if age_of(s) < before]
+            assert index.remove(each.id) == known.pop(each.id)
+        newest_first = sorted(known.values(), key=start_key, reverse=True)
+        assert list(index.iterate_newest_first()) == newest_first
+        before = start_key(each)
+        assert list(index.iterate_newest_first(before)) == [
+            s for s in newest_first if start_key(s) < before
+        ]
         for node in (None, *NODES):
             unsealed = {s.id for s in known.values() if s.state != "sealed"}
             unsealed &= {s.id for s in known.values() if node in (None, s.node)}
-            assert {s.id for s in index.unsealed(node)} == unsealed
+            assert {s.id for s in index.list_unsealed(node)} == unsealed
         assert (len(index), each.id in index) == (len(known), each.id in known)

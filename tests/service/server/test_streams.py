@@ -16,11 +16,11 @@ from devices.frames import (
     FRAME_COLUMNS,
     FrameBatch,
 )
-from service.link import PROTOCOL, EarlierStream, Hello
+from service.protocol import PROTOCOL, EarlierStream, Hello
 from service.server.node import ServerNode
 from storage.intervals import NO_END, Intervals
 from storage.schema import wire_schema
-from storage.wire import encode
+from storage.wire import encode_frames
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import make_frames
 
@@ -33,7 +33,7 @@ def frames(first: int, last: int, boot: str) -> FrameBatch:
     return make_frames(
         seq,
         t_mono_ns=seq * PERIOD_NS + (0 if boot == OLD else 10**12),
-        padc=300 + np.stack([seq % 97, seq % 89], axis=1),
+        pressure_raw=300 + np.stack([seq % 97, seq % 89], axis=1),
     )
 
 
@@ -42,7 +42,7 @@ class Told:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.info = {boot: make_array(boot_id=boot) for boot in (OLD, NEW)}
+        self.info = {boot: make_array(stream_id=boot) for boot in (OLD, NEW)}
         self.node: ServerNode
         self.restart()
 
@@ -55,7 +55,7 @@ class Told:
         content: dict[str, Any] = {
             "protocol": PROTOCOL,
             "array_info": self.info[NEW],
-            "held": (),
+            "stored": (),
             "next_seq": 0,
             "t_mono_ns": 10**12,
             "scene": {},
@@ -66,16 +66,16 @@ class Told:
         return Hello(**(content | changes))
 
     def earlier(self, **changes: Any) -> EarlierStream:
-        content: dict[str, Any] = {"array_info": self.info[OLD], "held": (), "next_seq": 0}
+        content: dict[str, Any] = {"array_info": self.info[OLD], "stored": (), "next_seq": 0}
         return EarlierStream(**(content | changes))
 
     def connect(self, **changes: Any) -> None:
-        self.node.attach(self.hello(**changes), UTC_NS)
+        self.node.on_hello(self.hello(**changes), UTC_NS)
 
     def take(self, first: int, last: int, boot: str = NEW) -> list[int]:
         """Numbers whose estimates are due then."""
-        payload = encode(frames(first, last, boot), wire_schema(self.info[boot]))
-        *_, due = self.node.take(self.node.streams[boot], payload, UTC_NS)
+        payload = encode_frames(frames(first, last, boot), wire_schema(self.info[boot]))
+        *_, due = self.node.receive_frames(self.node.streams[boot], payload, UTC_NS)
         return [int(seq) for batch, _ in due for seq in batch.seq]
 
     def synced(self) -> dict[str, Intervals]:
@@ -83,12 +83,12 @@ class Told:
         acks = {}
         for boot, stream in self.node.streams.items():
             stream.sync()
-            acks[boot], stream.owed, stream.unsynced = stream.owed, Intervals(), Intervals()
+            acks[boot], stream.unacked, stream.unsynced = stream.unacked, Intervals(), Intervals()
         return acks
 
     def lacks(self, **needed: list[tuple[int, int]]) -> dict[str, list[tuple[int, int | None]]]:
         named = {{"old": OLD, "new": NEW}[name]: Intervals(n) for name, n in needed.items()}
-        return {each.boot_id: [*each.numbers] for each in self.node.lacks(named)}
+        return {each.stream_id: [*each.numbers] for each in self.node.missing_ranges(named)}
 
     def close(self) -> None:
         for journal in self.node.journals.values():
@@ -128,9 +128,9 @@ def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_hel
 
         def connect() -> None:
             told.connect(
-                held=whole,
+                stored=whole,
                 next_seq=total,
-                earlier=(told.earlier(held=whole, next_seq=total),),
+                earlier=(told.earlier(stored=whole, next_seq=total),),
             )
             lacks = told.lacks(old=[(0, NO_END)])
             for boot in (OLD, NEW):
@@ -161,75 +161,75 @@ def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_hel
         note_acks()
         for boot in (OLD, NEW):
             journal = told.node.journals[boot]
-            assert journal.held == Intervals(whole)
+            assert journal.stored == Intervals(whole)
             assert acked[boot] == Intervals(whole)
-            found = FrameBatch.concatenate(list(journal.read(0, total)))
+            found = FrameBatch.concatenate(list(journal.read_frames(0, total)))
             for name in FRAME_COLUMNS:
                 np.testing.assert_array_equal(
                     getattr(found, name), getattr(frames(0, total - 1, boot), name)
                 )
-        assert told.node.lost == {}
+        assert told.node.lost_by_reason == {}
         assert told.node.backlog_frames == 0
         told.close()
 
 
 def test_what_is_missing_and_still_with_the_node_is_backlog_and_not_lost(told: Told) -> None:
-    told.connect(held=((0, 99),), next_seq=100)
+    told.connect(stored=((0, 99),), next_seq=100)
     told.take(100, 104)
     assert told.node.backlog_frames == 100
-    assert told.node.lost == {}
+    assert told.node.lost_by_reason == {}
     told.take(50, 54)
     assert told.node.backlog_frames == 95
 
 
 def test_what_the_node_has_lost_is_counted_by_its_reason_and_no_backlog(told: Told) -> None:
-    told.connect(held=((0, 99),), next_seq=100)
+    told.connect(stored=((0, 99),), next_seq=100)
     told.take(100, 104)
-    told.node.present.note_losses({"evicted": ((0, 9),), "disk_full": ((20, 24),)})
-    assert told.node.lost == {"evicted": 10, "disk_full": 5}
+    told.node.present_stream.set_losses({"evicted": ((0, 9),), "disk_full": ((20, 24),)})
+    assert told.node.lost_by_reason == {"evicted": 10, "disk_full": 5}
     assert told.node.backlog_frames == 85
 
 
 def test_a_loss_that_came_all_the_same_is_none(told: Told) -> None:
-    told.connect(held=((0, 9),), next_seq=10)
+    told.connect(stored=((0, 9),), next_seq=10)
     told.take(0, 9)
-    told.node.present.note_losses({"disk_full": ((5, 6),)})
-    assert told.node.lost == {}
+    told.node.present_stream.set_losses({"disk_full": ((5, 6),)})
+    assert told.node.lost_by_reason == {}
 
 
 def test_frames_from_before_the_server_knew_the_node_are_not_lost(told: Told) -> None:
-    told.connect(held=((500, 599),), next_seq=600)
+    told.connect(stored=((500, 599),), next_seq=600)
     told.take(500, 599)
     told.take(600, 609)
-    assert told.node.lost == {}
+    assert told.node.lost_by_reason == {}
 
 
 def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_restart(
     told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.server.node.RING_NS", 20 * PERIOD_NS)
-    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 10 * PERIOD_NS)
+    monkeypatch.setattr("service.server.node.RING_DURATION_NS", 20 * PERIOD_NS)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 10 * PERIOD_NS)
     told.connect()
     for n in range(0, 100, 5):
         told.take(n, n + 4)
     told.synced()
-    told.node.prune({NEW: Intervals([(10, 12)])})
-    held = told.node.present.held
-    assert held.missing(10, 12).count == 0
-    assert held.missing(0, 99).count > 50
-    assert told.node.lost == {}
+    told.node.delete_unneeded_step({NEW: Intervals([(10, 12)])})
+    held = told.node.present_stream.stored
+    assert held.missing_in(10, 12).count == 0
+    assert held.missing_in(0, 99).count > 50
+    assert told.node.lost_by_reason == {}
     # It is not asked for again either, but what a session needs is.
-    told.connect(held=((0, 99),), next_seq=100)
+    told.connect(stored=((0, 99),), next_seq=100)
     assert told.lacks() == {NEW: [(100, None)]}
     assert told.lacks(new=[(30, 39)]) == {NEW: [(30, 39), (100, None)]}
     told.restart()
-    told.connect(held=((100, 104),), next_seq=105)
+    told.connect(stored=((100, 104),), next_seq=105)
     told.take(105, 109)
-    assert told.node.lost == {}
+    assert told.node.lost_by_reason == {}
 
 
 def test_of_the_present_stream_all_is_asked_for_and_what_sessions_need_first(told: Told) -> None:
-    told.connect(held=((0, 99),), next_seq=100)
+    told.connect(stored=((0, 99),), next_seq=100)
     assert told.lacks() == {NEW: [(0, None)]}
     assert told.lacks(new=[(40, 49)]) == {NEW: [(40, 49), (0, 39), (50, None)]}
     assert told.lacks(new=[(40, NO_END)]) == {NEW: [(40, 99), (0, 39), (100, None)]}
@@ -240,7 +240,7 @@ def test_of_the_present_stream_all_is_asked_for_and_what_sessions_need_first(tol
 def test_of_earlier_streams_only_what_sessions_need_and_the_node_has_is_asked_for(
     told: Told,
 ) -> None:
-    told.connect(earlier=(told.earlier(held=((0, 49), (60, 99)), next_seq=100),))
+    told.connect(earlier=(told.earlier(stored=((0, 49), (60, 99)), next_seq=100),))
     assert told.lacks() == {NEW: [(0, None)]}
     told.take(70, 74, OLD)
     asked = told.lacks(old=[(40, NO_END)])
@@ -248,83 +248,83 @@ def test_of_earlier_streams_only_what_sessions_need_and_the_node_has_is_asked_fo
 
 
 def test_frames_of_an_earlier_stream_are_kept_and_never_shown(told: Told) -> None:
-    told.connect(earlier=(told.earlier(held=((0, 9),), next_seq=10),))
+    told.connect(earlier=(told.earlier(stored=((0, 9),), next_seq=10),))
     assert told.take(0, 4) == [0, 1, 2, 3, 4]
     assert told.take(5, 9, OLD) == []
     assert told.node.last_seq == 4
-    assert told.node.journals[OLD].held == Intervals([(5, 9)])
+    assert told.node.journals[OLD].stored == Intervals([(5, 9)])
 
 
 def test_a_stream_that_the_node_does_not_mention_cannot_come(told: Told) -> None:
-    told.connect(earlier=(told.earlier(held=((0, 9),), next_seq=10),))
+    told.connect(earlier=(told.earlier(stored=((0, 9),), next_seq=10),))
     told.take(0, 4, OLD)
-    assert told.node.streams[OLD].may_come == Intervals([(0, 9)])
+    assert told.node.streams[OLD].obtainable == Intervals([(0, 9)])
     told.connect()
-    assert not told.node.streams[OLD].may_come
+    assert not told.node.streams[OLD].obtainable
 
 
 def test_before_the_node_has_said_anything_everything_may_come(told: Told) -> None:
-    told.connect(earlier=(told.earlier(held=((0, 9),), next_seq=10),))
+    told.connect(earlier=(told.earlier(stored=((0, 9),), next_seq=10),))
     told.take(0, 4, OLD)
     told.synced()
     told.restart()
-    assert told.node.streams[OLD].may_come == Intervals([(0, NO_END)])
+    assert told.node.streams[OLD].obtainable == Intervals([(0, NO_END)])
 
 
 def test_what_the_node_said_of_a_stream_outlives_the_server(told: Told) -> None:
     said = told.earlier(
-        held=((0, 9),),
+        stored=((0, 9),),
         next_seq=12,
         lost={"disk_full": ((10, 11),)},
-        unsynced_tail_max=280,
+        max_lost_tail_frames=280,
         missed_slots=3,
     )
-    told.connect(earlier=(said,), lost={"evicted": ((0, 4),)}, next_seq=20, held=((5, 19),))
+    told.connect(earlier=(said,), lost={"evicted": ((0, 4),)}, next_seq=20, stored=((5, 19),))
     told.take(0, 4, OLD)
     told.take(5, 9)
     told.synced()
     told.restart()
     notes = told.node.streams[OLD].notes
-    assert (notes.next_seq, notes.unsynced_tail_max, notes.missed_slots) == (12, 280, 3)
+    assert (notes.next_seq, notes.max_lost_tail_frames, notes.missed_slots) == (12, 280, 3)
     assert notes.lost == {"disk_full": ((10, 11),)}
-    present = told.node.present.notes
+    present = told.node.present_stream.notes
     assert (present.next_seq, present.lost) == (None, {"evicted": ((0, 4),)})
 
 
 def test_what_was_damaged_here_is_known_after_a_restart_until_it_comes_again(told: Told) -> None:
-    told.connect(held=((0, 9),), next_seq=10)
+    told.connect(stored=((0, 9),), next_seq=10)
     told.take(0, 4)
     told.take(5, 9)
-    told.node.present.disown(Intervals([(0, 4)]), corrupt=True)
+    told.node.present_stream.invalidate(Intervals([(0, 4)]), are_corrupt=True)
     told.synced()
     told.restart()
-    assert told.node.streams[NEW].for_session(None).damaged == Intervals([(0, 4)])
-    told.connect(held=((0, 9),), next_seq=10)
+    assert told.node.streams[NEW].make_session_stream(None).damaged == Intervals([(0, 4)])
+    told.connect(stored=((0, 9),), next_seq=10)
     told.take(0, 4)
     told.synced()
     told.restart()
-    assert not told.node.streams[NEW].for_session(None).damaged
+    assert not told.node.streams[NEW].make_session_stream(None).damaged
 
 
 def test_slots_that_a_killed_node_has_forgotten_are_still_counted(told: Told) -> None:
-    told.connect(held=((0, 9),), next_seq=10)
-    stream = told.node.present
+    told.connect(stored=((0, 9),), next_seq=10)
+    stream = told.node.present_stream
     stream.missed_slots = 4
-    stream.has_ended(told.earlier(held=((0, 9),), next_seq=10, missed_slots=0))
+    stream.on_earlier(told.earlier(stored=((0, 9),), next_seq=10, missed_slots=0))
     assert (stream.missed_slots, stream.notes.missed_slots) == (4, 4)
-    stream.has_ended(told.earlier(held=((0, 9),), next_seq=10, missed_slots=5))
+    stream.on_earlier(told.earlier(stored=((0, 9),), next_seq=10, missed_slots=5))
     assert (stream.missed_slots, stream.notes.missed_slots) == (5, 5)
 
 
 def test_frames_that_are_damaged_here_may_come_again_while_the_node_has_them(told: Told) -> None:
-    told.connect(held=((0, 9),), next_seq=10)
+    told.connect(stored=((0, 9),), next_seq=10)
     told.take(0, 4)
     told.take(5, 9)
-    stream = told.node.present
-    stream.disown(Intervals([(0, 4)]), corrupt=True)
+    stream = told.node.present_stream
+    stream.invalidate(Intervals([(0, 4)]), are_corrupt=True)
     assert not stream.lost
-    told.connect(held=((5, 9),), next_seq=10)
-    assert stream.lost.as_pairs() == {"corrupt": ((0, 4),)}
+    told.connect(stored=((5, 9),), next_seq=10)
+    assert stream.lost.to_pairs() == {"corrupt": ((0, 4),)}
 
 
 @settings(max_examples=40, deadline=None)
@@ -339,7 +339,7 @@ def test_what_is_held_next_to_an_instant_is_the_same_whether_it_was_asked_before
 ) -> None:
     with TemporaryDirectory() as folder:
         told = Told(Path(folder))
-        told.connect(held=((0, 8 * PER_MESSAGE - 1),), next_seq=8 * PER_MESSAGE)
+        told.connect(stored=((0, 8 * PER_MESSAGE - 1),), next_seq=8 * PER_MESSAGE)
         t_ns = UTC_NS + 10**12 + at * PERIOD_NS
         sent = Intervals()
         for n in order:
@@ -347,15 +347,15 @@ def test_what_is_held_next_to_an_instant_is_the_same_whether_it_was_asked_before
                 continue
             told.take(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
             sent.add(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
-            stream = told.node.present
-            found = stream.around(t_ns, at_least=at_least)
+            stream = told.node.present_stream
+            found = stream.find_seqs_around(t_ns, min_seq=at_least)
             held = [seq for a, b in sent for seq in range(a, b + 1) if seq >= at_least]
             until = max((seq for seq in held if seq <= at), default=at_least - 1)
             after = min((seq for seq in held if seq > at), default=None)
             assert found == (None if after is None else (until, after))
             # While frames in between may come, it may answer as before, but says that they lack.
-            lazy = stream.around(t_ns, at_least=at_least, waiting=True)
+            lazy = stream.find_seqs_around(t_ns, min_seq=at_least, wait_for_missing=True)
             assert (lazy is None) == (found is None)
             if lazy is not None and lazy != found:
-                assert stream.may_come.within(lazy[0] + 1, lazy[1] - 1)
+                assert stream.obtainable.restricted_to(lazy[0] + 1, lazy[1] - 1)
         told.close()

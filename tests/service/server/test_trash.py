@@ -12,11 +12,11 @@ import pytest
 
 import service.api.routes.recordings.sessions
 import service.server
-import service.server.settling
+import service.server.sealer
 from devices.errors import StorageError
-from service.sessions.sealing import seal
+from service.sessions.sealing import seal_session
 from storage.intervals import Intervals
-from storage.sessions.folder import DOOMED_PREFIX, SessionFolder
+from storage.sessions.folder import DELETED_PREFIX, SessionsFolder
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused, closed
@@ -104,9 +104,9 @@ def test_a_session_that_is_being_sealed_is_not_deleted(
 
     def slow(*arguments: Any) -> Any:
         assert may_seal.wait(20.0)
-        return seal(*arguments)
+        return seal_session(*arguments)
 
-    monkeypatch.setattr(service.server.settling, "seal", slow)
+    monkeypatch.setattr(service.server.sealer, "seal_session", slow)
     try:
         session = tared.record()
         tared.deliver(20)
@@ -141,7 +141,7 @@ def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_empt
     running.restart()
     tared.connect()
     [wanted] = tared.wanted.streams
-    assert (wanted.boot_id, [*wanted.numbers]) == (tared.boot_id, [(70, None)])
+    assert (wanted.stream_id, [*wanted.numbers]) == (tared.stream_id, [(70, None)])
     tared.send_again(tared.sent[-1])
     tared.send(10, now=True)
     tared.acknowledged(tared.seq - 1, first=120)
@@ -162,20 +162,20 @@ def test_a_session_is_in_one_place_however_a_delete_was_cut_off(
 ) -> None:
     session = sealed(tared)
     cut_off = refusing(StorageError, "No space left")
-    move = SessionFolder.move
-    monkeypatch.setattr(SessionFolder, "move", cut_off)
+    move = SessionsFolder.move_to
+    monkeypatch.setattr(SessionsFolder, "move_to", cut_off)
     assert running.http.delete(session.url).status_code == 507
     assert ids(running, "/sessions") == [session.id]
     assert ids(running, "/trash") == []
-    monkeypatch.setattr(SessionFolder, "move", move)
+    monkeypatch.setattr(SessionsFolder, "move_to", move)
 
-    def then_killed(folder: SessionFolder, session_id: str, to: SessionFolder) -> None:
+    def then_killed(folder: SessionsFolder, session_id: str, to: SessionsFolder) -> None:
         move(folder, session_id, to)
         cut_off()  # the folder was renamed, and the process ends before it knows
 
-    monkeypatch.setattr(SessionFolder, "move", then_killed)
+    monkeypatch.setattr(SessionsFolder, "move_to", then_killed)
     assert running.http.delete(session.url).status_code == 507
-    monkeypatch.setattr(SessionFolder, "move", move)
+    monkeypatch.setattr(SessionsFolder, "move_to", move)
     running.restart()
     assert ids(running, "/sessions") == []
     assert ids(running, "/trash") == [session.id]
@@ -186,10 +186,10 @@ def test_what_was_half_deleted_is_no_session_and_gone_at_the_next_start(
 ) -> None:
     session = sealed(tared)
     running.http.delete(session.url)
-    monkeypatch.setattr(service.server.server, "destroy", lambda folders: 0)  # killed before
+    monkeypatch.setattr(service.server.server, "delete_files", lambda folders: 0)  # killed before
     running.http.delete("/trash")
     assert [path.name for path in (running.data / "trash").iterdir()] == [
-        DOOMED_PREFIX + session.id
+        DELETED_PREFIX + session.id
     ]
     running.restart()
     assert ids(running, "/trash") == []
@@ -219,9 +219,9 @@ def test_a_session_whose_node_never_comes_back_can_be_sealed_without_it(
     assert answer.status_code == 200, answer.text
     done = session.sealed()
     assert (done["complete"], done["frames"]) == ("lossy", 50)
-    assert done["parts"] == [{"boot_id": tared.boot_id, "seq_first": 70, "seq_last": 119}]
+    assert done["parts"] == [{"stream_id": tared.stream_id, "seq_first": 70, "seq_last": 119}]
     # Nobody knows how many there were: at most as many as fit between the last one and the stop.
-    assert done["tail_frames_max"] >= 30
+    assert done["max_lost_tail_frames"] >= 30
     assert done["pending_frames"] == 0
 
 
@@ -241,7 +241,7 @@ def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
     done = session.sealed()
     assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 70, {"given_up": 30})
     ledger = session.ledger()
-    assert ledger["parts"][0]["unsynced_tail_max"] == 0
+    assert ledger["parts"][0]["max_lost_tail_frames"] == 0
 
 
 def test_only_a_pending_session_can_be_given_up(running: Running, tared: FakeNode) -> None:
@@ -256,7 +256,7 @@ def test_only_a_pending_session_can_be_given_up(running: Running, tared: FakeNod
 
 def damage(running: Running, node: FakeNode, at: float = 0.5) -> None:
     """Flip a bit in the middle of the node's journal."""
-    [path] = (running.data / "journal" / "bench" / node.boot_id).glob("*.arrows")
+    [path] = (running.data / "journal" / "bench" / node.stream_id).glob("*.arrows")
     content = bytearray(path.read_bytes())
     content[int(len(content) * at)] ^= 0x10
     with path.open("r+b") as file:
@@ -277,7 +277,7 @@ def test_frames_that_are_found_damaged_are_asked_for_again_and_the_session_is_co
     first, last = lacks[0]
     assert last is not None
     assert 70 <= first <= last <= 269
-    tared.send_again(tared.all_sent().rows(first, last + 1))
+    tared.send_again(tared.all_sent().slice_rows(first, last + 1))
     done = session.sealed()
     assert (done["complete"], done["frames"], done["lost"]) == (True, 200, {})
 
@@ -303,7 +303,9 @@ def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
 def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_the_next(
     running: Running, tared: FakeNode, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service.server.settling, "seal", refusing(StorageError, "No space left"))
+    monkeypatch.setattr(
+        service.server.sealer, "seal_session", refusing(StorageError, "No space left")
+    )
     session = tared.record()
     tared.deliver(20)
     session.stop()
@@ -311,7 +313,7 @@ def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_th
         tared.send(10, now=True)
         until(lambda: "No space" in (session.now()["problem"] or ""))
     assert session.now()["state"] == state
-    monkeypatch.setattr(service.server.settling, "seal", seal)
+    monkeypatch.setattr(service.server.sealer, "seal_session", seal_session)
     running.restart()
     if state == "pending":
         tared.connect()
@@ -346,27 +348,29 @@ def test_what_killed_processes_left_half_written_is_removed_at_the_start(
 def test_frames_of_an_unsealed_session_are_never_pruned(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.server.node.RING_NS", 0)
+    monkeypatch.setattr("service.server.node.RING_DURATION_NS", 0)
     pending(tared)
     node = running.server.nodes.get("bench")
-    running.call(lambda: node.prune(running.server.recorder.needed("bench")))
-    assert not (Intervals([(70, 119)]) - node.present.held)
+    running.call(lambda: node.delete_unneeded_step(running.server.recorder.needed_frames("bench")))
+    assert not (Intervals([(70, 119)]) - node.present_stream.stored)
 
 
 def test_journals_that_nobody_needs_go_one_at_a_time(running: Running, tared: FakeNode) -> None:
     # A node that was switched on a thousand times holds nobody up while all of them are deleted.
-    boots = [tared.boot_id]
+    boots = [tared.stream_id]
     for _ in range(2):
         tared.close()
         tared.reboot()
         until(lambda: not running.node()["connected"])
         tared.connect()
         tared.deliver(10)
-        boots.append(tared.boot_id)
+        boots.append(tared.stream_id)
     node = running.server.nodes.get("bench")
     folder = running.data / "journal" / "bench"
     left = []
-    while running.call(lambda: node.prune(running.server.recorder.needed("bench"))):
+    while running.call(
+        lambda: node.delete_unneeded_step(running.server.recorder.needed_frames("bench"))
+    ):
         left.append(sorted(path.name for path in folder.iterdir()))
     assert left == [sorted(boots[1:]), boots[2:]]
-    assert node.present.held
+    assert node.present_stream.stored

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 
 from devices.errors import StorageError
-from service.api.address import token_for
-from service.offline.calibrations import read_calibration
-from service.server import settling
+from service.api.address import load_or_create_token
+from service.offline.calibration_lookup import read_calibration
+from service.server import sealer
 from service.server.data_folder import DataFolder
-from service.server.nodes import ServerNodes
+from service.server.nodes import NodeRegistry
 from service.server.server import Server
 from service.sessions.calibration_file import write_calibration
 from service.sessions.tares import TareHistory
-from storage import durable
-from storage.checked_json import write_checked
+from storage import durable_files
+from storage.checksummed_json import write_checksummed_json
 from storage.journal import journal as journal_module
-from storage.journal.node.in_flight import IN_FLIGHT_FILE, InFlight
+from storage.journal.node.in_flight import IN_FLIGHT_FILE, InFlightWriter
 from storage.journal.node.journal import NodeJournal
-from storage.journal.node.wanted import ServerWants, Wanted
+from storage.journal.node.retention_requests import RetentionRequest, RetentionRequests
 from storage.journal.stream_notes import StreamNotes
 from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare
@@ -36,7 +36,7 @@ from tests.service.running import Running
 from tests.waiting import until
 
 INFO = make_array()
-NEEDED = ServerWants(streams={"a": ((0, 9),)})
+NEEDED = RetentionRequest(streams={"a": ((0, 9),)})
 
 
 @contextmanager
@@ -47,7 +47,7 @@ def unreadable(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[None]:
         raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patched:
-        patched.setattr(durable, "_without_following", refuse)
+        patched.setattr(durable_files, "_without_following", refuse)
         yield
 
 
@@ -60,12 +60,12 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def _tares(folder: Path) -> None:
-    TareHistory(folder / "tares.json").add(make_tare(2), INFO)
+    TareHistory(folder / "tares.json").add_tare(make_tare(2), INFO)
 
 
 def _wanted(folder: Path) -> None:
-    wanted = Wanted(folder / "wanted.json")
-    wanted.say("other", NEEDED)
+    wanted = RetentionRequests(folder / "wanted.json")
+    wanted.update_server_request("other", NEEDED)
     wanted.save()
 
 
@@ -74,7 +74,7 @@ def _server_id(folder: Path) -> None:
 
 
 def _token(folder: Path) -> None:
-    token_for(None, folder)
+    load_or_create_token(None, folder)
 
 
 def _calibration(folder: Path) -> None:
@@ -85,11 +85,11 @@ def _calibration(folder: Path) -> None:
 
 
 def _stream(folder: Path) -> None:
-    stream = folder / "journal" / "bench" / INFO.boot_id
+    stream = folder / "journal" / "bench" / INFO.stream_id
     if not stream.exists():
         stream.mkdir(parents=True)
         StreamNotes(array_info=INFO, number=1).save(stream)
-        InFlight(stream, INFO).close()
+        InFlightWriter(stream, INFO).close()
         assert (stream / IN_FLIGHT_FILE).exists()
     journal = NodeJournal(folder, "bench")
     try:
@@ -121,16 +121,16 @@ def test_a_node_goes_on_and_writes_what_servers_need_only_once_it_was_read(
 ) -> None:
     _wanted(tmp_path)
     with unreadable(monkeypatch, errno.EACCES):
-        wanted = Wanted(tmp_path / "wanted.json")
-        assert wanted.may_be_all
+        wanted = RetentionRequests(tmp_path / "wanted.json")
+        assert wanted.is_unknown
         assert "frames are kept" in wanted.problems[0]
-        assert wanted.say("laptop", NEEDED)
+        assert wanted.update_server_request("laptop", NEEDED)
         with pytest.raises(StorageError):
             wanted.save()
     wanted.save()
-    again = Wanted(tmp_path / "wanted.json")
-    assert not again.say("other", NEEDED)
-    assert not again.say("laptop", NEEDED)
+    again = RetentionRequests(tmp_path / "wanted.json")
+    assert not again.update_server_request("other", NEEDED)
+    assert not again.update_server_request("laptop", NEEDED)
 
 
 def test_tares_that_are_damaged_and_cannot_be_set_aside_are_not_written_over(
@@ -149,7 +149,7 @@ def test_tares_that_are_damaged_and_cannot_be_set_aside_are_not_written_over(
         with pytest.raises(StorageError, match="Move it away by hand"):
             TareHistory(path)
     assert contents(tmp_path) == before
-    assert len(TareHistory(path).all) == 1
+    assert len(TareHistory(path).tares) == 1
 
 
 @pytest.mark.parametrize("name", ["hello.json", "tares.json"])
@@ -159,7 +159,7 @@ def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
     running.stop()
     folder = running.data / "nodes" / "bench"
     before = contents(folder)
-    really = durable._without_following
+    really = durable_files._without_following
 
     def refuse(path: str, flags: int) -> int:
         if path == str(folder / name):
@@ -167,8 +167,8 @@ def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
         return really(path, flags)
 
     with monkeypatch.context() as patched:
-        patched.setattr(durable, "_without_following", refuse)
-        found = ServerNodes(running.data)
+        patched.setattr(durable_files, "_without_following", refuse)
+        found = NodeRegistry(running.data)
     assert (list(found), contents(folder)) == ([], before)
     assert name in found.problems[0]
     running.start()
@@ -183,9 +183,9 @@ def refused_journals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     def refuse(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(settling, "_SEAL_AGAIN_S", 0.1)
+    monkeypatch.setattr(sealer, "_RETRY_S", 0.1)
     with monkeypatch.context() as disk:
-        disk.setattr(journal_module, "recover", refuse)
+        disk.setattr(journal_module, "recover_segment", refuse)
         yield
 
 
@@ -239,15 +239,15 @@ def test_who_gives_up_what_cannot_be_read_keeps_what_followed_it(
 def test_frames_of_a_stream_whose_notes_another_version_wrote_are_not_lost(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(settling, "_SEAL_AGAIN_S", 0.1)
+    monkeypatch.setattr(sealer, "_RETRY_S", 0.1)
     recording = tared.record()
     tared.deliver(100, 5.0)
     running.stop()
-    notes = running.data / "journal" / "bench" / tared.boot_id / "stream.json"
+    notes = running.data / "journal" / "bench" / tared.stream_id / "stream.json"
     ours = notes.read_bytes()
     theirs = json.loads(ours) | {"of_later": 1}
     del theirs["check"]
-    write_checked(notes, json.dumps(theirs).encode())
+    write_checksummed_json(notes, json.dumps(theirs).encode())
     running.start()
     tared.reboot()
     tared.connect()
@@ -266,7 +266,7 @@ def test_a_session_that_cannot_be_read_stays_as_it_is_and_is_named(
     tared.finish(recording)
     running.stop()
     before = contents(running.data / "sessions")
-    really = durable._without_following
+    really = durable_files._without_following
 
     def refuse(path: str, flags: int) -> int:
         if path.endswith("session.json"):
@@ -274,10 +274,10 @@ def test_a_session_that_cannot_be_read_stays_as_it_is_and_is_named(
         return really(path, flags)
 
     with monkeypatch.context() as patched:
-        patched.setattr(durable, "_without_following", refuse)
+        patched.setattr(durable_files, "_without_following", refuse)
         server = Server(running.data)
         said = " ".join(server.sessions.problems)
-        server.folder.close()
+        server.data_folder.close()
     assert "Too many open files" in said
     assert contents(running.data / "sessions") == before
     running.start()

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus
-from service.sessions.recover import Recovered, Recovery, recover
+from devices.frames import ArrayInfo, FrameBatch, FrameFlag
+from service.sessions.recovery import RecoveredSession, RecoveryReport, recover_folder
 from storage.journal.journal import Journal
-from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
-from storage.sessions.folder import Event, Ledger, Part, Session, SessionFolder
+from storage.journal.stream_notes import StreamNotes, compute_max_lost_tail_frames
+from storage.sessions.folder import Ledger, Marker, Part, Session, SessionsFolder
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import make_frames
 
@@ -20,13 +20,13 @@ ID = "20200101T000000Z-00000a"
 BOOT = "a" * 32
 OTHER_BOOT = "b" * 32
 LEAD = 400
-TAIL = unsynced_tail_max(500.0)
+TAIL = compute_max_lost_tail_frames(500.0)
 
 Frames = Callable[..., FrameBatch]
 
 
-def info_of(boot_id: str = BOOT) -> ArrayInfo:
-    return make_array(boot_id=boot_id)
+def info_of(stream_id: str = BOOT) -> ArrayInfo:
+    return make_array(stream_id=stream_id)
 
 
 def frames(first: int, last: int) -> FrameBatch:
@@ -35,8 +35,8 @@ def frames(first: int, last: int) -> FrameBatch:
     lead = seq < LEAD
     return make_frames(
         seq,
-        padc=(np.where(lead, 500, 490) + seq % 2)[:, None],
-        frame_status=np.where(lead, FrameStatus.LEAD, 0),
+        pressure_raw=(np.where(lead, 500, 490) + seq % 2)[:, None],
+        frame_flags=np.where(lead, FrameFlag.LEAD, 0),
     )
 
 
@@ -47,11 +47,11 @@ def t_ns(seq: int) -> int:
 def stream(
     data: Path, info: ArrayInfo, *runs: tuple[int, int], closed: bool = True, **notes: Any
 ) -> Path:
-    folder = data / "journal" / info.node / info.boot_id
+    folder = data / "journal" / info.node / info.stream_id
     journal = Journal(folder, info)
     for first, last in runs:
         for begin in range(first, last + 1, 10):
-            journal.append(frames(begin, min(begin + 9, last)))
+            journal.append_new_frames(frames(begin, min(begin + 9, last)))
     StreamNotes(array_info=info, **notes).save(folder)
     journal.close()
     if not closed:  # as a killed process leaves it
@@ -67,26 +67,26 @@ def session(data: Path, session_id: str = ID, **changes: Any) -> Session:
         "node": "bench",
         "state": "recording",
         "started_t_ns": t_ns(0),
-        "parts": (Part(boot_id=BOOT, seq_first=0),),
+        "parts": (Part(stream_id=BOOT, seq_first=0),),
         "scene": "test",
         "scene_content": {"name": "test"},
         "subject": "leg 2",
         "notes": "in mud",
         "tags": ("wet",),
-        "events": (Event(id="e1", label="slip", t_ns=t_ns(500)),),
+        "markers": (Marker(id="e1", label="slip", t_ns=t_ns(500)),),
     }
     kept = Session(**content | changes)
-    SessionFolder(data / "sessions").save(kept)
+    SessionsFolder(data / "sessions").save(kept)
     return kept
 
 
 def loaded(data: Path, session_id: str = ID) -> Session:
-    return SessionFolder(data / "sessions").load(session_id)
+    return SessionsFolder(data / "sessions").load(session_id)
 
 
-def recovered(data: Path, **how: Any) -> tuple[Recovered, Ledger]:
+def recovered(data: Path, **how: Any) -> tuple[RecoveredSession, Ledger]:
     """The one session that is recovered, and what became of its frames."""
-    (one,) = recover(data, **how).sessions
+    (one,) = recover_folder(data, **how).sessions
     assert one.ledger is not None
     return one, one.ledger
 
@@ -104,5 +104,5 @@ def servers(data: Path) -> Path:
     return data
 
 
-def outcomes(recovery: Recovery) -> list[str]:
+def outcomes(recovery: RecoveryReport) -> list[str]:
     return [one.outcome for one in recovery.sessions]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus
+from devices.frames import ArrayInfo, FrameBatch, FrameFlag
 from service.estimation.calibration import Calibration
 from service.sessions.pipeline import EstimateOptions, EstimateStream
 from tests.builders.arrays import PERIOD_NS, make_array
@@ -44,8 +44,8 @@ def options(**changes: Any) -> EstimateOptions:
 def frames(
     forces_n: np.ndarray, *, lead: int = 0, period_ns: int = PERIOD_NS, **columns: Any
 ) -> FrameBatch:
-    status = np.where(np.arange(len(forces_n)) < lead, FrameStatus.LEAD, 0)
-    return loaded_frames(forces_n, period_ns=period_ns, frame_status=status, **columns)
+    status = np.where(np.arange(len(forces_n)) < lead, FrameFlag.LEAD, 0)
+    return loaded_frames(forces_n, period_ns=period_ns, frame_flags=status, **columns)
 
 
 def hopping(n: int, *, loaded_from: int, seed: int = 0) -> np.ndarray:
@@ -60,7 +60,8 @@ def cut(batch: FrameBatch, cuts: Sequence[int]) -> list[Piece]:
     """The batch in pieces, each with an extra column that tells its frames apart."""
     edges = [0, *sorted(set(cuts) & set(range(1, len(batch)))), len(batch)]
     return [
-        (batch.rows(a, b), {"true_grf_n": 1000.0 + np.arange(a, b)}) for a, b in pairwise(edges)
+        (batch.slice_rows(a, b), {"true_grf_n": 1000.0 + np.arange(a, b)})
+        for a, b in pairwise(edges)
     ]
 
 
@@ -68,7 +69,7 @@ def run(
     pieces: Sequence[Piece], info: ArrayInfo | None = None, **changes: Any
 ) -> tuple[EstimateStream, FrameBatch, dict[str, np.ndarray]]:
     stream = EstimateStream(info or array(), options(**changes))
-    out = list(stream.run(pieces))
+    out = list(stream.estimate_batches(pieces))
     for batch, columns in out:
         assert {len(values) for values in columns.values()} == {len(batch)}
     columns = {name: np.concatenate([c[name] for _, c in out]) for name in out[0][1]}

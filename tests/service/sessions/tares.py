@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from devices.frames import ArrayInfo
-from service.estimation.tare.tare import Source, Tare
+from service.estimation.tare.tare import Tare, TareSource
 from service.sessions.tare_file import RecordedTare
 from service.sessions.tares import TareHistory
 from tests.builders.arrays import make_array, make_tile
@@ -26,12 +26,12 @@ INFO = array("T01", "T02")
 OTHERS = (array("T01", "T03"), array("T02", "T01"), array("T01"), array("T01", "T02", "T03"))
 
 
-def tare(t_ns: int = 0, *, tiles: int = 2, source: Source = "unloaded") -> Tare:
+def tare(t_ns: int = 0, *, tiles: int = 2, source: TareSource = "unloaded") -> Tare:
     return make_tare(
         tiles,
         baseline_kpa=100.0 + np.arange(tiles) / 3,
         noise_kpa=1 / 7,
-        tadc_counts=480.0 + np.arange(tiles) / 7,
+        temperature_raw_counts=480.0 + np.arange(tiles) / 7,
         t_ns=t_ns,
         source=source,
     )
@@ -51,7 +51,7 @@ def same(one: RecordedTare, other: RecordedTare) -> None:
 def history(tmp_path: Path, *t_ns: int) -> TareHistory:
     made = TareHistory(tmp_path / "node" / "tares.json")
     for t in t_ns:
-        made.add(tare(t), INFO)
+        made.add_tare(tare(t), INFO)
     return made
 
 

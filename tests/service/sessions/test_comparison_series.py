@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import service.sessions.comparison_series
 import storage.sessions.comparisons
-from service.sessions.comparison_series import Series, SeriesKept
+from service.sessions.comparison_series import ComparisonSeries, ComparisonSeriesCache
 from storage.formats.slice import Slice
-from storage.sessions.comparisons import SCHEMA, SERIES_NAME, write_series
+from storage.sessions.comparisons import SERIES_NAME, SERIES_SCHEMA, write_series
 from storage.sessions.pyramid import Bins
 
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -32,12 +32,12 @@ def series(t_ms: Any, ours_n: Any, reference_n: Any) -> pa.Table:
         pa.array([None] * n, pa.float32()),
         pa.array([0.0] * n, pa.float32()),
     ]
-    return pa.table(columns, schema=SCHEMA)
+    return pa.table(columns, schema=SERIES_SCHEMA)
 
 
-def kept(folder: Path, table: pa.Table) -> Series:
+def kept(folder: Path, table: pa.Table) -> ComparisonSeries:
     write_series(folder / SERIES_NAME, table)
-    found = SeriesKept().of(folder)
+    found = ComparisonSeriesCache().get(folder)
     assert found is not None
     return found
 
@@ -70,7 +70,7 @@ def test_no_peak_of_the_reference_hides_and_no_bin_reaches_over_a_gap(
         patch.setattr(storage.sessions.comparisons, "_GROUP_ROWS", 50)
         found = kept(folder, series(t_ms, ours_n, theirs_n))
     part = Slice(1e-3 * begin, 1e-3 * (begin + length))
-    bins, size = found.seen(BEGIN_NS, part, points)
+    bins, size = found.get_bins(BEGIN_NS, part, points)
     inside = np.flatnonzero((t_ms >= begin) & (t_ms < begin + length))
     rows = [rows_of(bins, i, t_ms) for i in range(len(bins["frames"]))]
     assert bins["frames"].tolist() == [len(each) for each in rows]
@@ -96,21 +96,21 @@ def test_a_zoom_costs_the_same_wherever_it_is_and_however_long_the_series(
     forces_n = np.arange(n) % 1000
     whole = kept(tmp_path, series(2 * np.arange(n), forces_n, forces_n))
     read: list[int] = []
-    within = storage.sessions.comparisons.series_within
+    within = storage.sessions.comparisons.read_series_range
 
     def counted(folder: Path, footer: Any, *bounds_ns: int | None) -> pa.Table:
-        read.append(len(storage.sessions.comparisons._groups_within(footer, *bounds_ns)))
+        read.append(len(storage.sessions.comparisons._find_row_groups(footer, *bounds_ns)))
         return within(folder, footer, *bounds_ns)
 
-    monkeypatch.setattr(service.sessions.comparison_series, "series_within", counted)
+    monkeypatch.setattr(service.sessions.comparison_series, "read_series_range", counted)
     for part in (ALL, Slice(0.0, 550.0), Slice(100.0, 400.0)):
-        bins, size = whole.seen(BEGIN_NS, part, 500)
+        bins, size = whole.get_bins(BEGIN_NS, part, 500)
         assert 500 <= len(bins["frames"]) <= 2000 + 2
         assert size >= 64
         assert bins["error_n_max"].max() == 0.0
     assert read == []
     for start_s in (0.0, 300.0, 595.0):
-        bins, size = whole.seen(BEGIN_NS, Slice(start_s, start_s + 2.0), 800)
+        bins, size = whole.get_bins(BEGIN_NS, Slice(start_s, start_s + 2.0), 800)
         assert (len(bins["frames"]), size) == (1000, 1)
     assert read == [1, 1, 1]
 
@@ -126,34 +126,34 @@ def test_it_is_read_whole_once_and_again_when_it_is_another(
         return whole(folder)
 
     monkeypatch.setattr(service.sessions.comparison_series, "read_series", counted)
-    series_kept = SeriesKept()
+    series_kept = ComparisonSeriesCache()
     write_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [2.0, 2.0]))
-    first = series_kept.of(tmp_path)
-    assert series_kept.of(tmp_path) is first
+    first = series_kept.get(tmp_path)
+    assert series_kept.get(tmp_path) is first
     write_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [5.0, 2.0]))
-    second = series_kept.of(tmp_path)
+    second = series_kept.get(tmp_path)
     assert second is not None
-    assert second.seen(BEGIN_NS, ALL, 10)[0]["reference_grf_n_max"].tolist() == [5.0, 2.0]
+    assert second.get_bins(BEGIN_NS, ALL, 10)[0]["reference_grf_n_max"].tolist() == [5.0, 2.0]
     assert len(read) == 2
     for folder in (tmp_path / str(i) for i in range(6)):
         folder.mkdir()
         write_series(folder / SERIES_NAME, series([0], [1.0], [1.0]))
-        assert series_kept.of(folder) is not None
-    assert len(series_kept._of) == 4
+        assert series_kept.get(folder) is not None
+    assert len(series_kept._entries) == 4
 
 
 def test_what_is_asked_for_is_some_time_of_it_and_nothing_is_no_error(tmp_path: Path) -> None:
     table = kept(tmp_path, series(range(0, 100, 2), [1.0] * 50, [2.0] * 50))
-    bins, size = table.seen(BEGIN_NS, Slice(start_s=0.01, end_s=0.02), 100)
+    bins, size = table.get_bins(BEGIN_NS, Slice(start_s=0.01, end_s=0.02), 100)
     assert size == 1
     assert ((bins["t_first_ns"] - BEGIN_NS) * 1e-6).tolist() == pytest.approx([10, 12, 14, 16, 18])
-    bins, _ = table.seen(BEGIN_NS, Slice(start_s=5.0), 100)
+    bins, _ = table.get_bins(BEGIN_NS, Slice(start_s=5.0), 100)
     assert {len(values) for values in bins.values()} == {0}
 
 
 def test_bins_are_broken_where_something_is_missing(tmp_path: Path) -> None:
     t_ms = [*range(0, 20, 2), *range(100, 120, 2)]
-    bins, size = kept(tmp_path, series(t_ms, [1.0] * 20, [2.0] * 20)).seen(BEGIN_NS, ALL, 3)
+    bins, size = kept(tmp_path, series(t_ms, [1.0] * 20, [2.0] * 20)).get_bins(BEGIN_NS, ALL, 3)
     assert size == 4
     assert bins["frames"].tolist() == [4, 4, 2, 4, 4, 2]
     assert bins["missing"].tolist() == [0, 0, 0, 1, 0, 0]

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from service.sessions.tares import TareHistory
-from storage.checked_json import read_checked
+from storage.checksummed_json import read_checksummed_json
 from tests.service.sessions.tares import INFO, as_older, history, same, tare
 
 
 def assert_lost(path: Path) -> None:
     found = TareHistory(path)
-    assert found.all == []
-    assert found.in_force(INFO) is None
-    assert found.is_lost(INFO)
-    assert [tare.is_lost for tare in found.during(INFO, 0, 9)] == [True]
+    assert found.tares == []
+    assert found.tare_in_force(INFO) is None
+    assert found.is_tare_lost(INFO)
+    assert [tare.is_lost for tare in found.tares_between(INFO, 0, 9)] == [True]
     assert path.with_name("tares.json.damaged-1").exists()
     assert found.problem is not None
     assert "tares.json.damaged-1" in found.problem
@@ -28,17 +28,17 @@ def assert_lost(path: Path) -> None:
 def test_tares_of_an_older_version_are_read_called_unproven_and_written_with_hashes(
     tmp_path: Path,
 ) -> None:
-    before = history(tmp_path, 1, 2).all
+    before = history(tmp_path, 1, 2).tares
     path = tmp_path / "node" / "tares.json"
     as_older(path)
     found = TareHistory(path)
-    for one, other in zip(before, found.all, strict=True):
+    for one, other in zip(before, found.tares, strict=True):
         same(one, other)
     assert found.problem is not None
     assert "unproven" in found.problem
     again = TareHistory(path)
     assert again.problem is None
-    assert read_checked(path).is_proven
+    assert read_checksummed_json(path).has_checksum
 
 
 DAMAGES: dict[str, dict[str, Any]] = {
@@ -48,8 +48,8 @@ DAMAGES: dict[str, dict[str, Any]] = {
     "no baselines": {"tare": {"baseline_kpa": None}},
     "noise that is no number": {"tare": {"noise_kpa": [1.0, float("nan")]}},
     "one noise for all": {"tare": {"noise_kpa": 1.0}},
-    "a temperature too many": {"tare": {"tadc_counts": [1.0, 2.0, 3.0]}},
-    "words for temperatures": {"tare": {"tadc_counts": ["warm", "cold"]}},
+    "a temperature too many": {"tare": {"temperature_raw_counts": [1.0, 2.0, 3.0]}},
+    "words for temperatures": {"tare": {"temperature_raw_counts": ["warm", "cold"]}},
     "another shape": {"tare": {"baseline_sigma_kpa": [[1.0, 1.0]]}},
     "words for an instant": {"tare": {"t_ns": "yesterday"}},
     "no instant": {"tare": {"t_ns": None}},
@@ -98,11 +98,11 @@ def test_tares_of_an_older_version_have_no_temperature_and_are_readable(tmp_path
     path = tmp_path / "node" / "tares.json"
 
     def without(content: Any) -> None:
-        del content[0]["tare"]["tadc_counts"]
+        del content[0]["tare"]["temperature_raw_counts"]
 
     as_older(path, without)
-    (old,) = history(tmp_path).all
-    assert np.isnan(old.tare.tadc_counts).tolist() == [True, True]
-    history(tmp_path).add(tare(2), INFO)  # and can be written again, as JSON that has no NaN
+    (old,) = history(tmp_path).tares
+    assert np.isnan(old.tare.temperature_raw_counts).tolist() == [True, True]
+    history(tmp_path).add_tare(tare(2), INFO)  # and can be written again, as JSON that has no NaN
     json.loads(path.read_bytes(), parse_constant=pytest.fail)
-    assert np.isnan(history(tmp_path).all[0].tare.tadc_counts).all()
+    assert np.isnan(history(tmp_path).tares[0].tare.temperature_raw_counts).all()

@@ -13,23 +13,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.link import PROTOCOL, Hello
-from service.node.recording import NodeRecording
-from service.server import following
-from service.server.book import SessionBook, Trash
+from service.node.local_recording import LocalRecording
+from service.protocol import PROTOCOL, Hello
+from service.server import session_parts
 from service.server.node import ServerNode
-from service.server.nodes import ServerNodes
+from service.server.nodes import NodeRegistry
 from service.server.recorder import Recorder
-from service.server.settling import Settling
-from service.sessions.recover import recover
+from service.server.sealer import SessionSealer
+from service.server.session_store import SessionStore, Trash
+from service.sessions.recovery import recover_folder
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockOffset
 from storage.intervals import Losses
 from storage.journal.journal import Journal
 from storage.journal.node.journal import NodeJournal
 from storage.journal.stream_notes import StreamNotes
-from storage.sessions.folder import Part, Session, SessionFolder
-from storage.sessions.ledger import ledger_of, states_of
+from storage.sessions.folder import Part, Session, SessionsFolder
+from storage.sessions.ledger import adjust_states_to_session, compute_ledger
 from storage.verify.session import verify_session
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration, make_tare
@@ -37,7 +37,7 @@ from tests.builders.frames import make_frames
 
 ID = "20200101T000000Z-00000a"
 BOOT, PRESENT = "a" * 32, "b" * 32
-INFO = make_array(boot_id=BOOT)
+INFO = make_array(stream_id=BOOT)
 BATCH, BATCHES = 5, 8
 SERVER_MINUS_NODE_NS = 7_000_000_000
 REASONS = ("disk_full", "evicted", "corrupt")
@@ -67,10 +67,10 @@ class Stream:
         for number, fate in enumerate(self.fates):
             first, last = number * BATCH, number * BATCH + BATCH - 1
             if fate == "held":
-                journal.append(make_frames(np.arange(first, last + 1)))
+                journal.append_new_frames(make_frames(np.arange(first, last + 1)))
             elif fate in REASONS:
                 lost.setdefault(fate, []).append((first, last))
-        StreamNotes(array_info=INFO, lost=Losses(lost).as_pairs(), **self.notes).save(folder)
+        StreamNotes(array_info=INFO, lost=Losses(lost).to_pairs(), **self.notes).save(folder)
         journal.close()
 
 
@@ -83,7 +83,7 @@ def streams(draw: st.DrawFn, *, has_ended: bool) -> Stream:
     if has_ended or draw(st.booleans()):
         beyond = draw(st.integers(0, 3))
         notes |= {"next_seq": len(fates) * BATCH + beyond}
-        notes |= {"unsynced_tail_max": draw(st.sampled_from((0, 0, 40)))}
+        notes |= {"max_lost_tail_frames": draw(st.sampled_from((0, 0, 40)))}
     return Stream(fates, notes)
 
 
@@ -102,17 +102,17 @@ SEQ = st.integers(0, BATCHES * BATCH)
 
 
 def keep(data: Path, kept: Session) -> Path:
-    folder = SessionFolder(data / "sessions")
+    folder = SessionsFolder(data / "sessions")
     folder.save(kept)
-    return folder.path(kept.id)
+    return folder.get_path(kept.id)
 
 
 def loaded(data: Path) -> Session:
-    return SessionFolder(data / "sessions").load(ID)
+    return SessionsFolder(data / "sessions").load(ID)
 
 
 def what_it_is(done: Session) -> dict[str, Any]:
-    names = {"parts", "stopped_t_ns", "unsynced_tail_max", "problem", "calibration_id", "frames"}
+    names = {"parts", "stopped_t_ns", "max_lost_tail_frames", "problem", "calibration_id", "frames"}
     return {"ledger": done.ledger, **done.model_dump(include=names)}
 
 
@@ -130,7 +130,7 @@ def test_a_node_alone_and_recovery_in_its_folder_seal_the_same_session(
     end = None if length is None else first + length - 1
     begun = session(
         state="recording",
-        parts=(Part(boot_id=BOOT, seq_first=first, seq_last=end),),
+        parts=(Part(stream_id=BOOT, seq_first=first, seq_last=end),),
         calibration=calibration,
     )
     with TemporaryDirectory() as path:
@@ -140,19 +140,19 @@ def test_a_node_alone_and_recovery_in_its_folder_seal_the_same_session(
         counted = verify_session(folder).ledger
         shutil.copytree(alone, recovered)
         journal = NodeJournal(alone, "bench")
-        recording = NodeRecording(
+        recording = LocalRecording(
             alone,
             "bench",
             journal,
-            name=None,
+            session_name=None,
             calibration=None,
             scene_content={},
-            emulated=True,
+            is_emulated=True,
             report=lambda _: None,
         )
-        recording.seal_what_was_left()
+        recording.seal_earlier_sessions()
         journal.close()
-        recover(recovered)
+        recover_folder(recovered)
         done = loaded(alone)
         assert done.state == "sealed"
         assert what_it_is(done) == what_it_is(loaded(recovered))
@@ -186,14 +186,14 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
 ) -> None:
     end = None if length is None else first + length - 1
     row = ClockOffset(
-        boot_id=BOOT,
+        stream_id=BOOT,
         t_mono_ns=0,
         server_minus_node_ns=SERVER_MINUS_NODE_NS if is_measured else 0,
         uncertainty_ns=1,
     )
     begun = session(
         stopped_t_ns=t_ns(stopped) + row.server_minus_node_ns,
-        parts=(Part(boot_id=BOOT, seq_first=first, seq_last=end),),
+        parts=(Part(stream_id=BOOT, seq_first=first, seq_last=end),),
         clock=(row,) if is_measured else (),
         missed_slots_at_start=2,
         missed_slots_at_stop={} if missed_slots_at_stop is None else {BOOT: missed_slots_at_stop},
@@ -204,25 +204,27 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
         stream.write(data)
         if tared is not None:
             history = TareHistory(data / "nodes" / "bench" / "tares.json")
-            history.add(make_tare(t_ns=t_ns(tared)), INFO)
+            history.add_tare(make_tare(t_ns=t_ns(tared)), INFO)
         recorder, node = server_on(data, begun)
-        made = recorder.sources(ID)
-        waiting = recorder.ledger(ID)
+        made = recorder.collect_inputs(ID)
+        waiting = recorder.get_ledger(ID)
         if end is not None:
             counted = verify_session(data / "sessions" / ID).ledger
             assert counted is not None
             assert (counted.parts, counted.missed_slots) == (waiting.parts, waiting.missed_slots)
-            (one,) = recover(data).sessions
+            (one,) = recover_folder(data).sessions
             assert one.outcome == "sealed" or one.ledger == waiting
             keep(data, begun)
-        given_up = following.given_up(begun, node)
-        (one,) = recover(data, give_up=True).sessions
+        given_up = session_parts.abandon_missing(begun, node)
+        (one,) = recover_folder(data, abandon_missing=True).sessions
         done = one.session
         assert done.state == "sealed"
         assert (done.parts, done.given_up) == (given_up.parts, True)
-        assert done.unsynced_tail_max == given_up.unsynced_tail_max
-        streams_then = following.streams_of(given_up, node)
-        ledger = ledger_of(given_up.parts, states_of(given_up, streams_then), finished=True)
+        assert done.max_lost_tail_frames == given_up.max_lost_tail_frames
+        streams_then = session_parts.find_streams(given_up, node)
+        ledger = compute_ledger(
+            given_up.parts, adjust_states_to_session(given_up, streams_then), is_finished=True
+        )
         assert done.ledger == ledger
         if done.frames and made.problem is not None:
             assert done.problem == f"no estimates: {made.problem}"
@@ -231,11 +233,11 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
 
 def server_on(data: Path, begun: Session) -> tuple[Recorder, ServerNode]:
     """A server that was started on this folder, whose node has not connected since."""
-    nodes = ServerNodes(data)
+    nodes = NodeRegistry(data)
     hello = Hello(
         protocol=PROTOCOL,
-        array_info=make_array(boot_id=PRESENT),
-        held=(),
+        array_info=make_array(stream_id=PRESENT),
+        stored=(),
         next_seq=0,
         t_mono_ns=0,
         scene={},
@@ -243,12 +245,12 @@ def server_on(data: Path, begun: Session) -> tuple[Recorder, ServerNode]:
         calibration=None,
         calibration_problem="for this test",
     )
-    node = nodes.greet(hello)
-    node.keep()
+    node = nodes.get_or_create(hello)
+    node.save()
     keep(data, begun)
-    book = SessionBook(
-        SessionFolder(data / "sessions"), Trash(data / "trash"), changed=lambda _: None
+    book = SessionStore(
+        SessionsFolder(data / "sessions"), Trash(data / "trash"), on_change=lambda _: None
     )
-    settling = Settling(book, nodes, ask_again=lambda _: None)
+    settling = SessionSealer(book, nodes, request_resend=lambda _: None)
     recorder = Recorder(book, nodes, settling)
     return recorder, node

@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import CalibrationError, TareError, UsageError
-from devices.frames import FrameBatch, TileStatus
+from devices.frames import FrameBatch, TileFlag
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimator
 from service.estimation.estimates import Estimates
-from service.estimation.ladder.plan import make_plan
+from service.estimation.pipeline.plan import make_plan
 from service.estimation.tare.tare import Tare
 from service.sessions import pipeline
-from service.sessions.pipeline import EstimateStream, estimate_columns, notes_of
-from storage.schema import ESTIMATES
+from service.sessions.pipeline import EstimateStream, estimate_columns, make_notes
+from storage.schema import ESTIMATE_COLUMNS
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
 from tests.service.sessions.pieces import (
     Piece,
@@ -49,7 +49,7 @@ def test_every_frame_comes_out_once_with_its_own_estimate_whatever_the_pieces(
     batch = frames(hopping(120, loaded_from=lead), lead=lead)
     _, _, whole = run(cut(batch, []), lag_ms=lag_ms)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "CHUNK", chunk)
+        patch.setattr(pipeline, "ROWS_PER_STEP", chunk)
         _, out, columns = run(cut(batch, cuts), lag_ms=lag_ms)
     for f in fields(FrameBatch):
         assert getattr(out, f.name).tobytes() == getattr(batch, f.name).tobytes(), f.name
@@ -62,7 +62,7 @@ def test_the_estimate_beside_a_frame_is_about_that_frame() -> None:
     batch = frames(hopping(300, loaded_from=50), lead=50)
     stream, out, columns = run(cut(batch, [13, 77, 78, 200]), lag_ms=100.0)
     assert stream.plan is not None
-    counts = 500 - out.padc.astype(np.float64)
+    counts = 500 - out.pressure_raw.astype(np.float64)
     offset = (stream.plan.tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA
     np.testing.assert_allclose(columns["gauge_kpa"] / COUNT_KPA, counts - offset, atol=1e-9)
 
@@ -79,7 +79,7 @@ def test_frames_leave_before_the_recording_ends() -> None:
             yield piece
 
     stream = EstimateStream(array(), options(lag_ms=10.0))
-    for out, _ in stream.run(pieces()):
+    for out, _ in stream.estimate_batches(pieces()):
         assert int(out.seq[-1]) >= asked - 51
     assert asked == 300
 
@@ -87,10 +87,10 @@ def test_frames_leave_before_the_recording_ends() -> None:
 def test_all_columns_of_the_schema_are_there_in_its_order_and_double_precision() -> None:
     batch = frames(hopping(100, loaded_from=50), lead=50)
     _, _, columns = run([(batch, {})])
-    assert list(columns) == [column.name for column in ESTIMATES]
-    assert {columns[c.name].dtype for c in ESTIMATES[:-2]} == {np.dtype(np.float64)}
+    assert list(columns) == [column.name for column in ESTIMATE_COLUMNS]
+    assert {columns[c.name].dtype for c in ESTIMATE_COLUMNS[:-2]} == {np.dtype(np.float64)}
     assert columns["contact"].dtype == np.uint8
-    assert columns["estimate_status"].dtype == np.uint16
+    assert columns["estimate_flags"].dtype == np.uint16
 
 
 def test_the_lead_is_taken_to_its_end_even_over_many_pieces() -> None:
@@ -169,7 +169,7 @@ def test_a_recording_that_is_never_unloaded_is_refused() -> None:
 
 def test_a_recording_without_frames_is_refused() -> None:
     with pytest.raises(TareError, match="no frames"):
-        list(EstimateStream(array(), options()).run([]))
+        list(EstimateStream(array(), options()).estimate_batches([]))
 
 
 def test_an_interval_after_the_end_is_refused() -> None:
@@ -205,7 +205,7 @@ def test_a_tile_without_calibration_is_refused_before_the_first_frame() -> None:
 def test_the_plan_is_there_with_the_first_estimates() -> None:
     stream = EstimateStream(array(), options())
     assert stream.plan is None
-    next(stream.run([(frames(hopping(100, loaded_from=50), lead=50), {})]))
+    next(stream.estimate_batches([(frames(hopping(100, loaded_from=50), lead=50), {})]))
     assert stream.plan is not None
 
 
@@ -213,13 +213,13 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
     batch = frames(hopping(300, loaded_from=100), lead=100)
     stream, _, columns = run([(batch, {})], lag_ms=9.2, models=("static",))
     assert stream.plan is not None
-    notes = json.loads(json.dumps(notes_of(stream.plan, stream.rounding), allow_nan=False))
+    notes = json.loads(json.dumps(make_notes(stream.plan, stream.rounding), allow_nan=False))
     kept = notes["tare"]
     tare = Tare(
         baseline_kpa=np.array(kept["baseline_kpa"]),
         baseline_sigma_kpa=np.array(kept["baseline_sigma_kpa"]),
         noise_kpa=np.array(kept["noise_kpa"]),
-        tadc_counts=np.array(kept["tadc_counts"]),
+        temperature_raw_counts=np.array(kept["temperature_raw_counts"]),
         t_ns=kept["t_ns"],
         begin_s=kept["begin_s"],
         end_s=kept["end_s"],
@@ -234,7 +234,7 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
         lag_ms=notes["lag_ms"],
     )
     estimator = Estimator(plan)
-    first, last = estimator.step(batch), estimator.finish()
+    first, last = estimator.process_frames(batch), estimator.finish()
     assert last is not None
     again = {
         f.name: np.concatenate([getattr(first, f.name), getattr(last, f.name)])
@@ -247,7 +247,7 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
 def test_the_notes_say_what_was_used() -> None:
     stream, _, _ = run([(frames(hopping(300, loaded_from=100), lead=100), {})], lag_ms=100.0)
     assert stream.plan is not None
-    notes = notes_of(stream.plan, stream.rounding)
+    notes = make_notes(stream.plan, stream.rounding)
     assert notes["calibration_id"] == calibration().id
     assert notes["absolute_scale"] == "measured"
     assert notes["models"] == ["unwrap", "static"]
@@ -261,7 +261,7 @@ def test_an_assumed_scale_is_said_in_the_notes() -> None:
     assumed = calibration(absolute_scale="assumed")
     stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=assumed)
     assert stream.plan is not None
-    assert notes_of(stream.plan, stream.rounding)["absolute_scale"] == "assumed"
+    assert make_notes(stream.plan, stream.rounding)["absolute_scale"] == "assumed"
 
 
 def test_the_calibration_in_the_notes_is_the_one_that_they_name() -> None:
@@ -269,7 +269,7 @@ def test_the_calibration_in_the_notes_is_the_one_that_they_name() -> None:
     many = calibration("T07", "T02", "T01", "T05")
     stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=many)
     assert stream.plan is not None
-    notes = notes_of(stream.plan, stream.rounding)
+    notes = make_notes(stream.plan, stream.rounding)
     assert Calibration.model_validate(notes["calibration"]).id == notes["calibration_id"]
 
 
@@ -280,7 +280,7 @@ def test_estimate_columns_are_those_of_the_estimates_without_number_and_time() -
         Tare(np.zeros(2), np.zeros(2), np.ones(2), np.zeros(2), 0, 0.0, 0.0, 0, "interval"),
         models=("static",),
     )
-    estimates = Estimator(plan).step(frames(np.zeros((3, 2))))
+    estimates = Estimator(plan).process_frames(frames(np.zeros((3, 2))))
     columns = estimate_columns(estimates)
     assert set(columns) == {f.name for f in fields(Estimates)} - {"seq", "t_ns"}
     assert columns["grf_n"] is estimates.grf_n
@@ -288,9 +288,9 @@ def test_estimate_columns_are_those_of_the_estimates_without_number_and_time() -
 
 def test_faults_in_the_lead_leave_the_rest_of_it_as_tare() -> None:
     batch = frames(hopping(200, loaded_from=100), lead=100)
-    status = batch.status.copy()
-    status[:30, 1] = TileStatus.NO_ANSWER
-    stream, _, columns = run(cut(replace(batch, status=status), [50]))
+    status = batch.tile_flags.copy()
+    status[:30, 1] = TileFlag.NO_ANSWER
+    stream, _, columns = run(cut(replace(batch, tile_flags=status), [50]))
     assert stream.plan is not None
     assert stream.plan.tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=0.1)
     assert np.isnan(columns["grf_n"]).sum() == 30

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
-from service.sessions.pipeline import EstimateStream, notes_of
+from service.sessions.pipeline import EstimateStream, make_notes
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
 from tests.service.sessions.pieces import (
     Piece,
@@ -35,7 +35,7 @@ def taken_at(t_ns: int, counts: float) -> Tare:
         baseline_kpa=np.full(2, UNLOADED_KPA + counts * COUNT_KPA),
         baseline_sigma_kpa=np.full(2, 0.001),
         noise_kpa=np.full(2, COUNT_KPA),
-        tadc_counts=np.full(2, 480.0),
+        temperature_raw_counts=np.full(2, 480.0),
         t_ns=10**18 + t_ns,
         begin_s=0.0,
         end_s=0.25,
@@ -46,7 +46,7 @@ def taken_at(t_ns: int, counts: float) -> Tare:
 
 def baselines(batch: FrameBatch, columns: dict[str, np.ndarray]) -> list[int]:
     """Counts above 500 of the baseline with which each frame was estimated."""
-    counts = 500 - batch.padc.astype(np.float64)
+    counts = 500 - batch.pressure_raw.astype(np.float64)
     return [round(c) for c in (counts - columns["gauge_kpa"] / COUNT_KPA)[:, 0].tolist()]
 
 
@@ -82,7 +82,7 @@ def test_a_tare_is_in_force_from_the_frame_after_its_instant_whatever_the_pieces
 def test_tares_that_were_taken_win_over_a_lead_and_need_no_wait() -> None:
     batch = frames(hopping(300, loaded_from=100), lead=100)
     stream = EstimateStream(array(), options(lag_ms=0.0, tares=(taken_at(0, 7.0),)))
-    first, columns = next(stream.run(cut(batch, range(1, 300))))
+    first, columns = next(stream.estimate_batches(cut(batch, range(1, 300))))
     assert len(first) == 1
     assert baselines(first, columns) == [7]
 
@@ -99,10 +99,10 @@ def test_all_tares_are_in_the_notes_and_none_if_none_were_taken() -> None:
     tares = (taken_at(0, 0.0), taken_at(10**8, 5.0))
     stream, _, _ = run([(frames(hopping(99, loaded_from=50)), {})], tares=tares)
     assert stream.plan is not None
-    notes = json.loads(json.dumps(notes_of(stream.plan, stream.rounding, tares), allow_nan=False))
+    notes = json.loads(json.dumps(make_notes(stream.plan, stream.rounding, tares), allow_nan=False))
     assert [kept["t_ns"] for kept in notes["tares"]] == [tare.t_ns for tare in tares]
     assert notes["tare"] == notes["tares"][0]
-    assert "tares" not in notes_of(stream.plan, stream.rounding)
+    assert "tares" not in make_notes(stream.plan, stream.rounding)
 
 
 def later_part(batch: FrameBatch, after_ns: int) -> FrameBatch:
@@ -142,7 +142,7 @@ def test_a_recording_that_goes_on_after_a_restart_has_one_estimate_a_frame(
     same(columns, whole)
     assert stream.plan is not None
     if not tared:
-        counts = 500 - out.padc.astype(np.float64)
+        counts = 500 - out.pressure_raw.astype(np.float64)
         gauge = counts - (stream.plan.tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA
         np.testing.assert_allclose(columns["gauge_kpa"] / COUNT_KPA, gauge, atol=1e-9)
 
@@ -186,13 +186,13 @@ def test_a_stream_that_goes_on_with_what_others_have_kept_gives_the_bits_of_one(
             some.append(pieces.pop(0))
             rows += len(some[-1][0])
         given = rows
-        found += list(stream.run(some, ends=at == 240))
+        found += list(stream.estimate_batches(some, is_final=at == 240))
         if at != 240:
-            kept = through_a_file(stream.kept())
+            kept = through_a_file(stream.state_dict())
             stream = EstimateStream(array(), options(lag_ms=lag_ms, tares=tares))
-            stream.go_on(kept)
+            stream.load_state(kept)
     joined = FrameBatch.concatenate([batch for batch, _ in found])
-    assert joined.is_same(frames_once)
+    assert joined.has_equal_values(frames_once)
     same({name: np.concatenate([c[name] for _, c in found]) for name in found[0][1]}, once)
 
 
@@ -206,4 +206,4 @@ def through_a_file(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def test_what_nobody_has_begun_cannot_be_kept() -> None:
     with pytest.raises(TareError, match="no frames"):
-        EstimateStream(array(), options()).kept()
+        EstimateStream(array(), options()).state_dict()

@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import ArrayInfo
-from service.estimation.tare.tare import Source, Tare
+from service.estimation.tare.tare import Tare, TareSource
 from service.sessions.tares import TareHistory
-from storage.checked_json import write_checked
+from storage.checksummed_json import write_checksummed_json
 from tests.builders.arrays import make_array, make_tile
 from tests.builders.calibrations import make_tare
 
@@ -29,7 +29,7 @@ def array(*serials: str) -> ArrayInfo:
 
 INFO, OTHER = array("T01", "T02"), array("T03", "T04")
 ARRAYS = (INFO, OTHER)
-TAKEN: tuple[tuple[int, ArrayInfo, Source, bool], ...] = (
+TAKEN: tuple[tuple[int, ArrayInfo, TareSource, bool], ...] = (
     (10, INFO, "lead", False),
     (20, OTHER, "unloaded", False),
     (30, INFO, "flight", True),
@@ -45,9 +45,9 @@ def written(folder: Path, count: int = len(TAKEN)) -> Path:
     tares = TareHistory(path)
     for t_ns, info, source, undone in TAKEN[:count]:
         tare = make_tare(2, baseline_kpa=100.0 + t_ns / 7, t_ns=t_ns, source=source)
-        recorded = tares.add(tare, info)
+        recorded = tares.add_tare(tare, info)
         if undone:
-            tares.undo(recorded.id)
+            tares.undo_tare(recorded.id)
     return path
 
 
@@ -59,12 +59,12 @@ def in_use(tares: TareHistory) -> dict[str, str]:
     """What is estimated with: now, and at every instant of sessions of every length."""
     found = {}
     for name, info in zip("IO", ARRAYS, strict=True):
-        found[f"{name} now"] = told(tares.to_use(info))
-        lost = any(tare.is_lost for tare in tares.during(info, 0, END))
+        found[f"{name} now"] = told(tares.tare_for_estimates(info))
+        lost = any(tare.is_lost for tare in tares.tares_between(info, 0, END))
         found[f"{name} empty"] = "lost" if lost else str(tares.is_empty(info))
         for begin in range(0, END, 20):
             for end in range(begin, END, 20):
-                during = tares.during(info, begin + 5, end + 5)
+                during = tares.tares_between(info, begin + 5, end + 5)
                 for t_ns in range(begin, end + 10, 10):
                     until = [tare for tare in during if tare.t_ns < t_ns]
                     used = until[-1] if until else during[0] if during else None
@@ -149,7 +149,7 @@ def test_a_file_that_is_cut_off_anywhere_gives_what_is_whole_and_lost_ones(
     for length in range(0, len(text), 3 if count == 1 else 29):
         found = play(tmp_path / "cut", text[:length], used)
         assert found.problem is not None
-        assert len(found.all) == len(re.findall(rb'"sha256": "[0-9a-f]{64}"\}', text[:length]))
+        assert len(found.tares) == len(re.findall(rb'"sha256": "[0-9a-f]{64}"\}', text[:length]))
 
 
 def test_an_older_file_line_of_the_same_place_is_not_believed(tmp_path: Path) -> None:
@@ -159,8 +159,8 @@ def test_an_older_file_line_of_the_same_place_is_not_believed(tmp_path: Path) ->
     lines[2] = older[2]
     path.write_bytes(b"\n".join(lines))
     found = TareHistory(path)
-    assert found.all == [], "it is not known which of both files it is"
-    assert found.is_lost(INFO)
+    assert found.tares == [], "it is not known which of both files it is"
+    assert found.is_tare_lost(INFO)
 
 
 def test_a_tare_after_the_lost_one_puts_all_right_again_and_so_it_stays(tmp_path: Path) -> None:
@@ -168,25 +168,25 @@ def test_a_tare_after_the_lost_one_puts_all_right_again_and_so_it_stays(tmp_path
     text = path.read_bytes()
     path.write_bytes(text.replace(b'"number": 6', b'"number": 7'))
     found = TareHistory(path)
-    assert found.to_use(OTHER) is not None
-    assert found.is_lost(INFO)
-    assert found.is_lost(OTHER), "it is not known whose it was"
-    assert found.anchor(INFO) is None
+    assert found.tare_for_estimates(OTHER) is not None
+    assert found.is_tare_lost(INFO)
+    assert found.is_tare_lost(OTHER), "it is not known whose it was"
+    assert found.automatic_reference(INFO) is None
     assert not found.is_empty(INFO)
-    mine = found.add(make_tare(2, t_ns=90, source="flight"), INFO)
+    mine = found.add_tare(make_tare(2, t_ns=90, source="flight"), INFO)
     for tares in (found, TareHistory(path)):
         assert tares.problem is None or tares is found
-        in_force = tares.in_force(INFO)
+        in_force = tares.tare_in_force(INFO)
         assert in_force is not None
         assert in_force.id == mine.id
-        assert not tares.is_lost(INFO)
-        assert tares.is_lost(OTHER)
-        assert [(t.t_ns, t.is_lost) for t in tares.during(INFO, 75, 95)] == [
+        assert not tares.is_tare_lost(INFO)
+        assert tares.is_tare_lost(OTHER)
+        assert [(t.t_ns, t.is_lost) for t in tares.tares_between(INFO, 75, 95)] == [
             (75, True),
             (90, False),
         ]
-    found.undo(mine.id)
-    assert found.is_lost(INFO), "none that is older takes its place"
+    found.undo_tare(mine.id)
+    assert found.is_tare_lost(INFO), "none that is older takes its place"
 
 
 def _folder(path: Path) -> None:
@@ -228,7 +228,7 @@ def test_what_is_no_file_is_set_aside_and_all_is_lost(
     whole = in_use(TareHistory(path))
     damage(path)
     found = assert_right_or_lost(path, whole)
-    assert found.all == []
+    assert found.tares == []
     assert os.path.lexists(path.with_name("tares.json.damaged-1"))
 
 
@@ -238,7 +238,7 @@ def test_a_foreign_text_is_set_aside_and_all_is_lost(tmp_path: Path, content: by
     whole = in_use(TareHistory(path))
     path.write_bytes(content)
     found = assert_right_or_lost(path, whole)
-    assert found.all == []
+    assert found.tares == []
     assert found.problem is not None
     assert str(path) in found.problem
 
@@ -248,12 +248,12 @@ def test_if_it_was_set_aside_and_nothing_was_written_all_is_lost_and_not_none(
 ) -> None:
     path = written(tmp_path / "n")
     path.rename(path.with_name("tares.json.damaged-1"))
-    assert TareHistory(path).is_lost(INFO)
+    assert TareHistory(path).is_tare_lost(INFO)
 
 
 def test_tares_of_a_later_version_are_set_aside_and_lost(tmp_path: Path) -> None:
     path = written(tmp_path / "n")
     later = TareHistory(path)
-    write_checked(path, b'{"baselines": []}')
-    assert TareHistory(path).is_lost(INFO)
-    assert later.all
+    write_checksummed_json(path, b'{"baselines": []}')
+    assert TareHistory(path).is_tare_lost(INFO)
+    assert later.tares

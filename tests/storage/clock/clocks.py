@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from hypothesis import strategies as st
 
-from storage.clock.bounds import WANDER, Rows
+from storage.clock.bounds import RATE_TOLERANCE, OffsetRows
 
 Int64 = npt.NDArray[np.int64]
 SECOND = 1_000_000_000
@@ -36,7 +36,7 @@ class Clock:
             offset += np.where(t_mono_ns - BEGIN_NS > after_ns, jump_ns, 0)
         return offset
 
-    def measured(self, t_mono_ns: Int64, seed: int, *, slow_ns: float = 3e6) -> Rows:
+    def measured(self, t_mono_ns: Int64, seed: int, *, slow_ns: float = 3e6) -> OffsetRows:
         """Best of eight probes at each instant: ways back take three times as long as ways there.
 
         The server is read when the probe arrives; the row is about the middle of the round trip.
@@ -51,18 +51,18 @@ class Clock:
         sent, came = t_mono_ns, t_mono_ns + go + back
         middle = (sent + came) // 2
         server = sent + go + self.at(sent + go)
-        return Rows(middle, server - middle, (came - sent + 1) // 2)
+        return OffsetRows(middle, server - middle, (came - sent + 1) // 2)
 
 
 def every(seconds: float, n: int) -> Int64:
     return BEGIN_NS + np.arange(n, dtype=np.int64) * round(seconds * SECOND)
 
 
-def rows_of(*rows: tuple[int, int, int]) -> Rows:
-    return Rows(*np.array(rows, dtype=np.int64).T.copy())
+def rows_of(*rows: tuple[int, int, int]) -> OffsetRows:
+    return OffsetRows(*np.array(rows, dtype=np.int64).T.copy())
 
 
-def anywhere(rows: Rows, seed: int, n: int = 500, beyond_ns: int = 0) -> Int64:
+def anywhere(rows: OffsetRows, seed: int, n: int = 500, beyond_ns: int = 0) -> Int64:
     random = np.random.default_rng(seed + 1)
     begin, end = int(rows.t_mono_ns.min()), int(rows.t_mono_ns.max())
     drawn = random.integers(begin - beyond_ns, end + beyond_ns + 1, n)
@@ -70,7 +70,10 @@ def anywhere(rows: Rows, seed: int, n: int = 500, beyond_ns: int = 0) -> Int64:
 
 
 RATES = st.tuples(
-    st.floats(-80, 80), st.floats(0, WANDER * 1e6), st.integers(2, 40), st.integers(0, 2**32)
+    st.floats(-80, 80),
+    st.floats(0, RATE_TOLERANCE * 1e6),
+    st.integers(2, 40),
+    st.integers(0, 2**32),
 )
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.clock.bounds import CRYSTAL, ClockMap, Rows
+from storage.clock.bounds import CRYSTAL_RATE_LIMIT, ClockOffsets, OffsetRows
 from tests.storage.clock.clocks import BEGIN_NS, HOUR, SECOND, Clock, anywhere, every, rows_of
 
 # --- drift ----------------------------------------------------------------------------------------
@@ -15,13 +15,13 @@ from tests.storage.clock.clocks import BEGIN_NS, HOUR, SECOND, Clock, anywhere, 
 
 @given(drift_ppm=st.floats(-99, 99), n=st.integers(2, 60), seed=st.integers(0, 2**32))
 def test_the_drift_is_within_its_bounds(drift_ppm: float, n: int, seed: int) -> None:
-    (stretch,) = ClockMap(Clock((drift_ppm,)).measured(every(10, n), seed)).stretches
-    slowest, fastest = stretch.mean_rate
+    (stretch,) = ClockOffsets(Clock((drift_ppm,)).measured(every(10, n), seed)).stretches
+    slowest, fastest = stretch.mean_rate_bounds
     assert slowest - 1e-12 <= drift_ppm * 1e-6 <= fastest + 1e-12
 
 
 def test_the_drift_of_ten_hours_is_known_to_a_part_in_ten_million() -> None:
-    (stretch,) = ClockMap(Clock((40.0,)).measured(every(10, 3600), 1)).stretches
+    (stretch,) = ClockOffsets(Clock((40.0,)).measured(every(10, 3600), 1)).stretches
     assert stretch.drift_bounds is not None
     slowest, fastest = stretch.drift_bounds
     assert slowest < 40e-6 < fastest
@@ -29,23 +29,23 @@ def test_the_drift_of_ten_hours_is_known_to_a_part_in_ten_million() -> None:
 
 
 def test_one_row_has_no_drift_and_grows_by_a_crystals() -> None:
-    clock = ClockMap(rows_of((BEGIN_NS, 5, 1000)))
+    clock = ClockOffsets(rows_of((BEGIN_NS, 5, 1000)))
     assert clock.stretches[0].drift_bounds is None
-    offset, bound = clock.at(BEGIN_NS + np.array([-100, 0, 100]) * SECOND)
+    offset, bound = clock.offset_at(BEGIN_NS + np.array([-100, 0, 100]) * SECOND)
     assert offset.tolist() == [5, 5, 5]
     assert bound[1] in (1001, 1002)
-    assert bound[0] == bound[2] == pytest.approx(1001 + 100 * SECOND * CRYSTAL, abs=2)
+    assert bound[0] == bound[2] == pytest.approx(1001 + 100 * SECOND * CRYSTAL_RATE_LIMIT, abs=2)
 
 
 def test_a_rate_that_moves_more_than_is_assumed_widens_the_bound_and_is_no_step() -> None:
     rates = (*(30.0,) * 30, *(-30.0,) * 30)  # the node has gone from the sun into the mud
     clock = Clock(rates)
     rows = clock.measured(every(10, 60), 1, slow_ns=1e4)
-    mapped = ClockMap(rows)
+    mapped = ClockOffsets(rows)
     assert len(mapped.stretches) == 1
-    assert not mapped.stretches[0].steady
+    assert not mapped.stretches[0].is_steady
     t_mono_ns = anywhere(rows, 1)
-    offset, bound = mapped.at(t_mono_ns)
+    offset, bound = mapped.offset_at(t_mono_ns)
     assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
 
 
@@ -53,12 +53,12 @@ def test_a_rate_that_moves_more_than_is_assumed_widens_the_bound_and_is_no_step(
 def test_a_clock_that_is_far_off_but_steady_has_not_stepped(drift_ppm: float) -> None:
     clock = Clock((drift_ppm,))
     rows = clock.measured(every(10, 200), 1)
-    mapped = ClockMap(rows)
+    mapped = ClockOffsets(rows)
     assert len(mapped.stretches) == 1
-    slowest, fastest = mapped.stretches[0].mean_rate
+    slowest, fastest = mapped.stretches[0].mean_rate_bounds
     assert slowest < drift_ppm * 1e-6 < fastest
     t_mono_ns = anywhere(rows, 1)
-    offset, bound = mapped.at(t_mono_ns)
+    offset, bound = mapped.offset_at(t_mono_ns)
     assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
 
 
@@ -69,11 +69,11 @@ def test_a_clock_that_is_far_off_but_steady_has_not_stepped(drift_ppm: float) ->
 def test_a_clock_that_stepped_is_seen_as_two_stretches(jump_ns: int) -> None:
     clock = Clock((20.0,), steps=((305 * SECOND, jump_ns),))
     rows = clock.measured(every(10, 60), 1)
-    mapped = ClockMap(rows)
+    mapped = ClockOffsets(rows)
     one, other = mapped.stretches
     assert (len(one.rows), len(other.rows)) == (31, 29)
-    middle = (one.end_ns + other.begin_ns) // 2
-    offset, bound = mapped.at(np.array([one.end_ns, middle, other.begin_ns]))
+    middle = (one.end_t_mono_ns + other.begin_t_mono_ns) // 2
+    offset, bound = mapped.offset_at(np.array([one.end_t_mono_ns, middle, other.begin_t_mono_ns]))
     assert bound[0] < 10_000_000
     assert bound[2] < 10_000_000
     assert bound[1] > abs(jump_ns) / 2  # it is not known where the step was
@@ -87,27 +87,27 @@ def test_rows_too_vague_to_belong_to_either_side_leave_open_where_the_step_was()
         *((BEGIN_NS + i * 10 * SECOND, 0, 900 * ms) for i in range(5, 8)),
         *((BEGIN_NS + i * 10 * SECOND, 500 * ms, ms) for i in range(8, 12)),
     )
-    mapped = ClockMap(rows)
+    mapped = ClockOffsets(rows)
     one, other = mapped.stretches
     assert (len(one.rows), len(other.rows)) == (5, 4)
-    _, bound = mapped.at(rows.t_mono_ns)
+    _, bound = mapped.offset_at(rows.t_mono_ns)
     assert (bound[5:8] > 250 * ms).all()
     assert (bound[5:8] < 255 * ms).all()
 
 
 def test_a_step_between_the_first_two_rows_is_no_fast_clock() -> None:
     clock = Clock((20.0,), steps=((5 * SECOND, 4_000_000),))
-    mapped = ClockMap(clock.measured(every(10, 60), 1, slow_ns=1e4))
+    mapped = ClockOffsets(clock.measured(every(10, 60), 1, slow_ns=1e4))
     assert [len(stretch.rows) for stretch in mapped.stretches] == [1, 59]
-    _, bound = mapped.at(BEGIN_NS - np.array([100 * SECOND]))
-    assert bound[0] < 100 * SECOND * CRYSTAL + 2_000_000
+    _, bound = mapped.offset_at(BEGIN_NS - np.array([100 * SECOND]))
+    assert bound[0] < 100 * SECOND * CRYSTAL_RATE_LIMIT + 2_000_000
 
 
 def test_a_clock_set_forth_and_back_has_three_stretches() -> None:
     clock = Clock((5.0,), steps=((105 * SECOND, HOUR), (205 * SECOND, -HOUR)))
-    assert len(ClockMap(clock.measured(every(10, 30), 1)).stretches) == 3
+    assert len(ClockOffsets(clock.measured(every(10, 30), 1)).stretches) == 3
 
 
 def test_a_step_at_every_row_is_a_stretch_for_every_row() -> None:
-    rows = Rows(every(10, 2000), np.arange(2000) % 2 * HOUR, np.full(2000, 1000))
-    assert len(ClockMap(rows).stretches) == 2000
+    rows = OffsetRows(every(10, 2000), np.arange(2000) % 2 * HOUR, np.full(2000, 1000))
+    assert len(ClockOffsets(rows).stretches) == 2000

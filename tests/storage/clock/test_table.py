@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.facts import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
-from storage.clock.bounds import Rows
+from devices.types import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
+from storage.clock.bounds import OffsetRows
 from storage.clock.log import ClockOffset
-from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
-from storage.schema import NO_INSTANT
+from storage.clock.table import ClockTable, StreamClockFacts, group_rows_by_stream
+from storage.schema import UNKNOWN_T_NS
 
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
@@ -38,7 +38,7 @@ class NodeClock:
         """What it reads so long after the beginning, by the server's clock."""
         return self.booted_ns + round(since_ns / self.rate)
 
-    def rows(self, boot_id: str, seed: int, *, n: int = 30) -> list[ClockOffset]:
+    def rows(self, stream_id: str, seed: int, *, n: int = 30) -> list[ClockOffset]:
         random = np.random.default_rng(seed)
         rows = []
         for i in range(n):
@@ -49,7 +49,7 @@ class NodeClock:
             read_ns = SERVER_NS + asked_ns + round(go)
             rows.append(
                 ClockOffset(
-                    boot_id=boot_id,
+                    stream_id=stream_id,
                     t_mono_ns=middle,
                     server_minus_node_ns=read_ns - middle - self.utc_offset_ns,
                     uncertainty_ns=(came - sent + 1) // 2,
@@ -57,14 +57,14 @@ class NodeClock:
             )
         return rows
 
-    def table(self, boot_id: str, seed: int, *, clock_set: bool = True) -> ClockTable:
-        facts = StreamFacts(boot_id, self.utc_offset_ns, clock_set)
-        return ClockTable(rows_by_stream(self.rows(boot_id, seed)), [facts], [boot_id])
+    def table(self, stream_id: str, seed: int, *, clock_set: bool = True) -> ClockTable:
+        facts = StreamClockFacts(stream_id, self.utc_offset_ns, clock_set)
+        return ClockTable(group_rows_by_stream(self.rows(stream_id, seed)), [facts], [stream_id])
 
     def server_ns(self, table: ClockTable, since_ns: int) -> tuple[int, int]:
         """Server's time and bound of a frame that was taken then."""
         t_mono_ns = np.array([self.t_mono_ns(since_ns)])
-        columns = table.columns(t_mono_ns, t_mono_ns + self.utc_offset_ns, None)
+        columns = table.compute_server_time(t_mono_ns, t_mono_ns + self.utc_offset_ns, None)
         return int(columns["t_server_ns"][0]), int(columns["t_server_uncertainty_ns"][0])
 
 
@@ -90,8 +90,8 @@ def test_two_nodes_that_saw_the_same_event_agree_on_when_it_was(seed: int, since
 
 def test_a_summary_says_drift_and_offset_of_every_stream() -> None:
     node = NodeClock(booted_ns=300 * SECOND, wrong_ns=HOUR, drift_ppm=40.0)
-    (stream,) = node.table("b", 1).summary().streams
-    assert (stream.boot_id, stream.state, stream.rows, stream.steps) == ("b", "measured", 30, ())
+    (stream,) = node.table("b", 1).summarize().streams
+    assert (stream.stream_id, stream.state, stream.rows, stream.steps) == ("b", "measured", 30, ())
     (stretch,) = stream.stretches
     assert stretch.drift_ppm is not None
     assert stretch.drift_uncertainty_ppm is not None
@@ -109,8 +109,10 @@ def test_the_servers_clock_set_by_an_hour_is_a_step_in_the_summary() -> None:
         row.model_copy(update={"server_minus_node_ns": row.server_minus_node_ns + (i >= 12) * HOUR})
         for i, row in enumerate(node.rows("b", 1))
     ]
-    table = ClockTable(rows_by_stream(rows), [StreamFacts("b", node.utc_offset_ns)], ["b"])
-    (stream,) = table.summary().streams
+    table = ClockTable(
+        group_rows_by_stream(rows), [StreamClockFacts("b", node.utc_offset_ns)], ["b"]
+    )
+    (stream,) = table.summarize().streams
     assert [stretch.rows for stretch in stream.stretches] == [12, 18]
     (step,) = stream.steps
     assert abs(step.jump_ns - HOUR) <= step.jump_uncertainty_ns < 30_000_000
@@ -126,14 +128,17 @@ def test_a_node_that_was_started_anew_an_hour_off_has_two_streams_and_no_step() 
     first = NodeClock(booted_ns=300 * SECOND, wrong_ns=0, drift_ppm=40.0)
     second = NodeClock(booted_ns=20 * SECOND, wrong_ns=HOUR, drift_ppm=40.0)
     table = ClockTable(
-        rows_by_stream([*second.rows("two", 2), *first.rows("one", 1)]),
-        [StreamFacts("one", first.utc_offset_ns), StreamFacts("two", second.utc_offset_ns)],
+        group_rows_by_stream([*second.rows("two", 2), *first.rows("one", 1)]),
+        [
+            StreamClockFacts("one", first.utc_offset_ns),
+            StreamClockFacts("two", second.utc_offset_ns),
+        ],
         ["one", "two"],
     )
-    assert [len(stream.steps) for stream in table.summary().streams] == [0, 0]
+    assert [len(stream.steps) for stream in table.summarize().streams] == [0, 0]
     t_mono_ns = np.array([first.t_mono_ns(SECOND), second.t_mono_ns(SECOND)])
     t_ns = t_mono_ns + np.array([first.utc_offset_ns, second.utc_offset_ns])
-    columns = table.columns(t_mono_ns, t_ns, np.array([0, 1], dtype=np.uint16))
+    columns = table.compute_server_time(t_mono_ns, t_ns, np.array([0, 1], dtype=np.uint16))
     errors = columns["t_server_ns"] - (SERVER_NS + SECOND)
     assert (np.abs(errors) <= columns["t_server_uncertainty_ns"]).all()
     assert t_ns[0] - t_ns[1] == HOUR  # raw stays as it was
@@ -146,52 +151,54 @@ def test_a_node_that_was_started_anew_an_hour_off_has_two_streams_and_no_step() 
 def test_a_stream_that_nobody_measured_gets_no_time(clock_set: bool | None, state: str) -> None:
     node = NodeClock(booted_ns=300 * SECOND, wrong_ns=0, drift_ppm=0.0)
     table = ClockTable(
-        rows_by_stream(node.rows("other", 1)),
-        [StreamFacts("other", node.utc_offset_ns), StreamFacts("mine", 0, clock_set)],
+        group_rows_by_stream(node.rows("other", 1)),
+        [StreamClockFacts("other", node.utc_offset_ns), StreamClockFacts("mine", 0, clock_set)],
         ["other", "mine"],
     )
-    assert [stream.state for stream in table.summary().streams] == ["measured", state]
+    assert [stream.state for stream in table.summarize().streams] == ["measured", state]
     t_mono_ns = np.array([node.t_mono_ns(0)] * 3)
     part = np.array([0, 1, 7], dtype=np.uint16)
-    columns = table.columns(t_mono_ns, t_mono_ns, part)
+    columns = table.compute_server_time(t_mono_ns, t_mono_ns, part)
     for values in columns.values():
-        assert (values == NO_INSTANT).tolist() == [False, True, True]
+        assert (values == UNKNOWN_T_NS).tolist() == [False, True, True]
 
 
 def test_an_unsynchronised_node_that_was_measured_is_measured() -> None:
     node = NodeClock(booted_ns=300 * SECOND, wrong_ns=0, drift_ppm=0.0)
     table = node.table("b", 1, clock_set=False)
-    assert table.summary().streams[0].state == "measured"
+    assert table.summarize().streams[0].state == "measured"
 
 
 def test_instants_that_are_none_get_no_servers_time() -> None:
-    rows = {"b": Rows(np.array([0]), np.array([2**60 - 1]), np.array([0]))}
-    table = ClockTable(rows, [StreamFacts("b")], ["b"])
+    rows = {"b": OffsetRows(np.array([0]), np.array([2**60 - 1]), np.array([0]))}
+    table = ClockTable(rows, [StreamClockFacts("b")], ["b"])
     end = T_NS_END
     ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
-    columns = table.columns(np.zeros(6, dtype=np.int64), ends, None)
-    assert (columns["t_server_ns"] == NO_INSTANT).tolist() == [True] * 4 + [False] * 2
+    columns = table.compute_server_time(np.zeros(6, dtype=np.int64), ends, None)
+    assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True] * 4 + [False] * 2
     assert columns["t_server_ns"][-1] == 2**60 - 1
     end = T_MONO_NS_END
     ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
-    columns = table.columns(ends, np.zeros(6, dtype=np.int64), None)
-    assert (columns["t_server_ns"] == NO_INSTANT).tolist() == [True] * 4 + [False] * 2
+    columns = table.compute_server_time(ends, np.zeros(6, dtype=np.int64), None)
+    assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True] * 4 + [False] * 2
 
 
 def test_a_sum_that_is_no_instant_is_none() -> None:
     begin_ns = 2**62 - 3 * 10**9
-    rows = Rows(np.array([0, 10**14]), begin_ns + np.array([0, 2 * 10**9]), np.array([0, 0]))
-    table = ClockTable({"b": rows}, [StreamFacts("b")], ["b"])
+    rows = OffsetRows(np.array([0, 10**14]), begin_ns + np.array([0, 2 * 10**9]), np.array([0, 0]))
+    table = ClockTable({"b": rows}, [StreamClockFacts("b")], ["b"])
     t_ns = np.array([2**62 - 1, 0])
-    columns = table.columns(np.array([2**59, 2**59]), t_ns, None)
-    assert (columns["t_server_ns"] == NO_INSTANT).tolist() == [True, False]
-    assert (columns["t_server_uncertainty_ns"] == NO_INSTANT).tolist() == [True, False]
+    columns = table.compute_server_time(np.array([2**59, 2**59]), t_ns, None)
+    assert (columns["t_server_ns"] == UNKNOWN_T_NS).tolist() == [True, False]
+    assert (columns["t_server_uncertainty_ns"] == UNKNOWN_T_NS).tolist() == [True, False]
 
 
 def test_frames_without_parts_are_of_the_first() -> None:
-    rows = {name: Rows(np.array([0]), np.array([i]), np.array([0])) for i, name in enumerate("ab")}
-    table = ClockTable(rows, [StreamFacts("a"), StreamFacts("b")], ["a", "b"])
-    columns = table.columns(np.array([0]), np.array([7]), None)
+    rows = {
+        name: OffsetRows(np.array([0]), np.array([i]), np.array([0])) for i, name in enumerate("ab")
+    }
+    table = ClockTable(rows, [StreamClockFacts("a"), StreamClockFacts("b")], ["a", "b"])
+    columns = table.compute_server_time(np.array([0]), np.array([7]), None)
     assert columns["t_server_ns"].tolist() == [7]
 
 
@@ -212,10 +219,10 @@ def test_a_row_that_cannot_be_is_refused_by_name(
     t_mono_ns: int, offset_ns: int, uncertainty_ns: int, named: str
 ) -> None:
     row = ClockOffset(
-        boot_id="b",
+        stream_id="b",
         t_mono_ns=t_mono_ns,
         server_minus_node_ns=offset_ns,
         uncertainty_ns=uncertainty_ns,
     )
     with pytest.raises(FileFormatError, match=named):
-        ClockTable(rows_by_stream([row]), [StreamFacts("b")], ["b"])
+        ClockTable(group_rows_by_stream([row]), [StreamClockFacts("b")], ["b"])

@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
-from storage.formats.export import Content, Export, content_of
-from storage.formats.marks import Marks
+from storage.formats.export import Export, FrameSource, make_frame_source
+from storage.formats.markers import PlacedMarkers
 from storage.formats.options import FormatOptions
 from storage.formats.slice import Slice
-from storage.formats.written.registry import format_named
+from storage.formats.writers.registry import get_format
 from storage.schema import CONTACT_UNKNOWN, Array
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
@@ -30,21 +30,21 @@ Piece = tuple[FrameBatch, dict[str, Array]]
 def frames(rows: int = ROWS, tiles: int = 2) -> FrameBatch:
     """Frames of which some values are not known."""
     rng = np.random.default_rng(5)
-    padc = rng.integers(250, 420, (rows, tiles))
-    padc[rng.random((rows, tiles)) < 0.2] = NOT_READ
+    pressure_raw = rng.integers(250, 420, (rows, tiles))
+    pressure_raw[rng.random((rows, tiles)) < 0.2] = NOT_READ
     servo_counts = rng.integers(-5000, 5000, rows)
     servo_counts[::7] = NO_SERVO_COUNTS
     return make_frames(
         np.arange(rows) + 2**60,
         tiles,
         t_mono_ns=123 + PERIOD_NS * np.arange(rows),
-        padc=padc,
-        tadc=rng.integers(470, 490, (rows, tiles)),
+        pressure_raw=pressure_raw,
+        temperature_raw=rng.integers(470, 490, (rows, tiles)),
         sample_offset_us=rng.integers(-100, 3000, (rows, tiles)),
         servo_counts=servo_counts,
         servo_age_us=np.where(servo_counts == NO_SERVO_COUNTS, NO_SERVO_AGE, 5),
-        status=rng.integers(0, 64, (rows, tiles)),
-        frame_status=rng.integers(0, 32, rows),
+        tile_flags=rng.integers(0, 64, (rows, tiles)),
+        frame_flags=rng.integers(0, 32, rows),
     )
 
 
@@ -59,7 +59,7 @@ def extra(rows: int = ROWS, tiles: int = 2) -> dict[str, Array]:
         "force_n": force_n,
         "grf_n": force_n.sum(axis=1),
         "contact": contact,
-        "estimate_status": rng.integers(0, 512, rows).astype(np.uint16),
+        "estimate_flags": rng.integers(0, 512, rows).astype(np.uint16),
         "phase": np.array(["rest, or 'not'" if i % 3 else 'a "tap"' for i in range(rows)]),
     }
 
@@ -67,7 +67,7 @@ def extra(rows: int = ROWS, tiles: int = 2) -> dict[str, Array]:
 def cut(batch: FrameBatch, columns: Mapping[str, Array], every: int) -> Iterator[Piece]:
     for a in range(0, len(batch), every):
         yield (
-            batch.rows(a, a + every),
+            batch.slice_rows(a, a + every),
             {name: values[a : a + every] for name, values in columns.items()},
         )
 
@@ -79,24 +79,24 @@ NO_TIMES = FormatOptions(times=False)
 
 
 def export(
-    content: Content,
+    content: FrameSource,
     info: ArrayInfo,
     notes: Mapping[str, object],
     to: str,
     part: Slice,
     clock: ClockTable | None = None,
-    marks: Marks | None = None,
+    markers: PlacedMarkers | None = None,
     source: Mapping[str, object] | None = None,
     options: FormatOptions = NO_TIMES,
 ) -> Iterator[bytes]:
-    wanted = Export(content, info, notes, part, clock, marks, source or {}, options)
-    return format_named(to).written(wanted)
+    wanted = Export(content, info, notes, part, clock, markers, source or {}, options)
+    return get_format(to).encode(wanted)
 
 
 def exported(
     to: str, part: Slice | None = None, *, every: int = 20, options: FormatOptions = NO_TIMES
 ) -> bytes:
-    content = content_of(cut(frames(), extra(), every))
+    content = make_frame_source(cut(frames(), extra(), every))
     chunks = export(content, make_array(), NOTES, to, part or Slice(), options=options)
     return b"".join(chunks)
 

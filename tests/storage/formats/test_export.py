@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from devices.errors import UsageError
 from devices.frames import NO_SERVO_COUNTS, NOT_READ, ArrayInfo
-from storage.clock.bounds import Rows
-from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import content_of
+from storage.clock.bounds import OffsetRows
+from storage.clock.table import ClockTable, StreamClockFacts
+from storage.formats.export import make_frame_source
 from storage.formats.slice import Slice
-from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, FRAMES
+from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, MEASURED_COLUMNS
 from storage.sessions.footer import NOTES_KEY
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.storage.formats.exports import (
@@ -45,7 +45,7 @@ from tests.storage.formats.exports import (
     start=st.one_of(st.none(), st.integers(0, ROWS - 1)),
     length=st.one_of(st.none(), st.integers(1, 60)),
     columns=st.lists(
-        st.sampled_from(["seq", "t_ns", "padc_1", "force_n", "grf_n", "contact", "phase"]),
+        st.sampled_from(["seq", "t_ns", "pressure_raw_1", "force_n", "grf_n", "contact", "phase"]),
         unique=True,
     ),
 )
@@ -72,11 +72,13 @@ def test_every_format_says_the_same_of_a_slice(
 @pytest.mark.parametrize("to", TABLES)
 def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: str) -> None:
     def with_a_gap() -> Iterator[Piece]:
-        yield frames().rows(0, 10), {}
-        yield frames().rows(40, ROWS), {}
+        yield frames().slice_rows(0, 10), {}
+        yield frames().slice_rows(40, ROWS), {}
 
     part = Slice(20 * PERIOD_NS * 1e-9, 30 * PERIOD_NS * 1e-9, ("seq",))
-    found = read(b"".join(export(content_of(with_a_gap()), make_array(), NOTES, to, part)), to)
+    found = read(
+        b"".join(export(make_frame_source(with_a_gap()), make_array(), NOTES, to, part)), to
+    )
     assert found.column_names == ["seq"]
     assert found.num_rows == 0
 
@@ -84,7 +86,11 @@ def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: str) -> None:
 @pytest.mark.parametrize("to", TABLES)
 def test_a_slice_that_begins_after_the_end_is_refused_before_the_first_chunk(to: str) -> None:
     chunks = export(
-        content_of(cut(frames(), extra(), 20)), make_array(), NOTES, to, Slice(ROWS * 2e-3 + 1)
+        make_frame_source(cut(frames(), extra(), 20)),
+        make_array(),
+        NOTES,
+        to,
+        Slice(ROWS * 2e-3 + 1),
     )
     with pytest.raises(UsageError, match=r"starts at 1\.1 s, and the session ends at 0\.098 s"):
         next(chunks)
@@ -108,8 +114,8 @@ def test_a_slice_that_can_hold_nothing_is_refused(
 def test_values_are_those_of_the_session_and_what_is_not_known_is_null() -> None:
     batch, columns = frames(), extra()
     table = read(exported("arrow"), "arrow")
-    padc = [None if v == NOT_READ else v for v in batch.padc[:, 1].tolist()]
-    assert table.column("padc_1").to_pylist() == padc
+    pressure_raw = [None if v == NOT_READ else v for v in batch.pressure_raw[:, 1].tolist()]
+    assert table.column("pressure_raw_1").to_pylist() == pressure_raw
     servo = [None if v == NO_SERVO_COUNTS else v for v in batch.servo_counts.tolist()]
     assert table.column("servo_counts").to_pylist() == servo
     contact = [None if v == CONTACT_UNKNOWN else v for v in columns["contact"].tolist()]
@@ -122,8 +128,8 @@ def test_values_are_those_of_the_session_and_what_is_not_known_is_null() -> None
 
 
 def test_all_columns_come_in_the_order_of_a_sealed_file() -> None:
-    flat = [f for column in FRAMES for f in column.flat_names(2)]
-    further = ["part", "force_n_0", "force_n_1", "grf_n", "contact", "estimate_status", "phase"]
+    flat = [f for column in MEASURED_COLUMNS for f in column.flat_names(2)]
+    further = ["part", "force_n_0", "force_n_1", "grf_n", "contact", "estimate_flags", "phase"]
     for to in TABLES:
         assert names(Slice(), to) == flat + further
 
@@ -154,17 +160,21 @@ def test_csv_is_lines_with_a_header() -> None:
 def clock() -> ClockTable:
     """The server's clock was set by an hour between the rows at 20 and at 60 ms."""
     hour_ns = 3_600_000_000_000
-    rows = Rows(
+    rows = OffsetRows(
         np.array([0, 20_000_000, 60_000_000]), np.array([5, 5, 5 + hour_ns]), np.array([100] * 3)
     )
-    return ClockTable({"0" * 32: rows}, [StreamFacts("0" * 32, 10**18, True)], ["0" * 32, "other"])
+    return ClockTable(
+        {"0" * 32: rows}, [StreamClockFacts("0" * 32, 10**18, True)], ["0" * 32, "other"]
+    )
 
 
 def on_servers_axis(to: str, part: Slice | None = None, *, every: int = 20) -> bytes:
     columns = extra()
     columns["part"][30:] = 1
     pieces = cut(frames(), columns, every)
-    return b"".join(export(content_of(pieces), make_array(), NOTES, to, part or Slice(), clock()))
+    return b"".join(
+        export(make_frame_source(pieces), make_array(), NOTES, to, part or Slice(), clock())
+    )
 
 
 @pytest.mark.parametrize("to", TABLES)
@@ -227,7 +237,7 @@ def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: st
             later = (asked - 1) * rows * PERIOD_NS
             yield replace(piece, t_ns=piece.t_ns + later), {}
 
-    chunks = export(content_of(endless()), make_array(), {}, to, Slice())
+    chunks = export(make_frame_source(endless()), make_array(), {}, to, Slice())
     sizes = []
     for number in range(1, 31):
         sizes.append(len(next(chunks)))
@@ -239,7 +249,7 @@ def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: st
 @pytest.mark.parametrize("to", TABLES)
 def test_frames_outside_of_a_slice_make_no_chunks(to: str) -> None:
     part = Slice(0.09, None, ("seq",))
-    chunks = list(export(content_of(cut(frames(), extra(), 1)), make_array(), {}, to, part))
+    chunks = list(export(make_frame_source(cut(frames(), extra(), 1)), make_array(), {}, to, part))
     assert len(chunks) <= 1 + 5 + 1
     assert read(b"".join(chunks), to).num_rows == 5
 
@@ -247,7 +257,7 @@ def test_frames_outside_of_a_slice_make_no_chunks(to: str) -> None:
 @pytest.mark.parametrize("to", TABLES)
 def test_a_session_without_frames_is_refused(to: str) -> None:
     with pytest.raises(UsageError, match="no frames"):
-        next(export(content_of([]), make_array(), {}, to, Slice()))
+        next(export(make_frame_source([]), make_array(), {}, to, Slice()))
 
 
 @pytest.mark.parametrize("to", TABLES)
@@ -256,7 +266,7 @@ def test_an_error_on_the_way_is_not_the_end_of_a_file(to: str) -> None:
         yield frames(), {}
         raise OSError("the disk is gone")
 
-    chunks = export(content_of(broken()), make_array(), {}, to, Slice())
+    chunks = export(make_frame_source(broken()), make_array(), {}, to, Slice())
     next(chunks)
     with pytest.raises(OSError, match="the disk is gone"):
         list(chunks)

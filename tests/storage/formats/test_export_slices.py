@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from storage.formats.export import content_of
+from storage.formats.export import make_frame_source
 from storage.formats.slice import Slice
-from storage.schema import FRAMES
+from storage.schema import MEASURED_COLUMNS
 from tests.builders.arrays import make_array
 from tests.storage.formats.exports import (
     ROWS,
@@ -61,9 +61,9 @@ def test_seconds_count_from_the_first_frame_whatever_the_pieces_are() -> None:
 
 
 def test_only_a_slice_of_everything_is_all() -> None:
-    assert Slice().is_all
-    assert not Slice(start_s=0.0).is_all
-    assert not Slice(columns=("seq",)).is_all
+    assert Slice().is_whole_session
+    assert not Slice(start_s=0.0).is_whole_session
+    assert not Slice(columns=("seq",)).is_whole_session
 
 
 # --- columns --------------------------------------------------------------------------------------
@@ -80,7 +80,7 @@ def test_only_a_slice_of_everything_is_all() -> None:
         (("force_n_1", "seq", "force_n_0"), "force_n_1 seq force_n_0"),
         (("force_n_1", "grf_n", "force_n"), "force_n_1 grf_n force_n_0"),
         (("grf_n", "grf_n", "seq", "grf_n"), "grf_n seq"),
-        (("phase", "padc", "phase"), "phase padc_0 padc_1"),
+        (("phase", "pressure_raw", "phase"), "phase pressure_raw_0 pressure_raw_1"),
     ],
 )
 def test_columns_are_asked_for_by_tile_or_for_all_tiles_and_keep_their_order(
@@ -97,7 +97,7 @@ def test_a_column_that_is_not_there_is_refused_before_the_first_chunk(
     to: str, unknown: str
 ) -> None:
     chunks = export(
-        content_of(cut(frames(), extra(), 20)),
+        make_frame_source(cut(frames(), extra(), 20)),
         make_array(),
         {},
         to,
@@ -110,6 +110,8 @@ def test_a_column_that_is_not_there_is_refused_before_the_first_chunk(
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.lists(st.sampled_from([f for c in FRAMES for f in c.flat_names(2)]), min_size=1))
+@given(
+    st.lists(st.sampled_from([f for c in MEASURED_COLUMNS for f in c.flat_names(2)]), min_size=1)
+)
 def test_any_choice_of_columns_is_that_choice_without_repetitions(asked: Sequence[str]) -> None:
     assert names(Slice(columns=tuple(asked))) == list(dict.fromkeys(asked))

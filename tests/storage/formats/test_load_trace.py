@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
 from storage.formats.load_trace import read_load_trace
-from storage.formats.reference import Stated
+from storage.formats.reference import ReferenceOptions
 from tests.builders.c3d import c3d_bytes, force_plate
 
 Read = Callable[[str | bytes], LoadTrace]
@@ -407,8 +407,8 @@ def test_a_plate_of_several_is_named_and_its_unit_stated(tmp_path: Path) -> None
         read_load_trace(path)
     columns = {"grf_n": "plate2_fz", "cop_x_m": "plate2_cop_x", "cop_y_m": "-plate2_cop_y"}
     with pytest.raises(LoadTraceError, match=r"not stated.*--units grf="):
-        read_load_trace(path, Stated(columns))
-    trace = read_load_trace(path, Stated(columns, {"grf": "N", "cop": "mm"}))
+        read_load_trace(path, ReferenceOptions(columns))
+    trace = read_load_trace(path, ReferenceOptions(columns, {"grf": "N", "cop": "mm"}))
     assert trace.fz_n is not None
     assert trace.cop_m is not None
     np.testing.assert_allclose(trace.fz_n, load_n, atol=1e-4)
@@ -419,7 +419,7 @@ def test_names_units_and_sign_of_a_table_are_stated(tmp_path: Path) -> None:
     path = tmp_path / "trace.csv"
     path.write_text("Time,Fz,Px,Py\n0,0,,\n10,-0.2,4,-5\n20,-0.3,5,-6\n")
     columns = {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "Px", "cop_y_m": "Py"}
-    stated = Stated(columns, {"time": "ms", "grf": "kN", "cop": "mm"}, "-")
+    stated = ReferenceOptions(columns, {"time": "ms", "grf": "kN", "cop": "mm"}, "-")
     trace = read_load_trace(path, stated)
     np.testing.assert_allclose(trace.time_s, [0.0, 0.01, 0.02])
     assert trace.fz_n is not None

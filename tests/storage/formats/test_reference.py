@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, FootTileError, UsageError
-from storage.formats.reference import ReferenceData, Stated, read_reference
-from storage.formats.tables.times import spread_even
+from storage.formats.readers.sample_times import respace_repeated_times
+from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
 
-LAB = Stated(
+LAB = ReferenceOptions(
     {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "COPx", "cop_y_m": "COPy"},
     {"grf": "N", "cop": "mm"},
     "+",
@@ -23,7 +23,9 @@ LAB = Stated(
 GOOD = "Time,Fz,COPx,COPy\n0.00,0,,\n0.01,10.5,10,-20\n0.02,20,20,-30\n0.03,0,,\n"
 
 
-def read(tmp_path: Path, text: str, stated: Stated = LAB, name: str = "plate.csv") -> ReferenceData:
+def read(
+    tmp_path: Path, text: str, stated: ReferenceOptions = LAB, name: str = "plate.csv"
+) -> ReferenceData:
     path = tmp_path / name
     path.write_text(text, "utf-8")
     return read_reference(path, stated)
@@ -40,13 +42,13 @@ def test_columns_are_mapped_and_units_converted_and_an_empty_cop_is_unknown(tmp_
 
 
 def test_our_own_names_say_unit_and_sign(tmp_path: Path) -> None:
-    found = read(tmp_path, "time_s,grf_n\n0,1\n1,5\n", Stated())
+    found = read(tmp_path, "time_s,grf_n\n0,1\n1,5\n", ReferenceOptions())
     assert found.grf_n.tolist() == [1.0, 5.0]
     assert found.cop_m is None
 
 
 def test_a_negative_sign_and_a_turned_coordinate_are_turned(tmp_path: Path) -> None:
-    stated = Stated({**LAB.columns, "cop_y_m": "-COPy"}, {"grf": "kN", "cop": "cm"}, "-")
+    stated = ReferenceOptions({**LAB.columns, "cop_y_m": "-COPy"}, {"grf": "kN", "cop": "cm"}, "-")
     found = read(tmp_path, GOOD.replace("10.5", "-10.5").replace("20,20", "-20,20"), stated)
     assert found.grf_n.tolist() == [0.0, 10_500.0, 20_000.0, 0.0]
     assert found.cop_m is not None
@@ -78,7 +80,7 @@ time\tground_force_vy\tground_force_px\tground_force_pz
 0.1\t20.0\t0.1\t0.03
 0.2\t10.0\t0.2\t0.02
 """
-MAPPED = Stated(
+MAPPED = ReferenceOptions(
     {
         "grf_n": "ground_force_vy",
         "cop_x_m": "ground_force_px",
@@ -101,7 +103,7 @@ def test_ground_reactions_of_opensim_are_read_with_their_own_units(
 def test_samples_without_a_force_and_gaps_are_left_out_and_said(tmp_path: Path) -> None:
     rows = [f"{0.01 * i:.2f},{i % 7}" for i in range(20) if not 8 <= i < 12]
     rows[3] = "0.03,"
-    found = read(tmp_path, "Time,Fz\n" + "\n".join(rows) + "\n", Stated(
+    found = read(tmp_path, "Time,Fz\n" + "\n".join(rows) + "\n", ReferenceOptions(
         {"time_s": "Time", "grf_n": "Fz"}, {"grf": "N"}, "+"))  # fmt: skip
     assert len(found.time_s) == 15
     assert "1 of 16 samples have no force" in found.notes[0]
@@ -140,13 +142,13 @@ def test_what_is_no_measurement_is_refused_by_name(tmp_path: Path, text: str, sa
 @pytest.mark.parametrize(
     ("stated", "says"),
     [
-        (Stated(LAB.columns, {"cop": "mm"}, "+"), "--units grf=N|kN|mN"),
-        (Stated(LAB.columns, {"grf": "N"}, "+"), "--units cop=m|cm|mm"),
-        (Stated(LAB.columns, LAB.units), "--sign +"),
+        (ReferenceOptions(LAB.columns, {"cop": "mm"}, "+"), "--units grf=N|kN|mN"),
+        (ReferenceOptions(LAB.columns, {"grf": "N"}, "+"), "--units cop=m|cm|mm"),
+        (ReferenceOptions(LAB.columns, LAB.units), "--sign +"),
     ],
 )
 def test_units_and_sign_that_are_not_stated_are_not_guessed(
-    tmp_path: Path, stated: Stated, says: str
+    tmp_path: Path, stated: ReferenceOptions, says: str
 ) -> None:
     with pytest.raises(UsageError) as caught:
         read(tmp_path, GOOD, stated)
@@ -166,7 +168,7 @@ def test_what_cannot_be_stated_is_refused(
     columns: dict[str, str], units: dict[str, str], sign: str | None, says: str
 ) -> None:
     with pytest.raises(UsageError, match=says):
-        Stated(columns, units, sign)
+        ReferenceOptions(columns, units, sign)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +206,7 @@ def test_rounded_times_are_spread_evenly_within_their_rounding(
 ) -> None:
     true_s = begin_s + np.arange(count) / hz
     rounded_s = np.round(true_s / quantum_s) * quantum_s
-    found_s, note = spread_even(rounded_s)
+    found_s, note = respace_repeated_times(rounded_s)
     np.testing.assert_allclose(found_s, true_s, atol=quantum_s)
     assert bool(note) == bool((np.diff(rounded_s) == 0.0).any())
     if note:
@@ -214,7 +216,7 @@ def test_rounded_times_are_spread_evenly_within_their_rounding(
 def test_times_that_pause_or_fall_are_not_spread() -> None:
     time_s = np.repeat(np.arange(20.0), 2)
     for other_s in (np.where(time_s > 10.0, time_s + 5.0, time_s), time_s[::-1]):
-        found_s, note = spread_even(other_s)
+        found_s, note = respace_repeated_times(other_s)
         assert found_s is other_s
         assert note == ""
 
@@ -229,27 +231,27 @@ def test_times_that_pause_or_fall_are_not_spread() -> None:
 def test_samples_are_numbered_at_a_stated_rate(
     tmp_path: Path, text: str, columns: dict[str, str]
 ) -> None:
-    found = read(tmp_path, text, Stated(columns, {"grf": "N"}, "+", rate_hz=100.0))
+    found = read(tmp_path, text, ReferenceOptions(columns, {"grf": "N"}, "+", rate_hz=100.0))
     expected = [0.1, 0.11, 0.13] if "time_s" in columns else [0.0, 0.01, 0.02]
     np.testing.assert_allclose(found.time_s, expected)
 
 
 def test_a_rate_beside_times_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--rate-hz needs sample numbers"):
-        read(tmp_path, GOOD, Stated(LAB.columns, LAB.units, "+", rate_hz=100.0))
+        read(tmp_path, GOOD, ReferenceOptions(LAB.columns, LAB.units, "+", rate_hz=100.0))
 
 
 def test_a_centre_of_pressure_of_one_axis_is_read(tmp_path: Path) -> None:
-    found = read(tmp_path, "time_s,grf_n,cop_y_m\n0,0,\n1,5,0.1\n", Stated())
+    found = read(tmp_path, "time_s,grf_n,cop_y_m\n0,0,\n1,5,0.1\n", ReferenceOptions())
     np.testing.assert_array_equal(found.cop_m, [[np.nan, np.nan], [np.nan, 0.1]])
     assert "along y only" in found.notes[0]
 
 
 def test_plates_are_added_up(tmp_path: Path) -> None:
     text = "time_s,a (N),b (N),c (kN)\n0,1,2,0\n1,5,7,1\n"
-    found = read(tmp_path, text, Stated({"grf_n": "a (N) + b (N)"}, {}, "+"))
+    found = read(tmp_path, text, ReferenceOptions({"grf_n": "a (N) + b (N)"}, {}, "+"))
     assert found.grf_n.tolist() == [3.0, 12.0]
     with pytest.raises(UsageError, match="have different units"):
-        read(tmp_path, text, Stated({"grf_n": "a (N)+c (kN)"}, {}, "+"))
+        read(tmp_path, text, ReferenceOptions({"grf_n": "a (N)+c (kN)"}, {}, "+"))
     with pytest.raises(FileFormatError, match="no column 'd'"):
-        read(tmp_path, text, Stated({"grf_n": "a (N)+d"}, {}, "+"))
+        read(tmp_path, text, ReferenceOptions({"grf_n": "a (N)+d"}, {}, "+"))

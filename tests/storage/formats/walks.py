@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from devices.frames import ArrayInfo
-from storage.clock.bounds import Rows
-from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import Content, Export, content_of
+from storage.clock.bounds import OffsetRows
+from storage.clock.table import ClockTable, StreamClockFacts
+from storage.formats.export import Export, FrameSource, make_frame_source
 from storage.formats.slice import Slice
 from storage.schema import CONTACT_UNKNOWN, Array
 from tests.builders.arrays import UTC_NS, make_array, make_tile
@@ -43,22 +43,22 @@ def walk() -> dict[str, Array]:
     columns = {
         "grf_n": np.where(n % 2, 0.05, -0.05),
         "grf_sigma_n": np.full(ROWS, 0.25),
-        "grf_at_least_n": np.zeros(ROWS),
+        "grf_lower_bound_n": np.zeros(ROWS),
         "cop_x_m": np.full(ROWS, np.nan),
         "cop_y_m": np.full(ROWS, np.nan),
         "contact": np.zeros(ROWS, dtype=np.uint8),
-        "estimate_status": np.full(ROWS, 16, dtype=np.uint16),
+        "estimate_flags": np.full(ROWS, 16, dtype=np.uint16),
         "part": np.zeros(ROWS, dtype=np.uint16),
     }
     for number, (begin, end) in enumerate(STANCES):
         phase = (np.arange(begin, end) - begin + 1) / (end - begin + 1)
         columns["contact"][begin:end] = 1
         columns["grf_n"][begin:end] = PEAK_N * np.sin(np.pi * phase)
-        columns["grf_at_least_n"][begin:end] = columns["grf_n"][begin:end] - 0.6
+        columns["grf_lower_bound_n"][begin:end] = columns["grf_n"][begin:end] - 0.6
         rows = slice(begin + 1, end - 1)
         columns["cop_x_m"][rows] = -0.01 + 0.04 * phase[1:-1] if number == 0 else 0.02
         columns["cop_y_m"][rows] = 0.004
-        columns["estimate_status"][rows] = 0
+        columns["estimate_flags"][rows] = 0
     force_n = np.repeat(0.25 * columns["grf_n"][:, None], len(ARRAY.tiles), axis=1)
     force_n[:, -1] = np.nan
     return {**columns, "force_n": force_n}
@@ -80,7 +80,7 @@ def saturated(columns: dict[str, Array], rows: slice) -> dict[str, Array]:
     changed = {name: values.copy() for name, values in columns.items()}
     for name in ("grf_n", "cop_x_m", "cop_y_m"):
         changed[name][rows] = np.nan
-    changed["estimate_status"][rows] |= 1 | 16
+    changed["estimate_flags"][rows] |= 1 | 16
     return changed
 
 
@@ -124,17 +124,17 @@ def export_of_walk(
     given = {name: np.asarray(values)[kept] for name, values in (times or {}).items()}
     frames = with_columns(make_frames(kept, len(info.tiles)), **given)
 
-    def content() -> Content:
-        return content_of(
+    def content() -> FrameSource:
+        return make_frame_source(
             (
-                frames.rows(a, a + every),
+                frames.slice_rows(a, a + every),
                 {name: v[kept][a : a + every] for name, v in columns.items()},
             )
             for a in range(0, len(kept), every)
         )
 
     # As often as a format likes, as a sealed file gives them.
-    again = replace(content(), read=lambda names: content().read(names))
+    again = replace(content(), read_columns=lambda names: content().read_columns(names))
     made = Export(again, info, notes or {}, facts.pop("part", Slice()))
     return replace(made, **facts)
 
@@ -145,9 +145,9 @@ BOUND_NS = 400_000
 
 def compared(later_ns: int) -> ClockTable:
     """A clock that is behind the server's by so much."""
-    boot_id = ARRAY.boot_id
-    rows = Rows(*np.array([[0], [later_ns], [BOUND_NS]], dtype=np.int64))
-    return ClockTable({boot_id: rows}, [StreamFacts(boot_id, UTC_NS, True)], [boot_id])
+    stream_id = ARRAY.stream_id
+    rows = OffsetRows(*np.array([[0], [later_ns], [BOUND_NS]], dtype=np.int64))
+    return ClockTable({stream_id: rows}, [StreamClockFacts(stream_id, UTC_NS, True)], [stream_id])
 
 
 def two_feet(*nodes: str, **facts: Any) -> list[Export]:

@@ -10,7 +10,7 @@ import numpy as np
 from devices.frames import FrameBatch
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.open_segments import SEGMENT_NS
+from storage.journal.open_segments import SEGMENT_DURATION_NS
 from storage.schema import wire_schema
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import any_frames, assert_same_bits
@@ -32,7 +32,7 @@ SCHEMA = wire_schema(make_array())
 
 def part(first: int, last: int) -> FrameBatch:
     """Frames `first` to `last`, both included, of the one stream that all tests take them from."""
-    return ALL.rows(first, last + 1)
+    return ALL.slice_rows(first, last + 1)
 
 
 def members(intervals: Intervals) -> set[int]:
@@ -43,9 +43,9 @@ def assert_holds(
     journal: Journal, numbers: set[int], first: int = 0, last: int = TOP, of: FrameBatch = ALL
 ) -> None:
     """Reading from `first` to `last` gives these frames of the stream, in order, each once."""
-    assert members(journal.held) == numbers
+    assert members(journal.stored) == numbers
     expected = sorted(n for n in numbers if first <= n <= last)
-    batches = list(journal.read(first, last))
+    batches = list(journal.read_frames(first, last))
     assert all(len(batch) for batch in batches)
     read = [int(n) for batch in batches for n in batch.seq]
     assert read == expected
@@ -73,7 +73,7 @@ def reopened(folder: Path) -> Journal:
 def filled(folder: Path, *parts: tuple[int, int]) -> Journal:
     journal = begun(folder)
     for first, last in parts:
-        journal.append(part(first, last))
+        journal.append_new_frames(part(first, last))
     return journal
 
 
@@ -81,6 +81,6 @@ def segments(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.arrows"))
 
 
-LONG = stream(200, period_ns=SEGMENT_NS // 20)
+LONG = stream(200, period_ns=SEGMENT_DURATION_NS // 20)
 """Ten minutes of frames, twenty a segment."""
 HEADER = len(SCHEMA.serialize().to_pybytes())

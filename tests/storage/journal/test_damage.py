@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.segment_format import RECORD
+from storage.journal.segment_format import RECORD_DTYPE
 from storage.schema import wire_schema
 from storage.verify.segment import verify_segment
-from storage.wire import encode
+from storage.wire import encode_frames
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
 from tests.storage.journal.journals import (
@@ -51,7 +51,7 @@ def test_a_cut_anywhere_keeps_every_whole_message_before_it(
     header = len(SCHEMA.serialize().to_pybytes())
     edges, held = [header], [0, 10, 11, 13]
     for first, last in ((0, 9), (10, 10), (11, 12)):
-        edges.append(edges[-1] + len(encode(part(first, last), SCHEMA)))
+        edges.append(edges[-1] + len(encode_frames(part(first, last), SCHEMA)))
     assert edges[-1] == len(content)
     # At every byte near an edge, at fewer within later messages, and fewer still of the header.
     near = {cut for edge in edges[1:] for cut in range(edge - 40, edge + 41)}
@@ -63,10 +63,10 @@ def test_a_cut_anywhere_keeps_every_whole_message_before_it(
         (folder / path.name).write_bytes(content[:cut])
         journal = begun(folder)
         kept = set(range(held[sum(cut >= edge for edge in edges[1:])]))
-        assert members(journal.held) == kept, cut
+        assert members(journal.stored) == kept, cut
         if cut % 13 == 0 or cut in edges:  # it can be appended to, and read again
             assert_holds(journal, kept)
-            journal.append(part(5, 19))
+            journal.append_new_frames(part(5, 19))
             assert_holds(journal, kept | set(range(5, 20)))
             journal.close()
             assert_holds(reopened(folder), kept | set(range(5, 20)))
@@ -82,7 +82,7 @@ def test_a_cut_in_the_first_message_leaves_an_empty_journal_that_can_be_appended
         path.write_bytes(content[:cut])
         journal = begun(tmp_path)
         assert_holds(journal, set())
-        journal.append(part(0, 9))
+        journal.append_new_frames(part(0, 9))
         journal.close()
         assert segments(tmp_path) == [path]
         assert path.read_bytes() == content
@@ -110,7 +110,7 @@ def test_garbage_behind_whole_messages_is_cut_off(
     journal = reopened(folder)
     assert_holds(journal, set(range(10)))
     assert path.read_bytes() == content
-    journal.append(part(10, 19))
+    journal.append_new_frames(part(10, 19))
     assert_holds(journal, set(range(20)))
 
 
@@ -118,7 +118,7 @@ def test_a_tail_of_another_array_is_cut_off(tmp_path: Path) -> None:
     filled(tmp_path, (0, 9)).close()
     (path,) = segments(tmp_path)
     with path.open("ab") as file:
-        file.write(encode(stream(5, 3), wire_schema(make_array(3))))
+        file.write(encode_frames(stream(5, 3), wire_schema(make_array(3))))
     assert_holds(reopened(tmp_path), set(range(10)))
 
 
@@ -135,10 +135,10 @@ def test_a_batch_that_was_damaged_since_is_refused_when_it_is_read(tmp_path: Pat
     journal.sync()
     (path,) = segments(tmp_path)
     content = bytearray(path.read_bytes())
-    second = len(content) - len(encode(part(10, 19), SCHEMA))
+    second = len(content) - len(encode_frames(part(10, 19), SCHEMA))
     content[second : second + 8] = bytes(8)
     path.write_bytes(content)
-    reading = journal.read(0, 19)
+    reading = journal.read_frames(0, 19)
     assert_same_bits(next(reading), part(0, 9))
     with pytest.raises(FileFormatError):
         next(reading)
@@ -152,7 +152,7 @@ def crashed(folder: Path, *parts: tuple[int, int]) -> Path:
     """The only segment of a journal that was never closed."""
     journal = begun(folder)
     for first, last in parts:
-        journal.append(part(first, last))
+        journal.append_new_frames(part(first, last))
     copy = folder.with_name(folder.name + "-crashed")
     shutil.copytree(folder, copy)
     (path,) = segments(copy)
@@ -169,7 +169,7 @@ def test_a_flipped_bit_is_found_wherever_it_is_and_costs_its_own_batch_only(
     at = data.draw(st.integers(HEADER, len(content) - 1))
     content[at] ^= 1 << data.draw(st.integers(0, 7))
     path.write_bytes(content)
-    length = len(encode(part(0, 9), SCHEMA))
+    length = len(encode_frames(part(0, 9), SCHEMA))
     hit = (at - HEADER) // length
     journal = reopened(path.parent)
     gone = set(range(10 * hit, 10 * hit + 10))
@@ -177,7 +177,7 @@ def test_a_flipped_bit_is_found_wherever_it_is_and_costs_its_own_batch_only(
     # What stood at the end of a file that was not closed may never have been on the disk.
     named = members(journal.lost.by_reason.get("corrupt", Intervals()))
     assert named == (gone if hit < 2 else set())
-    journal.append(part(0, 29))
+    journal.append_new_frames(part(0, 29))
     assert_holds(journal, set(range(30)))
     assert not journal.lost
 
@@ -193,7 +193,7 @@ def test_a_flipped_bit_in_the_index_costs_nothing_or_one_batch_and_never_gives_w
     index[at] ^= 1 << data.draw(st.integers(0, 7))
     index_of(path).write_bytes(index)
     journal = reopened(path.parent)
-    held = members(journal.held)
+    held = members(journal.stored)
     assert len(held) >= 20
     assert_holds(journal, held)
 
@@ -204,17 +204,17 @@ def test_a_segment_that_was_closed_is_not_read_through_but_its_frames_are_checke
     filled(tmp_path, (0, 9), (10, 19), (20, 29)).close()
     (path,) = segments(tmp_path)
     content = bytearray(path.read_bytes())
-    content[HEADER + len(encode(part(0, 9), SCHEMA)) + 200] ^= 8
+    content[HEADER + len(encode_frames(part(0, 9), SCHEMA)) + 200] ^= 8
     path.write_bytes(content)
     journal = reopened(tmp_path)
-    assert members(journal.held) == set(range(30))
+    assert members(journal.stored) == set(range(30))
     with pytest.raises(DamagedFramesError, match="frames 10 to 19") as caught:
-        list(journal.read(0, 29))
+        list(journal.read_frames(0, 29))
     assert (caught.value.seq_first, caught.value.seq_last) == (10, 19)
-    journal.disown(Intervals([(10, 19)]))
+    journal.invalidate(Intervals([(10, 19)]))
     assert_holds(journal, {*range(10), *range(20, 30)})
     # A copy that comes later is the one that counts, after a restart, too.
-    journal.append(part(10, 19))
+    journal.append_new_frames(part(10, 19))
     journal.close()
     assert_holds(reopened(tmp_path), set(range(30)))
 
@@ -226,29 +226,29 @@ def test_one_damaged_batch_among_thousands_of_frames_costs_its_own_frames_only(
     cuts = [*range(0, 9000, 25), 9000]
     journal = begun(tmp_path)
     for a, b in pairwise(cuts):
-        journal.append(whole.rows(a, b))
+        journal.append_new_frames(whole.slice_rows(a, b))
     journal.close()
     (path,) = segments(tmp_path)
     content = bytearray(path.read_bytes())
-    records = np.frombuffer(index_of(path).read_bytes(), RECORD)
+    records = np.frombuffer(index_of(path).read_bytes(), RECORD_DTYPE)
     record = records[records["seq_first"] == 5000][0]
     content[int(record["offset"]) + int(record["length"]) // 2] ^= 1
     path.write_bytes(content)
     journal = reopened(tmp_path)
     before: list[int] = []
     with pytest.raises(DamagedFramesError, match="frames 5000 to 5024") as caught:
-        before += (int(seq) for batch in journal.read(3, 9000) for seq in batch.seq)
+        before += (int(seq) for batch in journal.read_frames(3, 9000) for seq in batch.seq)
     assert (caught.value.seq_first, caught.value.seq_last) == (5000, 5024)
     assert before == list(range(3, 5000))
-    journal.disown(Intervals([(5000, 5024)]))
+    journal.invalidate(Intervals([(5000, 5024)]))
     held = {*range(5000), *range(5025, 9000)}
     assert_holds(journal, held, 3, 8990, of=whole)
-    assert max(len(batch) for batch in journal.read(0, 9000)) > 1000
+    assert max(len(batch) for batch in journal.read_frames(0, 9000)) > 1000
 
 
 def with_record(path: Path, at: int, **columns: int) -> None:
     """A record of the index says something else, and its checksum is right."""
-    records = np.frombuffer(index_of(path).read_bytes(), RECORD).copy()
+    records = np.frombuffer(index_of(path).read_bytes(), RECORD_DTYPE).copy()
     for name, value in columns.items():
         records[name][at] = value
     records["check"][at] = zlib.crc32(records[at].tobytes()[:-4])
@@ -279,7 +279,7 @@ def test_a_batch_of_other_frames_than_its_index_says_is_refused_whatever_its_che
     with pytest.raises(
         DamagedFramesError, match=r"frames 40 to 49.*the frames that its index says"
     ):
-        read += (int(seq) for batch in journal.read(0, 59) for seq in batch.seq)
+        read += (int(seq) for batch in journal.read_frames(0, 59) for seq in batch.seq)
     assert read == [*range(10), *range(20, 30)]
 
 
@@ -288,7 +288,7 @@ def test_a_sector_that_cannot_be_read_costs_no_frame_before_it(
 ) -> None:
     journal = filled(tmp_path, *((a, a + 9) for a in range(0, 60, 10)))
     journal.sync()
-    bad = HEADER + 3 * len(encode(part(0, 9), SCHEMA)) + 100
+    bad = HEADER + 3 * len(encode_frames(part(0, 9), SCHEMA)) + 100
     real = os.pread
 
     def pread(descriptor: int, length: int, offset: int) -> bytes:
@@ -299,14 +299,14 @@ def test_a_sector_that_cannot_be_read_costs_no_frame_before_it(
     monkeypatch.setattr("os.pread", pread)
     read: list[int] = []
     with pytest.raises(StorageError, match="Input/output error"):
-        read += (int(seq) for batch in journal.read(0, 59) for seq in batch.seq)
+        read += (int(seq) for batch in journal.read_frames(0, 59) for seq in batch.seq)
     assert read == list(range(30))
 
 
 def test_a_truncation_exactly_at_a_batch_is_seen_by_the_index(tmp_path: Path) -> None:
     filled(tmp_path, (0, 9), (10, 19), (20, 29)).close()
     (path,) = segments(tmp_path)
-    os.truncate(path, HEADER + 2 * len(encode(part(0, 9), SCHEMA)))
+    os.truncate(path, HEADER + 2 * len(encode_frames(part(0, 9), SCHEMA)))
     journal = reopened(tmp_path)
     assert_holds(journal, set(range(20)))
     assert members(journal.lost.by_reason["corrupt"]) == set(range(20, 30))
@@ -352,7 +352,7 @@ def test_a_segment_that_is_gone_is_an_error_that_names_it(tmp_path: Path) -> Non
     (path,) = segments(tmp_path)
     path.unlink()
     with pytest.raises(StorageError, match=path.name):
-        list(journal.read(0, 9))
+        list(journal.read_frames(0, 9))
     with pytest.raises(StorageError, match=path.name):
         journal.close()  # what was written to it is nowhere
 
@@ -365,14 +365,14 @@ def test_a_damaged_record_of_the_index_gives_its_neighbours_instant_never_a_far_
     (path,) = segments(tmp_path)
     index = path.with_suffix(".idx")
     content = bytearray(index.read_bytes())
-    content[record * RECORD.itemsize + 9] ^= 1
+    content[record * RECORD_DTYPE.itemsize + 9] ^= 1
     index.write_bytes(content)
     asked = 10 * record + 2
-    oldest, newest = (journal.t_ns_near(asked, newest=newest) for newest in (False, True))
+    oldest, newest = (journal.find_t_ns_near(asked, is_upper=newest) for newest in (False, True))
     assert oldest == part(10 * record + 10, 10 * record + 10).t_ns[0]
     assert newest == (part(10 * record - 1, 10 * record - 1).t_ns[0] if record else None)
     index.write_bytes(b"")
-    assert journal.t_ns_near(asked, newest=False) is None
+    assert journal.find_t_ns_near(asked, is_upper=False) is None
 
 
 def test_an_index_that_was_emptied_is_said(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from devices.errors import StorageError
 from storage.journal import segment_writer
-from storage.wire import encode
+from storage.wire import encode_frames
 from tests.storage.faulty_disk import IO_ERROR, NO_SPACE, disk_with_room_for, failing_if, refusing
 from tests.storage.journal.journals import (
     HEADER,
@@ -34,15 +34,15 @@ def test_a_full_disk_holds_nothing_of_the_batch_and_goes_on_when_there_is_room(
 ) -> None:
     journal = filled(tmp_path, (0, 9))
     (path,) = segments(tmp_path)
-    needed = len(encode(part(10, 39), SCHEMA))
+    needed = len(encode_frames(part(10, 39), SCHEMA))
     # In the segment that is written, then in the new ones that are tried.
     for begin in (path.stat().st_size, HEADER, HEADER):
         with pytest.raises(StorageError) as caught, disk_with_room_for(begin + needed - short):
-            journal.append(part(10, 39))
+            journal.append_new_frames(part(10, 39))
         assert str(tmp_path) in str(caught.value)
         assert_holds(journal, set(range(10)))
-    journal.append(part(10, 39))
-    journal.append(part(40, 49))
+    journal.append_new_frames(part(10, 39))
+    journal.append_new_frames(part(40, 49))
     assert_holds(journal, set(range(50)))
     journal.close()
     assert_holds(reopened(tmp_path), set(range(50)))
@@ -57,9 +57,9 @@ def test_a_disk_that_is_full_from_the_beginning_leaves_nothing_that_is_in_the_wa
     journal = begun(tmp_path)
     for _ in range(2):
         with pytest.raises(StorageError), disk_with_room_for(room):
-            journal.append(part(0, 59))
+            journal.append_new_frames(part(0, 59))
         assert_holds(journal, set())
-    journal.append(part(0, 59))
+    journal.append_new_frames(part(0, 59))
     assert_holds(journal, set(range(60)))
     journal.close()
     assert_holds(reopened(tmp_path), set(range(60)))
@@ -70,19 +70,19 @@ def test_a_disk_that_neither_takes_nor_gives_back_leaves_all_whole_messages(
 ) -> None:
     """A write that stops halfway and cannot be taken back: the next begins another segment."""
     journal = filled(tmp_path, (0, 9))
-    whole = segment_writer.write_all
+    whole = segment_writer.write_all_or_none
 
     def halfway(file: Any, data: bytes) -> None:
         whole(file, data[: len(data) // 2])
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(segment_writer, "write_all", halfway)
+        patch.setattr(segment_writer, "write_all_or_none", halfway)
         with pytest.raises(StorageError, match="No space left"):
-            journal.append(part(10, 19))
+            journal.append_new_frames(part(10, 19))
     assert_holds(journal, set(range(10)))
-    journal.append(part(10, 19))
-    journal.append(part(20, 29))
+    journal.append_new_frames(part(10, 19))
+    journal.append_new_frames(part(20, 29))
     assert_holds(journal, set(range(30)))
     assert len(segments(tmp_path)) == 2
     journal.close()
@@ -96,13 +96,17 @@ def test_a_disk_that_fills_between_the_gaps_of_a_batch_holds_what_was_written_an
     """A batch that fills three gaps is three writes."""
     journal, held = filled(tmp_path, (5, 9), (15, 19)), {*range(5, 10), *range(15, 20)}
     writes = itertools.count(1)  # of each gap a header, a batch and a record
-    full = failing_if(lambda *_: next(writes) > 3 * written, segment_writer.write_all, *NO_SPACE)
+    full = failing_if(
+        lambda *_: next(writes) > 3 * written, segment_writer.write_all_or_none, *NO_SPACE
+    )
     with monkeypatch.context() as patch:
-        patch.setattr(segment_writer, "write_all", full)
+        patch.setattr(segment_writer, "write_all_or_none", full)
         with pytest.raises(StorageError):
-            journal.append(part(0, 29))
+            journal.append_new_frames(part(0, 29))
     assert_holds(journal, held | set(range(10 * written)))
-    assert members(journal.append(part(0, 29))) == set(range(30)) - held - set(range(10 * written))
+    assert members(journal.append_new_frames(part(0, 29))) == set(range(30)) - held - set(
+        range(10 * written)
+    )
     journal.close()
     assert_holds(reopened(tmp_path), set(range(30)))
 
@@ -120,7 +124,7 @@ def test_appending_never_waits_for_the_disk(
     journal = begun(tmp_path / "stream")
     monkeypatch.setattr("os.fsync", count)
     for first in range(0, 200, 20):
-        journal.append(LONG.rows(first, first + 20))
+        journal.append_new_frames(LONG.slice_rows(first, first + 20))
     assert synced == []
     assert len(segments(tmp_path / "stream")) == 10
     journal.sync()
@@ -139,7 +143,7 @@ def test_a_disk_that_does_not_sync_is_an_error(
             journal.sync()
         with pytest.raises(StorageError, match="Input/output error"):
             journal.close()
-    journal.append(part(10, 19))
+    journal.append_new_frames(part(10, 19))
     assert_holds(journal, set(range(20)))
 
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from devices.errors import FileFormatError, StorageError
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.open_segments import SEGMENT_NS
-from storage.schema import from_record_batch
-from storage.wire import encode
+from storage.journal.open_segments import SEGMENT_DURATION_NS
+from storage.schema import frames_from_record_batch
+from storage.wire import encode_frames
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import assert_same_bits
 from tests.storage.journal.journals import (
@@ -56,7 +56,7 @@ def test_every_frame_is_held_once_whatever_comes_twice_and_in_whatever_order(
             journal.close()
             journal = begun(folder)
         batch = part(first, last)
-        new = journal.append(batch, encode(batch, SCHEMA) if sent else None)
+        new = journal.append_new_frames(batch, encode_frames(batch, SCHEMA) if sent else None)
         assert members(new) == set(range(first, last + 1)) - held
         held |= set(range(first, last + 1))
     assert_holds(journal, held)
@@ -76,7 +76,7 @@ def test_what_is_held_can_be_read_before_it_is_synced_and_after(tmp_path: Path) 
     journal = filled(tmp_path, (0, 9))
     assert_holds(journal, set(range(10)))
     journal.sync()
-    journal.append(part(10, 19))
+    journal.append_new_frames(part(10, 19))
     journal.sync()
     journal.close()
     journal.sync()
@@ -85,17 +85,17 @@ def test_what_is_held_can_be_read_before_it_is_synced_and_after(tmp_path: Path) 
 
 def test_reading_goes_on_while_frames_come(tmp_path: Path) -> None:
     journal = filled(tmp_path, (0, 9), (10, 19))
-    reading = journal.read(0, 100)
+    reading = journal.read_frames(0, 100)
     first = next(reading)
-    journal.append(part(20, 29))
+    journal.append_new_frames(part(20, 29))
     read = [first, *reading]
     assert [int(seq) for batch in read for seq in batch.seq] == list(range(20))
 
 
 def test_bytes_that_came_are_the_bytes_on_disk(tmp_path: Path) -> None:
     journal, batch = begun(tmp_path), part(0, 9)
-    payload = encode(batch, SCHEMA)
-    journal.append(batch, payload)
+    payload = encode_frames(batch, SCHEMA)
+    journal.append_new_frames(batch, payload)
     (path,) = segments(tmp_path)
     assert path.read_bytes() == SCHEMA.serialize().to_pybytes() + payload
 
@@ -106,7 +106,7 @@ def test_arrow_alone_reads_a_segment(tmp_path: Path) -> None:
     for path in segments(tmp_path):
         with pa.ipc.open_stream(path.read_bytes()) as reader:
             assert reader.schema.equals(SCHEMA, check_metadata=True)
-            found.append([from_record_batch(record) for record in reader])
+            found.append([frames_from_record_batch(record) for record in reader])
     numbers = [[n for batch in rows for n in batch.seq.tolist()] for rows in found]
     assert numbers == [[*range(10), *range(15, 20)], [*range(10, 15)]]
     assert_same_bits(found[0][0], part(0, 9))
@@ -119,12 +119,12 @@ def test_within_a_segment_time_never_runs_back_in_whatever_order_frames_come(
     journal = begun(tmp_path)
     for turn in range(3):
         for first in (30 + 10 * turn, 10 * turn):
-            journal.append(part(first, first + 9))
+            journal.append_new_frames(part(first, first + 9))
     assert_holds(journal, set(range(60)))
     journal.close()
     assert len(segments(tmp_path)) == 2
     for path in segments(tmp_path):
-        rows = [from_record_batch(r) for r in pa.ipc.open_stream(path.read_bytes())]
+        rows = [frames_from_record_batch(r) for r in pa.ipc.open_stream(path.read_bytes())]
         seq = [n for batch in rows for n in batch.seq.tolist()]
         assert seq == sorted(seq)
     assert_holds(reopened(tmp_path), set(range(60)))
@@ -145,7 +145,7 @@ def test_an_index_whose_segment_a_power_cut_took_is_set_aside_when_the_journal_i
 ) -> None:
     journal = filled(tmp_path, (0, 9), (20, 29))
     journal.close()
-    journal.append(part(10, 19))
+    journal.append_new_frames(part(10, 19))
     journal.close()
     gone = tmp_path / f"{10:020d}.arrows"
     gone.unlink()
@@ -172,7 +172,7 @@ def test_what_was_set_aside_before_is_not_replaced(tmp_path: Path) -> None:
 
 def test_a_deleted_journal_is_gone(tmp_path: Path) -> None:
     journal = filled(tmp_path / "journal", (0, 9))
-    journal.delete()
+    journal.close_and_delete()
     assert not (tmp_path / "journal").exists()
     assert_holds(journal, set())
 
@@ -197,7 +197,7 @@ def test_names_and_files_are_on_the_disk_before_anything_is_promised(
 def long_journal(folder: Path, rows: int = 10) -> Journal:
     journal = begun(folder)
     for first in range(0, 200, rows):
-        journal.append(LONG.rows(first, first + rows))
+        journal.append_new_frames(LONG.slice_rows(first, first + rows))
     return journal
 
 
@@ -207,7 +207,7 @@ def test_a_segment_is_closed_after_a_minute_of_frames(tmp_path: Path, rows: int)
     begins = [int(path.stem) for path in segments(tmp_path)]
     starts = [0]
     for first in range(0, 200, rows):
-        if LONG.t_ns[first] - LONG.t_ns[starts[-1]] >= SEGMENT_NS:
+        if LONG.t_ns[first] - LONG.t_ns[starts[-1]] >= SEGMENT_DURATION_NS:
             starts.append(first)
     assert begins == starts
     assert len(begins) >= 9
@@ -223,7 +223,7 @@ def test_only_what_is_older_and_not_kept_is_deleted_and_never_what_is_written(
 ) -> None:
     folder = tmp_path_factory.mktemp("prune")
     journal = long_journal(folder, 20)
-    before_t_ns = UTC_NS + before * (SEGMENT_NS // 20)
+    before_t_ns = UTC_NS + before * (SEGMENT_DURATION_NS // 20)
     kept = set[int]()
     for first in range(0, 200, 20):
         numbers = set(range(first, first + 20))
@@ -231,7 +231,7 @@ def test_only_what_is_older_and_not_kept_is_deleted_and_never_what_is_written(
         if not old or numbers & set(keep) or first == 180:
             kept |= numbers
     journal.sync()
-    gone = journal.prune(before_t_ns, Intervals((n, n) for n in keep))
+    gone = journal.delete_old_segments(before_t_ns, Intervals((n, n) for n in keep))
     assert members(gone) == set(range(200)) - kept
     assert_holds(journal, kept, 0, 199, of=LONG)
     assert {int(path.stem) for path in segments(folder)} == {n for n in kept if n % 20 == 0}
@@ -242,12 +242,12 @@ def test_only_what_is_older_and_not_kept_is_deleted_and_never_what_is_written(
 def test_frames_come_after_pruning_and_pruned_ones_can_come_again(tmp_path: Path) -> None:
     journal = long_journal(tmp_path, 20)
     journal.sync()
-    assert members(journal.prune(2**62, Intervals())) == set(range(180))
-    journal.append(LONG.rows(0, 200))
+    assert members(journal.delete_old_segments(2**62, Intervals())) == set(range(180))
+    journal.append_new_frames(LONG.slice_rows(0, 200))
     assert_holds(journal, set(range(200)), 0, 199, of=LONG)
 
 
-times = st.integers(-30, 230).map(lambda n: UTC_NS + n * (SEGMENT_NS // 40))
+times = st.integers(-30, 230).map(lambda n: UTC_NS + n * (SEGMENT_DURATION_NS // 40))
 subsets = st.lists(st.integers(0, 19), unique=True, max_size=20)
 
 
@@ -258,10 +258,10 @@ def test_the_first_number_since_an_instant_is_at_most_a_batch_early_and_never_la
 ) -> None:
     journal = begun(tmp_path_factory.mktemp("since"))
     for n in order:
-        journal.append(LONG.rows(n * 5, n * 5 + 5))
-    young = sorted(n for n in members(journal.held) if LONG.t_ns[n] >= t_ns)
+        journal.append_new_frames(LONG.slice_rows(n * 5, n * 5 + 5))
+    young = sorted(n for n in members(journal.stored) if LONG.t_ns[n] >= t_ns)
     expected = young[0] // 5 * 5 if young else None
-    assert journal.first_seq_since(t_ns) == expected
+    assert journal.find_first_seq_since(t_ns) == expected
 
 
 @settings(max_examples=60, deadline=None)
@@ -271,9 +271,9 @@ def test_the_last_number_until_an_instant_is_known_once_the_stream_has_passed_it
 ) -> None:
     journal = begun(tmp_path_factory.mktemp("until"))
     for n in order:
-        journal.append(LONG.rows(n * 5, n * 5 + 5))
-    held = {n for n in members(journal.held) if n >= at_least}
-    found = journal.last_seq_until(t_ns, at_least=at_least)
+        journal.append_new_frames(LONG.slice_rows(n * 5, n * 5 + 5))
+    held = {n for n in members(journal.stored) if n >= at_least}
+    found = journal.find_last_seq_until(t_ns, min_seq=at_least)
     if not any(LONG.t_ns[n] > t_ns for n in held):
         assert found is None
     else:
@@ -288,10 +288,10 @@ def test_open_files_do_not_grow_with_segments(tmp_path: Path) -> None:
     journal = long_journal(tmp_path, 20)
     journal.sync()
     assert len(open_here()) == 2
-    while_read = [len(open_here()) for _ in journal.read(0, 199)]
-    while_read += [len(open_here()) for _ in journal.messages(0, 199)]
+    while_read = [len(open_here()) for _ in journal.read_frames(0, 199)]
+    while_read += [len(open_here()) for _ in journal.read_messages(0, 199)]
     assert max(while_read) <= 2 + 8
-    assert sum(len(batch) for batch in journal.read(0, 199)) == 200
+    assert sum(len(batch) for batch in journal.read_frames(0, 199)) == 200
     assert len(open_here()) == 2
     journal.close()
     assert len(open_here()) == 0
@@ -308,9 +308,9 @@ def test_names_of_segments_sort_as_their_frames(tmp_path: Path) -> None:
 
 def test_what_was_disowned_is_asked_for_again_and_held_once(tmp_path: Path) -> None:
     journal = filled(tmp_path, (0, 9), (10, 19))
-    journal.disown(Intervals([(10, 19)]))
-    assert journal.held == Intervals([(0, 9)])
-    journal.append(part(10, 19))
+    journal.invalidate(Intervals([(10, 19)]))
+    assert journal.stored == Intervals([(0, 9)])
+    journal.append_new_frames(part(10, 19))
     assert_holds(journal, set(range(20)))
     journal.close()
     assert_holds(reopened(tmp_path), set(range(20)))
@@ -320,12 +320,12 @@ def test_what_the_file_under_its_name_never_had_is_disowned_as_well(tmp_path: Pa
     journal = filled(tmp_path / "data", (0, 9))
     journal.sync()
     shutil.copytree(tmp_path / "data", tmp_path / "copy")
-    journal.append(part(10, 19))
+    journal.append_new_frames(part(10, 19))
     (tmp_path / "data").rename(tmp_path / "away")
     (tmp_path / "copy").rename(tmp_path / "data")
-    journal.disown(Intervals([(10, 19)]))
-    assert journal.held == Intervals([(0, 9)])
-    journal.append(part(10, 19))
+    journal.invalidate(Intervals([(10, 19)]))
+    assert journal.stored == Intervals([(0, 9)])
+    journal.append_new_frames(part(10, 19))
     assert_holds(journal, set(range(20)))
     with pytest.raises(StorageError, match="another file is in its place"):
         journal.close()
@@ -338,10 +338,10 @@ def test_a_doubtful_copy_is_forgotten_when_its_segment_is_closed(tmp_path: Path)
     """
     journal = filled(tmp_path, (0, 9), (10, 19))
     (path,) = segments(tmp_path)
-    journal.disown(Intervals([(10, 19)]))
-    journal.append(part(10, 19))
+    journal.invalidate(Intervals([(10, 19)]))
+    journal.append_new_frames(part(10, 19))
     journal.close()
-    assert path.stat().st_size == HEADER + len(encode(part(0, 9), SCHEMA))
+    assert path.stat().st_size == HEADER + len(encode_frames(part(0, 9), SCHEMA))
     again = reopened(tmp_path)
     assert_holds(again, set(range(20)))
     assert not again.lost

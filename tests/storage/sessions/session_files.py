@@ -13,9 +13,9 @@ from devices.errors import FileFormatError
 from devices.frames import (
     FrameBatch,
 )
-from storage.file_hash import FORMAT_WITHOUT_HASH
-from storage.sessions.file import SessionWriter
-from storage.sessions.reader import SessionReader
+from storage.parquet_hash import FORMAT_WITHOUT_HASH
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 
@@ -27,13 +27,13 @@ def frames(rows: int, tiles: int = 2, *, seed: int = 0, period_ns: int = PERIOD_
         rows,
         tiles,
         period_ns=period_ns,
-        padc=rng.integers(250, 420, shape),
-        tadc=rng.integers(470, 490, shape),
+        pressure_raw=rng.integers(250, 420, shape),
+        temperature_raw=rng.integers(470, 490, shape),
         sample_offset_us=rng.integers(-100, 3000, shape),
         servo_counts=rng.integers(-5000, 5000, rows),
         servo_age_us=rng.integers(0, 20000, rows),
-        status=rng.integers(0, 64, shape),
-        frame_status=rng.integers(0, 32, rows),
+        tile_flags=rng.integers(0, 64, shape),
+        frame_flags=rng.integers(0, 32, rows),
         reference_force_n=rng.normal(0, 30, rows),
     )
 
@@ -41,14 +41,14 @@ def frames(rows: int, tiles: int = 2, *, seed: int = 0, period_ns: int = PERIOD_
 def write(
     path: Path, batch: FrameBatch, notes: dict[str, object] | None = None, **extra: np.ndarray
 ) -> Path:
-    with SessionWriter(path, make_array(batch.tile_count), notes or {}) as writer:
-        writer.append(batch, extra)
+    with SealedFileWriter(path, make_array(batch.tile_count), notes or {}) as writer:
+        writer.append_frames(batch, extra)
     return path
 
 
 def read(path: Path) -> FrameBatch:
-    with SessionReader(path) as session:
-        return session.frames()
+    with SealedFileReader(path) as session:
+        return session.read_frames()
 
 
 def rewritten(path: Path, table: pa.Table, **metadata: bytes | None) -> Path:

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
-from storage.file_hash import file_hashes, write_file_hash
-from storage.sessions.file import SessionWriter
-from storage.sessions.reader import SessionReader
+from storage.parquet_hash import embed_file_hashes, read_stated_and_actual_hash
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 
@@ -36,13 +36,13 @@ def frames(rows: int, tiles: int = 2) -> FrameBatch:
         rows,
         tiles,
         period_ns=1_000_000_000,
-        padc=rng.choice([300, NOT_READ], shape),
-        tadc=rng.choice([480, NOT_READ], shape),
+        pressure_raw=rng.choice([300, NOT_READ], shape),
+        temperature_raw=rng.choice([480, NOT_READ], shape),
         sample_offset_us=rng.integers(-100, 3000, shape),
         servo_counts=rng.choice([NO_SERVO_COUNTS, 5], rows),
         servo_age_us=rng.choice([NO_SERVO_AGE, 7], rows),
-        status=rng.integers(0, 64, shape),
-        frame_status=rng.integers(0, 32, rows),
+        tile_flags=rng.integers(0, 64, shape),
+        frame_flags=rng.integers(0, 32, rows),
         reference_force_n=rng.choice([np.nan, -0.0, 3.25], rows),
     )
 
@@ -60,11 +60,11 @@ def extra(rows: int) -> dict[str, Any]:
 
 def write(path: Path, rows: int = 200, cuts: Sequence[int] = (), **notes: object) -> Path:
     batch, columns = frames(rows), extra(rows)
-    with SessionWriter(path, make_array(), notes) as writer:
+    with SealedFileWriter(path, make_array(), notes) as writer:
         bounds = [0, *cuts, rows]
         for begin, end in itertools.pairwise(bounds):
             piece = {name: values[begin:end] for name, values in columns.items()}
-            writer.append(batch.rows(begin, end), piece)
+            writer.append_frames(batch.slice_rows(begin, end), piece)
     return path
 
 
@@ -75,7 +75,7 @@ def metadata_of(path: Path) -> dict[bytes, bytes]:
 
 
 def content(path: Path) -> dict[str, Any]:
-    with SessionReader(path) as reader:
+    with SealedFileReader(path) as reader:
         assert reader.content is not None
         return reader.content
 
@@ -119,8 +119,8 @@ def test_row_groups_and_encodings_do_not_change_the_hashes_of_columns(tmp_path: 
 
     digest = ContentDigest()
     for group in range(pq.ParquetFile(other).num_row_groups):
-        digest.feed(pq.ParquetFile(other).read_row_group(group))
-    assert digest.content() == said
+        digest.add_table(pq.ParquetFile(other).read_row_group(group))
+    assert digest.describe_content() == said
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_row_groups_and_encodings_do_not_change_the_hashes_of_columns(tmp_path: 
     [
         ("reference_force_n", np.float32(np.nan), np.float32(0.0)),
         ("reference_force_n", np.float32(-0.0), np.float32(0.0)),
-        ("padc", 65535, 65534),
+        ("pressure_raw", 65535, 65534),
         ("servo_age_us", -1, 0),
     ],
 )
@@ -140,17 +140,17 @@ def test_nothing_that_is_missing_is_taken_for_a_number(
         batch = frames(3)
         getattr(batch, name)[...] = value
         path = tmp_path / f"{len(found)}.parquet"
-        with SessionWriter(path, make_array(), {}) as writer:
-            writer.append(batch, {})
+        with SealedFileWriter(path, make_array(), {}) as writer:
+            writer.append_frames(batch, {})
         found.append(content(path)["columns"])
     changed = {column for column in found[0] if found[0][column] != found[1][column]}
     assert {re.sub(r"_\d$", "", column) for column in changed} == {name}
 
 
 def test_counts_and_parts_are_in_the_metadata(tmp_path: Path) -> None:
-    with SessionWriter(tmp_path / "s.parquet", make_array(), {}) as writer:
+    with SealedFileWriter(tmp_path / "s.parquet", make_array(), {}) as writer:
         batch = frames(10)
-        writer.append(batch, {"part": np.array([0] * 4 + [1] * 6, np.uint16)})
+        writer.append_frames(batch, {"part": np.array([0] * 4 + [1] * 6, np.uint16)})
     said = content(tmp_path / "s.parquet")
     assert said["frames"] == 10
     assert said["parts"] == [
@@ -164,7 +164,7 @@ def test_notes_and_array_are_in_the_content_hash(tmp_path: Path) -> None:
     hashes = set()
     kept: tuple[dict[str, object], ...] = ({"a": 1}, {"a": 2}, {})
     for number, notes in enumerate(kept):
-        with SessionReader(write(tmp_path / f"{number}.parquet", 200, (), **notes)) as reader:
+        with SealedFileReader(write(tmp_path / f"{number}.parquet", 200, (), **notes)) as reader:
             hashes.add(reader.content_sha256)
     assert len(hashes) == 3
 
@@ -178,21 +178,21 @@ def test_a_changed_note_is_seen_whenever_the_file_is_opened(tmp_path: Path) -> N
     kept = {key: said[key] for key in said if key.startswith(b"foottile.content")}
     pq.write_table(table.replace_schema_metadata({**changed, **kept}), path)
     with pytest.raises(FileFormatError, match="its hash is gone"):
-        SessionReader(path)
+        SealedFileReader(path)
     path.write_bytes(whole)
-    SessionReader(path).close()
+    SealedFileReader(path).close()
 
 
 def test_the_file_hash_is_of_every_byte(tmp_path: Path) -> None:
     path = write(tmp_path / "s.parquet", 40)
     whole = path.read_bytes()
-    stated, found = file_hashes(path) or ("", "other")
+    stated, found = read_stated_and_actual_hash(path) or ("", "other")
     assert stated == found
     for at in range(0, len(whole), 41):
         damaged = bytearray(whole)
         damaged[at] ^= 0x04
         path.write_bytes(damaged)
-        hashes = file_hashes(path)
+        hashes = read_stated_and_actual_hash(path)
         assert hashes is None or hashes[0] != hashes[1], at
 
 
@@ -200,27 +200,32 @@ def test_the_file_hash_is_of_every_byte(tmp_path: Path) -> None:
 def test_what_is_too_short_states_no_hash(tmp_path: Path, size: int) -> None:
     path = write(tmp_path / "s.parquet", 40)
     path.write_bytes(path.read_bytes()[-size:] if size else b"")
-    assert file_hashes(path) is None
+    assert read_stated_and_actual_hash(path) is None
     with pytest.raises(FileFormatError, match="no place"):
-        write_file_hash(path)
+        embed_file_hashes(path)
 
 
 def test_a_note_that_looks_like_the_hash_is_none(tmp_path: Path) -> None:
     trap = "foottile.file_sha256\x18\x40" + "0" * 64
     path = write(tmp_path / "s.parquet", trap=trap)
-    stated, found = file_hashes(path) or ("", "other")
+    stated, found = read_stated_and_actual_hash(path) or ("", "other")
     assert stated == found
 
 
 def test_a_footer_that_gives_a_column_the_name_of_another_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
-    with SessionWriter(path, make_array(2), {}) as writer:
-        writer.append(make_frames(20, 2), {})
+    with SealedFileWriter(path, make_array(2), {}) as writer:
+        writer.append_frames(make_frames(20, 2), {})
     whole = path.read_bytes()
     # Every page keeps its checksum: only the footer's names are exchanged.
-    swapped = whole.replace(b"tadc_0", b"tadc_x").replace(b"tadc_1", b"tadc_0")
-    for changed in (swapped.replace(b"tadc_x", b"tadc_1"), whole.replace(b"padc_1", b"padc_0")):
+    swapped = whole.replace(b"temperature_raw_0", b"temperature_raw_x").replace(
+        b"temperature_raw_1", b"temperature_raw_0"
+    )
+    for changed in (
+        swapped.replace(b"temperature_raw_x", b"temperature_raw_1"),
+        whole.replace(b"pressure_raw_1", b"pressure_raw_0"),
+    ):
         assert len(changed) == len(whole)
         path.write_bytes(changed)
         with pytest.raises(FileFormatError, match="changed since it was sealed"):
-            SessionReader(path)
+            SealedFileReader(path)

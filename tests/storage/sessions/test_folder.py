@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError, UnknownError
-from storage.checked_json import without_check
+from storage.checksummed_json import strip_checksum
 from storage.clock.log import ClockOffset
 from storage.sessions.folder import (
-    Event,
     Ledger,
+    Marker,
     Part,
     PartLedger,
     Session,
-    SessionFolder,
-    new_session_id,
+    SessionsFolder,
+    make_session_id,
 )
 from tests.storage.faulty_disk import NO_SPACE, failing_if, refusing
 
@@ -53,7 +53,7 @@ def session(session_id: str = ID, **changes: Any) -> Session:
         "node": "bench",
         "state": "recording",
         "started_t_ns": 10**18,
-        "parts": (Part(boot_id=BOOT, seq_first=0),),
+        "parts": (Part(stream_id=BOOT, seq_first=0),),
         "scene": "mud",
     }
     return Session(**content | changes)
@@ -64,23 +64,25 @@ def whole() -> Session:
         state="sealed",
         stopped_t_ns=10**18 + 1,
         parts=(
-            Part(boot_id=BOOT, seq_first=5, seq_last=9),
-            Part(boot_id="0" * 32, seq_first=0, seq_last=2**62),
+            Part(stream_id=BOOT, seq_first=5, seq_last=9),
+            Part(stream_id="0" * 32, seq_first=0, seq_last=2**62),
         ),
         subject='Ärmel \'n "Söhne"\n\u2028',
         notes="\x00\ud7ff🦶",
         tags=("a", "b", ""),
-        events=(Event(id="e1", label="slip", t_ns=10**18 + 7),),
-        clock=(ClockOffset(boot_id=BOOT, t_mono_ns=1, server_minus_node_ns=-2, uncertainty_ns=3),),
+        markers=(Marker(id="e1", label="slip", t_ns=10**18 + 7),),
+        clock=(
+            ClockOffset(stream_id=BOOT, t_mono_ns=1, server_minus_node_ns=-2, uncertainty_ns=3),
+        ),
         missed_slots_at_start=4,
-        unsynced_tail_max={BOOT: 17},
+        max_lost_tail_frames={BOOT: 17},
         problem="none",
         ledger=Ledger(
             complete=False,
             lossy=True,
             parts=(
                 PartLedger(
-                    boot_id=BOOT,
+                    stream_id=BOOT,
                     seq_first=5,
                     seq_last=9,
                     recorded=3,
@@ -104,9 +106,9 @@ def whole() -> Session:
 
 @pytest.mark.parametrize("bad", BAD_IDS, ids=lambda text: ascii(text)[:30])
 def test_what_is_no_id_is_no_session_and_no_path(tmp_path: Path, bad: str) -> None:
-    folder = SessionFolder(tmp_path / "sessions")
+    folder = SessionsFolder(tmp_path / "sessions")
     with pytest.raises(UnknownError) as caught:
-        folder.path(bad)
+        folder.get_path(bad)
     assert len(str(caught.value)) < 1000
     with pytest.raises(UnknownError):
         folder.load(bad)
@@ -119,7 +121,7 @@ def test_what_is_no_id_is_no_session_and_no_path(tmp_path: Path, bad: str) -> No
 @given(st.one_of(st.text(max_size=40), st.from_regex(r"\A\d{8}T\d{6}Z-[0-9a-f]{6}\Z")))
 def test_a_path_is_directly_in_the_folder_and_its_name_is_plain(text: str) -> None:
     try:
-        path = SessionFolder(Path("/data/sessions")).path(text)
+        path = SessionsFolder(Path("/data/sessions")).get_path(text)
     except UnknownError:
         return
     assert path.parent == Path("/data/sessions")
@@ -129,37 +131,37 @@ def test_a_path_is_directly_in_the_folder_and_its_name_is_plain(text: str) -> No
 def test_ids_sort_by_time_and_are_of_utc() -> None:
     east = timezone(timedelta(hours=9))
     at = datetime(2020, 2, 1, 8, 59, 59, tzinfo=east)
-    assert new_session_id(at).startswith("20200131T235959Z-")
-    made = [new_session_id(at + timedelta(seconds=n)) for n in range(100)]
+    assert make_session_id(at).startswith("20200131T235959Z-")
+    made = [make_session_id(at + timedelta(seconds=n)) for n in range(100)]
     assert made == sorted(made)
-    folder = SessionFolder(Path("x"))
-    assert [folder.path(one).name for one in made] == made
+    folder = SessionsFolder(Path("x"))
+    assert [folder.get_path(one).name for one in made] == made
 
 
 def test_two_sessions_of_one_second_have_different_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = iter(["000001", "000002"])
     monkeypatch.setattr("secrets.token_hex", lambda n: next(drawn))
     now = datetime(2020, 1, 1, tzinfo=UTC)
-    assert [new_session_id(now) for _ in "ab"] == [
+    assert [make_session_id(now) for _ in "ab"] == [
         "20200101T000000Z-000001",
         "20200101T000000Z-000002",
     ]
 
 
 def test_ids_are_newest_first_and_other_names_are_none(tmp_path: Path) -> None:
-    folder = SessionFolder(tmp_path)
+    folder = SessionsFolder(tmp_path)
     made = [f"2020013{i}T000000Z-00000{i}" for i in (1, 0, 5, 3)]
     for one in made:
         folder.save(session(one))
     for name in ("lost+found", ".20200131T235959Z-0a1b2c.tmp", "20200131"):
         (tmp_path / name).mkdir()
-    assert list(folder.ids()) == sorted(made, reverse=True)
+    assert list(folder.list_ids()) == sorted(made, reverse=True)
 
 
 def test_a_folder_that_is_not_there_yet_has_no_sessions(tmp_path: Path) -> None:
-    assert list(SessionFolder(tmp_path / "none").ids()) == []
+    assert list(SessionsFolder(tmp_path / "none").list_ids()) == []
     (tmp_path / "file").write_bytes(b"")
-    assert list(SessionFolder(tmp_path / "file").ids()) == []
+    assert list(SessionsFolder(tmp_path / "file").list_ids()) == []
 
 
 # --- save and load --------------------------------------------------------------------------------
@@ -167,10 +169,10 @@ def test_a_folder_that_is_not_there_yet_has_no_sessions(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kept", [session(), whole()], ids=["new", "sealed"])
 def test_a_session_survives_its_file(tmp_path: Path, kept: Session) -> None:
-    folder = SessionFolder(tmp_path / "data" / "sessions")
+    folder = SessionsFolder(tmp_path / "data" / "sessions")
     folder.save(kept)
     assert folder.load(ID) == kept
-    assert [p.name for p in folder.path(ID).iterdir()] == ["session.json"]
+    assert [p.name for p in folder.get_path(ID).iterdir()] == ["session.json"]
 
 
 @given(st.text(max_size=30), st.lists(st.text(max_size=5), max_size=3))
@@ -178,23 +180,23 @@ def test_a_session_survives_its_file(tmp_path: Path, kept: Session) -> None:
 def test_whatever_a_person_writes_is_kept_as_it_is(
     tmp_path_factory: pytest.TempPathFactory, text: str, tags: list[str]
 ) -> None:
-    folder = SessionFolder(tmp_path_factory.mktemp("sessions"))
+    folder = SessionsFolder(tmp_path_factory.mktemp("sessions"))
     kept = session(name=text, notes=text[::-1], subject=text, tags=tuple(tags))
     folder.save(kept)
     assert folder.load(ID) == kept
 
 
 def test_saving_again_replaces_and_touches_no_other_file(tmp_path: Path) -> None:
-    folder = SessionFolder(tmp_path)
+    folder = SessionsFolder(tmp_path)
     folder.save(session())
-    (folder.path(ID) / "frames.parquet").write_bytes(b"frames")
+    (folder.get_path(ID) / "frames.parquet").write_bytes(b"frames")
     folder.save(whole())
     assert folder.load(ID) == whole()
-    assert (folder.path(ID) / "frames.parquet").read_bytes() == b"frames"
+    assert (folder.get_path(ID) / "frames.parquet").read_bytes() == b"frames"
 
 
 def test_a_session_that_is_not_there_is_unknown(tmp_path: Path) -> None:
-    folder = SessionFolder(tmp_path)
+    folder = SessionsFolder(tmp_path)
     with pytest.raises(UnknownError, match=ID):
         folder.load(ID)
     (tmp_path / ID).mkdir()
@@ -203,9 +205,9 @@ def test_a_session_that_is_not_there_is_unknown(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
-    folder = SessionFolder(tmp_path)
+    folder = SessionsFolder(tmp_path)
     folder.save(session())
-    path = folder.path(ID) / "session.json"
+    path = folder.get_path(ID) / "session.json"
     content = path.read_bytes()
     for length in range(len(content)):
         path.write_bytes(content[:length])
@@ -227,12 +229,12 @@ def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
 def test_what_is_not_a_session_is_refused_with_its_path(
     tmp_path: Path, old: bytes, new: bytes
 ) -> None:
-    folder = SessionFolder(tmp_path)
+    folder = SessionsFolder(tmp_path)
     folder.save(session())
-    path = folder.path(ID) / "session.json"
+    path = folder.get_path(ID) / "session.json"
     content = path.read_bytes()
     assert old in content
-    path.write_bytes(without_check(content).replace(old, new, 1))
+    path.write_bytes(strip_checksum(content).replace(old, new, 1))
     with pytest.raises(FileFormatError, match="not a session") as caught:
         folder.load(ID)
     assert caught.value.where == str(path)
@@ -245,25 +247,25 @@ def test_what_is_not_a_session_is_refused_with_its_path(
 def test_a_folder_in_place_of_the_file_is_damage_too(tmp_path: Path) -> None:
     (tmp_path / ID / "session.json").mkdir(parents=True)
     with pytest.raises(DamagedFileError, match="not a file"):
-        SessionFolder(tmp_path).load(ID)
+        SessionsFolder(tmp_path).load(ID)
 
 
 def test_a_session_that_cannot_be_written_stays_what_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = SessionFolder(tmp_path)
+    folder = SessionsFolder(tmp_path)
     folder.save(session())
     monkeypatch.setattr("os.fsync", refusing(*NO_SPACE))
     with pytest.raises(StorageError, match="No space left"):
         folder.save(whole())
     assert folder.load(ID) == session()
-    assert [p.name for p in folder.path(ID).iterdir()] == ["session.json"]
+    assert [p.name for p in folder.get_path(ID).iterdir()] == ["session.json"]
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
     (tmp_path / "sessions").write_bytes(b"a file")
     with pytest.raises(StorageError):
-        SessionFolder(tmp_path / "sessions").save(session())
+        SessionsFolder(tmp_path / "sessions").save(session())
 
 
 @pytest.mark.parametrize("sync", range(4))
@@ -273,7 +275,7 @@ def test_a_session_that_a_full_disk_did_not_take_leaves_no_folder(
     real, calls = os.fsync, itertools.count()
     fails = failing_if(lambda _: next(calls) == sync, real, *NO_SPACE)
     (tmp_path / "sessions").mkdir()
-    folder = SessionFolder(tmp_path / "sessions")
+    folder = SessionsFolder(tmp_path / "sessions")
     monkeypatch.setattr(os, "fsync", fails)
     try:
         folder.save(session())
@@ -288,7 +290,7 @@ def test_a_session_that_a_full_disk_did_not_take_leaves_no_folder(
 def test_a_session_that_was_there_before_stays_when_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = SessionFolder(tmp_path)
+    folder = SessionsFolder(tmp_path)
     folder.save(session())
     with monkeypatch.context() as context:
         context.setattr(os, "fsync", refusing(*NO_SPACE))
@@ -299,7 +301,7 @@ def test_a_session_that_was_there_before_stays_when_the_disk_is_full(
 
 def test_a_folder_in_which_nothing_was_written_whole_is_no_session(tmp_path: Path) -> None:
     # As a kill leaves it between making the folder and writing into it.
-    folder = SessionFolder(tmp_path)
+    folder = SessionsFolder(tmp_path)
     (tmp_path / ID).mkdir()
     assert folder.load_all() == ([], {})
     (tmp_path / ID / ".session.json.1.2.0123abcd.tmp").write_bytes(b"{")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
 from storage.intervals import Intervals
-from storage.sessions.frame_order import FrameOrder, in_order
+from storage.sessions.frame_order import FrameOrderChecker, iterate_checking_order
 from tests.builders.frames import make_frames
 
 
@@ -24,11 +24,11 @@ def columns(seq: list[int], part: list[int] | None = None) -> dict[str, Any]:
     return found if part is None else found | {"part": np.array(part, dtype=np.uint16)}
 
 
-def looked_at(content: dict[str, Any], cuts: list[int]) -> FrameOrder:
-    order = FrameOrder()
+def looked_at(content: dict[str, Any], cuts: list[int]) -> FrameOrderChecker:
+    order = FrameOrderChecker()
     bounds = [0, *sorted(cuts), len(content["seq"])]
     for begin, end in itertools.pairwise(bounds):
-        order.feed({name: values[begin:end] for name, values in content.items()})
+        order.check_frames({name: values[begin:end] for name, values in content.items()})
     return order
 
 
@@ -42,8 +42,8 @@ def test_what_is_there_is_counted_however_it_comes(parts: list[set[int]], cuts: 
     order = looked_at(columns(seq, part), [min(cut, len(seq)) for cut in cuts])
     assert order.problems == []
     for found, numbers in zip(order.parts, parts, strict=True):
-        assert found.frames == found.held.count == len(numbers)
-        assert found.held == Intervals((n, n) for n in numbers)
+        assert found.frames == found.numbers.count == len(numbers)
+        assert found.numbers == Intervals((n, n) for n in numbers)
         assert (found.seq_first, found.seq_last) == (min(numbers), max(numbers))
         assert found.gaps.count == max(numbers) - min(numbers) + 1 - len(numbers)
         assert found.offset_ns == 7
@@ -85,7 +85,7 @@ def test_who_relies_on_order_is_given_frames_up_to_the_first_disorder() -> None:
     given_out = []
     pieces: list[tuple[FrameBatch, dict[str, np.ndarray]]]
     pieces = [(batch([0, 1]), {}), (batch([2, 3]), {}), (batch([3, 4]), {})]
-    ordered = in_order(pieces, where="walk.parquet")
+    ordered = iterate_checking_order(pieces, where="walk.parquet")
     given_out += [int(next(ordered)[0].seq[0]) for _ in range(2)]
     with pytest.raises(FileFormatError, match=r"walk\.parquet.*out of order.*frame 3 follows"):
         next(ordered)

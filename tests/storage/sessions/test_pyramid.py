@@ -13,18 +13,18 @@ from hypothesis import strategies as st
 
 from devices.frames import NOT_READ
 from storage.sessions.pyramid import (
-    FACTOR,
-    ROWS,
-    TOP,
-    UNKNOWN,
-    WITH,
-    WITHOUT,
+    BINS_PER_COARSER_BIN,
+    CONTACT_ABSENT,
+    CONTACT_PRESENT,
+    CONTACT_UNCERTAIN,
+    FRAMES_PER_FINEST_BIN,
+    MAX_COARSEST_BINS,
     Bins,
-    Pyramid,
-    bin_columns,
-    frame_columns,
-    levels_over,
-    merged,
+    PyramidBuilder,
+    bin_column_types,
+    build_levels,
+    merge_bins,
+    required_frame_columns,
 )
 
 TILES = 2
@@ -38,14 +38,14 @@ def frames(n: int, seed: int = 0, parts: Sequence[int] = ()) -> dict[str, Any]:
     some: dict[str, Any] = {
         "seq": np.cumsum(rng.choice([1, 1, 1, 5], n)).astype(np.uint64),
         "t_ns": 10**18 + np.cumsum(rng.integers(1, 3_000_000, n)),
-        "status": rng.choice([0, 0, 1, 4], (n, TILES)).astype(np.uint8),
-        "frame_status": rng.choice([0, 0, 8], n).astype(np.uint8),
+        "tile_flags": rng.choice([0, 0, 1, 4], (n, TILES)).astype(np.uint8),
+        "frame_flags": rng.choice([0, 0, 8], n).astype(np.uint8),
         "grf_n": grf_n,
         "contact": rng.choice([0, 1, 255], n).astype(np.uint8),
-        "estimate_status": (2 ** rng.integers(0, 14, n)).astype(np.uint16),
+        "estimate_flags": (2 ** rng.integers(0, 14, n)).astype(np.uint16),
         "force_n": rng.normal(5.0, 3.0, (n, TILES)).astype(np.float32),
     }
-    floats = ("grf_sigma_n", "grf_at_least_n", "cop_x_m", "cop_y_m", "angle_rad")
+    floats = ("grf_sigma_n", "grf_lower_bound_n", "cop_x_m", "cop_y_m", "angle_rad")
     for name in (*floats, "cop_sigma_x_m", "cop_sigma_y_m"):
         some[name] = rng.random(n).astype(np.float32)
     if parts:
@@ -60,11 +60,11 @@ def rows(columns: Mapping[str, Any], begin: int, end: int) -> dict[str, Any]:
     return {name: values[begin:end] for name, values in columns.items()}
 
 
-def gathered(columns: Mapping[str, Any], cuts: Sequence[int] = ()) -> Pyramid:
-    pyramid = Pyramid()
+def gathered(columns: Mapping[str, Any], cuts: Sequence[int] = ()) -> PyramidBuilder:
+    pyramid = PyramidBuilder()
     edges = [0, *sorted(cuts), len(columns["seq"])]
     for begin, end in itertools.pairwise(edges):
-        pyramid.feed(rows(columns, begin, end))
+        pyramid.add_frames(rows(columns, begin, end))
     return pyramid
 
 
@@ -85,14 +85,14 @@ def test_however_frames_are_cut_the_bins_are_those_worked_out_one_by_one(
 ) -> None:
     n = sum(parts)
     columns = frames(n, seed, parts)
-    found = gathered(columns, [cut for cut in cuts if cut < n]).finest()
+    found = gathered(columns, [cut for cut in cuts if cut < n]).get_finest_level()
     assert found is not None
-    assert set(found) == set(bin_columns(TILES, estimated=True))
+    assert set(found) == set(bin_column_types(TILES, has_estimates=True))
     at = 0
     for number, length in enumerate(parts):
         first = sum(parts[:number])
-        for begin in range(first, first + length, ROWS):
-            end = min(begin + ROWS, first + length)
+        for begin in range(first, first + length, FRAMES_PER_FINEST_BIN):
+            end = min(begin + FRAMES_PER_FINEST_BIN, first + length)
             some = rows(columns, begin, end)
             before = columns["seq"][begin - 1] if begin > first else None
             check(found, at, some, before, number)
@@ -120,11 +120,15 @@ def check(found: Bins, at: int, some: dict[str, Any], before: Any, part: int) ->
             "cop_x_m_min": some["cop_x_m"].min(),
             "cop_x_low_m_min": (some["cop_x_m"] - np.float32(1.96) * some["cop_sigma_x_m"]).min(),
             "cop_y_high_m_max": (some["cop_y_m"] + np.float32(1.96) * some["cop_sigma_y_m"]).max(),
-            "estimate_status": np.bitwise_or.reduce(some["estimate_status"]),
-            "status_0": np.bitwise_or.reduce(some["status"][:, 0]),
+            "estimate_flags": np.bitwise_or.reduce(some["estimate_flags"]),
+            "tile_flags_0": np.bitwise_or.reduce(some["tile_flags"][:, 0]),
             "contact": sum(
                 bit
-                for bit, value in ((WITHOUT, 0), (WITH, 1), (UNKNOWN, 255))
+                for bit, value in (
+                    (CONTACT_ABSENT, 0),
+                    (CONTACT_PRESENT, 1),
+                    (CONTACT_UNCERTAIN, 255),
+                )
                 if (some["contact"] == value).any()
             ),
         }
@@ -133,58 +137,69 @@ def check(found: Bins, at: int, some: dict[str, Any], before: Any, part: int) ->
 
 
 def test_each_level_has_the_extremes_of_the_frames_whatever_is_in_between() -> None:
-    columns = frames(ROWS * TOP * 3, parts=(ROWS * TOP * 2 + 7, ROWS * TOP - 7))
-    finest = gathered(columns).finest()
+    columns = frames(
+        FRAMES_PER_FINEST_BIN * MAX_COARSEST_BINS * 3,
+        parts=(
+            FRAMES_PER_FINEST_BIN * MAX_COARSEST_BINS * 2 + 7,
+            FRAMES_PER_FINEST_BIN * MAX_COARSEST_BINS - 7,
+        ),
+    )
+    finest = gathered(columns).get_finest_level()
     assert finest is not None
-    levels = levels_over(finest)
+    levels = build_levels(finest)
     assert [len(level["part"]) for level in levels[1:]] == [
-        -(-(2 * TOP + 1) // FACTOR) + TOP // FACTOR
+        -(-(2 * MAX_COARSEST_BINS + 1) // BINS_PER_COARSER_BIN)
+        + MAX_COARSEST_BINS // BINS_PER_COARSER_BIN
     ]
     for level in levels:
         assert level["frames"].sum() == len(columns["seq"])
         assert np.nanmax(level["grf_n_max"]) == np.nanmax(columns["grf_n"])
         assert level["missing"].sum() == finest["missing"].sum()
-    same(levels[1], merged(finest, FACTOR))
+    same(levels[1], merge_bins(finest, BINS_PER_COARSER_BIN))
 
 
 def test_parts_of_a_bin_each_do_not_go_on_for_ever() -> None:
-    columns = frames(TOP + 10, parts=(1,) * (TOP + 10))
-    finest = gathered(columns).finest()
+    columns = frames(MAX_COARSEST_BINS + 10, parts=(1,) * (MAX_COARSEST_BINS + 10))
+    finest = gathered(columns).get_finest_level()
     assert finest is not None
-    assert [len(level["part"]) for level in levels_over(finest)] == [TOP + 10]
+    assert [len(level["part"]) for level in build_levels(finest)] == [MAX_COARSEST_BINS + 10]
 
 
 def test_frames_without_estimates_have_their_counts_and_what_was_not_read_is_no_extreme() -> None:
     n = 100
     columns = {
-        name: values for name, values in frames(n).items() if name in frame_columns(estimated=False)
+        name: values
+        for name, values in frames(n).items()
+        if name in required_frame_columns(has_estimates=False)
     }
-    columns["padc"] = np.tile(np.array([500, 400], dtype=np.uint16), (n, 1))
-    columns["padc"][3:5, 0] = NOT_READ, 510
-    columns["padc"][ROWS:, 1] = NOT_READ
-    found = gathered(columns).finest()
+    columns["pressure_raw"] = np.tile(np.array([500, 400], dtype=np.uint16), (n, 1))
+    columns["pressure_raw"][3:5, 0] = NOT_READ, 510
+    columns["pressure_raw"][FRAMES_PER_FINEST_BIN:, 1] = NOT_READ
+    found = gathered(columns).get_finest_level()
     assert found is not None
-    assert set(found) == set(bin_columns(TILES, estimated=False))
-    assert found["padc_0_min"].tolist() == [500, 500]
-    assert found["padc_0_max"].tolist() == [510, 500]
-    assert found["padc_1_max"][0] == 400
-    assert np.isnan(found["padc_1_max"][1])
+    assert set(found) == set(bin_column_types(TILES, has_estimates=False))
+    assert found["pressure_raw_0_min"].tolist() == [500, 500]
+    assert found["pressure_raw_0_max"].tolist() == [510, 500]
+    assert found["pressure_raw_1_max"][0] == 400
+    assert np.isnan(found["pressure_raw_1_max"][1])
 
 
 def test_without_a_frame_there_is_nothing() -> None:
-    pyramid = Pyramid()
-    pyramid.feed(rows(frames(10), 0, 0))
-    assert pyramid.finest() is None
-    assert pyramid.levels() == []
+    pyramid = PyramidBuilder()
+    pyramid.add_frames(rows(frames(10), 0, 0))
+    assert pyramid.get_finest_level() is None
+    assert pyramid.finish() == []
 
 
 @pytest.mark.parametrize("estimated", [True, False])
 def test_every_column_of_a_bin_has_its_type(estimated: bool) -> None:
     columns = dict(frames(200))
     if not estimated:
-        columns = {n: columns[n] for n in frame_columns(estimated=False) if n in columns}
-        columns["padc"] = np.full((200, TILES), 500, dtype=np.uint16)
-    found = gathered(columns).finest()
+        columns = {
+            n: columns[n] for n in required_frame_columns(has_estimates=False) if n in columns
+        }
+        columns["pressure_raw"] = np.full((200, TILES), 500, dtype=np.uint16)
+    found = gathered(columns).get_finest_level()
     assert found is not None
-    for name, type_ in bin_columns(TILES, estimated=estimated).items():
+    for name, type_ in bin_column_types(TILES, has_estimates=estimated).items():
         assert np.can_cast(found[name].dtype, type_, casting="same_kind"), name

@@ -13,8 +13,13 @@ from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError, OtherVersionError
 from service.estimation.stances import STANCE_COLUMNS, Stance
-from storage.checked_table import write_table
-from storage.sessions.stances import STANCES, read_stances, stances_table, write_stances
+from storage.hashed_table import write_hashed_table
+from storage.sessions.stances import (
+    STORED_STANCE_COLUMNS,
+    make_stance_table,
+    read_stances,
+    write_stances,
+)
 
 NAN = float("nan")
 HOP = Stance(
@@ -29,13 +34,13 @@ HASH = "0123456789abcdef" * 4
 
 
 def written(path: Path) -> pa.Table:
-    table = stances_table(stance.as_dict() for stance in (HOP, HIDDEN))
+    table = make_stance_table(stance.as_dict() for stance in (HOP, HIDDEN))
     write_stances(path, table, frames_sha256=HASH)
     return table
 
 
 def test_the_table_has_what_is_said_of_a_stance_with_units(tmp_path: Path) -> None:
-    assert tuple(column.name for column in STANCES) == STANCE_COLUMNS
+    assert tuple(column.name for column in STORED_STANCE_COLUMNS) == STANCE_COLUMNS
     written(tmp_path / "stances.parquet")
     schema = pq.read_schema(tmp_path / "stances.parquet")
     units = {field.name: (field.metadata or {})[b"unit"].decode() for field in schema}
@@ -61,7 +66,7 @@ def test_what_was_written_is_read_and_what_is_not_known_is_null(tmp_path: Path) 
 
 
 def test_a_session_without_a_stance_has_a_table_without_rows(tmp_path: Path) -> None:
-    write_stances(tmp_path / "stances.parquet", stances_table(()), frames_sha256=HASH)
+    write_stances(tmp_path / "stances.parquet", make_stance_table(()), frames_sha256=HASH)
     assert read_stances(tmp_path / "stances.parquet").table.to_pylist() == []
 
 
@@ -79,10 +84,10 @@ def test_any_flipped_bit_is_damage(tmp_path: Path, at: int, bit: int) -> None:
 
 def test_another_table_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "stances.parquet"
-    write_table(path, pa.table({"number": [1]}))
+    write_hashed_table(path, pa.table({"number": [1]}))
     with pytest.raises(DamagedFileError, match="no table of stances"):
         read_stances(path)
-    pq.write_table(stances_table(()), path)  # without a hash
+    pq.write_table(make_stance_table(()), path)  # without a hash
     with pytest.raises(DamagedFileError, match="no table of stances"):
         read_stances(path)
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.clock.bounds import Rows
-from storage.clock.table import ClockTable, StreamFacts
-from storage.sessions.time_axis import GAP_MAX_NS, NODE_AXIS, PartSpan, TimeAxis, time_axis
+from storage.clock.bounds import OffsetRows
+from storage.clock.table import ClockTable, StreamClockFacts
+from storage.sessions.time_axis import MAX_GAP_NS, NODE_AXIS, PartSpan, TimeAxis, compute_time_axis
 
 SECOND = 1_000_000_000
 PERIOD_NS = 2_000_000
@@ -48,18 +48,20 @@ def spans_and_clock(parts: list[Part]) -> tuple[list[PartSpan], ClockTable, list
         ends = (t_mono_ns, t_mono_ns + part.length_ns), (t_ns, t_ns + part.length_ns)
         spans.append(PartSpan(number, name, *ends))
         if part.is_measured:
-            rows[name] = Rows(*np.array([[t_mono_ns], [part.wrong_ns], [BOUND_NS]], dtype=np.int64))
+            rows[name] = OffsetRows(
+                *np.array([[t_mono_ns], [part.wrong_ns], [BOUND_NS]], dtype=np.int64)
+            )
         now_ns += part.length_ns
     names = [span.stream_id for span in spans]
-    return spans, ClockTable(rows, [StreamFacts(name) for name in names], names), begins_ns
+    return spans, ClockTable(rows, [StreamClockFacts(name) for name in names], names), begins_ns
 
 
 def found(parts: list[Part]) -> tuple[TimeAxis, list[int], list[int]]:
     """The axis, where on it each part begins, and where it truly does."""
     spans, clock, begins_ns = spans_and_clock(parts)
-    axis = time_axis(spans, clock, period_ns=PERIOD_NS)
+    axis = compute_time_axis(spans, clock, period_ns=PERIOD_NS)
     first_ns = spans[0].t_ns[0]
-    on_axis = [span.t_ns[0] + axis.shift_ns(span.number) - first_ns for span in spans]
+    on_axis = [span.t_ns[0] + axis.get_shift_ns(span.number) - first_ns for span in spans]
     return axis, on_axis, begins_ns
 
 
@@ -84,10 +86,10 @@ def test_parts_follow_each_other_on_the_axis_whatever_dates_their_node_had(
     parts: list[Part],
 ) -> None:
     axis, on_axis, _ = found(parts)
-    assert axis.shift_ns(0) == 0
+    assert axis.get_shift_ns(0) == 0
     for i in range(1, len(parts)):
         gap_ns = on_axis[i] - on_axis[i - 1] - parts[i - 1].length_ns
-        assert 0 < gap_ns <= GAP_MAX_NS
+        assert 0 < gap_ns <= MAX_GAP_NS
 
 
 @given(PARTS)
@@ -120,28 +122,28 @@ def test_without_a_comparison_on_both_sides_parts_are_end_to_end_and_that_is_sai
     axis, on_axis, _ = found(parts)
     assert axis.bases == ("node", "joined")
     assert on_axis[1] == SECOND + PERIOD_NS
-    assert "not compared" in axis.remark()
+    assert "not compared" in axis.describe_shift()
 
 
 def test_when_it_was_the_servers_date_that_was_set_the_nodes_is_believed() -> None:
     parts = [Part(0, SECOND, -YEARS_57, True), Part(5 * SECOND, SECOND, -YEARS_57, True)]
     spans, _, _ = spans_and_clock(parts)
     rows = {
-        "stream-0": Rows(*np.array([[50 * SECOND], [-2 * YEARS_57], [9]], dtype=np.int64)),
-        "stream-1": Rows(*np.array([[50 * SECOND], [-YEARS_57], [9]], dtype=np.int64)),
+        "stream-0": OffsetRows(*np.array([[50 * SECOND], [-2 * YEARS_57], [9]], dtype=np.int64)),
+        "stream-1": OffsetRows(*np.array([[50 * SECOND], [-YEARS_57], [9]], dtype=np.int64)),
     }
     names = list(rows)
-    clock = ClockTable(rows, [StreamFacts(name) for name in names], names)
-    assert not time_axis(spans, clock, period_ns=PERIOD_NS).is_shifted
+    clock = ClockTable(rows, [StreamClockFacts(name) for name in names], names)
+    assert not compute_time_axis(spans, clock, period_ns=PERIOD_NS).is_shifted
 
 
 def test_a_part_without_frames_takes_no_time_and_two_parts_of_one_stream_have_one_date() -> None:
     spans, clock, _ = spans_and_clock([Part(0, SECOND, YEARS_57, True), Part(SECOND, 9, 0, True)])
     behind = PartSpan(2, spans[1].stream_id, *((t, t) for t in (10**12, SERVER_NS)))
-    axis = time_axis([spans[0], spans[1], behind], clock, period_ns=PERIOD_NS)
-    assert axis.shift_ns(2) == axis.shift_ns(1) == axis.shift_ns(99) != 0
+    axis = compute_time_axis([spans[0], spans[1], behind], clock, period_ns=PERIOD_NS)
+    assert axis.get_shift_ns(2) == axis.get_shift_ns(1) == axis.get_shift_ns(99) != 0
     alone = PartSpan(3, "stream-1", spans[1].t_mono_ns, spans[1].t_ns)
-    assert time_axis([alone], None, period_ns=PERIOD_NS).shifts_ns == (0, 0, 0, 0)
+    assert compute_time_axis([alone], None, period_ns=PERIOD_NS).shifts_ns == (0, 0, 0, 0)
 
 
 @given(
@@ -155,7 +157,7 @@ def test_no_frame_of_a_time_is_left_out(
 ) -> None:
     axis = TimeAxis(tuple(shifts_ns))
     part = np.arange(len(t_ns), dtype=np.uint16) % len(shifts_ns)
-    at_ns = axis.at(np.array(t_ns, dtype=np.int64), part)
+    at_ns = axis.shift_to_axis(np.array(t_ns, dtype=np.int64), part)
     inside = np.ones(len(t_ns), dtype=bool)
     inside &= True if begin_ns is None else at_ns >= begin_ns
     inside &= True if end_ns is None else at_ns < end_ns
@@ -164,8 +166,8 @@ def test_no_frame_of_a_time_is_left_out(
 
 def test_it_is_read_back_as_it_was_stated() -> None:
     axis = TimeAxis((0, -YEARS_57), ("node", "server"))
-    assert TimeAxis.from_dicts(axis.as_dicts(), where="x") == axis
-    assert NODE_AXIS.remark() == ""
+    assert TimeAxis.from_json_list(axis.to_json_list(), where="x") == axis
+    assert NODE_AXIS.describe_shift() == ""
     odd: list[object] = [
         None,
         [{}],
@@ -175,4 +177,4 @@ def test_it_is_read_back_as_it_was_stated() -> None:
     ]
     for wrong in odd:
         with pytest.raises(ValueError, match="no time axis"):
-            TimeAxis.from_dicts(wrong, where="x")
+            TimeAxis.from_json_list(wrong, where="x")

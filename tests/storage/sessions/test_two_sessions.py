@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from storage.clock.bounds import Rows
-from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import content_of
+from storage.clock.bounds import OffsetRows
+from storage.clock.table import ClockTable, StreamClockFacts
+from storage.formats.export import make_frame_source
 from storage.formats.slice import Slice
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
@@ -42,7 +42,7 @@ class Node:
         """Its monotonic clock at these instants of the server's."""
         return self._booted_ns + np.rint((server_ns - BEGIN_NS) / self._rate).astype(np.int64)
 
-    def rows(self, seed: int) -> Rows:
+    def rows(self, seed: int) -> OffsetRows:
         random = np.random.default_rng(seed)
         sent_ns = BEGIN_NS + 10 * SECOND * np.arange(7, dtype=np.int64)
         go_ns = np.rint(3e5 + random.exponential(1e6, 7)).astype(np.int64)
@@ -50,14 +50,14 @@ class Node:
         sent, came = self.read_ns(sent_ns), self.read_ns(sent_ns + go_ns + back_ns)
         middle = (sent + came) // 2
         offset = sent_ns + go_ns - middle - self._utc_offset_ns
-        return Rows(middle, offset, (came - sent + 1) // 2)
+        return OffsetRows(middle, offset, (came - sent + 1) // 2)
 
     def export(self, path: Path, seed: int, *, measured_parts: int) -> None:
         """Write what `foottile export --clock server` does, of two parts, measured or not."""
         info = make_array(
             1,
             node=self.name,
-            boot_id="first",
+            stream_id="first",
             nominal_rate_hz=1e9 / PERIOD_NS,
             utc_offset_ns=self._utc_offset_ns,
             clock_set=False,
@@ -68,9 +68,11 @@ class Node:
         part = (np.arange(FRAMES) >= FRAMES - 100).astype(np.uint16)
         names = ["first", "second"]
         rows = dict.fromkeys(names[:measured_parts], self.rows(seed))
-        clock = ClockTable(rows, [StreamFacts(name) for name in names], names)
+        clock = ClockTable(rows, [StreamClockFacts(name) for name in names], names)
         pieces = iter([(frames, {"part": part})])
-        path.write_bytes(b"".join(export(content_of(pieces), info, {}, "parquet", Slice(), clock)))
+        path.write_bytes(
+            b"".join(export(make_frame_source(pieces), info, {}, "parquet", Slice(), clock))
+        )
 
 
 @pytest.fixture

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from devices.frames import ArrayInfo, FrameBatch
-from service.sessions.sealing import seal
-from service.sessions.sources import Sources
-from storage.checked_json import with_check
+from service.sessions.inputs import SessionInputs
+from service.sessions.sealing import seal_session
+from storage.checksummed_json import append_checksum
 from storage.clock.log import ClockOffset
 from storage.intervals import Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
-from storage.sessions.folder import Event, Part, Session, SessionFolder
-from storage.sessions.ledger import StreamState, ledger_of
+from storage.sessions.folder import Marker, Part, Session, SessionsFolder
+from storage.sessions.ledger import StreamState, compute_ledger
 from storage.verify.session import verify_session
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
@@ -25,11 +25,11 @@ from tests.builders.frames import make_frames
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
 BOOTS = ("a" * 32, "b" * 32)
-EVENTS = (Event(id="e1", label="slip", t_ns=UTC_NS + 5),)
+EVENTS = (Marker(id="e1", label="slip", t_ns=UTC_NS + 5),)
 
 
 def array(boot: int = 0) -> ArrayInfo:
-    return make_array(1, boot_id=BOOTS[boot], utc_offset_ns=UTC_NS + boot)
+    return make_array(1, stream_id=BOOTS[boot], utc_offset_ns=UTC_NS + boot)
 
 
 def frames(first: int, last: int, boot: int = 0) -> FrameBatch:
@@ -41,7 +41,7 @@ def journal(data: Path, boot: int, *runs: tuple[int, int], **notes: Any) -> Jour
     held = Journal(folder, array(boot))
     for first, last in runs:
         for begin in range(first, last + 1, 5):
-            held.append(frames(begin, min(begin + 4, last), boot))
+            held.append_new_frames(frames(begin, min(begin + 4, last), boot))
     held.close()
     StreamNotes(array_info=array(boot), **notes).save(folder)
     return held
@@ -56,14 +56,14 @@ def session(session_id: str = ID, **changes: Any) -> Session:
         "started_t_ns": UTC_NS,
         "stopped_t_ns": UTC_NS + 10**9,
         "parts": (
-            Part(boot_id=BOOTS[0], seq_first=10, seq_last=49),
-            Part(boot_id=BOOTS[1], seq_first=0, seq_last=19),
+            Part(stream_id=BOOTS[0], seq_first=10, seq_last=49),
+            Part(stream_id=BOOTS[1], seq_first=0, seq_last=19),
         ),
         "scene": "test",
         "notes": "first try",
-        "events": EVENTS,
+        "markers": EVENTS,
         "clock": (
-            ClockOffset(boot_id=BOOTS[0], t_mono_ns=1, server_minus_node_ns=2, uncertainty_ns=3),
+            ClockOffset(stream_id=BOOTS[0], t_mono_ns=1, server_minus_node_ns=2, uncertainty_ns=3),
         ),
     }
     return Session(**content | changes)
@@ -71,7 +71,7 @@ def session(session_id: str = ID, **changes: Any) -> Session:
 
 def keep(data: Path, kept: Session, *, place: str = "sessions") -> Path:
     """As a server keeps it, with the hash of its own text."""
-    SessionFolder(data / place).save(kept)
+    SessionsFolder(data / place).save(kept)
     return data / place / kept.id
 
 
@@ -84,13 +84,15 @@ def sealed(data: Path, session_id: str = ID, **changes: Any) -> Path:
     }
     lost = {BOOTS[0]: Losses({"disk_full": [(20, 24)]})}
     states = {
-        boot_id: StreamState(held=held.held, lost=lost.get(boot_id, Losses()))
-        for boot_id, held in journals.items()
+        stream_id: StreamState(stored=held.stored, lost=lost.get(stream_id, Losses()))
+        for stream_id, held in journals.items()
     }
-    ledger = ledger_of(begun.parts, states, finished=True)
-    notes = {"lost": {boot_id: losses.as_pairs() for boot_id, losses in lost.items()}}
+    ledger = compute_ledger(begun.parts, states, is_finished=True)
+    notes = {"lost": {stream_id: losses.to_pairs() for stream_id, losses in lost.items()}}
     folder = keep(data, begun)
-    done = seal(Sources(begun, array(), journals, None, "none", (), notes), folder, ledger)
+    done = seal_session(
+        SessionInputs(begun, array(), journals, None, "none", (), notes), folder, ledger
+    )
     return keep(data, done)
 
 
@@ -103,7 +105,7 @@ def edited(folder: Path, change: Any) -> None:
     content = json.loads(path.read_bytes())
     content.pop("check", None)
     change(content)
-    path.write_bytes(with_check(json.dumps(content).encode()))
+    path.write_bytes(append_checksum(json.dumps(content).encode()))
 
 
 def raised(name: str, value: Any) -> Any:

@@ -14,17 +14,17 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
-from storage.checked_json import without_check
+from storage.checksummed_json import strip_checksum
 from storage.clock.log import ClockLog, ClockOffset
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.segment_format import INDEX_SUFFIX, RECORD, read_header
+from storage.journal.segment_format import INDEX_SUFFIX, RECORD_DTYPE, read_schema_and_first_offset
 from storage.journal.segment_writer import SegmentWriter
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
-from storage.schema import array_info, older_wire_schema, wire_schema
-from storage.verify.journal import verify_stream
+from storage.schema import legacy_wire_schema, read_array_info, wire_schema
+from storage.verify.journal import verify_journal
 from storage.verify.segment import verify_segment
-from storage.wire import EncodedBatch, encode
+from storage.wire import EncodedBatch, encode_frames
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 
@@ -32,7 +32,7 @@ BOOT = "a" * 32
 
 
 def array(**changes: Any) -> ArrayInfo:
-    return make_array(1, **{"boot_id": BOOT} | changes)
+    return make_array(1, **{"stream_id": BOOT} | changes)
 
 
 def frames(first: int, last: int, *, at_ns: int = 0) -> FrameBatch:
@@ -45,7 +45,7 @@ def stream(root: Path, *, next_seq: int | None = None) -> Path:
     folder = root / "journal" / "bench" / BOOT
     journal = Journal(folder, array())
     for first in range(0, 40, 5):
-        journal.append(frames(first, first + 4))
+        journal.append_new_frames(frames(first, first + 4))
     journal.close()
     StreamNotes(array_info=array(), next_seq=next_seq).save(folder)
     return folder
@@ -61,27 +61,27 @@ def index_of(folder: Path) -> Path:
 
 
 def ends(folder: Path) -> list[int]:
-    records = np.frombuffer(index_of(folder).read_bytes(), RECORD)
+    records = np.frombuffer(index_of(folder).read_bytes(), RECORD_DTYPE)
     return [int(r["offset"] + r["length"]) for r in records if r["count"]]
 
 
 def problems(folder: Path) -> str:
-    return "; ".join(verify_stream(folder).problems)
+    return "; ".join(verify_journal(folder).problems)
 
 
 def opened(folder: Path) -> Path:
     """As it is while it is written: the mark of the end is not there yet."""
     path = index_of(folder)
-    path.write_bytes(path.read_bytes()[: -RECORD.itemsize])
+    path.write_bytes(path.read_bytes()[: -RECORD_DTYPE.itemsize])
     return folder
 
 
 def test_a_whole_journal_is_counted_and_nothing_is_touched(tmp_path: Path) -> None:
     folder = stream(tmp_path, next_seq=40)
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
-    report = verify_stream(folder)
+    report = verify_journal(folder)
     assert report.problems == report.remarks == []
-    assert report.held == Intervals([(0, 39)])
+    assert report.stored == Intervals([(0, 39)])
     assert not report.missing
     assert not report.unsynced
     assert before == {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.iterdir()}
@@ -93,9 +93,9 @@ def test_a_journal_that_is_being_written_is_whole(tmp_path: Path) -> None:
     StreamNotes(array_info=array()).save(folder)
     assert problems(folder) == ""
     for first in range(0, 20, 5):
-        journal.append(frames(first, first + 4))
-        report = verify_stream(folder)
-        assert (report.problems, report.held.last) == ([], first + 4)
+        journal.append_new_frames(frames(first, first + 4))
+        report = verify_journal(folder)
+        assert (report.problems, report.stored.last) == ([], first + 4)
     journal.close()
 
 
@@ -110,26 +110,26 @@ def test_a_segment_that_was_cut_at_any_byte_is_damaged_if_it_was_closed(
     whole, boundaries = path.read_bytes(), ends(folder)
     for size in sorted({*range(0, len(whole), 97), *boundaries[:-1], len(whole) - 1}):
         path.write_bytes(whole[:size])
-        report = verify_stream(folder)
+        report = verify_journal(folder)
         gone = 40 - 5 * sum(end <= size for end in boundaries)
         if closed:
             assert report.problems, size
         else:  # nobody was promised what is gone, and the index still says how much it is
             assert report.problems == [], size
             assert report.unsynced.count == gone or size < boundaries[0]
-            assert report.held.count == 40 - gone
+            assert report.stored.count == 40 - gone
 
 
 def test_a_cut_at_a_batch_of_segment_and_index_is_seen_by_the_stream_s_end(tmp_path: Path) -> None:
     folder = stream(tmp_path, next_seq=40)
     path, index = segment_of(folder), index_of(folder)
     path.write_bytes(path.read_bytes()[: ends(folder)[4]])
-    index.write_bytes(index.read_bytes()[: 5 * RECORD.itemsize])
-    report = verify_stream(folder)
+    index.write_bytes(index.read_bytes()[: 5 * RECORD_DTYPE.itemsize])
+    report = verify_journal(folder)
     assert report.missing == Intervals([(25, 39)])
     assert "cut behind frame 24" in "; ".join(report.problems)
     (tmp_path / "nodes").mkdir()  # a server may still get the rest
-    report = verify_stream(folder)
+    report = verify_journal(folder)
     assert (report.problems, report.missing.count) == ([], 15)
 
 
@@ -137,10 +137,10 @@ def test_batches_that_are_in_no_index_are_seen(tmp_path: Path) -> None:
     folder = stream(tmp_path)
     index = index_of(folder)
     whole = index.read_bytes()
-    index.write_bytes(whole[: 4 * RECORD.itemsize])
+    index.write_bytes(whole[: 4 * RECORD_DTYPE.itemsize])
     assert "4 batches behind its last one are in no index" in problems(folder)
-    index.write_bytes(whole[: 7 * RECORD.itemsize])  # the newest may be on its way
-    report = verify_stream(folder)
+    index.write_bytes(whole[: 7 * RECORD_DTYPE.itemsize])  # the newest may be on its way
+    report = verify_journal(folder)
     assert report.problems == []
     assert "in no index" in "; ".join(report.remarks)
 
@@ -173,11 +173,11 @@ def test_one_flipped_bit_anywhere_in_a_closed_segment_or_its_index_is_found(
     content[at] ^= 1 << data.draw(st.integers(0, 7))
     try:
         path.write_bytes(content)
-        report = verify_stream(folder)
+        report = verify_journal(folder)
     finally:
         path.write_bytes(whole)
     # A header has padding, and bytes that nobody reads.
-    harmless = path.suffix == ".arrows" and at < ends(folder)[0] and report.held.count == 40
+    harmless = path.suffix == ".arrows" and at < ends(folder)[0] and report.stored.count == 40
     assert report.problems or harmless
 
 
@@ -185,10 +185,10 @@ def test_a_column_whose_name_is_damaged_beyond_reading_is_a_problem(tmp_path: Pa
     folder = opened(stream(tmp_path))
     path = segment_of(folder)
     content = path.read_bytes()
-    path.write_bytes(content.replace(b"frame_status", b"\xf2rame_status", 1))
-    report = verify_stream(folder)
+    path.write_bytes(content.replace(b"frame_flags", b"\xf2rame_flags", 1))
+    report = verify_journal(folder)
     assert "its columns are not those of a stream of frames" in "; ".join(report.problems)
-    assert report.held == Intervals([(0, 39)])
+    assert report.stored == Intervals([(0, 39)])
 
 
 def test_a_damaged_batch_costs_itself_only_and_is_named(tmp_path: Path) -> None:
@@ -197,9 +197,9 @@ def test_a_damaged_batch_costs_itself_only_and_is_named(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[ends(folder)[3] - 9] ^= 1
     path.write_bytes(content)
-    report = verify_stream(folder)
+    report = verify_journal(folder)
     assert "frames 15 to 19 do not agree with their checksum" in "; ".join(report.problems)
-    assert report.held == Intervals([(0, 14), (20, 39)])
+    assert report.stored == Intervals([(0, 14), (20, 39)])
     assert report.lost.by_reason["corrupt"] == Intervals([(15, 19)])
 
 
@@ -213,8 +213,8 @@ def test_a_journal_in_another_stream_s_place_is_seen(tmp_path: Path) -> None:
 def test_a_segment_of_another_stream_is_seen(tmp_path: Path) -> None:
     folder = stream(tmp_path / "one")
     other = tmp_path / "two"
-    journal = Journal(other, array(boot_id="b" * 32))
-    journal.append(frames(40, 49))
+    journal = Journal(other, array(stream_id="b" * 32))
+    journal.append_new_frames(frames(40, 49))
     journal.close()
     for path in other.iterdir():
         shutil.copy(path, folder)
@@ -230,17 +230,17 @@ def test_notes_that_are_damaged_are_named(tmp_path: Path) -> None:
     (folder / NOTES_FILE).write_bytes(b"{")
     assert problems(folder).startswith(NOTES_FILE)
     (folder / NOTES_FILE).unlink()
-    report = verify_stream(folder)
+    report = verify_journal(folder)
     assert report.problems == []
     assert "nothing says where the stream ended" in "; ".join(report.remarks)
 
 
 def test_time_that_runs_back_from_one_segment_to_the_next_is_seen(tmp_path: Path) -> None:
     folder = stream(tmp_path)
-    payload = encode(late := frames(40, 44, at_ns=-(10**9)), wire_schema(array()))
+    payload = encode_frames(late := frames(40, 44, at_ns=-(10**9)), wire_schema(array()))
     header = wire_schema(array()).serialize().to_pybytes()
     writer = SegmentWriter(folder / f"{40:020d}.arrows", header)
-    writer.append(EncodedBatch.of(late, payload))
+    writer.append(EncodedBatch.from_frames_and_payload(late, payload))
     writer.close()
     assert "time runs back before frame 40" in problems(folder)
 
@@ -248,7 +248,7 @@ def test_time_that_runs_back_from_one_segment_to_the_next_is_seen(tmp_path: Path
 def test_a_segment_proves_itself_alone(tmp_path: Path) -> None:
     path = segment_of(stream(tmp_path))
     report = verify_segment(path)
-    assert (report.held.count, report.is_closed, report.problems) == (40, True, [])
+    assert (report.stored.count, report.is_closed, report.problems) == (40, True, [])
     with pytest.raises(FileFormatError, match=r"none\.arrows"):
         verify_segment(path.with_name("none.arrows"))
 
@@ -257,26 +257,26 @@ def test_what_was_cut_off_after_a_crash_is_mentioned(tmp_path: Path) -> None:
     folder = opened(stream(tmp_path))
     path = segment_of(folder)
     path.write_bytes(path.read_bytes() + b"half a batch")
-    assert verify_stream(folder).problems == []
+    assert verify_journal(folder).problems == []
     Journal.open(folder).close()
-    report = verify_stream(folder)
-    assert (report.problems, report.held.count) == ([], 40)
+    report = verify_journal(folder)
+    assert (report.problems, report.stored.count) == ([], 40)
     assert "no whole batch" in "; ".join(report.remarks)
 
 
 def test_what_a_disk_refused_once_and_was_written_again_is_no_disorder(tmp_path: Path) -> None:
-    folder = tmp_path / "journal" / "bench" / array().boot_id
+    folder = tmp_path / "journal" / "bench" / array().stream_id
     journal = Journal(folder, array())
     for first in range(0, 40, 10):
-        journal.append(frames(first, first + 9))
-    journal.disown(Intervals([(20, 39)]))
+        journal.append_new_frames(frames(first, first + 9))
+    journal.invalidate(Intervals([(20, 39)]))
     for first in range(20, 60, 10):
-        journal.append(frames(first, first + 9))
+        journal.append_new_frames(frames(first, first + 9))
     StreamNotes(array_info=array(), next_seq=60).save(folder)
     journal.close()
-    report = verify_stream(folder)
+    report = verify_journal(folder)
     assert report.problems == []
-    assert list(report.held) == [(0, 59)]
+    assert list(report.stored) == [(0, 59)]
 
 
 # --- beside the segments --------------------------------------------------------------------------
@@ -287,7 +287,7 @@ def with_clock(folder: Path) -> Path:
     for second in range(4):
         log.append(
             ClockOffset(
-                boot_id=BOOT,
+                stream_id=BOOT,
                 t_mono_ns=second * 10**9,
                 server_minus_node_ns=second,
                 uncertainty_ns=500,
@@ -305,13 +305,15 @@ def test_a_damaged_clock_row_is_said_and_a_torn_last_one_is_no_damage(tmp_path: 
         damaged = bytearray(whole)
         damaged[at] ^= 4
         path.write_bytes(damaged)
-        report = verify_stream(path.parent)  # a power cut may leave anything of the last line
+        report = verify_journal(path.parent)  # a power cut may leave anything of the last line
         assert "clock.jsonl" in " ".join(report.problems if at < last else report.remarks)
     path.write_bytes(whole[:-20])
-    report = verify_stream(path.parent)
+    report = verify_journal(path.parent)
     assert (report.problems, "clock.jsonl" in report.remarks[-1]) == ([], True)
-    ClockLog(path.parent).append(ClockLog(path.parent).rows()[0])  # which cuts the torn one off
-    assert verify_stream(path.parent).remarks == []
+    ClockLog(path.parent).append(
+        ClockLog(path.parent).read_rows()[0]
+    )  # which cuts the torn one off
+    assert verify_journal(path.parent).remarks == []
 
 
 def test_no_flip_in_a_streams_notes_is_read_and_older_ones_are_unproven(tmp_path: Path) -> None:
@@ -325,8 +327,8 @@ def test_no_flip_in_a_streams_notes_is_read_and_older_ones_are_unproven(tmp_path
         with pytest.raises(FileFormatError):
             StreamNotes.load(folder)
     assert NOTES_FILE in problems(folder)
-    path.write_bytes(without_check(whole))
-    report = verify_stream(folder)
+    path.write_bytes(strip_checksum(whole))
+    report = verify_journal(folder)
     assert (report.problems, NOTES_FILE in report.unproven[0]) == ([], True)
 
 
@@ -335,14 +337,14 @@ def test_no_flip_in_a_segments_header_gives_another_array(tmp_path: Path) -> Non
     (folder / NOTES_FILE).unlink()  # so that only the segment says which array it is of
     path = segment_of(folder)
     whole = path.read_bytes()
-    _, header_bytes = read_header(path)
+    _, header_bytes = read_schema_and_first_offset(path)
     for at in range(0, header_bytes, 3):
         damaged = bytearray(whole)
         damaged[at] ^= 1 << at % 8
         path.write_bytes(damaged)
-        schema, _ = read_header(path)
+        schema, _ = read_schema_and_first_offset(path)
         with suppress(FileFormatError):
-            same = schema is None or array_info(schema, where="") == array()
+            same = schema is None or read_array_info(schema, where="") == array()
             assert same, f"flipped at {at}"
             continue
         assert problems(folder) != ""
@@ -351,10 +353,12 @@ def test_no_flip_in_a_segments_header_gives_another_array(tmp_path: Path) -> Non
 def test_segments_of_older_versions_without_a_hash_are_read(tmp_path: Path) -> None:
     info = array()
     writer = SegmentWriter(
-        tmp_path / f"{0:020}.arrows", older_wire_schema(info).serialize().to_pybytes()
+        tmp_path / f"{0:020}.arrows", legacy_wire_schema(info).serialize().to_pybytes()
     )
     batch = frames(0, 4)
-    writer.append(EncodedBatch.of(batch, encode(batch, wire_schema(info))))
+    writer.append(
+        EncodedBatch.from_frames_and_payload(batch, encode_frames(batch, wire_schema(info)))
+    )
     writer.close()
     report = verify_segment(tmp_path / f"{0:020}.arrows")
-    assert (report.problems, report.held.count, report.info) == ([], 5, info)
+    assert (report.problems, report.stored.count, report.info) == ([], 5, info)

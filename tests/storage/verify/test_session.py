@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from devices.errors import FileFormatError
-from service.sessions.sealing import seal
-from service.sessions.sources import Sources
+from service.sessions.inputs import SessionInputs
+from service.sessions.sealing import seal_session
 from storage.sessions.folder import Part, Session
-from storage.sessions.ledger import ledger_of
-from storage.verify.data import verdict_of, verify
-from storage.verify.file import verify_file
+from storage.sessions.ledger import compute_ledger
+from storage.verify.data_folder import find_verdict, verify_path
+from storage.verify.sealed_file import verify_sealed_file
 from storage.verify.session import SessionReport, verify_session
 from tests.storage.verify.folders import (
     BOOTS,
@@ -39,30 +39,33 @@ def test_a_whole_session_is_proven_and_nothing_is_touched(tmp_path: Path) -> Non
     before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.iterdir()}
     report = verify_session(folder)
     assert (report.problems, report.unproven) == ([], [])
-    assert verdict_of(report) == "lossy"
-    content = report.as_dict()
+    assert find_verdict(report) == "lossy"
+    content = report.to_json_dict()
     assert set(content) == {
         *("complete", "lossy", "parts", "missed_slots"),
         *("id", "problems", "sha256", "unproven"),
     }
     assert (content["complete"], content["lossy"], content["id"]) == (False, True, ID)
     assert content["parts"][0] == {
-        "boot_id": BOOTS[0],
+        "stream_id": BOOTS[0],
         "seq_first": 10,
         "seq_last": 49,
         "recorded": 35,
         "lost": {"disk_full": 5},
         "pending": 0,
-        "unsynced_tail_max": 0,
+        "max_lost_tail_frames": 0,
     }
     assert before == {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.iterdir()}
 
 
 def test_a_session_without_a_frame_is_whole(tmp_path: Path) -> None:
-    begun = session(parts=(Part(boot_id=BOOTS[0], seq_first=0, seq_last=-1),))
-    ledger = ledger_of(begun.parts, {}, finished=True)
+    begun = session(parts=(Part(stream_id=BOOTS[0], seq_first=0, seq_last=-1),))
+    ledger = compute_ledger(begun.parts, {}, is_finished=True)
     folder = keep(tmp_path, begun)
-    keep(tmp_path, seal(Sources(begun, array(), {}, None, "none", (), {}), folder, ledger))
+    keep(
+        tmp_path,
+        seal_session(SessionInputs(begun, array(), {}, None, "none", (), {}), folder, ledger),
+    )
     assert problems(folder) == ""
     (folder / "frames.parquet").write_bytes(b"")
     assert "no frame recorded" in problems(folder)
@@ -79,11 +82,11 @@ def test_a_session_that_was_pulled_is_proven_too(tmp_path: Path) -> None:
     )
     view = kept.model_dump(
         mode="json",
-        exclude={"ledger", "events", "clock", "scene_content", "calibration"},
+        exclude={"ledger", "markers", "clock", "scene_content", "calibration"},
         exclude_defaults=False,
     )
     view.pop("missed_slots_at_start")
-    view.pop("unsynced_tail_max")
+    view.pop("max_lost_tail_frames")
     pulled = tmp_path / "pulled" / ID
     pulled.mkdir(parents=True)
     shutil.copy(folder / "frames.parquet", pulled)
@@ -92,7 +95,7 @@ def test_a_session_that_was_pulled_is_proven_too(tmp_path: Path) -> None:
     (pulled / "ledger.json").write_text(kept.ledger.model_dump_json())
     report = verify_session(pulled)
     assert report.problems == []
-    assert verdict_of(report) == "lossy"
+    assert find_verdict(report) == "lossy"
     edited_ledger = kept.ledger.model_copy(update={"lossy": False, "complete": True})
     (pulled / "ledger.json").write_text(edited_ledger.model_dump_json())
     assert "ledgers" in problems(pulled)
@@ -100,10 +103,10 @@ def test_a_session_that_was_pulled_is_proven_too(tmp_path: Path) -> None:
 
 def test_a_lone_file_says_what_it_cannot_prove(tmp_path: Path) -> None:
     path = sealed(tmp_path) / "frames.parquet"
-    report = verify(path)
+    report = verify_path(path)
     assert isinstance(report, SessionReport)
-    assert report.as_dict()["id"] == ID
-    assert verdict_of(report) == "lossy"
+    assert report.to_json_dict()["id"] == ID
+    assert find_verdict(report) == "lossy"
     assert "session.json" in " ".join(report.unproven)
 
 
@@ -116,31 +119,31 @@ def test_a_session_that_waits_is_counted_from_the_journals(tmp_path: Path) -> No
     folder = keep(tmp_path, session(state="pending", missed_slots_at_start=4))
     report = verify_session(folder)
     assert report.problems == []
-    assert verdict_of(report) == "pending"
-    content = report.as_dict()
+    assert find_verdict(report) == "pending"
+    content = report.to_json_dict()
     assert (content["complete"], content["sha256"], content["missed_slots"]) == (False, None, 5)
     first, second = content["parts"]
     assert (first["recorded"], first["lost"], first["pending"]) == (35, {"disk_full": 2}, 3)
     assert (second["recorded"], second["pending"]) == (0, 20)
     shutil.rmtree(tmp_path / "nodes")  # a node has what there is
-    first, second = verify_session(folder).as_dict()["parts"]
+    first, second = verify_session(folder).to_json_dict()["parts"]
     assert (first["lost"], first["pending"]) == ({"disk_full": 2, "node_restarted": 3}, 0)
     assert second["lost"] == {"node_restarted": 20}
 
 
 def test_a_session_that_is_recorded_reaches_to_the_newest_frame(tmp_path: Path) -> None:
     journal(tmp_path, 0, (0, 29))
-    parts = (Part(boot_id=BOOTS[0], seq_first=5),)
+    parts = (Part(stream_id=BOOTS[0], seq_first=5),)
     folder = keep(tmp_path, session(state="recording", parts=parts, stopped_t_ns=None))
     report = verify_session(folder)
     assert report.ledger is not None
     assert (report.ledger.parts[0].seq_last, report.ledger.parts[0].recorded) == (29, 25)
-    assert verdict_of(report) == "pending"
+    assert find_verdict(report) == "pending"
     lonely = tmp_path / "far" / "off" / ID
     shutil.copytree(folder, lonely)
     report = verify_session(lonely)
     assert "journals are not here" in " ".join(report.unproven)
-    assert verify_session(lonely, data=tmp_path).frames == 25
+    assert verify_session(lonely, data_folder=tmp_path).frame_count == 25
 
 
 def test_damage_in_a_journal_that_it_needs_is_its_own(tmp_path: Path) -> None:
@@ -149,7 +152,7 @@ def test_damage_in_a_journal_that_it_needs_is_its_own(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
-    parts = (Part(boot_id=BOOTS[0], seq_first=0, seq_last=60),)
+    parts = (Part(stream_id=BOOTS[0], seq_first=0, seq_last=60),)
     report = verify_session(keep(tmp_path, session(state="pending", parts=parts)))
     assert "do not agree with their checksum" in "; ".join(report.problems)
     assert report.ledger is not None
@@ -169,9 +172,9 @@ def test_what_changes_while_it_is_read_is_read_again(
     def meanwhile(path: Path) -> Any:
         calls.append(path)
         (folder / "session.json").write_bytes(before)
-        return verify_file(path)
+        return verify_sealed_file(path)
 
-    monkeypatch.setattr(module, "verify_file", meanwhile)
+    monkeypatch.setattr(module, "verify_sealed_file", meanwhile)
     assert verify_session(folder).problems == []
     assert len(calls) == 2
 
@@ -183,25 +186,25 @@ def test_a_data_folder_is_all_of_its_sessions_and_journals(tmp_path: Path) -> No
     sealed(tmp_path)
     deleted = keep(tmp_path, session(OTHER_ID, state="pending"), place="trash")
     (tmp_path / "sessions" / "20200101T000000Z-00000c").mkdir()  # begun, and killed
-    report = verify(tmp_path)
-    assert verdict_of(report) == "lossy"
-    content = report.as_dict()
+    report = verify_path(tmp_path)
+    assert find_verdict(report) == "lossy"
+    content = report.to_json_dict()
     assert set(content) == {"sessions", "journals", "problems", "unproven", "set_aside"}
     assert [one["id"] for one in content["sessions"]] == [ID, OTHER_ID]
     assert [one["frames"] for one in content["journals"]] == [56, 20]
     assert content["problems"] == []
     (deleted / "session.json").write_bytes(b"{")
-    assert verdict_of(verify(tmp_path)) == "damaged"
+    assert find_verdict(verify_path(tmp_path)) == "damaged"
 
 
 def test_whatever_is_named_is_found(tmp_path: Path) -> None:
     folder = sealed(tmp_path)
     stream = tmp_path / "journal" / "bench" / BOOTS[0]
     for path in (folder, folder / "session.json", stream, stream / "stream.json", tmp_path):
-        assert verify(path).as_dict()["problems"] == []
+        assert verify_path(path).to_json_dict()["problems"] == []
     for path in stream.glob("0*"):
-        assert verify(path).as_dict()["closed"] is True
+        assert verify_path(path).to_json_dict()["closed"] is True
     (tmp_path / "empty").mkdir()
     for path in (tmp_path / "none", tmp_path / "empty"):
         with pytest.raises(FileFormatError):
-            verify(path)
+            verify_path(path)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from storage.verify.data import verdict_of, verify
+from storage.verify.data_folder import find_verdict, verify_path
 from storage.verify.session import verify_session
 from tests.storage.verify.folders import (
     EVENTS,
@@ -31,7 +31,7 @@ from tests.storage.verify.folders import (
     [
         ("frames.parquet", "frames.parquet is missing"),
         ("session.json", "session.json is missing"),
-        ("events.parquet", "events.parquet is missing"),
+        ("markers.parquet", "markers.parquet is missing"),
         ("clock.parquet", "clock.parquet is missing"),
     ],
 )
@@ -40,14 +40,14 @@ def test_a_file_that_is_missing_is_damage(tmp_path: Path, name: str, said: str) 
     (folder / name).unlink()
     assert said in problems(folder)
     report = verify_session(folder)
-    assert report.as_dict()["id"] == ID
-    assert verdict_of(report) == "damaged"
+    assert report.to_json_dict()["id"] == ID
+    assert find_verdict(report) == "damaged"
 
 
-@pytest.mark.parametrize("name", ["session.json", "frames.parquet", "events.parquet"])
+@pytest.mark.parametrize("name", ["session.json", "frames.parquet", "markers.parquet"])
 def test_a_file_of_another_session_in_its_place_is_seen(tmp_path: Path, name: str) -> None:
     one = sealed(tmp_path / "one")
-    two = sealed(tmp_path / "two", OTHER_ID, events=(EVENTS[0].model_copy(update={"id": "e2"}),))
+    two = sealed(tmp_path / "two", OTHER_ID, markers=(EVENTS[0].model_copy(update={"id": "e2"}),))
     shutil.copy(two / name, one / name)
     assert problems(one)
     assert problems(two) == ""
@@ -56,8 +56,8 @@ def test_a_file_of_another_session_in_its_place_is_seen(tmp_path: Path, name: st
 def test_a_session_in_another_one_s_folder_is_seen(tmp_path: Path) -> None:
     folder = sealed(tmp_path)
     folder.rename(folder.with_name(OTHER_ID))
-    report = verify(tmp_path)
-    assert any("lies in the folder of" in said for said in report.as_dict()["problems"])
+    report = verify_path(tmp_path)
+    assert any("lies in the folder of" in said for said in report.to_json_dict()["problems"])
 
 
 @settings(max_examples=120, deadline=None)
@@ -104,7 +104,7 @@ def test_a_file_that_was_cut_anywhere_is_damage(tmp_path: Path, name: str) -> No
         (raised("calibration_id", "x"), "says calibration_id"),
         (raised("absolute_scale", "measured"), "says absolute_scale"),
         (raised("ledger", None), "its ledger is missing"),
-        (raised("events", []), "other events"),
+        (raised("markers", []), "other events"),
         (lambda c: c["clock"][0].update(uncertainty_ns=4), "clock.parquet has other rows"),
         (in_ledger("recorded", 40), "ledgers of session.json and frames.parquet"),
         (in_ledger("lost", {}), "ledgers of session.json and frames.parquet"),
@@ -137,7 +137,7 @@ def test_an_edited_note_is_seen_by_the_check_alone(tmp_path: Path) -> None:
 
 def test_a_damaged_table_beside_it_is_seen(tmp_path: Path) -> None:
     folder = sealed(tmp_path)
-    for name in ("events.parquet", "clock.parquet"):
+    for name in ("markers.parquet", "clock.parquet"):
         whole = (folder / name).read_bytes()
         (folder / name).write_bytes(whole[:-9])
         assert name in problems(folder)

@@ -12,27 +12,33 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
 
 from devices.errors import StateError
-from service.api.problems import problem
-from service.api.routes.access import ServerState, file_answer, has_it, present, problems
+from service.api.problems import problem_response
+from service.api.routes.common import (
+    ServerState,
+    file_response,
+    has_matching_etag,
+    problem_responses,
+    require_file,
+)
 from service.api.routes.downloads.data_query import DataQuery
-from service.api.routes.downloads.made import (
+from service.api.routes.downloads.exports import (
     Chunks,
-    file_stem,
-    known,
-    made,
-    said_of_marks,
-    tag_of_made,
+    compute_export_etag,
+    export_response,
+    make_file_stem,
+    marker_headers,
+    require_frames,
 )
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
-from service.sessions.frames_so_far import FramesSoFar
-from service.sessions.so_far import SoFar
+from service.sessions.preview import SessionPreview
+from service.sessions.preview_frames import PreviewFrames
 from storage.formats.export import Export
-from storage.formats.marks import TIMES, Marks, place
-from storage.formats.sealed import export_of, marks_of
+from storage.formats.markers import PLACEMENT_COLUMNS, PlacedMarkers, place_markers
+from storage.formats.sealed_export import make_sealed_export, place_session_markers
 from storage.formats.slice import Slice
-from storage.formats.written.parquet import PARQUET
-from storage.formats.written.registry import FORMATS
+from storage.formats.writers.parquet import PARQUET
+from storage.formats.writers.registry import FORMATS
 from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
@@ -55,7 +61,7 @@ MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
         },
         206: {"description": "A range of the stored file."},
         304: {"description": "Unchanged."},
-        **problems(
+        **problem_responses(
             _404="No such session, or nothing was recorded.",
             _409="This format needs a sealed session.",
             _416="The range is outside the file.",
@@ -63,7 +69,7 @@ MEDIA_TYPES = [each.media_type for each in FORMATS.values()]
         ),
     },
 )
-async def data(
+async def get_data(
     session_id: str,
     query: Annotated[DataQuery, Query()],
     request: Request,
@@ -76,32 +82,32 @@ async def data(
     while a session is recorded it has the present frames. `Foottile-Complete` states whether frames
     are missing, `Foottile-Marks` the number of markers in it and of markers left out.
     """
-    session = known(server.sessions.get(session_id))
-    ledger = server.recorder.ledger(session_id)
+    session = require_frames(server.sessions.get_session(session_id))
+    ledger = server.recorder.get_ledger(session_id)
     complete = "lossy" if ledger.lossy else str(ledger.complete).lower()
     headers = {"Foottile-Complete": complete}
-    if session.state != "sealed" and query.to.needs_sealed:
+    if session.state != "sealed" and query.format_spec.needs_sealed:
         others = [each.name for each in FORMATS.values() if not each.needs_sealed]
         raise StateError(
-            f"session {session_id} is {session.state}, and {query.to.title} is available when it "
-            "is sealed",
+            f"session {session_id} is {session.state}, and {query.format_spec.title} is available "
+            "when it is sealed",
             remedy=f"Stop it, or ask for format={' or '.join(others)}",
         )
     if session.sha256 is not None and query.is_stored:
-        return _stored(session, session.sha256, request, server, headers)
-    return await _made(session, query, request, server, headers)
+        return _stored_response(session, session.sha256, request, server, headers)
+    return await _export_response(session, query, request, server, headers)
 
 
-def _stored(
+def _stored_response(
     session: Session, sha256: str, request: Request, server: Server, headers: dict[str, str]
 ) -> Response:
-    path = present(server.sessions.folder.path(session.id) / FRAMES_NAME)
+    path = require_file(server.sessions.folder.get_path(session.id) / FRAMES_NAME)
     headers |= {
         "ETag": f'"{sha256}"',
         "Cache-Control": f"private, max-age={_YEAR_S}, immutable",
         "Repr-Digest": f"sha-256=:{b64encode(bytes.fromhex(sha256)).decode()}:",
     }
-    if has_it(request, sha256):
+    if has_matching_etag(request, sha256):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     size = path.stat().st_size
     wanted = request.headers.get("range")
@@ -111,65 +117,67 @@ def _stored(
             # RFC 9110 14.2: an invalid range, or several, are ignored.
             del MutableHeaders(scope=request.scope)["range"]
         elif (found[1] and int(found[1]) >= size) or found[3] == "0":
-            return problem(
+            return problem_response(
                 request.url.path,
                 HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
                 f"the range {wanted[:80]!r} is outside the file's {size} bytes",
                 {"Content-Range": f"bytes */{size}"},
             )
-    answer = file_answer(
+    answer = file_response(
         path,
         headers=headers,
         media_type=PARQUET.media_type,
-        filename=f"{file_stem(session.name, session.id, Slice())}.parquet",
+        filename=f"{make_file_stem(session.name, session.id, Slice())}.parquet",
     )
     answer.chunk_size = _CHUNK
     return answer
 
 
-async def _made(
+async def _export_response(
     session: Session, query: DataQuery, request: Request, server: Server, headers: dict[str, str]
 ) -> Response:
-    tag = await tag_of_made(session, query, server)
+    tag = await compute_export_etag(session, query, server)
     weak = "" if session.sha256 is not None else "W/"
     headers |= {"ETag": f'{weak}"{tag}"'}
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
-    if has_it(request, tag):
+    if has_matching_etag(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     marks = None
-    if query.has_marks:
-        marks = await run_in_threadpool(_marks, session, query, server)
-        headers |= said_of_marks([marks])
-    stem = file_stem(session.name, session.id, query.slice)
-    return await made(_chunks(session, query, server, marks), query, stem, headers)
+    if query.has_markers:
+        marks = await run_in_threadpool(_place_markers, session, query, server)
+        headers |= marker_headers([marks])
+    stem = make_file_stem(session.name, session.id, query.slice)
+    return await export_response(_write_export(session, query, server, marks), query, stem, headers)
 
 
-def _marks(session: Session, query: DataQuery, server: Server) -> Marks:
-    if not session.events:
-        return Marks(())
+def _place_markers(session: Session, query: DataQuery, server: Server) -> PlacedMarkers:
+    if not session.markers:
+        return PlacedMarkers(())
     if session.sha256 is not None:
-        with server.sessions.frames(session.id, only_slices=True) as reader:
-            return marks_of(reader, session.events, query.slice)
-    sources = server.recorder.sources(session.id)
+        with server.sessions.open_frames(session.id, only_slices=True) as reader:
+            return place_session_markers(reader, session.markers, query.slice)
+    sources = server.recorder.collect_inputs(session.id)
     times = (
-        {name: getattr(frames, name) for name in TIMES} | {"part": columns["part"]}
-        for frames, columns in SessionFrames(sources).raw()
+        {name: getattr(frames, name) for name in PLACEMENT_COLUMNS} | {"part": columns["part"]}
+        for frames, columns in SessionFrames(sources).iterate_raw()
     )
-    axis = sources.time_axis()
-    return place(session.events, times, sources.clock_table(), query.slice, axis=axis)
+    axis = sources.compute_time_axis()
+    return place_markers(session.markers, times, sources.make_clock_table(), query.slice, axis=axis)
 
 
-def _chunks(session: Session, query: DataQuery, server: Server, marks: Marks | None) -> Chunks:
+def _write_export(
+    session: Session, query: DataQuery, server: Server, marks: PlacedMarkers | None
+) -> Chunks:
     if session.sha256 is None:
-        sources = server.recorder.sources(session.id)
-        clock = sources.clock_table() if query.clock == "server" else None
+        sources = server.recorder.collect_inputs(session.id)
+        clock = sources.make_clock_table() if query.clock == "server" else None
         # A whole session is estimated once: no cached preview is needed.
-        is_some, so_fars = query.slice.is_some, server.so_fars
-        so_far = so_fars.nearly(sources) if is_some else SoFar(sources, server.data)
-        frames = FramesSoFar(so_far, sources, query.slice)
+        is_some, so_fars = query.slice.has_time_bounds, server.previews
+        so_far = so_fars.get_quickly(sources) if is_some else SessionPreview(sources, server.data)
+        frames = PreviewFrames(so_far, sources, query.slice)
         source = {"session": session.id, "state": session.state}
-        content = frames.content()  # reads the first frames, which sets `notes`
-        yield from query.to.written(
+        content = frames.make_content()  # reads the first frames, which sets `notes`
+        yield from query.format_spec.encode(
             Export(
                 content,
                 sources.info,
@@ -182,8 +190,10 @@ def _chunks(session: Session, query: DataQuery, server: Server, marks: Marks | N
             )
         )
         return
-    with server.sessions.frames(session.id, only_slices=not query.slice.is_all) as reader:
-        export = export_of(
-            reader, query.slice, clock=query.clock, marks=marks, options=query.options
+    with server.sessions.open_frames(
+        session.id, only_slices=not query.slice.is_whole_session
+    ) as reader:
+        export = make_sealed_export(
+            reader, query.slice, clock=query.clock, markers=marks, options=query.options
         )
-        yield from query.to.written(export)
+        yield from query.format_spec.encode(export)

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.api.routes.access import SecondsQuery
+from service.api.routes.common import SecondsQuery
 from storage.formats.export import ClockName
 from storage.formats.options import FormatOptions
 from storage.formats.slice import Slice
-from storage.formats.written.format import Format
-from storage.formats.written.parquet import PARQUET
-from storage.formats.written.registry import SEVERAL, FormatName, format_named, together_named
+from storage.formats.writers.format import ExportFormat
+from storage.formats.writers.parquet import PARQUET
+from storage.formats.writers.registry import (
+    MULTI_SESSION_FORMATS,
+    FormatName,
+    get_format,
+    get_multi_session_format,
+)
 
 
-class MadeQuery(SecondsQuery, FormatOptions):
+class ExportQuery(SecondsQuery, FormatOptions):
     """Query shared by all downloads."""
 
     format: FormatName
@@ -22,21 +27,21 @@ class MadeQuery(SecondsQuery, FormatOptions):
         description="Names, comma-separated: of all tiles (`force_n`) or one (`force_n_0`).",
         examples=["t_ns,grf_n,force_n_0"],
     )
-    marks: bool | None = Field(
+    markers: bool | None = Field(
         default=None,
         description="Adds `event`: the marker at the frame nearest in time; null elsewhere. "
         "Default: true, but false for Parquet, which is then the sealed file.",
     )
 
     @property
-    def to(self) -> Format:
+    def format_spec(self) -> ExportFormat:
         """Format of the download."""
-        return format_named(self.format)
+        return get_format(self.format)
 
     @property
-    def has_marks(self) -> bool:
+    def has_markers(self) -> bool:
         """True if markers are included."""
-        return self.to.is_marked if self.marks is None else self.marks
+        return self.format_spec.has_markers_by_default if self.markers is None else self.markers
 
     @property
     def options(self) -> FormatOptions:
@@ -55,16 +60,16 @@ class MadeQuery(SecondsQuery, FormatOptions):
         return "server"
 
     @property
-    def canonical(self) -> str:
+    def canonical_text(self) -> str:
         """Text that is equal for equivalent queries."""
         part = self.slice
         columns = ",".join(part.columns)
         rows = f"{part.start_s}|{part.end_s}"
         options = self.options.model_dump_json(exclude_none=True)
-        return f"{self.format}|{rows}|{columns}|{self.clock_name}|{self.has_marks}|{options}"
+        return f"{self.format}|{rows}|{columns}|{self.clock_name}|{self.has_markers}|{options}"
 
 
-class DataQuery(MadeQuery):
+class DataQuery(ExportQuery):
     """Query for one session."""
 
     format: FormatName = PARQUET.name
@@ -82,20 +87,24 @@ class DataQuery(MadeQuery):
     @property
     def is_stored(self) -> bool:
         """True if the answer is the sealed file as it is."""
-        is_plain = self.clock == "node" and not self.has_marks and not self.options.set_names
-        return self.to is PARQUET and self.slice.is_all and is_plain
+        is_plain = (
+            self.clock == "node" and not self.has_markers and not self.options.specified_names
+        )
+        return self.format_spec is PARQUET and self.slice.is_whole_session and is_plain
 
 
-class TakeDataQuery(MadeQuery):
+class TakeDataQuery(ExportQuery):
     """Query for a take, on the server's time axis."""
 
-    format: FormatName = Field(description="One that holds several: " + ", ".join(SEVERAL) + ".")
+    format: FormatName = Field(
+        description="One that holds several: " + ", ".join(MULTI_SESSION_FORMATS) + "."
+    )
 
     @property
-    def to(self) -> Format:
+    def format_spec(self) -> ExportFormat:
         """Format of the download.
 
         Raises:
             UsageError: it is for one session only.
         """
-        return together_named(self.format)
+        return get_multi_session_format(self.format)

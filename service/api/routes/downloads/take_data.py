@@ -11,20 +11,20 @@ from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError
-from service.api.routes.access import ServerState, has_it, problems
+from service.api.routes.common import ServerState, has_matching_etag, problem_responses
 from service.api.routes.downloads.data_query import TakeDataQuery
-from service.api.routes.downloads.made import (
+from service.api.routes.downloads.exports import (
     Chunks,
-    file_stem,
-    known,
-    made,
-    said_of_marks,
-    tag_of_made,
+    compute_export_etag,
+    export_response,
+    make_file_stem,
+    marker_headers,
+    require_frames,
 )
 from service.server.server import Server
-from storage.formats.marks import Marks
-from storage.formats.sealed import export_of, marks_of
-from storage.formats.written.registry import FORMATS, SEVERAL
+from storage.formats.markers import PlacedMarkers
+from storage.formats.sealed_export import make_sealed_export, place_session_markers
+from storage.formats.writers.registry import FORMATS, MULTI_SESSION_FORMATS
 from storage.sessions.folder import Session
 
 router = APIRouter(prefix="/takes", tags=["data"])
@@ -38,17 +38,17 @@ router = APIRouter(prefix="/takes", tags=["data"])
     responses={
         200: {
             "description": "The data.",
-            "content": {FORMATS[name].media_type: {} for name in SEVERAL},
+            "content": {FORMATS[name].media_type: {} for name in MULTI_SESSION_FORMATS},
         },
         304: {"description": "Unchanged."},
-        **problems(
+        **problem_responses(
             _404="No such take, or one of its sessions has no frames.",
             _409="One of its sessions is not sealed.",
             _422="A format for one session only, or a session that cannot be in it.",
         ),
     },
 )
-async def take_data(
+async def get_take_data(
     take_id: str, query: Annotated[TakeDataQuery, Query()], request: Request, server: ServerState
 ) -> Response:
     """Return the sessions of a take on the server's time axis, each with its uncertainty.
@@ -56,8 +56,8 @@ async def take_data(
     They are in the order of their nodes, without those in the trash. Seconds count from each
     session's first frame. `Foottile-Complete` is `lossy` if one of the sessions is.
     """
-    to = query.to
-    sessions = [known(session) for session in server.takes.get(take_id).sessions]
+    to = query.format_spec
+    sessions = [require_frames(session) for session in server.takes.get_take(take_id).sessions]
     for session in sessions:
         if session.sha256 is None:
             raise StateError(
@@ -65,8 +65,8 @@ async def take_data(
                 "take is available when all of it is sealed",
                 remedy="Stop it, or ask for each session by itself",
             )
-    is_lossy = any(server.recorder.ledger(session.id).lossy for session in sessions)
-    tags = [await tag_of_made(session, query, server) for session in sessions]
+    is_lossy = any(server.recorder.get_ledger(session.id).lossy for session in sessions)
+    tags = [await compute_export_etag(session, query, server) for session in sessions]
     tag = hashlib.sha256("|".join(tags).encode()).hexdigest()
     headers = {
         "Foottile-Complete": "lossy" if is_lossy else "true",
@@ -74,37 +74,37 @@ async def take_data(
         "Cache-Control": "private, no-cache",
         "Accept-Ranges": "none",
     }
-    if has_it(request, tag):
+    if has_matching_etag(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     marks = None
-    if query.has_marks:
-        marks = [await run_in_threadpool(_marks, each, query, server) for each in sessions]
-        headers |= said_of_marks(marks)
-    chunks = _chunks(sessions, query, server, marks)
-    stem = file_stem(sessions[0].name, f"take-{take_id}", query.slice)
-    return await made(chunks, query, stem, headers)
+    if query.has_markers:
+        marks = [await run_in_threadpool(_place_markers, each, query, server) for each in sessions]
+        headers |= marker_headers(marks)
+    chunks = _write_exports(sessions, query, server, marks)
+    stem = make_file_stem(sessions[0].name, f"take-{take_id}", query.slice)
+    return await export_response(chunks, query, stem, headers)
 
 
-def _marks(session: Session, query: TakeDataQuery, server: Server) -> Marks:
-    with server.sessions.frames(session.id, only_slices=True) as reader:
-        return marks_of(reader, session.events, query.slice)
+def _place_markers(session: Session, query: TakeDataQuery, server: Server) -> PlacedMarkers:
+    with server.sessions.open_frames(session.id, only_slices=True) as reader:
+        return place_session_markers(reader, session.markers, query.slice)
 
 
-def _chunks(
-    sessions: list[Session], query: TakeDataQuery, server: Server, marks: list[Marks] | None
+def _write_exports(
+    sessions: list[Session], query: TakeDataQuery, server: Server, marks: list[PlacedMarkers] | None
 ) -> Chunks:
     part = query.slice
     with ExitStack() as opened:
         exports = [
-            export_of(
+            make_sealed_export(
                 opened.enter_context(
-                    server.sessions.frames(session.id, only_slices=not part.is_all)
+                    server.sessions.open_frames(session.id, only_slices=not part.is_whole_session)
                 ),
                 part,
                 clock=query.clock_name,
-                marks=None if marks is None else marks[number],
+                markers=None if marks is None else marks[number],
                 options=query.options,
             )
             for number, session in enumerate(sessions)
         ]
-        yield from query.to.written_together(exports)
+        yield from query.format_spec.encode_together(exports)

@@ -10,9 +10,9 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError, UnknownError, UsageError
-from service.api.routes.access import ServerState, present, problems
-from service.api.routes.downloads.made import sent
-from storage.formats.zipped import Sealed, zipped
+from service.api.routes.common import ServerState, problem_responses, require_file
+from service.api.routes.downloads.exports import iterate_chunks
+from storage.formats.zip_stream import SealedSession, stream_zip
 from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
@@ -28,14 +28,14 @@ IDS_MAX = 1000
     response_class=Response,
     responses={
         200: {"description": "The files of each, in a folder.", "content": {"application/zip": {}}},
-        **problems(
+        **problem_responses(
             _404="No such session.",
             _409="One is not sealed yet, or its files are damaged.",
             _422="No ids, or too many.",
         ),
     },
 )
-async def zip_sessions(
+async def get_zip(
     ids: Annotated[
         str,
         Query(max_length=24 * IDS_MAX, description=f"With commas between; {IDS_MAX} at most."),
@@ -51,20 +51,23 @@ async def zip_sessions(
     if not 1 <= len(names) <= IDS_MAX:
         raise UsageError(f"{len(names)} sessions", expected=f"ids of 1 to {IDS_MAX}")
     chosen = [
-        _sealed(server.sessions.get(name), server.sessions.folder.path(name)) for name in names
+        _require_sealed(server.sessions.get_session(name), server.sessions.folder.get_path(name))
+        for name in names
     ]
     name = names[0] if len(names) == 1 else f"foottile-{len(names)}-sessions"
     headers = {
         "Content-Disposition": f'attachment; filename="{name}.zip"',
         "Cache-Control": "private, no-store",
     }
-    pieces = zipped(chosen)
+    pieces = stream_zip(chosen)
     # The first chunk now: a damaged file is then an answer, not a broken download.
     first = await run_in_threadpool(next, pieces)
-    return StreamingResponse(sent(pieces, first), headers=headers, media_type="application/zip")
+    return StreamingResponse(
+        iterate_chunks(pieces, first), headers=headers, media_type="application/zip"
+    )
 
 
-def _sealed(session: Session, folder: Path) -> Sealed:
+def _require_sealed(session: Session, folder: Path) -> SealedSession:
     if session.state != "sealed":
         raise StateError(
             f"session {session.id} is {session.state}, and a zip file has sealed ones only",
@@ -72,5 +75,5 @@ def _sealed(session: Session, folder: Path) -> Sealed:
         )
     if session.sha256 is None:
         raise UnknownError(f"session {session.id}: {session.problem}")
-    present(folder / FRAMES_NAME)
-    return Sealed(folder, session.sha256)
+    require_file(folder / FRAMES_NAME)
+    return SealedSession(folder, session.sha256)

@@ -7,13 +7,18 @@ from typing import Literal
 from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 
-from service.api.routes.access import ServerState, present, problems, stored_table
+from service.api.routes.common import (
+    ServerState,
+    problem_responses,
+    require_file,
+    stored_table_response,
+)
 from service.server.server import Server
 from storage.clock.file import CLOCK_NAME
 from storage.clock.table import ClockSummary
-from storage.formats.written.parquet import PARQUET
-from storage.sessions.beside import clock_beside
+from storage.formats.writers.parquet import PARQUET
 from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.sidecars import load_clock_table
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
@@ -27,13 +32,13 @@ _PARQUET = PARQUET.media_type
     response_model=ClockSummary,
     responses={
         200: {"description": "Summary, or the stored table.", "content": {_PARQUET: {}}},
-        **problems(
+        **problem_responses(
             _404="No such session, or its clock table is missing.",
             _409="The table is written when the session is sealed.",
         ),
     },
 )
-async def clock(
+async def get_clock(
     session_id: str,
     server: ServerState,
     format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
@@ -42,17 +47,19 @@ async def clock(
 
     `format=parquet` is `clock.parquet`, the stored measurements.
     """
-    session = server.sessions.get(session_id)
+    session = server.sessions.get_session(session_id)
     if format == "parquet":
-        return stored_table(session, server.sessions.folder.path(session_id) / CLOCK_NAME)
+        return stored_table_response(
+            session, server.sessions.folder.get_path(session_id) / CLOCK_NAME
+        )
     if session.sha256 is None:
-        table = server.recorder.sources(session_id).clock_table()
-        return await run_in_threadpool(table.summary)
-    return await run_in_threadpool(_sealed, session_id, server)
+        table = server.recorder.collect_inputs(session_id).make_clock_table()
+        return await run_in_threadpool(table.summarize)
+    return await run_in_threadpool(_read_sealed, session_id, server)
 
 
-def _sealed(session_id: str, server: Server) -> ClockSummary:
+def _read_sealed(session_id: str, server: Server) -> ClockSummary:
     for name in (CLOCK_NAME, FRAMES_NAME):
-        present(server.sessions.folder.path(session_id) / name)
-    with server.sessions.frames(session_id) as reader:
-        return clock_beside(reader).summary()
+        require_file(server.sessions.folder.get_path(session_id) / name)
+    with server.sessions.open_frames(session_id) as reader:
+        return load_clock_table(reader).summarize()

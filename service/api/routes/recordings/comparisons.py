@@ -13,17 +13,17 @@ from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from devices.errors import FileFormatError, StateError, UnknownError, UsageError
-from service.api.encoding import numbers_as_json
-from service.api.routes.access import SecondsQuery, ServerState, problems
-from service.private_paths import ShownText
+from service.api.compression import encode_columns_json
+from service.api.routes.common import SecondsQuery, ServerState, problem_responses
+from service.private_paths import PublicText
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX
 from storage.formats.slice import Slice
 from storage.sessions.comparisons import (
     SERIES_NAME,
-    comparison_of,
-    comparisons_of,
-    read_report,
+    find_comparison_folder,
+    find_comparison_folders,
+    read_comparison_report,
 )
 from storage.sessions.folder import Session
 
@@ -33,7 +33,7 @@ T = TypeVar("T")
 
 _ONE_AT_A_TIME = CapacityLimiter(1)
 """One thread: a series is read whole once."""
-_PROBLEMS = problems(
+_PROBLEMS = problem_responses(
     _404="No such session or comparison, or nothing was recorded.",
     _409="The session is not sealed.",
     _422="Damaged files of the comparison, or a slice that ends before it begins.",
@@ -44,8 +44,8 @@ class ComparisonView(BaseModel):
     """Comparison in the list."""
 
     name: str = Field(description="Name of its reference.")
-    problem: ShownText | None = Field(description="Reason why it cannot be read; null: it can.")
-    is_of_these_frames: bool | None = Field(
+    problem: PublicText | None = Field(description="Reason why it cannot be read; null: it can.")
+    matches_current_data: bool | None = Field(
         description="False: the session's frames were different then; null: unknown."
     )
     missed: list[str] = Field(description="Missed limits, as text.")
@@ -89,12 +89,12 @@ class SeriesView(BaseModel):
     "/{session_id}/comparisons",
     operation_id="listComparisons",
     summary="Comparisons",
-    responses=problems(_404="No such session.", _409="Its files are damaged."),
+    responses=problem_responses(_404="No such session.", _409="Its files are damaged."),
 )
 async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsView:
     """Return the session's comparisons, made by `foottile compare`, by name."""
-    session = server.sessions.get(session_id)
-    return ComparisonsView(items=await run_in_threadpool(_listed, session, server))
+    session = server.sessions.get_session(session_id)
+    return ComparisonsView(items=await run_in_threadpool(_list_comparisons, session, server))
 
 
 @router.get(
@@ -103,10 +103,12 @@ async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsV
     summary="A comparison",
     responses=_PROBLEMS,
 )
-async def comparison(session_id: str, name: str, server: ServerState) -> ReportView:
+async def get_comparison(session_id: str, name: str, server: ServerState) -> ReportView:
     """Return alignment, figures with their intervals, trials and limits."""
-    session = server.sessions.get(session_id)
-    return await run_in_threadpool(_clear, partial(_report, session, name, server))
+    session = server.sessions.get_session(session_id)
+    return await run_in_threadpool(
+        _run_with_usage_errors, partial(_make_report, session, name, server)
+    )
 
 
 @router.get(
@@ -116,19 +118,19 @@ async def comparison(session_id: str, name: str, server: ServerState) -> ReportV
     response_model=SeriesView,
     responses=_PROBLEMS,
 )
-async def series(
+async def get_series(
     session_id: str, name: str, query: Annotated[SeriesQuery, Query()], server: ServerState
 ) -> Response:
     """Return minimum and maximum of the reference, and of ours minus it, aligned in time."""
-    session = server.sessions.get(session_id)
+    session = server.sessions.get_session(session_id)
     if session.state != "sealed":
         raise StateError(f"session {session_id} is {session.state}", remedy="Stop it")
-    make = partial(_clear, partial(_series, session, name, query, server))
+    make = partial(_run_with_usage_errors, partial(_encode_series, session, name, query, server))
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     return Response(content, media_type="application/json")
 
 
-def _clear(make: Callable[[], T]) -> T:
+def _run_with_usage_errors(make: Callable[[], T]) -> T:
     """Run a function on user files; a damaged file is a usage error."""
     try:
         return make()
@@ -136,65 +138,67 @@ def _clear(make: Callable[[], T]) -> T:
         raise UsageError(str(error)) from error
 
 
-def _listed(session: Session, server: Server) -> list[ComparisonView]:
-    folders = comparisons_of(server.sessions.folder.path(session.id))
-    frames = _frames_hash(session, server) if folders else None
+def _list_comparisons(session: Session, server: Server) -> list[ComparisonView]:
+    folders = find_comparison_folders(server.sessions.folder.get_path(session.id))
+    frames = _read_frames_hash(session, server) if folders else None
     found = []
     for name, folder in folders.items():
         try:
-            found.append(_view(frames, name, read_report(folder).content))
+            found.append(_make_view(frames, name, read_comparison_report(folder).content))
         except FileFormatError as error:
             found.append(
-                ComparisonView(name=name, problem=str(error), is_of_these_frames=None, missed=[])
+                ComparisonView(name=name, problem=str(error), matches_current_data=None, missed=[])
             )
     return found
 
 
-def _frames_hash(session: Session, server: Server) -> object:
+def _read_frames_hash(session: Session, server: Server) -> object:
     """Return the hash that the frames state; None if they cannot be read."""
     try:
-        with server.sessions.frames(session.id, only_slices=True) as reader:
-            return reader.identity["file_sha256"]
+        with server.sessions.open_frames(session.id, only_slices=True) as reader:
+            return reader.source_reference["file_sha256"]
     except FileFormatError:
         return None
 
 
-def _view(frames: object, name: str, content: dict[str, Any]) -> ComparisonView:
+def _make_view(frames: object, name: str, content: dict[str, Any]) -> ComparisonView:
     compared_sha256 = content["session"].get("file_sha256")
     missed = content.get("missed")
     return ComparisonView(
         name=name,
         problem=None,
-        is_of_these_frames=compared_sha256 == frames
+        matches_current_data=compared_sha256 == frames
         if isinstance(compared_sha256, str) and frames is not None
         else None,
         missed=[str(line) for line in missed] if isinstance(missed, list) else [],
     )
 
 
-def _report(session: Session, name: str, server: Server) -> ReportView:
-    folder = comparison_of(server.sessions.folder.path(session.id), name)
-    read = read_report(folder)
+def _make_report(session: Session, name: str, server: Server) -> ReportView:
+    folder = find_comparison_folder(server.sessions.folder.get_path(session.id), name)
+    read = read_comparison_report(folder)
     return ReportView(
-        **_view(_frames_hash(session, server), name, read.content).model_dump(),
-        is_proven=read.is_proven,
+        **_make_view(_read_frames_hash(session, server), name, read.content).model_dump(),
+        is_proven=read.has_checksum,
         has_series=(folder / SERIES_NAME).is_file(),
         report={key: value for key, value in read.content.items() if key != "session"}
         | {"reference": Path(str(read.content["reference"])).name},
     )
 
 
-def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> bytes:
-    cached = server.series.of(comparison_of(server.sessions.folder.path(session.id), name))
+def _encode_series(session: Session, name: str, query: SeriesQuery, server: Server) -> bytes:
+    cached = server.comparison_series.get(
+        find_comparison_folder(server.sessions.folder.get_path(session.id), name)
+    )
     if cached is None:
         raise UnknownError(
             f"the comparison with {name!r} has no series",
             remedy="An older version made it, or it is too long: compare again",
         )
-    with server.sessions.frames(session.id, only_slices=True) as reader:
-        begin_ns, end_ns = reader.span_ns()
+    with server.sessions.open_frames(session.id, only_slices=True) as reader:
+        begin_ns, end_ns = reader.read_span_ns()
     part = Slice(query.start_s, query.end_s)
-    bins, size = cached.seen(begin_ns, part, query.points)
+    bins, size = cached.get_bins(begin_ns, part, query.points)
     columns = {column: values for column, values in bins.items() if column != "part"}
     times = {
         f"t_{which}_s": (columns.pop(f"t_{which}_ns") - begin_ns) * 1e-9
@@ -206,4 +210,4 @@ def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> 
         "duration_s": (end_ns - begin_ns) * 1e-9,
         "frames_in_bin": size,
     }
-    return numbers_as_json(metadata, times | columns)
+    return encode_columns_json(metadata, times | columns)

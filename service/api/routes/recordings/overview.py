@@ -13,17 +13,22 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from devices.errors import UnknownError, UsageError
-from service.api.encoding import (
+from service.api.compression import (
     ARROW_STREAM,
-    numbers_as_json,
-    packed,
-    takes_gzip,
-    write_arrow_stream,
+    accepts_gzip,
+    compress_gzip,
+    encode_arrow_stream,
+    encode_columns_json,
 )
-from service.api.routes.access import SecondsQuery, ServerState, has_it, problems
+from service.api.routes.common import (
+    SecondsQuery,
+    ServerState,
+    has_matching_etag,
+    problem_responses,
+)
 from service.server.server import Server
-from service.sessions.overview import POINTS_MAX, Seen, overview_of_session
-from service.version import SOFTWARE
+from service.sessions.overview import POINTS_MAX, BinnedSlice, bin_session
+from service.version import SOFTWARE_VERSION
 from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.folder import Session
@@ -73,7 +78,7 @@ class OverviewView(BaseModel):
     )
     serials: list[str] = Field(description="Serials of the tiles, in the order of the columns.")
     provisional: bool = Field(description="True: not sealed; frames and tares may still come.")
-    behind: bool = Field(description="True: there are more frames; request again.")
+    catching_up: bool = Field(description="True: there are more frames; request again.")
     columns: dict[str, list[float | int | None]]
 
 
@@ -85,14 +90,14 @@ class OverviewView(BaseModel):
     responses={
         200: {"description": "Bins, in the order of the frames.", "content": {ARROW_STREAM: {}}},
         304: {"description": "Unchanged."},
-        **problems(
+        **problem_responses(
             _404="No such session, or nothing was recorded.",
             _409="No frames yet, or damaged ones.",
             _422="No such column, or a slice that ends before it begins.",
         ),
     },
 )
-async def overview(
+async def get_overview(
     session_id: str,
     query: Annotated[OverviewQuery, Query()],
     request: Request,
@@ -106,21 +111,23 @@ async def overview(
     session has its present frames, `provisional`: some ten thousand bins, with more frames each the
     longer it is.
     """
-    session = server.sessions.get(session_id)
+    session = server.sessions.get_session(session_id)
     if session.state == "sealed" and session.sha256 is None:
         raise UnknownError(f"session {session_id}: {session.problem}")
     as_arrow = ARROW_STREAM in accept
-    as_gzip = not as_arrow and takes_gzip(accept_encoding)
+    as_gzip = not as_arrow and accepts_gzip(accept_encoding)
     if session.sha256 is None:
-        return await _so_far(session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
-    server.so_fars.forget(session_id)
-    etag_input = f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{as_gzip}|{SOFTWARE}"
+        return await _preview_response(session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
+    server.previews.discard(session_id)
+    etag_input = (
+        f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{as_gzip}|{SOFTWARE_VERSION}"
+    )
     tag = hashlib.sha256(etag_input.encode()).hexdigest()
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
     headers |= {"Vary": "Accept, Accept-Encoding"}
-    if has_it(request, tag):
+    if has_matching_etag(request, tag):
         return Response(status_code=304, headers=headers)
-    make = partial(_content, session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
+    make = partial(_encode_sealed, session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     if as_gzip:
         headers |= {"Content-Encoding": "gzip"}
@@ -128,17 +135,17 @@ async def overview(
     return Response(content, headers=headers, media_type=media_type)
 
 
-async def _so_far(
+async def _preview_response(
     session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool, as_gzip: bool
 ) -> Response:
-    sources = server.recorder.sources(session.id)
+    sources = server.recorder.collect_inputs(session.id)
     part = Slice(query.start_s, query.end_s)
 
     def make() -> bytes:
-        so_far = server.so_fars.taken(sources)
-        seen, serials = so_far.seen(part, query.points), list(sources.info.serials)
-        flags = {"provisional": True, "behind": so_far.is_behind}
-        return _written(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
+        so_far = server.previews.get_updated(sources)
+        seen, serials = so_far.get_bins(part, query.points), list(sources.info.serials)
+        flags = {"provisional": True, "catching_up": so_far.is_catching_up}
+        return _encode(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
 
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     headers = {"Cache-Control": "no-store"} | ({"Content-Encoding": "gzip"} if as_gzip else {})
@@ -147,21 +154,21 @@ async def _so_far(
     )
 
 
-def _content(
+def _encode_sealed(
     session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool, as_gzip: bool
 ) -> bytes:
     assert session.sha256 is not None  # noqa: S101  # asked before
     part = Slice(query.start_s, query.end_s)
-    with server.sessions.frames(session.id, only_slices=True) as reader:
-        seen = overview_of_session(reader, part, query.points, frames_sha256=session.sha256)
+    with server.sessions.open_frames(session.id, only_slices=True) as reader:
+        seen = bin_session(reader, part, query.points, frames_sha256=session.sha256)
         serials = list(reader.info.serials)
-    flags = {"provisional": False, "behind": False}
-    return _written(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
+    flags = {"provisional": False, "catching_up": False}
+    return _encode(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)
 
 
-def _written(
+def _encode(
     session: Session,
-    seen: Seen,
+    seen: BinnedSlice,
     serials: list[str],
     said: dict[str, bool],
     query: OverviewQuery,
@@ -169,25 +176,25 @@ def _written(
     as_arrow: bool,
     as_gzip: bool,
 ) -> bytes:
-    columns = _chosen(_in_seconds(seen), query.columns)
+    columns = _select_columns(_times_to_seconds(seen), query.columns)
     about = {
         "session_id": session.id,
         "begin_t_ns": seen.begin_ns,
         "duration_s": (seen.end_ns - seen.begin_ns) * 1e-9,
-        "frames_in_bin": seen.frames_in_bin,
-        "time_axis": seen.axis.as_dicts(),
+        "frames_in_bin": seen.frames_per_bin,
+        "time_axis": seen.time_axis.to_json_list(),
         "serials": serials,
         **said,
     }
     if not as_arrow:
-        text = numbers_as_json(about, columns)
-        return packed(text) if as_gzip else text
+        text = encode_columns_json(about, columns)
+        return compress_gzip(text) if as_gzip else text
     metadata = {"foottile.overview": json.dumps(about)}
     table = pa.table({name: pa.array(v) for name, v in columns.items()}, metadata=metadata)
-    return write_arrow_stream(table)
+    return encode_arrow_stream(table)
 
 
-def _in_seconds(seen: Seen) -> dict[str, Array]:
+def _times_to_seconds(seen: BinnedSlice) -> dict[str, Array]:
     """Convert times to seconds after the first frame: JSON has no integers of that size."""
     bins = dict(seen.bins)
     times = {
@@ -197,7 +204,7 @@ def _in_seconds(seen: Seen) -> dict[str, Array]:
     return times | bins
 
 
-def _chosen(columns: dict[str, Array], wanted: str | None) -> dict[str, Array]:
+def _select_columns(columns: dict[str, Array], wanted: str | None) -> dict[str, Array]:
     names = [name.strip() for name in (wanted or "").split(",") if name.strip()]
     for begin in names:
         if not any(name.startswith(begin) for name in columns):

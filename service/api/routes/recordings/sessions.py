@@ -10,43 +10,43 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Response
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
-from devices.facts import check_new_name, check_new_text
-from service.api.routes.access import (
+from devices.types import check_user_name, check_user_text
+from service.api.routes.common import (
     CHANGED,
     FULL,
     IdempotencyKey,
     IfMatch,
     ServerState,
-    asked_with,
-    problems,
-    stored_table,
-    tag_of,
+    make_idempotency_record,
+    parse_if_match,
+    problem_responses,
+    stored_table_response,
 )
-from service.private_paths import ShownText
-from service.server.screens.views import EventView, Page, SessionView
-from storage.formats.written.parquet import PARQUET
-from storage.sessions.beside import EVENTS_NAME
-from storage.sessions.choice import Choice, completeness_of, instant_ns
+from service.private_paths import PublicText
+from service.server.broadcast.views import MarkerView, Page, SessionView
+from storage.formats.writers.parquet import PARQUET
+from storage.sessions.filters import SessionFilter, parse_completeness, parse_t_ns
 from storage.sessions.folder import Ledger
+from storage.sessions.sidecars import MARKERS_NAME
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
-SETTLE_S = 5.0
+SEAL_TIMEOUT_S = 5.0
 """Time that a stop waits for the sealed file before it answers."""
 
-_UNKNOWN = problems(_404="No such session.", _409="Its files are damaged.")
-_NO_EVENT = problems(_404="No such session or event.", _409="Its files are damaged.")
+_UNKNOWN = problem_responses(_404="No such session.", _409="Its files are damaged.")
+_NO_EVENT = problem_responses(_404="No such session or event.", _409="Its files are damaged.")
 
 Name = Annotated[
     str,
     StringConstraints(strip_whitespace=True, min_length=1, max_length=200),
-    AfterValidator(check_new_name),
+    AfterValidator(check_user_name),
 ]
-Text = Annotated[str, StringConstraints(max_length=10_000), AfterValidator(check_new_text)]
+Text = Annotated[str, StringConstraints(max_length=10_000), AfterValidator(check_user_text)]
 Tag = Annotated[
     str,
     StringConstraints(strip_whitespace=True, min_length=1, max_length=100),
-    AfterValidator(check_new_name),
+    AfterValidator(check_user_name),
 ]
 Tags = Annotated[tuple[Tag, ...], Field(max_length=50)]
 
@@ -58,14 +58,14 @@ class _Body(BaseModel):
 class SessionPage(Page[SessionView]):
     """Page of sessions."""
 
-    unreadable: dict[str, ShownText] = Field(
+    unreadable: dict[str, PublicText] = Field(
         default={},
         description="Sessions with damaged files, and the errors, by id. No frames are dropped "
         "meanwhile; see `foottile verify`.",
     )
 
 
-class Describe(_Body):
+class RecordingDescription(_Body):
     """User-written description of a recording."""
 
     name: Name = Field(examples=["mud, third trial"])
@@ -77,7 +77,7 @@ class Describe(_Body):
     tags: Tags = ()
 
 
-class StartSession(Describe):
+class StartSession(RecordingDescription):
     """Request to record a node."""
 
     node: str = Field(examples=["demo"])
@@ -87,12 +87,12 @@ class ChangeSession(_Body):
     """Changes of a session's description; omitted fields are unchanged."""
 
     name: Name | None = None
-    subject: Annotated[Text, AfterValidator(check_new_name)] | None = None
+    subject: Annotated[Text, AfterValidator(check_user_name)] | None = None
     notes: Text | None = None
     tags: Tags | None = None
 
 
-class MarkEvent(_Body):
+class AddMarker(_Body):
     """New marker."""
 
     label: Name = Field(examples=["stepped on a stone"])
@@ -104,7 +104,7 @@ class MarkEvent(_Body):
     )
 
 
-class ChangeEvent(_Body):
+class ChangeMarker(_Body):
     """Changes of a marker; omitted fields are unchanged."""
 
     label: Name | None = None
@@ -119,7 +119,7 @@ class ChangeEvent(_Body):
     summary="Start recording",
     status_code=HTTPStatus.CREATED,
     responses={
-        **problems(
+        **problem_responses(
             _404="No such node.",
             _409="The node is not connected, or far behind; or the session of this key is in "
             "the trash.",
@@ -128,7 +128,7 @@ class ChangeEvent(_Body):
         **FULL,
     },
 )
-async def start(
+async def start_session(
     body: StartSession,
     server: ServerState,
     response: Response,
@@ -138,23 +138,23 @@ async def start(
 
     Several sessions may be recorded on one node at a time; each is stopped by its id.
     """
-    record = asked_with(idempotency_key, "session", body)
-    earlier = server.sessions.begun_by(record)
+    record = make_idempotency_record(idempotency_key, "session", body)
+    earlier = server.sessions.find_by_idempotency_key(record)
     if earlier:
         session = earlier[0]
     else:
-        session = server.recorder.start(
+        session = server.recorder.start_session(
             body.node,
             body.name,
             pre_roll_s=body.pre_roll_s,
             subject=body.subject or "",
             notes=body.notes,
             tags=body.tags,
-            asked=record,
+            request=record,
         )
-        server.tell_node(server.nodes.get(body.node))
+        server.notify_node_changed(server.nodes.get(body.node))
     response.headers["Location"] = f"/api/v1/sessions/{session.id}"
-    return SessionView.of(session, server.recorder)
+    return SessionView.from_session(session, server.recorder)
 
 
 @router.post(
@@ -163,35 +163,35 @@ async def start(
     summary="Stop recording",
     responses={**_UNKNOWN, **FULL},
 )
-async def stop(session_id: str, server: ServerState) -> SessionView:
+async def stop_session(session_id: str, server: ServerState) -> SessionView:
     """Stop a session now and seal it; answers when it is sealed, or after five seconds.
 
     A stopped session is unchanged: stopping twice is the same. If the node is not connected the
     session is `pending`, and completes when the node is back.
     """
-    session = server.recorder.stop(session_id)
+    session = server.recorder.stop_session(session_id)
     node = server.nodes.find(session.node)  # its folder may be gone
     if node is not None:
-        server.tell_node(node)
-    if node is not None and node.connected:
-        session = await server.settling.settled(session_id, SETTLE_S)
-    return SessionView.of(session, server.recorder)
+        server.notify_node_changed(node)
+    if node is not None and node.is_connected:
+        session = await server.sealer.wait_until_sealed(session_id, SEAL_TIMEOUT_S)
+    return SessionView.from_session(session, server.recorder)
 
 
 @router.post(
     "/{session_id}/seal",
     operation_id="sealSession",
     summary="Seal without what is missing",
-    responses={**_UNKNOWN, **problems(_409="It is not pending."), **FULL},
+    responses={**_UNKNOWN, **problem_responses(_409="It is not pending."), **FULL},
 )
-async def seal(session_id: str, server: ServerState) -> SessionView:
+async def abandon_missing(session_id: str, server: ServerState) -> SessionView:
     """Seal a pending session without its missing frames, because its node never comes back.
 
     It is sealed as lossy: the missing frames are lost, reason `given_up`.
     """
-    server.recorder.give_up(session_id)
-    session = await server.settling.settled(session_id, SETTLE_S)
-    return SessionView.of(session, server.recorder)
+    server.recorder.abandon_missing(session_id)
+    session = await server.sealer.wait_until_sealed(session_id, SEAL_TIMEOUT_S)
+    return SessionView.from_session(session, server.recorder)
 
 
 @router.get("", operation_id="listSessions", summary="Sessions, newest first")
@@ -229,27 +229,27 @@ async def list_sessions(
     ] = None,
 ) -> SessionPage:
     """Return a page of the sessions that pass all filters."""
-    choice = Choice(
+    choice = SessionFilter(
         nodes=node,
         tags=tag,
         take=take,
         q=q,
-        from_t_ns=None if from_ is None else instant_ns(from_, where="from"),
-        to_t_ns=None if to is None else instant_ns(to, where="to"),
-        complete=None if complete is None else completeness_of(complete, where="complete"),
+        from_t_ns=None if from_ is None else parse_t_ns(from_, where="from"),
+        to_t_ns=None if to is None else parse_t_ns(to, where="to"),
+        complete=None if complete is None else parse_completeness(complete, where="complete"),
     )
-    ends = [] if cursor is None else [_key_of(cursor)]
+    ends = [] if cursor is None else [_parse_cursor(cursor)]
     if choice.to_t_ns is not None:
         ends.append((choice.to_t_ns, ""))
     since_t_ns = choice.from_t_ns or 0
-    listed = server.sessions.newest_first(min(ends, default=None))
+    listed = server.sessions.iterate_newest_first(min(ends, default=None))
     recent = takewhile(lambda session: session.started_t_ns >= since_t_ns, listed)
-    get_completeness = server.recorder.completeness_of
-    found = (session for session in recent if choice.takes(session, get_completeness))
+    get_completeness = server.recorder.compute_completeness
+    found = (session for session in recent if choice.accepts(session, get_completeness))
     page = list(islice(found, limit))
     more = next(found, None) is not None
     return SessionPage(
-        items=[SessionView.of(session, server.recorder) for session in page],
+        items=[SessionView.from_session(session, server.recorder) for session in page],
         unreadable=server.sessions.unreadable,
         next_cursor=f"{page[-1].started_t_ns}.{page[-1].id}" if more else None,
     )
@@ -263,7 +263,7 @@ async def list_sessions(
 )
 async def get_session(session_id: str, server: ServerState) -> SessionView:
     """Return the present state of a session."""
-    return SessionView.of(server.sessions.get(session_id), server.recorder)
+    return SessionView.from_session(server.sessions.get_session(session_id), server.recorder)
 
 
 @router.patch(
@@ -272,13 +272,15 @@ async def get_session(session_id: str, server: ServerState) -> SessionView:
     summary="Rename or annotate",
     responses={**_UNKNOWN, **CHANGED, **FULL},
 )
-async def change(
+async def change_session(
     session_id: str, body: ChangeSession, server: ServerState, if_match: IfMatch = None
 ) -> SessionView:
     """Change name, subject, notes or tags; the sealed data does not change."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
-    session = server.sessions.change(session_id, only_if=tag_of(if_match), **changes)
-    return SessionView.of(session, server.recorder)
+    session = server.sessions.edit_description(
+        session_id, if_revision=parse_if_match(if_match), **changes
+    )
+    return SessionView.from_session(session, server.recorder)
 
 
 @router.delete(
@@ -289,105 +291,107 @@ async def change(
     response_model=None,
     responses={
         **_UNKNOWN,
-        **problems(_409="It is being recorded, or sealed."),
+        **problem_responses(_409="It is being recorded, or sealed."),
         **CHANGED,
         **FULL,
     },
 )
-async def delete(session_id: str, server: ServerState, if_match: IfMatch = None) -> None:
+async def delete_session(session_id: str, server: ServerState, if_match: IfMatch = None) -> None:
     """Move a session to the trash, where it can be restored.
 
     Only emptying the trash frees its space.
     """
-    server.recorder.discard(session_id, only_if=tag_of(if_match))
-    server.hub.notice({"type": "deleted", "session_id": session_id})
+    server.recorder.delete_session(session_id, if_revision=parse_if_match(if_match))
+    server.broadcaster.send_notice({"type": "deleted", "session_id": session_id})
 
 
 @router.post(
-    "/{session_id}/events",
+    "/{session_id}/markers",
     operation_id="markEvent",
     summary="Add a marker",
     status_code=HTTPStatus.CREATED,
     responses={**_UNKNOWN, **FULL},
 )
-async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventView:
+async def add_marker(session_id: str, body: AddMarker, server: ServerState) -> MarkerView:
     """Add a marker, now or at a given time."""
-    event = server.sessions.mark(session_id, body.label, body.t_ns, body.id)
-    return EventView.of(event)
+    event = server.sessions.add_marker(session_id, body.label, body.t_ns, body.id)
+    return MarkerView.from_marker(event)
 
 
 @router.patch(
-    "/{session_id}/events/{event_id}",
+    "/{session_id}/markers/{marker_id}",
     operation_id="changeEvent",
     summary="Rename or move a marker",
     responses={**_NO_EVENT, **CHANGED, **FULL},
 )
-async def change_mark(
+async def change_marker(
     session_id: str,
-    event_id: str,
-    body: ChangeEvent,
+    marker_id: str,
+    body: ChangeMarker,
     server: ServerState,
     if_match: IfMatch = None,
-) -> EventView:
+) -> MarkerView:
     """Change a marker's label or time."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
-    only_if = tag_of(if_match)
-    return EventView.of(
-        server.sessions.change_mark(session_id, event_id, only_if=only_if, **changes)
+    only_if = parse_if_match(if_match)
+    return MarkerView.from_marker(
+        server.sessions.edit_marker(session_id, marker_id, if_revision=only_if, **changes)
     )
 
 
 @router.delete(
-    "/{session_id}/events/{event_id}",
+    "/{session_id}/markers/{marker_id}",
     operation_id="deleteEvent",
     summary="Delete a marker",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
     responses={**_NO_EVENT, **CHANGED, **FULL},
 )
-async def remove_mark(
-    session_id: str, event_id: str, server: ServerState, if_match: IfMatch = None
+async def delete_marker(
+    session_id: str, marker_id: str, server: ServerState, if_match: IfMatch = None
 ) -> None:
     """Delete a marker for good; its `id` can be used again."""
-    server.sessions.remove_mark(session_id, event_id, only_if=tag_of(if_match))
+    server.sessions.remove_marker(session_id, marker_id, if_revision=parse_if_match(if_match))
 
 
 @router.get(
-    "/{session_id}/events",
+    "/{session_id}/markers",
     operation_id="listEvents",
     summary="Markers",
-    response_model=Page[EventView],
+    response_model=Page[MarkerView],
     responses={
         200: {
             "description": "List, or the stored table.",
             "content": {PARQUET.media_type: {}},
         },
-        **problems(
+        **problem_responses(
             _404="No such session, or its table is missing.",
             _409="The table is written when the session is sealed.",
         ),
     },
 )
-async def events(
+async def list_markers(
     session_id: str,
     server: ServerState,
     format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
-) -> Page[EventView] | Response:
-    """Return markers in order of time; `format=parquet` is the stored `events.parquet`."""
-    session = server.sessions.get(session_id)
+) -> Page[MarkerView] | Response:
+    """Return markers in order of time; `format=parquet` is the stored `markers.parquet`."""
+    session = server.sessions.get_session(session_id)
     if format == "parquet":
-        return stored_table(session, server.sessions.folder.path(session_id) / EVENTS_NAME)
-    marked = sorted(session.events, key=lambda event: event.t_ns)
-    return Page(items=[EventView.of(event) for event in marked])
+        return stored_table_response(
+            session, server.sessions.folder.get_path(session_id) / MARKERS_NAME
+        )
+    marked = sorted(session.markers, key=lambda event: event.t_ns)
+    return Page(items=[MarkerView.from_marker(event) for event in marked])
 
 
 @router.get("/{session_id}/ledger", operation_id="getLedger", summary="Ledger", responses=_UNKNOWN)
-async def ledger(session_id: str, server: ServerState) -> Ledger:
+async def get_ledger(session_id: str, server: ServerState) -> Ledger:
     """Return the fate of every frame: recorded, lost for a reason, or still with the node."""
-    return server.recorder.ledger(session_id)
+    return server.recorder.get_ledger(session_id)
 
 
-def _key_of(cursor: str) -> tuple[int, str]:
+def _parse_cursor(cursor: str) -> tuple[int, str]:
     t_ns, _, session_id = cursor.partition(".")
     number = re.fullmatch(r"[0-9]{1,19}", t_ns)
     return (int(t_ns), session_id) if number else (0, "")

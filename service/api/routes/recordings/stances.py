@@ -16,12 +16,12 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
 from devices.errors import StateError, UnknownError
-from service.api.encoding import ARROW_STREAM, packed, takes_gzip, write_arrow_stream
-from service.api.routes.access import ServerState, has_it, problems
+from service.api.compression import ARROW_STREAM, accepts_gzip, compress_gzip, encode_arrow_stream
+from service.api.routes.common import ServerState, has_matching_etag, problem_responses
 from service.server.server import Server
-from service.sessions.stance_overlay import overlay_of_session
-from service.sessions.stances import stances_of_session
-from service.version import SOFTWARE
+from service.sessions.stance_overlay import overlay_stances
+from service.sessions.stances import load_stances
+from service.version import SOFTWARE_VERSION
 from storage.sessions.folder import Session
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
@@ -53,7 +53,7 @@ class StanceView(BaseModel):
     frames: int
     unknown_frames: int
     missing_frames: int
-    estimate_status: int
+    estimate_flags: int
     begun: bool
     ended: bool
     is_whole: bool
@@ -66,13 +66,13 @@ class StanceView(BaseModel):
     response_model=list[StanceView],
     responses={
         200: {"description": "All stances, in order of time.", "content": {ARROW_STREAM: {}}},
-        **problems(
+        **problem_responses(
             _404="No such session, nothing was recorded, or it has no estimates.",
             _409="Stances are counted when the session is sealed.",
         ),
     },
 )
-async def stances(
+async def get_stances(
     session_id: str,
     server: ServerState,
     accept: Annotated[str, Header(description="The Arrow media type for an Arrow stream.")] = "",
@@ -81,11 +81,11 @@ async def stances(
 
     For sessions of versions without stances they are computed from the frames.
     """
-    session = _sealed(session_id, server)
-    folder = server.sessions.folder.path(session_id)
-    table = await run_in_threadpool(stances_of_session, folder, frames_sha256=session.sha256)
+    session = _require_sealed(session_id, server)
+    folder = server.sessions.folder.get_path(session_id)
+    table = await run_in_threadpool(load_stances, folder, frames_sha256=session.sha256)
     if ARROW_STREAM in accept:
-        return Response(write_arrow_stream(table), media_type=ARROW_STREAM)
+        return Response(encode_arrow_stream(table), media_type=ARROW_STREAM)
     rows: list[dict[str, Any]] = table.to_pylist()
     return rows
 
@@ -147,13 +147,13 @@ class OverlayView(BaseModel):
     response_model=OverlayView,
     responses={
         304: {"description": "Unchanged."},
-        **problems(
+        **problem_responses(
             _404="No such session, nothing was recorded, or it has no estimates.",
             _409="Stances are counted when the session is sealed.",
         ),
     },
 )
-async def stances_overlay(
+async def get_stance_overlay(
     session_id: str,
     query: Annotated[OverlayQuery, Query()],
     request: Request,
@@ -166,23 +166,23 @@ async def stances_overlay(
 
     Values between two frames are interpolated linearly.
     """
-    session = _sealed(session_id, server)
-    as_gzip = takes_gzip(accept_encoding)
-    etag_input = f"{session.sha256}|{query.model_dump_json()}|{as_gzip}|{SOFTWARE}"
+    session = _require_sealed(session_id, server)
+    as_gzip = accepts_gzip(accept_encoding)
+    etag_input = f"{session.sha256}|{query.model_dump_json()}|{as_gzip}|{SOFTWARE_VERSION}"
     tag = hashlib.sha256(etag_input.encode()).hexdigest()
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
-    if has_it(request, tag):
+    if has_matching_etag(request, tag):
         return Response(status_code=304, headers=headers)
-    make = partial(_overlay, session, query, server)
+    make = partial(_encode_overlay, session, query, server)
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
     if as_gzip:
         headers["Content-Encoding"] = "gzip"
-        content = packed(content)
+        content = compress_gzip(content)
     return Response(content, headers=headers, media_type="application/json")
 
 
-def _sealed(session_id: str, server: Server) -> Session:
-    session = server.sessions.get(session_id)
+def _require_sealed(session_id: str, server: Server) -> Session:
+    session = server.sessions.get_session(session_id)
     if session.state != "sealed":
         raise StateError(
             f"session {session_id} is {session.state}, and its stances are available when it is "
@@ -194,35 +194,35 @@ def _sealed(session_id: str, server: Server) -> Session:
     return session
 
 
-def _overlay(session: Session, query: OverlayQuery, server: Server) -> bytes:
-    folder = server.sessions.folder.path(session.id)
-    table = stances_of_session(folder, frames_sha256=session.sha256)
-    with server.sessions.frames(session.id, only_slices=True) as reader:
-        found = overlay_of_session(reader, table, points=query.points, curves=query.curves)
+def _encode_overlay(session: Session, query: OverlayQuery, server: Server) -> bytes:
+    folder = server.sessions.folder.get_path(session.id)
+    table = load_stances(folder, frames_sha256=session.sha256)
+    with server.sessions.open_frames(session.id, only_slices=True) as reader:
+        found = overlay_stances(reader, table, points=query.points, curves=query.curves)
     content = {
         "session_id": session.id,
         "points": query.points,
-        "whole": found.whole,
-        "overlaid": found.overlaid,
-        "not_whole": found.not_whole,
-        "too_short": found.too_short,
+        "whole": found.whole_count,
+        "overlaid": found.overlaid_count,
+        "not_whole": found.partial_count,
+        "too_short": found.too_short_count,
         "spread": {
             name: {
-                "mean": _plain(spread.mean),
-                "sd": _plain(spread.sd),
+                "mean": _round_to_list(spread.mean),
+                "sd": _round_to_list(spread.sd),
                 "count": spread.count.tolist(),
             }
-            for name, spread in found.overlay.spread.items()
+            for name, spread in found.overlay.statistics.items()
         },
         "curves": [
             {"number": number}
-            | {name: _plain(curves[i]) for name, curves in found.overlay.curves.items()}
+            | {name: _round_to_list(curves[i]) for name, curves in found.overlay.curves.items()}
             for i, number in enumerate(found.numbers)
         ],
     }
     return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
 
 
-def _plain(values: Floats) -> list[float | None]:
+def _round_to_list(values: Floats) -> list[float | None]:
     rounded: list[float] = np.round(values, _DIGITS).tolist()
     return [None if math.isnan(value) else value for value in rounded]

@@ -9,21 +9,26 @@ from typing import Annotated
 from fastapi import APIRouter, Response
 from pydantic import Field
 
-from service.api.routes.access import IdempotencyKey, ServerState, asked_with, problems
+from service.api.routes.common import (
+    IdempotencyKey,
+    ServerState,
+    make_idempotency_record,
+    problem_responses,
+)
 from service.api.routes.recordings import sessions as one
-from service.private_paths import ShownText
-from service.server.screens.views import SessionView, View
+from service.private_paths import PublicText
+from service.server.broadcast.views import SessionView, View
 from service.server.server import Server
 from service.server.takes import Take
 
 router = APIRouter(prefix="/takes", tags=["takes"])
 
-_UNKNOWN = problems(_404="No such take.")
-_FAILED = problems(_409="It failed on every node.")
-_OVER = problems(_409="No session is being recorded, or it failed on every node.")
+_UNKNOWN = problem_responses(_404="No such take.")
+_FAILED = problem_responses(_409="It failed on every node.")
+_OVER = problem_responses(_409="No session is being recorded, or it failed on every node.")
 
 
-class StartTake(one.Describe):
+class StartTake(one.RecordingDescription):
     """Request to record several nodes."""
 
     nodes: Annotated[tuple[str, ...], Field(min_length=1, max_length=1000)] | None = Field(
@@ -38,16 +43,16 @@ class TakeView(View):
     sessions: list[SessionView] = Field(
         description="Sessions on which the command succeeded; for a take, all."
     )
-    failed: dict[str, ShownText] = Field(
+    failed: dict[str, PublicText] = Field(
         description="Errors by node; the other nodes are not affected.",
         examples=[{"left": "node 'left' sends no frames. Connect it and retry"}],
     )
 
     @classmethod
-    def of(cls, take: Take, server: Server) -> TakeView:
+    def from_take(cls, take: Take, server: Server) -> TakeView:
         """Return the present state of a take."""
-        views = [SessionView.of(session, server.recorder) for session in take.sessions]
-        return cls(id=take.id, sessions=views, failed=take.failed)
+        views = [SessionView.from_session(session, server.recorder) for session in take.sessions]
+        return cls(id=take.id, sessions=views, failed=take.errors_by_node)
 
 
 @router.post(
@@ -55,12 +60,12 @@ class TakeView(View):
     operation_id="startTake",
     summary="Record several nodes together",
     status_code=HTTPStatus.CREATED,
-    responses=problems(
+    responses=problem_responses(
         _409="No node can be recorded; or a session of this key is in the trash.",
         _422="Invalid body, or the Idempotency-Key came with another request.",
     ),
 )
-async def start(
+async def start_take(
     body: StartTake, server: ServerState, response: Response, idempotency_key: IdempotencyKey = None
 ) -> TakeView:
     """Start one session per node, with one name and one `take`.
@@ -68,24 +73,24 @@ async def start(
     A node that cannot be recorded is in `failed` with the reason; the others are recorded. A
     repeated request with the same key starts no session later.
     """
-    take = server.takes.start(
+    take = server.takes.start_take(
         body.name,
         body.nodes,
         pre_roll_s=body.pre_roll_s,
         subject=body.subject or "",
         notes=body.notes,
         tags=body.tags,
-        asked=asked_with(idempotency_key, "take", body),
+        request=make_idempotency_record(idempotency_key, "take", body),
     )
-    _tell_nodes(server, take)
+    _notify_nodes_changed(server, take)
     response.headers["Location"] = f"/api/v1/takes/{take.id}"
-    return TakeView.of(take, server)
+    return TakeView.from_take(take, server)
 
 
 @router.get("/{take_id}", operation_id="getTake", summary="One take", responses=_UNKNOWN)
 async def get_take(take_id: str, server: ServerState) -> TakeView:
     """Return the present sessions of a take, without those in the trash."""
-    return TakeView.of(server.takes.get(take_id), server)
+    return TakeView.from_take(server.takes.get_take(take_id), server)
 
 
 @router.post(
@@ -94,38 +99,40 @@ async def get_take(take_id: str, server: ServerState) -> TakeView:
     summary="Stop all of a take",
     responses={**_UNKNOWN, **_FAILED},
 )
-async def stop(take_id: str, server: ServerState) -> TakeView:
+async def stop_take(take_id: str, server: ServerState) -> TakeView:
     """Stop all sessions of a take that are being recorded.
 
     Stopped ones are unchanged, and are in the answer, too.
     """
-    take = server.takes.stop(take_id)
-    _tell_nodes(server, take)
-    connected = [node.name for node in server.nodes if node.connected]
+    take = server.takes.stop_take(take_id)
+    _notify_nodes_changed(server, take)
+    connected = [node.name for node in server.nodes if node.is_connected]
     settled = [
-        server.settling.settled(session.id, one.SETTLE_S)
+        server.sealer.wait_until_sealed(session.id, one.SEAL_TIMEOUT_S)
         for session in take.sessions
         if session.node in connected
     ]
     await asyncio.gather(*settled)
-    now = [server.sessions.get(session.id) for session in take.sessions]
-    return TakeView.of(Take(take.id, now, take.failed), server)
+    now = [server.sessions.get_session(session.id) for session in take.sessions]
+    return TakeView.from_take(Take(take.id, now, take.errors_by_node), server)
 
 
 @router.post(
-    "/{take_id}/events",
+    "/{take_id}/markers",
     operation_id="markTake",
     summary="Add a marker to all of a take",
     status_code=HTTPStatus.CREATED,
     responses={**_UNKNOWN, **_OVER},
 )
-async def mark(take_id: str, body: one.MarkEvent, server: ServerState) -> TakeView:
+async def mark_take(take_id: str, body: one.AddMarker, server: ServerState) -> TakeView:
     """Add a marker at one time and with one id to all sessions that are being recorded."""
-    return TakeView.of(server.takes.mark(take_id, body.label, body.t_ns, body.id), server)
+    return TakeView.from_take(
+        server.takes.add_marker(take_id, body.label, body.t_ns, body.id), server
+    )
 
 
-def _tell_nodes(server: Server, take: Take) -> None:
+def _notify_nodes_changed(server: Server, take: Take) -> None:
     for session in take.sessions:
         node = server.nodes.find(session.node)  # its folder may be gone
         if node is not None:
-            server.tell_node(node)
+            server.notify_node_changed(node)

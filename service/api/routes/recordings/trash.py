@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter
 from pydantic import Field
 
-from service.api.routes.access import ServerState, problems
-from service.server.screens.views import Page, SessionView, View
+from service.api.routes.common import ServerState, problem_responses
+from service.server.broadcast.views import Page, SessionView, View
 
 router = APIRouter(prefix="/trash", tags=["trash"])
 
@@ -21,28 +21,28 @@ class Emptied(View):
 @router.get("", operation_id="listTrash", summary="Deleted sessions, newest first")
 async def list_trash(server: ServerState) -> Page[SessionView]:
     """Return deleted sessions, newest first; each can be restored."""
-    deleted = server.sessions.trash.all()
-    return Page(items=[SessionView.of(session, server.recorder) for session in deleted])
+    deleted = server.sessions.trash.list_sessions()
+    return Page(items=[SessionView.from_session(session, server.recorder) for session in deleted])
 
 
 @router.post(
     "/{session_id}/restore",
     operation_id="restoreSession",
     summary="Restore a session",
-    responses=problems(_404="No such session in the trash.", _507="The disk is full."),
+    responses=problem_responses(_404="No such session in the trash.", _507="The disk is full."),
 )
-async def restore(session_id: str, server: ServerState) -> SessionView:
+async def restore_session(session_id: str, server: ServerState) -> SessionView:
     """Restore a session; a pending one completes when its node is back."""
-    return SessionView.of(server.recorder.restore(session_id), server.recorder)
+    return SessionView.from_session(server.recorder.restore_session(session_id), server.recorder)
 
 
 @router.delete(
     "",
     operation_id="emptyTrash",
     summary="Empty the trash",
-    responses=problems(_507="The data folder cannot be written."),
+    responses=problem_responses(_507="The data folder cannot be written."),
 )
-async def empty(server: ServerState) -> Emptied:
+async def empty_trash(server: ServerState) -> Emptied:
     """Delete all sessions in the trash for good."""
     sessions, size_bytes = await server.empty_trash()
     return Emptied(sessions=sessions, bytes=size_bytes)

@@ -12,307 +12,317 @@ from typing import TypeVar
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from devices.errors import FileFormatError, LinkError, StorageError
-from devices.words import printable
-from service.api.protocols import send
-from service.link import (
+from devices.text import escape_control_chars
+from service.api.protocols import send_message
+from service.protocol import (
+    LINK_TIMEOUT_S,
     MESSAGE_BYTES_MAX,
+    NODE_MESSAGES,
     PROTOCOL,
-    SILENCE_S,
     SUBPROTOCOL,
     Ack,
-    ClockRow,
-    Close,
-    FramesOf,
-    FromNode,
-    HangUp,
+    ClockProbe,
+    ClockSample,
+    CloseConnection,
     Hello,
     Identify,
-    Lost,
-    Probe,
+    LinkCloseCode,
+    LossReport,
+    NodeMessage,
+    NodeStatus,
     Proof,
-    SaidByNode,
-    Status,
+    StreamSelect,
     Welcome,
-    checked,
-    close_reason,
-    heard,
-    say,
-    understood,
+    encode_message,
+    format_close_reason,
+    parse_message,
+    strip_binary_crc,
+    strip_text_crc,
 )
-from service.server.identities import Claim
+from service.server.identities import IdentityClaim
 from service.server.node import ServerNode
 from service.server.nodes import is_node_name
-from service.server.server import Link, Server
+from service.server.server import NodeLink, Server
 from service.server.streams import ServerStream
-from service.server_clock import utc_ns
+from service.server_clock import server_utc_ns
 
 log = logging.getLogger("foottile.ingest")
 
 _Message = TypeVar("_Message", Identify, Proof, Hello)
 
 
-async def ingest(socket: WebSocket, server: Server) -> None:
+async def serve_node(socket: WebSocket, server: Server) -> None:
     """Serve one node's connection until it ends; an error ends only this connection."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
     try:
-        claim = await _challenge(socket, server, offered)
+        claim = await _challenge_node(socket, server, offered)
         hello = await _receive_hello(socket, claim)
-        with _joined(server, hello, claim) as link:
-            await _welcome(socket, server, link)
-            await _serve(socket, server, link)
-    except HangUp as end:
-        await _close(socket, end)
+        with _registered_node(server, hello, claim) as link:
+            await _send_welcome(socket, server, link)
+            await _run_tasks(socket, server, link)
+    except CloseConnection as end:
+        await _close_socket(socket, end)
     except WebSocketDisconnect:  # it disconnected, perhaps while we were sending
         pass
     except Exception:
         log.exception("this is a bug; a node's connection ends, the server goes on")
-        await _close(socket, HangUp(Close.BUG, "bug in the server; see its log"))
+        await _close_socket(
+            socket, CloseConnection(LinkCloseCode.BUG, "bug in the server; see its log")
+        )
 
 
-async def _challenge(socket: WebSocket, server: Server, offered: list[str]) -> Claim:
+async def _challenge_node(socket: WebSocket, server: Server, offered: list[str]) -> IdentityClaim:
     """Request a proof that the connecting machine is the node that it names."""
     if SUBPROTOCOL not in offered:
-        raise HangUp(
-            Close.WRONG_VERSION,
+        raise CloseConnection(
+            LinkCloseCode.WRONG_VERSION,
             f"subprotocol {', '.join(offered) or 'none'} offered; this server speaks {SUBPROTOCOL}",
         )
-    first = await _receive(socket)
-    if (protocol := _protocol_of(first)) is not None and protocol != PROTOCOL:
+    first = await _receive_message(socket)
+    if (protocol := _read_protocol(first)) is not None and protocol != PROTOCOL:
         # Before parsing: another version's first message has other fields.
-        raise HangUp(
-            Close.WRONG_VERSION,
+        raise CloseConnection(
+            LinkCloseCode.WRONG_VERSION,
             f"protocol {protocol}; this server speaks {PROTOCOL}: update the "
             + ("node" if protocol < PROTOCOL else "server"),
         )
-    who = _expect(Identify, first)
+    who = _require_message(Identify, first)
     if not is_node_name(who.node):
-        raise HangUp(
-            Close.REFUSED, f"{who.node[:80]!r} is no name of a node: letters, digits, '.', '_', '-'"
+        raise CloseConnection(
+            LinkCloseCode.REFUSED,
+            f"{who.node[:80]!r} is no name of a node: letters, digits, '.', '_', '-'",
         )
-    with _try_later():
-        challenge = server.identities.challenge(who.node, server.id)
-    await send(socket, say(challenge))
-    answer = _expect(Proof, await _receive(socket))
+    with _close_on_storage_error():
+        challenge = server.identities.make_challenge(who.node, server.id)
+    await send_message(socket, encode_message(challenge))
+    answer = _require_message(Proof, await _receive_message(socket))
     client = socket.client
-    return Claim(who.node, challenge, answer, client.host if client is not None else "")
+    return IdentityClaim(who.node, challenge, answer, client.host if client is not None else "")
 
 
-async def _receive_hello(socket: WebSocket, claim: Claim) -> Hello:
-    hello = _expect(Hello, await _receive(socket))
+async def _receive_hello(socket: WebSocket, claim: IdentityClaim) -> Hello:
+    hello = _require_message(Hello, await _receive_message(socket))
     if hello.array_info.node != claim.node:
-        raise HangUp(
-            Close.REFUSED,
+        raise CloseConnection(
+            LinkCloseCode.REFUSED,
             f"node {claim.node!r} sends hello as {hello.array_info.node[:80]!r}",
         )
     return hello
 
 
-def _expect(kind: type[_Message], message: str | bytes) -> _Message:
+def _require_message(kind: type[_Message], message: str | bytes) -> _Message:
     name = kind.model_fields["type"].default
     if isinstance(message, bytes):
-        raise HangUp(Close.REFUSED, f"{name} was expected, in text")
-    parsed = _parse(message)
+        raise CloseConnection(LinkCloseCode.REFUSED, f"{name} was expected, in text")
+    parsed = _parse_message(message)
     if not isinstance(parsed, kind):
-        raise HangUp(Close.REFUSED, f"{name} was expected, not {parsed.type}")
+        raise CloseConnection(LinkCloseCode.REFUSED, f"{name} was expected, not {parsed.type}")
     return parsed
 
 
-def _is_proven(server: Server, claim: Claim) -> bool:
-    before = server.identities.replacements.get(claim.node)
+def _verify_claim(server: Server, claim: IdentityClaim) -> bool:
+    before = server.identities.refused_machines.get(claim.node)
     try:
-        with _try_later():
-            return server.identities.is_proven(claim, utc_ns())
-    except HangUp:
-        asking, node = server.identities.replacements.get(claim.node), server.nodes.find(claim.node)
+        with _close_on_storage_error():
+            return server.identities.verify_claim(claim, server_utc_ns())
+    except CloseConnection:
+        asking, node = (
+            server.identities.refused_machines.get(claim.node),
+            server.nodes.find(claim.node),
+        )
         # A refused machine retries for ever: notify subscribers once per machine.
         is_new = asking is not None and (before is None or before.secret != asking.secret)
         if node is not None and is_new:
-            server.tell_node(node)
+            server.notify_node_changed(node)
         raise
 
 
 @contextmanager
-def _try_later() -> Iterator[None]:
+def _close_on_storage_error() -> Iterator[None]:
     try:
         yield
     except StorageError as error:
-        raise HangUp(Close.TRY_LATER, str(error)) from error
+        raise CloseConnection(LinkCloseCode.TRY_LATER, str(error)) from error
 
 
 @contextmanager
-def _joined(server: Server, hello: Hello, claim: Claim) -> Iterator[Link]:
+def _registered_node(server: Server, hello: Hello, claim: IdentityClaim) -> Iterator[NodeLink]:
     """Context manager: register a node's connection while the block runs."""
-    name, boot_id = hello.array_info.node, hello.array_info.boot_id
-    is_proven = _is_proven(server, claim)
+    name, stream_id = hello.array_info.node, hello.array_info.stream_id
+    is_proven = _verify_claim(server, claim)
     other = server.links.get(name)
     if other is not None:
         # A node that was restarted lists the stream it had before. The ids of streams are
         # public, so without a secret they prove nothing.
-        known_ids = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
-        if not is_proven or other.node.boot_id not in known_ids:
-            raise HangUp(
-                Close.NAME_TAKEN,
+        known_ids = {stream_id, *(stream.array_info.stream_id for stream in hello.earlier)}
+        if not is_proven or other.node.stream_id not in known_ids:
+            raise CloseConnection(
+                LinkCloseCode.NAME_TAKEN,
                 f"a node {name!r} is connected already; give this one another name (--name)",
             )
-        other.end(Close.SUPERSEDED, "the same node has connected again")
+        other.request_close(LinkCloseCode.SUPERSEDED, "the same node has connected again")
     is_new = server.nodes.find(name) is None
     try:
-        node = server.nodes.greet(hello)
-        node.attach(hello, utc_ns())
-        server.recorder.know(node)
-        server.settling.follow(node)
+        node = server.nodes.get_or_create(hello)
+        node.on_hello(hello, server_utc_ns())
+        server.recorder.on_node_hello(node)
+        server.sealer.on_node_hello(node)
     except Exception as error:
         if is_new:
-            server.nodes.forget(name)
+            server.nodes.remove(name)
         if not isinstance(error, LinkError | StorageError):
             raise
-        code = Close.TRY_LATER if isinstance(error, StorageError) else Close.REFUSED
-        raise HangUp(code, str(error)) from error
+        code = LinkCloseCode.TRY_LATER if isinstance(error, StorageError) else LinkCloseCode.REFUSED
+        raise CloseConnection(code, str(error)) from error
     if not is_proven:
-        server.identities.keep_first(claim)
-    link = server.links[name] = Link(node)
-    node.connected = True
+        server.identities.store_first_secret(claim)
+    link = server.links[name] = NodeLink(node)
+    node.is_connected = True
     try:
         yield link
     finally:
         if server.links.get(name) is link:
             del server.links[name]
-            node.detach()
-            server.tell_node(node)
+            node.on_disconnect()
+            server.notify_node_changed(node)
             log.info("node %s has gone", name)
 
 
-async def _welcome(socket: WebSocket, server: Server, link: Link) -> None:
+async def _send_welcome(socket: WebSocket, server: Server, link: NodeLink) -> None:
     node = link.node
-    link.wanted = server.recorder.wanted(node.name)
-    lacks = node.lacks(server.recorder.needed(node.name))
-    welcome = Welcome(protocol=PROTOCOL, lacks=lacks, wanted=link.wanted)
-    await send(socket, say(welcome))
-    log.info("node %s connected, stream %s", node.name, node.boot_id)
-    server.tell_node(node)
+    link.retention_request = server.recorder.retention_request(node.name)
+    lacks = node.missing_ranges(server.recorder.needed_frames(node.name))
+    welcome = Welcome(protocol=PROTOCOL, missing=lacks, retention=link.retention_request)
+    await send_message(socket, encode_message(welcome))
+    log.info("node %s connected, stream %s", node.name, node.stream_id)
+    server.notify_node_changed(node)
 
 
-async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
+async def _run_tasks(socket: WebSocket, server: Server, link: NodeLink) -> None:
     tasks = [
-        asyncio.create_task(_take(socket, server, link)),
-        asyncio.create_task(_tell(socket, server, link)),
-        asyncio.create_task(link.ended.wait()),
+        asyncio.create_task(_receive_messages(socket, server, link)),
+        asyncio.create_task(_send_updates(socket, server, link)),
+        asyncio.create_task(link.close_requested.wait()),
     ]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
             task.result()
-        if link.closing is not None:
-            raise HangUp(*link.closing)
+        if link.close_reason is not None:
+            raise CloseConnection(*link.close_reason)
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _take(socket: WebSocket, server: Server, link: Link) -> None:
+async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -> None:
     node = link.node
     while True:
         # Received messages are returned without waiting: without this line a node with a long
         # backlog would block all others.
         await asyncio.sleep(0)
-        message = await _receive(socket)
+        message = await _receive_message(socket)
         if isinstance(message, bytes):
-            tare_before = node.estimates.live.tare
+            tare_before = node.estimator.live.tare
             try:
-                *_, due = node.take(link.stream, _frames(message), utc_ns())
+                *_, due = node.receive_frames(link.stream, _verify_frames(message), server_utc_ns())
             except LinkError as error:
-                raise HangUp(Close.REFUSED, str(error)) from error
-            server.hub.publish(node, due)
-            server.frames.publish(node, due)
+                raise CloseConnection(LinkCloseCode.REFUSED, str(error)) from error
+            server.broadcaster.add_frames(node, due)
+            server.live_feeds.add_batches(node, due)
             server.weighings.push(node, due)
-            if node.estimates.live.tare is not tare_before:
-                server.tell_node(node)
+            if node.estimator.live.tare is not tare_before:
+                server.notify_node_changed(node)
             continue
-        parsed = _parse(message)
+        parsed = _parse_message(message)
         match parsed:
-            case Probe(id=number):
-                await _answer(socket, Probe(id=number, server_t_ns=utc_ns()))
-            case FramesOf(boot_id=boot_id):
-                link.stream = _announced(node, boot_id)
-            case ClockRow():
-                server.recorder.note_clock(node, parsed, utc_ns())
-            case Status():
-                node.present.missed_slots = parsed.missed_slots
-                node.troubles, node.fault_counts = parsed.troubles, parsed.counts
-                server.tell_node(node)
-            case Lost():
-                _announced(node, parsed.boot_id).note_losses(parsed.lost)
+            case ClockProbe(id=number):
+                await _answer_probe(socket, ClockProbe(id=number, server_t_ns=server_utc_ns()))
+            case StreamSelect(stream_id=stream_id):
+                link.stream = _find_announced_stream(node, stream_id)
+            case ClockSample():
+                server.recorder.record_clock_offset(node, parsed, server_utc_ns())
+            case NodeStatus():
+                node.present_stream.missed_slots = parsed.missed_slots
+                node.troubles, node.fault_counts = parsed.warnings, parsed.counts
+                server.notify_node_changed(node)
+            case LossReport():
+                _find_announced_stream(node, parsed.stream_id).set_losses(parsed.lost)
             case Identify() | Proof() | Hello():
-                raise HangUp(Close.REFUSED, f"{parsed.type} was sent before")
+                raise CloseConnection(LinkCloseCode.REFUSED, f"{parsed.type} was sent before")
 
 
-def _announced(node: ServerNode, boot_id: str) -> ServerStream:
-    if boot_id not in node.order:
-        raise HangUp(Close.REFUSED, f"stream {boot_id!r} was not announced")
-    return node.streams[boot_id]
+def _find_announced_stream(node: ServerNode, stream_id: str) -> ServerStream:
+    if stream_id not in node.stream_order:
+        raise CloseConnection(LinkCloseCode.REFUSED, f"stream {stream_id!r} was not announced")
+    return node.streams[stream_id]
 
 
-async def _answer(socket: WebSocket, probe: Probe) -> None:
+async def _answer_probe(socket: WebSocket, probe: ClockProbe) -> None:
     try:
-        async with asyncio.timeout(SILENCE_S):
-            await send(socket, say(probe))
+        async with asyncio.timeout(LINK_TIMEOUT_S):
+            await send_message(socket, encode_message(probe))
     except TimeoutError as error:  # else the silence of the node would go unnoticed
-        raise HangUp(Close.SILENT, f"nothing was read for {SILENCE_S:g} s") from error
+        raise CloseConnection(
+            LinkCloseCode.SILENT, f"nothing was read for {LINK_TIMEOUT_S:g} s"
+        ) from error
 
 
-async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
+async def _send_updates(socket: WebSocket, server: Server, link: NodeLink) -> None:
     """Send acknowledgements, and the retention request whenever it changes."""
     while True:
-        await link.news.wait()
-        link.news.clear()
+        await link.has_outgoing.wait()
+        link.has_outgoing.clear()
         # The retention request goes first: a node may drop frames once they are acknowledged.
-        wanted = server.recorder.wanted(link.node.name)
-        if wanted != link.wanted:
-            link.wanted = wanted
-            await send(socket, say(wanted))
-        for boot_id, numbers in link.acks().items():
+        wanted = server.recorder.retention_request(link.node.name)
+        if wanted != link.retention_request:
+            link.retention_request = wanted
+            await send_message(socket, encode_message(wanted))
+        for stream_id, numbers in link.pop_acks().items():
             for first, last in numbers:
-                ack = Ack(boot_id=boot_id, seq_first=first, seq_last=last)
-                await send(socket, say(ack))
+                ack = Ack(stream_id=stream_id, seq_first=first, seq_last=last)
+                await send_message(socket, encode_message(ack))
 
 
-async def _receive(socket: WebSocket) -> str | bytes:
+async def _receive_message(socket: WebSocket) -> str | bytes:
     try:
-        async with asyncio.timeout(SILENCE_S):
+        async with asyncio.timeout(LINK_TIMEOUT_S):
             message = await socket.receive()
     except TimeoutError as error:
-        raise HangUp(Close.SILENT, f"nothing was received for {SILENCE_S:g} s") from error
+        raise CloseConnection(
+            LinkCloseCode.SILENT, f"nothing was received for {LINK_TIMEOUT_S:g} s"
+        ) from error
     if message["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(message.get("code", 1005))
     data: str | bytes | None = message.get("bytes")
     if data is None:
         data = message["text"]
     if len(data) > MESSAGE_BYTES_MAX:
-        raise HangUp(Close.TOO_BIG, f"a message of {len(data)} bytes")
+        raise CloseConnection(LinkCloseCode.TOO_BIG, f"a message of {len(data)} bytes")
     return data
 
 
-def _parse(message: str) -> SaidByNode:
+def _parse_message(message: str) -> NodeMessage:
     try:
-        text = heard(message)
+        text = strip_text_crc(message)
     except LinkError as error:
-        raise HangUp(Close.MALFORMED, str(error)) from error
+        raise CloseConnection(LinkCloseCode.MALFORMED, str(error)) from error
     try:
-        return understood(FromNode, text)
+        return parse_message(NODE_MESSAGES, text)
     except LinkError as error:
-        raise HangUp(Close.REFUSED, str(error)) from error
+        raise CloseConnection(LinkCloseCode.REFUSED, str(error)) from error
 
 
-def _frames(message: bytes) -> bytes:
+def _verify_frames(message: bytes) -> bytes:
     try:
-        return checked(message)
+        return strip_binary_crc(message)
     except FileFormatError as error:
-        raise HangUp(Close.MALFORMED, str(error)) from error
+        raise CloseConnection(LinkCloseCode.MALFORMED, str(error)) from error
 
 
-def _protocol_of(message: str | bytes) -> int | None:
+def _read_protocol(message: str | bytes) -> int | None:
     """Return the protocol of a first message, whatever else it has; None without one."""
     try:
         content = json.loads(message) if isinstance(message, str) else None
@@ -325,9 +335,9 @@ def _protocol_of(message: str | bytes) -> int | None:
     return protocol if isinstance(protocol, int) else None
 
 
-async def _close(socket: WebSocket, end: HangUp) -> None:
-    reason = close_reason(end.reason)
-    log.warning("link closed: %s", printable(end.reason))  # with local paths
+async def _close_socket(socket: WebSocket, end: CloseConnection) -> None:
+    reason = format_close_reason(end.reason)
+    log.warning("link closed: %s", escape_control_chars(end.reason))  # with local paths
     if socket.application_state is not WebSocketState.DISCONNECTED:
         with suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(end.code, reason)

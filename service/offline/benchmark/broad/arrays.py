@@ -11,34 +11,43 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from devices.emulation.parts import random_of
-from devices.scene.file import Scene, load_scene
+from devices.emulation.parts import make_rng
+from devices.scene.scene_file import Scene, load_scene
 from service.estimation.calibration import Calibration
-from service.offline.benchmark.broad.judge import JUDGED, judged, surely_below_end
-from service.offline.benchmark.broad.results import (
-    FIRST_SEED,
-    ArrayResult,
-    Judged,
-    Refusal,
-    Seeds,
-    Tile,
-    key_of,
+from service.offline.benchmark.broad.evaluation import (
+    EVALUATED_COLUMNS,
+    evaluate_estimates,
+    find_unsaturated_tiles,
 )
-from service.offline.benchmark.broad.tiles import tiles_of
-from service.offline.benchmark.draws import LAGS_MS, estimates_of, reason, recorded
-from service.offline.calibrations import EMULATED_RIG, RIG_REFERENCE, find_calibration
+from service.offline.benchmark.broad.results import (
+    FIRST_SEEDS,
+    ArrayResult,
+    CaseResult,
+    RefusedItem,
+    Seeds,
+    TileResult,
+    make_case_key,
+)
+from service.offline.benchmark.broad.tile_properties import describe_tiles
+from service.offline.benchmark.draws import (
+    LAGS_MS,
+    compute_estimates,
+    describe_error,
+    record_with_calibration,
+)
+from service.offline.calibration_lookup import EMULATED_RIG, RIG_REFERENCE, find_calibration
 
 SCENES = ("rolling", "poppy", "mud")
 SERIALS = ("T01", "T02", "T03", "T04")
 """Serials of the tiles, the same in all three scenes."""
-ROLLING_S = 12.0
+ROLLING_SCENE_S = 12.0
 """One pass of the arc, back, and half another."""
 HEAVY = "heavy"
 _HEAVY = {"mass_kg": 3.3, "leg_n_per_m": 2250.0, "strength_n_per_cm3": 1.0}
 """A leg of 3.3 kg on firmer poppy seeds: 28 N within 50 ms, near or beyond the range of the softer
 domes."""
 CLEAN = "clean"
-REPEATABILITY_MAX = 0.03
+MAX_REPEATABILITY = 0.03
 CONDITIONS: Mapping[str, str] = {
     CLEAN: "repeatability 0, drift 0, white noise",
     "repeatability": "loadings differ as on the array's rig, by 0 to 3 %",
@@ -59,7 +68,7 @@ class ArrayTask:
     @property
     def seed(self) -> int:
         """Seed of its parts, noise and grounds."""
-        return FIRST_SEED[self.seeds] + self.number
+        return FIRST_SEEDS[self.seeds] + self.number
 
 
 def run_array(task: ArrayTask) -> ArrayResult:
@@ -67,18 +76,20 @@ def run_array(task: ArrayTask) -> ArrayResult:
     began_s = time.process_time()
     repeatability = task.repeatability
     if repeatability is None:
-        drawn = random_of(f"repeatability/{task.seed}").uniform(0.0, REPEATABILITY_MAX)
+        drawn = make_rng(f"repeatability/{task.seed}").uniform(0.0, MAX_REPEATABILITY)
         repeatability = round(float(drawn), 6)
-    calibration, refusals = _bench(task.seed, repeatability)
+    calibration, refusals = _calibrate_array(task.seed, repeatability)
     bench_s = time.process_time() - began_s
-    found: dict[str, Judged] = {}
-    tiles: tuple[Tile, ...] = ()
+    found: dict[str, CaseResult] = {}
+    tiles: tuple[TileResult, ...] = ()
     if calibration is not None:
-        for scene, condition in _cases(repeatability):
+        for scene, condition in _iterate_cases(repeatability):
             try:
-                found_here, tiles_here = _case(scene, condition, task.seed, calibration)
+                found_here, tiles_here = _evaluate_case(scene, condition, task.seed, calibration)
             except Exception as error:
-                refusals.append(Refusal(what=f"{scene.name}, {condition}", why=reason(error)))
+                refusals.append(
+                    RefusedItem(what=f"{scene.name}, {condition}", why=describe_error(error))
+                )
             else:
                 found |= found_here
                 tiles = tiles_here or tiles
@@ -96,7 +107,9 @@ def run_array(task: ArrayTask) -> ArrayResult:
     )
 
 
-def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Refusal]]:
+def _calibrate_array(
+    seed: int, repeatability: float
+) -> tuple[Calibration | None, list[RefusedItem]]:
     """Calibrate the array; None with the reasons if a tile is refused."""
     entries: list[Calibration] = []
     refusals = []
@@ -110,13 +123,13 @@ def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Re
                         parts_seed=seed,
                         family="broad",
                         repeatability=repeatability,
-                        cache=Path(work),
+                        cache_folder=Path(work),
                     )
                 )
             except Exception as error:
                 # Without the path of the temporary folder.
-                why = re.sub(r"\S*/(?=bench-)", "", reason(error))
-                refusals.append(Refusal(what=f"calibration of {serial}", why=why))
+                why = re.sub(r"\S*/(?=bench-)", "", describe_error(error))
+                refusals.append(RefusedItem(what=f"calibration of {serial}", why=why))
     if refusals:
         return None, refusals
     tiles = tuple(tile for entry in entries for tile in entry.tiles)
@@ -126,7 +139,7 @@ def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Re
     return whole, []
 
 
-def _cases(repeatability: float) -> Iterator[tuple[Scene, str]]:
+def _iterate_cases(repeatability: float) -> Iterator[tuple[Scene, str]]:
     """Yield every scene under every condition; the heavy leg under one."""
     changes: Mapping[str, Mapping[str, Any]] = {
         CLEAN: {},
@@ -136,28 +149,30 @@ def _cases(repeatability: float) -> Iterator[tuple[Scene, str]]:
     }
     for condition in CONDITIONS:
         for name in SCENES:
-            yield _emulated(load_scene(name), **changes[condition]), condition
+            yield _make_broad_scene(load_scene(name), **changes[condition]), condition
     poppy = load_scene("poppy")
     ground = poppy.ground.model_copy(update=_HEAVY)
-    yield _emulated(poppy.model_copy(update={"ground": ground})), HEAVY
+    yield _make_broad_scene(poppy.model_copy(update={"ground": ground})), HEAVY
 
 
-def _emulated(scene: Scene, **changes: Any) -> Scene:
+def _make_broad_scene(scene: Scene, **changes: Any) -> Scene:
     """Return the scene with broad parts and without the servo, which no figure needs."""
     emulation = scene.emulation.model_copy(update={"family": "broad", **changes})
     return scene.model_copy(update={"emulation": emulation, "servo": None})
 
 
-def _case(
+def _evaluate_case(
     scene: Scene, condition: str, seed: int, calibration: Calibration
-) -> tuple[dict[str, Judged], tuple[Tile, ...]]:
+) -> tuple[dict[str, CaseResult], tuple[TileResult, ...]]:
     """Evaluate one recording in both modes; for clean poppy seeds also describe the tiles."""
-    seconds = ROLLING_S if scene.name == "rolling" else None
-    recording, world = recorded(scene, seconds, seed, calibration)
-    below_end = cache(partial(surely_below_end, recording, world))
+    seconds = ROLLING_SCENE_S if scene.name == "rolling" else None
+    recording, world = record_with_calibration(scene, seconds, seed, calibration)
+    below_end = cache(partial(find_unsaturated_tiles, recording, world))
     found = {}
     for mode, lag_ms in LAGS_MS.items():
-        columns = estimates_of(recording, scene.models, lag_ms, JUDGED)
-        found[key_of(scene.name, condition, mode)] = judged(columns, below_end, lag_ms)
+        columns = compute_estimates(recording, scene.models, lag_ms, EVALUATED_COLUMNS)
+        found[make_case_key(scene.name, condition, mode)] = evaluate_estimates(
+            columns, below_end, lag_ms
+        )
     is_reference = scene.name == "poppy" and condition == CLEAN
-    return found, tiles_of(recording, world, seed) if is_reference else ()
+    return found, describe_tiles(recording, world, seed) if is_reference else ()

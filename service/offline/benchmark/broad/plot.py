@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from devices.emulation.parts import random_of
+from devices.emulation.parts import make_rng
 from service.offline.accuracy import PHASES
 from service.offline.benchmark.broad.arrays import CLEAN, CONDITIONS, SCENES
 from service.offline.benchmark.broad.figures import (
     ANY_PHASE,
-    COP_P95_MM,
-    GRF_MAE_N,
-    Row,
-    rows_of,
+    COP_P95_GOALS_MM,
+    GRF_MAE_GOALS_N,
+    CaseSummary,
+    summarize_cases,
 )
-from service.offline.benchmark.broad.results import ArrayResult, key_of
+from service.offline.benchmark.broad.results import ArrayResult, make_case_key
 from service.offline.benchmark.draws import LAGS_MS
-from service.offline.benchmark.figures import COVERAGE, COVERAGE_OF_A_PHASE
+from service.offline.benchmark.figures import COVERAGE_GOAL, PHASE_COVERAGE_GOAL
 from service.offline.benchmark.plot import GREY, STYLES
-from service.offline.plots import new_figure, png_of
+from service.offline.figure_output import create_figure, render_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,13 +36,13 @@ def plot_broad(results: Sequence[ArrayResult]) -> bytes:
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    rows = rows_of(results)
-    figure = new_figure(13.5, 1.2 + 3.4 * len(SCENES))
+    rows = summarize_cases(results)
+    figure = create_figure(13.5, 1.2 + 3.4 * len(SCENES))
     panels = figure.subplots(len(SCENES), 3, squeeze=False)
     for scene, (force, centre, coverage) in zip(SCENES, panels, strict=True):
-        _dots(force, results, scene, "grf_mae_n", 1.0, GRF_MAE_N[scene])
-        _dots(centre, results, scene, "cop_p95_m", 1e3, COP_P95_MM)
-        _covered(coverage, [row for row in rows if row.scene == scene])
+        _plot_arrays(force, results, scene, "grf_mae_n", 1.0, GRF_MAE_GOALS_N[scene])
+        _plot_arrays(centre, results, scene, "cop_p95_m", 1e3, COP_P95_GOALS_MM)
+        _plot_coverage(coverage, [row for row in rows if row.scene == scene])
         force.set_ylabel("GRF error, mean absolute, N")
         centre.set_ylabel("COP error, 95th percentile, mm")
         coverage.set_ylabel("covered by the 95 % interval, %")
@@ -62,10 +62,10 @@ def plot_broad(results: Sequence[ArrayResult]) -> bytes:
     refused = sum(result.tiles_refused > 0 for result in results)
     but = f", {refused} of them without a calibration" if refused else ""
     figure.suptitle(f"{len(results)} arrays of unseen domes{but}", fontsize=14)
-    return png_of(figure)
+    return render_png(figure)
 
 
-def _dots(
+def _plot_arrays(
     axes: Axes,
     results: Sequence[ArrayResult],
     scene: str,
@@ -76,7 +76,7 @@ def _dots(
     """Draw arrays as dots, with median and range, under each condition."""
     for at, condition in enumerate(CONDITIONS):
         for side, (mode, (colour, shape)) in zip((-1, 1), STYLES.items(), strict=True):
-            key = key_of(scene, condition, mode)
+            key = make_case_key(scene, condition, mode)
             values = [getattr(r.judged[key], name) for r in results if key in r.judged]
             known = scale * np.array([value for value in values if value is not None])
             x = at + side * _APART
@@ -84,17 +84,17 @@ def _dots(
                 axes.hlines(goals[mode], x - _WIDTH, x + _WIDTH, colors=GREY, linestyles=":")
             if not len(known):
                 continue
-            aside = random_of(key).uniform(-0.6 * _WIDTH, 0.6 * _WIDTH, len(known))
+            aside = make_rng(key).uniform(-0.6 * _WIDTH, 0.6 * _WIDTH, len(known))
             axes.plot(x + aside, known, shape, color=colour, markersize=3.5, alpha=0.5)
             low, median, high = np.percentile(known, [5, 50, 95]).tolist()
             axes.hlines(median, x - _WIDTH, x + _WIDTH, colors="black", linewidth=2.0, zorder=4)
             axes.vlines(x, low, high, colors="black", linewidth=0.8, zorder=4)
     axes.set_xticks(range(len(CONDITIONS)), list(CONDITIONS))
     axes.set_ylim(bottom=0.0)
-    _plain(axes)
+    _remove_frame(axes)
 
 
-def _covered(axes: Axes, rows: Sequence[Row]) -> None:
+def _plot_coverage(axes: Axes, rows: Sequence[CaseSummary]) -> None:
     """Draw pooled coverage by phase; large dots: clean scenes, small dots: other conditions."""
     names = (ANY_PHASE, *PHASES)
     for row in rows:
@@ -114,13 +114,13 @@ def _covered(axes: Axes, rows: Sequence[Row]) -> None:
             markerfacecolor=colour if is_clean else "white",
         )
     for i, name in enumerate(names):
-        low, high = COVERAGE if name == ANY_PHASE else COVERAGE_OF_A_PHASE
+        low, high = COVERAGE_GOAL if name == ANY_PHASE else PHASE_COVERAGE_GOAL
         axes.fill_between([i - 0.45, i + 0.45], 100 * low, 100 * high, color=GREY, alpha=0.15)
     axes.set_xticks(range(len(names)), [name.replace("_", "-") for name in names], fontsize=9)
     axes.set_ylim(top=100.5)
-    _plain(axes)
+    _remove_frame(axes)
 
 
-def _plain(axes: Axes) -> None:
+def _remove_frame(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", color=GREY, alpha=0.15)

@@ -10,31 +10,31 @@ from service.offline.accuracy import PHASES
 from service.offline.benchmark.broad.arrays import CONDITIONS, HEAVY
 from service.offline.benchmark.broad.figures import (
     ANY_PHASE,
-    EXCEEDS_N,
-    Row,
-    error_goals,
-    models_of,
-    needs,
-    rows_of,
-    sigma_goals,
+    MIN_EFFECT_N,
+    CaseSummary,
+    compare_errors_with_goals,
+    compare_uncertainty_with_goals,
+    count_models,
+    needs_model,
+    summarize_cases,
 )
-from service.offline.benchmark.broad.run import BroadBench
-from service.offline.benchmark.figures import COVERED, Goal, Spread
-from service.offline.benchmark.report import EMULATED, table
+from service.offline.benchmark.broad.run import BroadBenchmarkResult
+from service.offline.benchmark.figures import COVERAGE_TITLES, Goal, Quantiles
+from service.offline.benchmark.report import EMULATED, format_table
 
 _HEAVY = "a leg of 3.3 kg on firmer poppy seeds, up to 28 N a tile: for saturation, without a goal"
 
 
-def markdown(bench: BroadBench) -> str:
+def format_broad_report(bench: BroadBenchmarkResult) -> str:
     """Format the report."""
     o, results = bench.options, bench.results
-    rows = rows_of(results)
+    rows = summarize_cases(results)
     spent_s = sum(result.cpu_bench_s + result.cpu_scenes_s for result in results)
     alike = "each array's own, 0 to 3 %" if o.repeatability is None else f"{o.repeatability:g}"
     lines = [
         "# Unseen domes",
         "",
-        f"{bench.software}, code {bench.made_by}, {bench.made}, on {bench.machine}.",
+        f"{bench.software}, code {bench.code_hash}, {bench.run_at}, on {bench.machine}.",
         "",
         f"{len(results)} arrays of four tiles of the broad family, seeds of {o.seeds}, each "
         f"calibrated on its own rig (repeatability there: {alike}), then run through every "
@@ -77,7 +77,7 @@ def markdown(bench: BroadBench) -> str:
         "",
         "## Models",
         "",
-        f"A tile needs a model if its true effect on poppy seeds exceeds {EXCEEDS_N:g} N in the "
+        f"A tile needs a model if its true effect on poppy seeds exceeds {MIN_EFFECT_N:g} N in the "
         "95th percentile of loaded frames; one in twenty has no effect at all.",
         "",
         *_models(bench),
@@ -89,14 +89,22 @@ def markdown(bench: BroadBench) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _goals(bench: BroadBench) -> list[str]:
-    errors, sigmas = _asked(error_goals(bench.results)), _asked(sigma_goals(bench.results))
+def _goals(bench: BroadBenchmarkResult) -> list[str]:
+    errors, sigmas = (
+        _asked(compare_errors_with_goals(bench.results)),
+        _asked(compare_uncertainty_with_goals(bench.results)),
+    )
     missed = [row for row in sigmas if row[-1] == "NO"]
     head = ("figure", "mode", "measured", "goal", "met")
     remark = (
         f"Of coverage, sigma and saturation {len(sigmas) - len(missed)} of {len(sigmas)} are met."
     )
-    return [*table(head, errors), "", remark, *(["", *table(head, missed)] if missed else [])]
+    return [
+        *format_table(head, errors),
+        "",
+        remark,
+        *(["", *format_table(head, missed)] if missed else []),
+    ]
 
 
 def _asked(goals: Sequence[Goal]) -> list[tuple[str, ...]]:
@@ -106,11 +114,11 @@ def _asked(goals: Sequence[Goal]) -> list[tuple[str, ...]]:
         asked = f"at most {goal.most:g}"
         if goal.least is not None:
             asked = f"{goal.least:g} to {goal.most:g}"
-        rows.append((goal.figure, goal.mode, value, asked, "yes" if goal.met else "NO"))
+        rows.append((goal.figure, goal.mode, value, asked, "yes" if goal.is_met else "NO"))
     return rows
 
 
-def _errors(rows: Sequence[Row]) -> list[str]:
+def _errors(rows: Sequence[CaseSummary]) -> list[str]:
     cells = [
         (
             *_place(row),
@@ -123,32 +131,34 @@ def _errors(rows: Sequence[Row]) -> list[str]:
         for row in rows
     ]
     head = ("GRF mean abs N", "stance peak N", "COP 95th percentile mm", "flight, mean N")
-    return table(("scene", "condition", "mode", "arrays", *head), cells)
+    return format_table(("scene", "condition", "mode", "arrays", *head), cells)
 
 
-def _coverage(rows: Sequence[Row]) -> list[str]:
+def _coverage(rows: Sequence[CaseSummary]) -> list[str]:
     cells = [
         (
             *_place(row),
             *(
                 _covered(row.coverage[name].share, row.coverage_of_arrays[name].p5)
-                for name in COVERED
+                for name in COVERAGE_TITLES
             ),
         )
         for row in rows
     ]
-    return table(("scene", "condition", "mode", *COVERED.values()), cells)
+    return format_table(("scene", "condition", "mode", *COVERAGE_TITLES.values()), cells)
 
 
-def _ratios(rows: Sequence[Row]) -> list[str]:
+def _ratios(rows: Sequence[CaseSummary]) -> list[str]:
     cells = [
         (*_place(row), *(_range(row.sigma_over_rms[name]) for name in (ANY_PHASE, *PHASES)))
         for row in rows
     ]
-    return table(("scene", "condition", "mode", *(COVERED[n] for n in (ANY_PHASE, *PHASES))), cells)
+    return format_table(
+        ("scene", "condition", "mode", *(COVERAGE_TITLES[n] for n in (ANY_PHASE, *PHASES))), cells
+    )
 
 
-def _saturation(rows: Sequence[Row]) -> list[str]:
+def _saturation(rows: Sequence[CaseSummary]) -> list[str]:
     cells = [
         (
             *_place(row),
@@ -167,18 +177,20 @@ def _saturation(rows: Sequence[Row]) -> list[str]:
         *("frames", "tile frames", "wrongly", "tile's bound holds", "GRF's bound holds"),
         *("frames after", "GRF mean abs N there"),
     )
-    return table(("scene", "condition", "mode", *head), cells)
+    return format_table(("scene", "condition", "mode", *head), cells)
 
 
-def _models(bench: BroadBench) -> list[str]:
+def _models(bench: BroadBenchmarkResult) -> list[str]:
     rows = [
         (m.name, str(m.needed), str(m.lost), str(m.lacking), str(m.invented))
-        for m in models_of(bench.results)
+        for m in count_models(bench.results)
     ]
-    return table(("model", "tiles that need it", "lost it", "without effect", "given it"), rows)
+    return format_table(
+        ("model", "tiles that need it", "lost it", "without effect", "given it"), rows
+    )
 
 
-def _refusals(bench: BroadBench) -> list[str]:
+def _refusals(bench: BroadBenchmarkResult) -> list[str]:
     rows, at_bound = [], Counter[str]()
     for result in bench.results:
         array = str(result.number)
@@ -188,14 +200,14 @@ def _refusals(bench: BroadBench) -> list[str]:
             rows += [
                 (array, f"{tile.serial}, {name}", _effect(tile.effect_n.get(name)), why)
                 for name, why in tile.refused.items()
-                if name != "ambient" and (name in tile.lacks or needs(tile, name))
+                if name != "ambient" and (name in tile.lacks or needs_model(tile, name))
             ]
-    rows += [("", refusal.what, "", refusal.why) for refusal in bench.lost]
+    rows += [("", refusal.what, "", refusal.why) for refusal in bench.lost_arrays]
     lines = [
         "Every array and scene that gave nothing, and every model that a tile was refused although "
         "it needs it, or lacks the effect; with the true effect.",
         "",
-        *table(("array", "of", "true effect N", "reason"), rows),
+        *format_table(("array", "of", "true effect N", "reason"), rows),
     ]
     if at_bound:
         found = ", ".join(f"{name} {n}" for name, n in at_bound.most_common())
@@ -214,15 +226,15 @@ def _effect(effect_n: float | None) -> str:
     return "" if effect_n is None else f"{effect_n:.2f}"
 
 
-def _place(row: Row) -> tuple[str, str, str]:
+def _place(row: CaseSummary) -> tuple[str, str, str]:
     return row.scene, row.condition, row.mode
 
 
-def _worst(spread: Spread, scale: float, digits: int) -> str:
+def _worst(spread: Quantiles, scale: float, digits: int) -> str:
     if not spread.n:
         return "-"
     return f"{scale * spread.median:.{digits}f}, {scale * spread.p95:.{digits}f}"
 
 
-def _range(spread: Spread) -> str:
+def _range(spread: Quantiles) -> str:
     return f"{spread.median:.2f} ({spread.p5:.2f} to {spread.p95:.2f})" if spread.n else "-"

@@ -13,16 +13,16 @@ import devices
 import service
 import storage
 from devices.errors import FootTileError
-from devices.facts import Facts
-from service.offline.accuracy import Covered
-from storage.checked_json import read_checked, write_checked
+from devices.types import StrictModel
+from service.offline.accuracy import CoverageCount
+from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 
 Seeds = Literal["development", "judgement"]
-FIRST_SEED: dict[Seeds, int] = {"development": 1_000_000, "judgement": 2_000_000}
+FIRST_SEEDS: dict[Seeds, int] = {"development": 1_000_000, "judgement": 2_000_000}
 """Seed of array 0. Estimator constants must not be tuned on arrays of the "judgement" range."""
 
 
-class Phase(Facts):
+class PhaseCounts(StrictModel):
     """Counts of one phase: frames, covered frames, and sums of squares in N^2."""
 
     frames: int
@@ -31,9 +31,9 @@ class Phase(Facts):
     error2: float
 
     @property
-    def covered(self) -> Covered:
+    def coverage(self) -> CoverageCount:
         """Coverage counts, for pooling."""
-        return Covered(self.frames, self.within)
+        return CoverageCount(self.frames, self.within)
 
     @property
     def sigma_over_rms(self) -> float:
@@ -41,7 +41,7 @@ class Phase(Facts):
         return math.sqrt(self.sigma2 / self.error2) if self.error2 else math.nan
 
 
-class Judged(Facts):
+class CaseResult(StrictModel):
     """Errors and counts of one scene, condition and mode; None where no frame qualifies.
 
     "Tile frames" are counted by tile. `wrongly`: flagged as saturated although the chip is within
@@ -54,7 +54,7 @@ class Judged(Facts):
     peak_error_n: float | None
     cop_p95_m: float | None
     flight_mean_n: float | None
-    phases: dict[str, Phase]
+    phases: dict[str, PhaseCounts]
     cop_frames: int
     cop_within: int
     saturated_frames: int
@@ -72,7 +72,7 @@ class Judged(Facts):
     """Number of false alarms: a tile flagged as stuck, clipped or off its baseline."""
 
 
-class Tile(Facts):
+class TileResult(StrictModel):
     """True properties of a tile, and those found on its rig.
 
     Attributes:
@@ -96,14 +96,14 @@ class Tile(Facts):
     at_bound: tuple[str, ...]
 
 
-class Refusal(Facts):
+class RefusedItem(StrictModel):
     """Item without a result, and the reason."""
 
     what: str
     why: str
 
 
-class ArrayResult(Facts):
+class ArrayResult(StrictModel):
     """Result of one array."""
 
     number: int
@@ -112,20 +112,20 @@ class ArrayResult(Facts):
     repeatability: float
     cpu_bench_s: float
     cpu_scenes_s: float
-    tiles: tuple[Tile, ...]
-    judged: dict[str, Judged]
-    """Results by scene, condition and mode; see `key_of`."""
+    tiles: tuple[TileResult, ...]
+    judged: dict[str, CaseResult]
+    """Results by scene, condition and mode; see `make_case_key`."""
     tiles_refused: int
     """Number of tiles refused by the calibration; the array then has no other results."""
-    refusals: tuple[Refusal, ...]
+    refusals: tuple[RefusedItem, ...]
 
 
-def key_of(scene: str, condition: str, mode: str) -> str:
+def make_case_key(scene: str, condition: str, mode: str) -> str:
     """Return the key of a scene, condition and mode in `ArrayResult.judged`."""
     return f"{scene}/{condition}/{mode}"
 
 
-def code_id() -> str:
+def hash_project_code() -> str:
     """Hash the project's code; results of other code are not reused."""
     digest = hashlib.sha256()
     for package in (devices, storage, service):
@@ -136,7 +136,7 @@ def code_id() -> str:
     return digest.hexdigest()[:16]
 
 
-def path_of(folder: Path, seeds: Seeds, number: int) -> Path:
+def get_result_path(folder: Path, seeds: Seeds, number: int) -> Path:
     """Return the path of an array's result file."""
     return folder / "arrays" / f"{seeds}-{number:05d}.json"
 
@@ -147,13 +147,13 @@ def write_result(folder: Path, result: ArrayResult) -> None:
     Raises:
         StorageError: the disk is full or not writable.
     """
-    path = path_of(folder, result.seeds, result.number)
-    write_checked(path, result.model_dump_json(indent=1).encode())
+    path = get_result_path(folder, result.seeds, result.number)
+    write_checksummed_json(path, result.model_dump_json(indent=1).encode())
 
 
 def read_result(path: Path) -> ArrayResult | None:
     """Read a result file; None if it is missing or damaged."""
     try:
-        return ArrayResult.model_validate_json(read_checked(path).text)
+        return ArrayResult.model_validate_json(read_checksummed_json(path).text)
     except (FileNotFoundError, FootTileError, pydantic.ValidationError):
         return None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from devices.chips.dynamixel.reader import Dynamixel, open_servo
+from devices.chips.dynamixel.driver import DynamixelServo, open_servo
 from devices.clock import VirtualClock
 from tests.builders.servo import FaultyServo
 
@@ -23,7 +23,7 @@ def emulated(
     timeout_s: float = AMPLE_S,
     asked_id: int = 1,
     protocol: int = 2,
-) -> Iterator[tuple[FaultyServo, Dynamixel, VirtualClock]]:
+) -> Iterator[tuple[FaultyServo, DynamixelServo, VirtualClock]]:
     clock = VirtualClock(t_ns=1_000_000_000)
     with FaultyServo(position, clock, baudrate=baudrate, protocol=protocol) as servo:
         driver = open_servo(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from devices.chips.dynamixel.reader import open_servo
+from devices.chips.dynamixel.driver import open_servo
 from devices.clock import SystemClock, VirtualClock
 from devices.errors import ServoPacketError, ServoTimeoutError
 from tests.builders.servo import FaultyServo
@@ -67,11 +67,11 @@ def test_the_time_stamp_is_midway_between_request_and_answer(
                         sample_ns,
                         reading.t_mono_ns - t_ns,
                         reading.half_width_ns,
-                        reading.done_ns - t_ns,
+                        reading.answered_ns - t_ns,
                     )
                 )
                 assert reading.counts == position(t_ns + sample_ns)
-                assert reading.done_ns == clock.now_ns()
+                assert reading.answered_ns == clock.now_ns()
         return stamps
 
     exchange_ns = request_ns + 500_000 + answer_ns
@@ -87,7 +87,7 @@ def test_on_a_system_clock_an_answer_takes_the_time_of_the_wire() -> None:
         with contextlib.closing(driver):
             t_ns = clock.now_ns()
             reading = driver.read_position()
-    assert reading.done_ns - t_ns >= 5_534_721
+    assert reading.answered_ns - t_ns >= 5_534_721
     assert reading.half_width_ns >= 250_000
 
 
@@ -121,7 +121,7 @@ def test_a_silent_servo_times_out_and_is_well_again_afterwards() -> None:
     with emulated() as (servo, driver, _):
         with servo.silent():
             pass
-        assert driver.identify().model_number == 311
+        assert driver.read_identity().model_number == 311
 
 
 def test_a_servo_of_another_id_is_silent() -> None:
@@ -129,7 +129,7 @@ def test_a_servo_of_another_id_is_silent() -> None:
         emulated(timeout_s=SHORT_S, asked_id=2) as (_, driver, _),
         pytest.raises(ServoTimeoutError, match="servo 2 at 1000000 baud"),
     ):
-        driver.identify()
+        driver.read_identity()
 
 
 def test_a_servo_at_another_baud_rate_is_silent() -> None:
@@ -137,7 +137,7 @@ def test_a_servo_at_another_baud_rate_is_silent() -> None:
     with FaultyServo(lambda _: 0, clock, baudrate=57_600) as servo:
         driver = open_servo(servo.port, baudrate=1_000_000, clock=clock, timeout_s=SHORT_S)
         with contextlib.closing(driver), pytest.raises(ServoTimeoutError, match="baud rate"):
-            driver.identify()
+            driver.read_identity()
 
 
 @both_protocols
@@ -145,6 +145,6 @@ def test_an_alert_keeps_the_value(protocol: int) -> None:
     with emulated(lambda _: -5, protocol=protocol) as (servo, driver, _):
         with servo.alert():
             reading = driver.read_position()
-            assert (reading.counts, reading.alert) == (-5, True)
-            assert driver.identify().model_number == {1: 310, 2: 311}[protocol]
-        assert not driver.read_position().alert
+            assert (reading.counts, reading.has_alert) == (-5, True)
+            assert driver.read_identity().model_number == {1: 310, 2: 311}[protocol]
+        assert not driver.read_position().has_alert

@@ -9,9 +9,9 @@ from smbus2 import i2c_msg
 
 from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
-from devices.scene.emulated import ReadDuringConversion
+from devices.scene.emulation_sections import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP
 
 MUX, OTHER_MUX, TILE = 0x70, 0x71, 0x60
@@ -25,7 +25,7 @@ def chip(
 ) -> EmulatedMpl115a2:
     """A part whose conversions give `results`, one after another."""
     coming = iter(results)
-    return EmulatedMpl115a2(Silicon(words, TC_NS, lambda _: next(coming)), mode)
+    return EmulatedMpl115a2(EmulatedPart(words, TC_NS, lambda _: next(coming)), mode)
 
 
 class Reader:

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 from smbus2 import i2c_msg
 
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, EmulatedPart
 from tests.builders.arrays import DATA_SHEET_CHIP
 from tests.devices.emulation.buses.readers import (
     MUX,
@@ -138,7 +138,7 @@ def test_a_conversion_begins_at_the_stop_of_its_convert() -> None:
         sampled_ns.append(t_ns)
         return 410, 507
 
-    reader = alone(EmulatedMpl115a2(Silicon(DATA_SHEET_CHIP, TC_NS, sense)))
+    reader = alone(EmulatedMpl115a2(EmulatedPart(DATA_SHEET_CHIP, TC_NS, sense)))
     begin_ns = reader.clock.now_ns()
     reader.convert()
     # 29 periods of 2.5 us to the STOP; sampled a quarter into the conversion (hardware.md 1.4)

@@ -18,7 +18,7 @@ from smbus2 import i2c_msg
 from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2
-from devices.scene.emulated import ReadDuringConversion
+from devices.scene.emulation_sections import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 from tests.devices.emulation.buses.readers import (
     MUX,
@@ -279,7 +279,7 @@ def test_a_broadcast_convert_reaches_all_open_tiles() -> None:
 
 
 def silent(part: EmulatedMpl115a2) -> EmulatedMpl115a2:
-    part.start = lambda reading, t_ns: False  # type: ignore[method-assign]  # for this part only
+    part.on_address = lambda reading, t_ns: False  # type: ignore[method-assign]  # for this part only
     return part
 
 
@@ -298,31 +298,31 @@ class Port:
 
     def __init__(self, address: int, acknowledges: Iterable[bool] = ()) -> None:
         self.address = address
-        self.mask = 0
+        self.connected_mask = 0
         self.heard: list[int | str] = []
         self._acknowledges = iter(acknowledges)
 
-    def start(self, reading: bool, t_ns: int) -> bool:
+    def on_address(self, reading: bool, t_ns: int) -> bool:
         self.heard.append("read" if reading else "write")
         return True
 
-    def write(self, value: int) -> bool:
+    def receive_byte(self, value: int) -> bool:
         self.heard.append(value)
         return next(self._acknowledges, True)
 
-    def read(self, count: int) -> bytes:
+    def send_bytes(self, count: int) -> bytes:
         return b"\xff" * count
 
-    def stop(self, t_ns: int) -> None:
+    def on_stop(self, t_ns: int) -> None:
         self.heard.append("stop")
 
-    def lose_supply(self) -> None:
+    def interrupt_supply(self) -> None:
         pass
 
-    def connected(self) -> Iterable[Port]:
+    def get_connected_devices(self) -> Iterable[Port]:
         return ()
 
-    def suffer(self, t_ns: int) -> None:
+    def apply_faults(self, t_ns: int) -> None:
         pass
 
     def reset(self) -> None:

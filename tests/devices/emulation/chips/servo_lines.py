@@ -8,7 +8,7 @@ from typing import Any
 
 import serial
 
-from devices.chips.dynamixel.packets import Instruction, PacketDecoder
+from devices.chips.dynamixel.protocol import Instruction, PacketDecoder
 from devices.chips.dynamixel.protocol1 import PROTOCOL_1
 from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 from devices.clock import VirtualClock
@@ -29,10 +29,10 @@ class Line:
         self.port.write(request)
         decoder = PacketDecoder(PROTOCOL_2)
         while True:
-            data = self.port.read(decoder.missing)
+            data = self.port.read(decoder.min_missing_bytes)
             assert data, "no answer"
-            for packet in decoder.feed(data):
-                assert packet.intact
+            for packet in decoder.decode_bytes(data):
+                assert packet.is_intact
                 assert packet.instruction == Instruction.STATUS
                 return packet.servo_id, packet.parameters[0], packet.parameters[1:]
 
@@ -62,10 +62,10 @@ class Line1:
         self.port.write(request)
         decoder = PacketDecoder(PROTOCOL_1)
         while True:
-            data = self.port.read(decoder.missing)
+            data = self.port.read(decoder.min_missing_bytes)
             assert data, "no answer"
-            for packet in decoder.feed(data):
-                assert packet.intact
+            for packet in decoder.decode_bytes(data):
+                assert packet.is_intact
                 return packet.servo_id, packet.instruction, packet.parameters
 
 

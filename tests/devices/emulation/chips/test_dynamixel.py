@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from devices.chips.dynamixel.packets import Instruction
+from devices.chips.dynamixel.protocol import Instruction
 from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 from devices.clock import VirtualClock
 from devices.errors import UsageError
@@ -34,7 +34,7 @@ def line(servo: FaultyServo) -> Iterator[Line]:
 
 def test_a_ping_returns_model_and_firmware(line: Line) -> None:
     assert line.ask(PING_1) == (1, 0, PONG)
-    assert line.ask(PROTOCOL_2.pack(0xFE, PING)) == (1, 0, PONG)
+    assert line.ask(PROTOCOL_2.encode_packet(0xFE, PING)) == (1, 0, PONG)
 
 
 def test_the_control_table_says_how_the_servo_is_set_up() -> None:
@@ -50,7 +50,7 @@ def test_the_control_table_says_how_the_servo_is_set_up() -> None:
         ) as servo,
         line_to(servo, 57_600) as line,
     ):
-        _, _, table = line.ask(PROTOCOL_2.read_request(7, 0, 147))
+        _, _, table = line.ask(PROTOCOL_2.encode_read_request(7, 0, 147))
     assert table[:2] == bytes([30, 0])
     assert table[6:10] == bytes([42, 7, 1, 10])
     assert table[13] == 2
@@ -60,10 +60,10 @@ def test_the_control_table_says_how_the_servo_is_set_up() -> None:
 def test_the_position_is_read_afresh_at_the_end_of_the_return_delay() -> None:
     clock = VirtualClock(1_000)
     with FaultyServo(lambda t_ns: t_ns, clock) as servo, line_to(servo) as line:
-        _, _, data = line.ask(PROTOCOL_2.read_request(1, 132, 4))
+        _, _, data = line.ask(PROTOCOL_2.encode_read_request(1, 132, 4))
         assert struct.unpack("<i", data) == (1_000 + 140_000 + 500_000,)
         assert clock.now_ns() == 1_000 + 140_000 + 500_000 + 150_000
-        _, _, high_half = line.ask(PROTOCOL_2.read_request(1, 134, 2))
+        _, _, high_half = line.ask(PROTOCOL_2.encode_read_request(1, 134, 2))
         later = 1_000 + 790_000 + 640_000
         assert high_half == struct.pack("<i", later)[2:]
 
@@ -72,8 +72,8 @@ def test_a_sync_read_is_answered_by_those_it_names(line: Line) -> None:
     minus_five = (1, 0, struct.pack("<i", -5))
     assert line.ask(SYNC_READ_1_2) == minus_five
     position = struct.pack("<HH", 132, 4)
-    others = PROTOCOL_2.pack(0xFE, Instruction.SYNC_READ, position + b"\x02\x03")
-    nobody = PROTOCOL_2.pack(0xFE, Instruction.SYNC_READ, position)
+    others = PROTOCOL_2.encode_packet(0xFE, Instruction.SYNC_READ, position + b"\x02\x03")
+    nobody = PROTOCOL_2.encode_packet(0xFE, Instruction.SYNC_READ, position)
     assert line.ask(others + nobody + PING_1) == (1, 0, PONG)
 
 
@@ -82,15 +82,15 @@ def test_a_sync_read_is_answered_by_those_it_names(line: Line) -> None:
     [
         b"\x00\x01\x02\xff\xff",
         bytes.fromhex("FFFF 01 02 01 FB"),
-        PROTOCOL_2.pack(2, PING),
-        PROTOCOL_2.pack(1, Instruction.STATUS, b"\x00"),
-        spoiled(PROTOCOL_2.pack(2, PING)),
-        spoiled(PROTOCOL_2.pack(0xFE, PING)),
+        PROTOCOL_2.encode_packet(2, PING),
+        PROTOCOL_2.encode_packet(1, Instruction.STATUS, b"\x00"),
+        spoiled(PROTOCOL_2.encode_packet(2, PING)),
+        spoiled(PROTOCOL_2.encode_packet(0xFE, PING)),
         spoiled(SYNC_READ_1_2),
-        PROTOCOL_2.read_request(0xFE, 132, 4),
-        PROTOCOL_2.pack(0xFE, 0x03, bytes([64, 0, 1])),
-        PROTOCOL_2.pack(0xFE, 0x8A, bytes([132, 0, 4, 0, 1])),
-        PROTOCOL_2.pack(0xFE, 0x77),
+        PROTOCOL_2.encode_read_request(0xFE, 132, 4),
+        PROTOCOL_2.encode_packet(0xFE, 0x03, bytes([64, 0, 1])),
+        PROTOCOL_2.encode_packet(0xFE, 0x8A, bytes([132, 0, 4, 0, 1])),
+        PROTOCOL_2.encode_packet(0xFE, 0x77),
     ],
     ids=[
         "garbage",
@@ -108,21 +108,21 @@ def test_a_sync_read_is_answered_by_those_it_names(line: Line) -> None:
 )
 def test_what_does_not_concern_it_is_ignored(line: Line, request_: bytes) -> None:
     # so that the first answer is that to the next request
-    assert line.ask(request_ + PROTOCOL_2.read_request(1, 7, 1)) == (1, 0, b"\x01")
+    assert line.ask(request_ + PROTOCOL_2.encode_read_request(1, 7, 1)) == (1, 0, b"\x01")
 
 
 @pytest.mark.parametrize(
     ("request_", "error"),
     [
-        (PROTOCOL_2.pack(1, 0x77), 2),
-        (PROTOCOL_2.pack(1, 0x03, bytes([64, 0, 1])), 2),
-        (PROTOCOL_2.pack(1, Instruction.SYNC_READ, bytes([132, 0, 4, 0, 1])), 2),
+        (PROTOCOL_2.encode_packet(1, 0x77), 2),
+        (PROTOCOL_2.encode_packet(1, 0x03, bytes([64, 0, 1])), 2),
+        (PROTOCOL_2.encode_packet(1, Instruction.SYNC_READ, bytes([132, 0, 4, 0, 1])), 2),
         (spoiled(PING_1), 3),
-        (spoiled(PROTOCOL_2.read_request(1, 132, 4)), 3),
-        (PROTOCOL_2.read_request(1, 660, 4), 4),
-        (PROTOCOL_2.read_request(1, 0xFFFF, 0xFFFF), 4),
-        (PROTOCOL_2.read_request(1, 132, 0), 5),
-        (PROTOCOL_2.pack(1, Instruction.READ, b"\x84\x00"), 5),
+        (spoiled(PROTOCOL_2.encode_read_request(1, 132, 4)), 3),
+        (PROTOCOL_2.encode_read_request(1, 660, 4), 4),
+        (PROTOCOL_2.encode_read_request(1, 0xFFFF, 0xFFFF), 4),
+        (PROTOCOL_2.encode_read_request(1, 132, 0), 5),
+        (PROTOCOL_2.encode_packet(1, Instruction.READ, b"\x84\x00"), 5),
     ],
 )
 def test_what_it_cannot_do_is_answered_with_an_error_number(
@@ -135,18 +135,18 @@ def test_an_alert_shows_in_the_error_byte_and_in_the_hardware_error_status(
     servo: FaultyServo, line: Line
 ) -> None:
     with servo.alert():
-        assert line.ask(PROTOCOL_2.read_request(1, 70, 1)) == (1, 0x80, b"\x01")
-        assert line.ask(PROTOCOL_2.pack(1, 0x77)) == (1, 0x82, b"")
-    assert line.ask(PROTOCOL_2.read_request(1, 70, 1)) == (1, 0, b"\x00")
+        assert line.ask(PROTOCOL_2.encode_read_request(1, 70, 1)) == (1, 0x80, b"\x01")
+        assert line.ask(PROTOCOL_2.encode_packet(1, 0x77)) == (1, 0x82, b"")
+    assert line.ask(PROTOCOL_2.encode_read_request(1, 70, 1)) == (1, 0, b"\x00")
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 @pytest.mark.parametrize(
     ("request_", "from_level", "answer"),
     [
-        (PROTOCOL_2.read_request(1, 132, 4), 1, (1, 0, struct.pack("<i", -5))),
+        (PROTOCOL_2.encode_read_request(1, 132, 4), 1, (1, 0, struct.pack("<i", -5))),
         (SYNC_READ_1_2, 1, (1, 0, struct.pack("<i", -5))),
-        (PROTOCOL_2.pack(1, 0x77), 2, (1, 2, b"")),
+        (PROTOCOL_2.encode_packet(1, 0x77), 2, (1, 2, b"")),
     ],
     ids=["read", "sync read", "unknown"],
 )

@@ -6,8 +6,8 @@ import struct
 
 import pytest
 
-from devices.chips.dynamixel.packets import Instruction
-from devices.chips.dynamixel.protocol1 import PROTOCOL_1, Error
+from devices.chips.dynamixel.protocol import Instruction
+from devices.chips.dynamixel.protocol1 import PROTOCOL_1, ErrorFlag
 from devices.clock import VirtualClock
 from devices.errors import UsageError
 from tests.builders.servo import FaultyServo
@@ -20,7 +20,7 @@ READ_OLD = bytes.fromhex("FFFF 01 04 02 24 02 D2")
 def test_an_old_servo_answers_a_ping_without_data() -> None:
     with line_1() as (line, _, _):
         assert line.ask(PING_OLD) == (1, 0, b"")
-        assert line.ask(PROTOCOL_1.pack(0xFE, PING)) == (1, 0, b"")
+        assert line.ask(PROTOCOL_1.encode_packet(0xFE, PING)) == (1, 0, b"")
 
 
 def test_an_old_servos_control_table_says_how_it_is_set_up() -> None:
@@ -29,7 +29,7 @@ def test_an_old_servos_control_table_says_how_it_is_set_up() -> None:
         _,
         _,
     ):
-        _, _, table = line.ask(PROTOCOL_1.read_request(253, 0, 74))
+        _, _, table = line.ask(PROTOCOL_1.encode_read_request(253, 0, 74))
     assert table[:6] == bytes([29, 0, 42, 253, 1, 10])
     assert table[16] == 1
     assert table[36:38] == struct.pack("<h", -5)
@@ -50,23 +50,23 @@ def test_an_old_servo_goes_no_further_than_seven_turns(counts: int, seen: int) -
 @pytest.mark.parametrize(
     ("request_", "error"),
     [
-        (PROTOCOL_1.pack(1, 0x77), Error.INSTRUCTION),
-        (PROTOCOL_1.pack(1, 0x03, bytes([24, 1])), Error.INSTRUCTION),
-        (PROTOCOL_1.pack(1, 0x92, bytes([0, 2, 1, 36])), Error.INSTRUCTION),
-        (spoiled(PING_OLD), Error.CHECKSUM),
-        (spoiled(READ_OLD), Error.CHECKSUM),
-        (PROTOCOL_1.read_request(1, 73, 2), Error.RANGE),
-        (PROTOCOL_1.read_request(1, 36, 0), Error.RANGE),
-        (PROTOCOL_1.pack(1, Instruction.READ, b"\x24"), Error.RANGE),
+        (PROTOCOL_1.encode_packet(1, 0x77), ErrorFlag.INSTRUCTION),
+        (PROTOCOL_1.encode_packet(1, 0x03, bytes([24, 1])), ErrorFlag.INSTRUCTION),
+        (PROTOCOL_1.encode_packet(1, 0x92, bytes([0, 2, 1, 36])), ErrorFlag.INSTRUCTION),
+        (spoiled(PING_OLD), ErrorFlag.CHECKSUM),
+        (spoiled(READ_OLD), ErrorFlag.CHECKSUM),
+        (PROTOCOL_1.encode_read_request(1, 73, 2), ErrorFlag.RANGE),
+        (PROTOCOL_1.encode_read_request(1, 36, 0), ErrorFlag.RANGE),
+        (PROTOCOL_1.encode_packet(1, Instruction.READ, b"\x24"), ErrorFlag.RANGE),
     ],
 )
 def test_what_an_old_servo_cannot_do_is_answered_with_an_error_bit(
-    request_: bytes, error: Error
+    request_: bytes, error: ErrorFlag
 ) -> None:
     with line_1() as (line, servo, _):
         assert line.ask(request_) == (1, error, b"")
         with servo.alert():
-            assert line.ask(request_) == (1, error | Error.VOLTAGE, b"")
+            assert line.ask(request_) == (1, error | ErrorFlag.VOLTAGE, b"")
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,11 @@ def test_what_an_old_servo_cannot_do_is_answered_with_an_error_bit(
     [
         b"\x00\x01\x02\xff",
         PING_1,
-        PROTOCOL_1.pack(2, PING),
-        spoiled(PROTOCOL_1.pack(2, PING)),
-        spoiled(PROTOCOL_1.pack(0xFE, PING)),
-        PROTOCOL_1.read_request(0xFE, 36, 2),
-        PROTOCOL_1.pack(0xFE, 0x92, bytes([0, 2, 1, 36])),
+        PROTOCOL_1.encode_packet(2, PING),
+        spoiled(PROTOCOL_1.encode_packet(2, PING)),
+        spoiled(PROTOCOL_1.encode_packet(0xFE, PING)),
+        PROTOCOL_1.encode_read_request(0xFE, 36, 2),
+        PROTOCOL_1.encode_packet(0xFE, 0x92, bytes([0, 2, 1, 36])),
     ],
     ids=[
         "garbage",
@@ -92,7 +92,7 @@ def test_what_an_old_servo_cannot_do_is_answered_with_an_error_bit(
 )
 def test_what_does_not_concern_an_old_servo_is_ignored(request_: bytes) -> None:
     with line_1() as (line, _, _):
-        assert line.ask(request_ + PROTOCOL_1.read_request(1, 3, 1)) == (1, 0, b"\x01")
+        assert line.ask(request_ + PROTOCOL_1.encode_read_request(1, 3, 1)) == (1, 0, b"\x01")
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
@@ -100,8 +100,8 @@ def test_what_does_not_concern_an_old_servo_is_ignored(request_: bytes) -> None:
     ("request_", "from_level", "answer"),
     [
         (READ_OLD, 1, (1, 0, struct.pack("<h", -5))),
-        (PROTOCOL_1.pack(1, 0x77), 2, (1, Error.INSTRUCTION, b"")),
-        (PROTOCOL_1.pack(1, 0x82), 2, (1, Error.INSTRUCTION, b"")),
+        (PROTOCOL_1.encode_packet(1, 0x77), 2, (1, ErrorFlag.INSTRUCTION, b"")),
+        (PROTOCOL_1.encode_packet(1, 0x82), 2, (1, ErrorFlag.INSTRUCTION, b"")),
     ],
     ids=["read", "unknown", "sync read, which 1.0 has not"],
 )

@@ -15,18 +15,18 @@ import pytest
 
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa
 from devices.emulation.chips.front_end import FrontEnd
-from devices.emulation.faults import Fault
-from devices.emulation.parts import ChipPart, DomePart
+from devices.emulation.fault_timing import FaultTiming
+from devices.emulation.parts import ChipProperties, DomeProperties
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulated import EmulationScene
+from devices.scene.emulation_sections import EmulationSection
 from tests.builders.arrays import DATA_SHEET_CHIP
 
 Floats = npt.NDArray[np.float64]
 
 DATA_SHEET = Coefficients.from_words(DATA_SHEET_CHIP)
 # With -5.35 counts per kelvin this chip reads 507, the data sheet's example, at 21 degC.
-CHIP = ChipPart(DATA_SHEET, conversion_ns=1_600_000, tadc_at_25_degc=507 - 4 * 5.35)
-DOME = DomePart(
+CHIP = ChipProperties(DATA_SHEET, conversion_ns=1_600_000, tadc_at_25_degc=507 - 4 * 5.35)
+DOME = DomeProperties(
     seal_kpa=100.0,
     knee_n=10.0,
     stiffening=0.085,
@@ -45,10 +45,10 @@ COUNT_KPA = 0.1255  # hardware.md 1.3
 def front_end(
     pressure: float | Callable[[float], float] = 96.587326, label: str = "test", **emulation: Any
 ) -> FrontEnd:
-    scene = EmulationScene(**emulation)
+    scene = EmulationSection(**emulation)
     pressure_kpa = pressure if callable(pressure) else (lambda _: pressure)
     sense = FrontEnd(CHIP, DOME, pressure_kpa, Surroundings(scene), scene, label)
-    sense.begin(7_000)
+    sense.begin_scene_time(7_000)
     return sense
 
 
@@ -224,34 +224,34 @@ def test_until_the_scene_begins_the_dome_is_at_its_first_instant() -> None:
         asked.append(t_s)
         return 100.0
 
-    scene = EmulationScene()
+    scene = EmulationSection()
     sense = FrontEnd(CHIP, DOME, pressure, Surroundings(scene), scene, "test")
     sense(5_000_000_000)
-    sense.begin(6_000_000_000)
+    sense.begin_scene_time(6_000_000_000)
     sense(5_999_999_000)  # a conversion that was under way
     sense(8_000_000_000)
     assert asked == pytest.approx([0.0, 0.0, 2.0])
 
 
 def test_a_tile_pressed_over_its_range_reads_45_kpa_more() -> None:
-    fault = Fault()
-    scene = EmulationScene(noise_kpa=0.0)
+    fault = FaultTiming()
+    scene = EmulationSection(noise_kpa=0.0)
     sense = FrontEnd(CHIP, DOME, lambda _: 100.0, Surroundings(scene), scene, "test", fault)
-    sense.begin(0)
+    sense.begin_scene_time(0)
     assert kpa(*words_at(sense, 0))[0] == pytest.approx(100.0, abs=0.15)
-    with fault.injected():
+    with fault.inject():
         assert kpa(*words_at(sense, 0))[0] == pytest.approx(145.0, abs=0.15)
     assert kpa(*words_at(sense, 0))[0] == pytest.approx(100.0, abs=0.15)
 
 
 def test_a_frozen_pressure_stands_still_while_the_temperature_does_not() -> None:
-    frozen, scene = Fault(), EmulationScene()
+    frozen, scene = FaultTiming(), EmulationSection()
     sense = FrontEnd(
         CHIP, DOME, lambda t_s: 100.0 + t_s, Surroundings(scene), scene, "x", None, frozen
     )
-    sense.begin(0)
+    sense.begin_scene_time(0)
     before = sense(0)[0]
-    with frozen.injected():
+    with frozen.inject():
         words = np.array([sense(i * 2_000_000) for i in range(1, 500)])
     assert (words[:, 0] == before).all()
     assert len(np.unique(words[:, 1])) > 1

@@ -7,13 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.clock import VirtualClock
-from devices.emulation.chips.mcp3208 import EmulatedMcp3208, Volts, amplifier_volts
-from devices.scene.hardware import ReferenceScene
+from devices.emulation.chips.mcp3208 import EmulatedMcp3208, InputVoltages, make_amplifier
+from devices.scene.hardware_sections import ReferenceSection
 
 VREF_V = 4.096  # one count is one millivolt
 
 
-def chip(volts: Volts, *, floats_high: bool = True) -> EmulatedMcp3208:
+def chip(volts: InputVoltages, *, floats_high: bool = True) -> EmulatedMcp3208:
     return EmulatedMcp3208(volts, VirtualClock(), vref_v=VREF_V, floats_high=floats_high)
 
 
@@ -125,11 +125,11 @@ def test_received_bytes_are_written_into_the_list_as_spidev_does() -> None:
 
 
 def test_the_amplifier_is_the_inverse_of_the_scenes_scale() -> None:
-    scene = ReferenceScene(channel=2, zero_v=1.65, n_per_v=-30.0)
-    volts = amplifier_volts(lambda t_ns: t_ns / 1000, scene)
+    scene = ReferenceSection(channel=2, zero_v=1.65, n_per_v=-30.0)
+    volts = make_amplifier(lambda t_ns: t_ns / 1000, scene)
     assert volts(2, 0) == 1.65
     assert volts(2, 15_000) == pytest.approx(1.15)
     assert volts(3, 15_000) == 0.0
     noises = iter([0.3, -0.6])
-    noisy = amplifier_volts(lambda t_ns: 0.0, scene, noise_n=lambda: next(noises))
+    noisy = make_amplifier(lambda t_ns: 0.0, scene, noise_n=lambda: next(noises))
     assert [noisy(2, 0), noisy(2, 0)] == pytest.approx([1.64, 1.67])

@@ -8,9 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
-from devices.emulation.faults import Fault
-from devices.scene.emulated import ReadDuringConversion
+from devices.emulation.chips.mpl115a2 import (
+    EmulatedMpl115a2,
+    EmulatedPart,
+    PartFaults,
+    SampleFunction,
+)
+from devices.emulation.fault_timing import FaultTiming
+from devices.scene.emulation_sections import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 
 TC_NS = 1_900_000
@@ -28,27 +33,27 @@ class Samples:
 
 
 def part(
-    sense: Sense | None = None,
+    sense: SampleFunction | None = None,
     mode: ReadDuringConversion = "stale",
     faults: PartFaults | None = None,
-    spare: Callable[[], Silicon] | None = None,
+    spare: Callable[[], EmulatedPart] | None = None,
 ) -> EmulatedMpl115a2:
     return EmulatedMpl115a2(
-        Silicon(DATA_SHEET_CHIP, TC_NS, sense or Samples()), mode, faults, spare
+        EmulatedPart(DATA_SHEET_CHIP, TC_NS, sense or Samples()), mode, faults, spare
     )
 
 
-def between(begin_ns: int, end_ns: int) -> Fault:
+def between(begin_ns: int, end_ns: int) -> FaultTiming:
     """A fault that is there in one window of time."""
-    fault = Fault([(begin_ns * 1e-9, end_ns * 1e-9)])
-    fault.begin(0)
+    fault = FaultTiming([(begin_ns * 1e-9, end_ns * 1e-9)])
+    fault.begin_scene_time(0)
     return fault
 
 
 def write(chip: EmulatedMpl115a2, t_ns: int, *values: int) -> None:
-    assert chip.start(False, t_ns)
-    assert all(chip.write(value) for value in values)
-    chip.stop(t_ns)
+    assert chip.on_address(False, t_ns)
+    assert all(chip.receive_byte(value) for value in values)
+    chip.on_stop(t_ns)
 
 
 def convert(chip: EmulatedMpl115a2, t_ns: int) -> None:
@@ -56,11 +61,11 @@ def convert(chip: EmulatedMpl115a2, t_ns: int) -> None:
 
 
 def counts(chip: EmulatedMpl115a2, t_ns: int) -> tuple[int, int]:
-    assert chip.start(False, t_ns)
-    assert chip.write(0x00)
-    assert chip.start(True, t_ns)
-    raw = chip.read(4)
-    chip.stop(t_ns)
+    assert chip.on_address(False, t_ns)
+    assert chip.receive_byte(0x00)
+    assert chip.on_address(True, t_ns)
+    raw = chip.send_bytes(4)
+    chip.on_stop(t_ns)
     return int.from_bytes(raw[:2], "big") >> 6, int.from_bytes(raw[2:], "big") >> 6
 
 
@@ -80,7 +85,7 @@ def test_the_pressure_is_sampled_a_quarter_into_the_conversion() -> None:
 @pytest.mark.parametrize("late_ns", [-300_000, 300_000])
 def test_a_part_may_sample_earlier_or_later_and_is_ready_when_it_would_be(late_ns: int) -> None:
     samples = Samples()
-    chip = EmulatedMpl115a2(Silicon(DATA_SHEET_CHIP, TC_NS, samples, late_ns))
+    chip = EmulatedMpl115a2(EmulatedPart(DATA_SHEET_CHIP, TC_NS, samples, late_ns))
     convert(chip, 1_000)
     assert samples.asked_ns == [1_000 + TC_NS // 4 + late_ns]
     assert counts(chip, 1_000 + TC_NS - 1) == (0, 0)
@@ -106,10 +111,10 @@ def test_a_convert_right_at_the_end_of_a_conversion_does_not_lose_it() -> None:
 def test_a_conversion_that_ends_while_the_next_convert_is_on_the_wire_is_not_lost() -> None:
     chip = part()
     convert(chip, 0)
-    assert chip.start(False, TC_NS - 1)
-    chip.write(0x12)
-    chip.write(0x00)
-    chip.stop(TC_NS + 1)
+    assert chip.on_address(False, TC_NS - 1)
+    chip.receive_byte(0x12)
+    chip.receive_byte(0x00)
+    chip.on_stop(TC_NS + 1)
     assert counts(chip, TC_NS + 2) == (1, 101)
     assert counts(chip, 2 * TC_NS + 1) == (2, 102)
 
@@ -117,13 +122,13 @@ def test_a_conversion_that_ends_while_the_next_convert_is_on_the_wire_is_not_los
 def test_a_conversion_starts_at_the_stop_and_not_at_the_data_byte() -> None:
     samples = Samples()
     chip = part(samples)
-    assert chip.start(False, 0)
-    chip.write(0x12)
-    chip.write(0x00)
+    assert chip.on_address(False, 0)
+    chip.receive_byte(0x12)
+    chip.receive_byte(0x00)
     assert samples.asked_ns == []
-    chip.stop(50_000)
+    chip.on_stop(50_000)
     assert samples.asked_ns == [50_000 + TC_NS // 4]
-    chip.stop(60_000)
+    chip.on_stop(60_000)
     assert len(samples.asked_ns) == 1, "one CONVERT, one conversion"
 
 
@@ -142,47 +147,47 @@ def test_only_a_data_byte_at_register_0x12_starts_a_conversion(register: int, da
 def test_words_are_left_justified_with_six_zeros(padc: int, tadc: int) -> None:
     chip = part(lambda _: (padc, tadc))
     convert(chip, 0)
-    chip.start(False, TC_NS)
-    chip.write(0x00)
-    chip.start(True, TC_NS)
-    raw = int.from_bytes(chip.read(4), "big")
+    chip.on_address(False, TC_NS)
+    chip.receive_byte(0x00)
+    chip.on_address(True, TC_NS)
+    raw = int.from_bytes(chip.send_bytes(4), "big")
     assert raw == padc << 22 | tadc << 6
 
 
 @given(first=st.integers(0, 127), count=st.integers(0, 200))
 def test_a_read_past_the_last_register_begins_again_at_the_first(first: int, count: int) -> None:
     chip = part()
-    chip.start(False, 0)
-    chip.write(first)
-    chip.start(True, 0)
+    chip.on_address(False, 0)
+    chip.receive_byte(first)
+    chip.on_address(True, 0)
     registers = (
         bytes(4) + b"".join(word.to_bytes(2, "big") for word in DATA_SHEET_CHIP) + bytes(116)
     )
-    assert chip.read(count) == bytes(registers[(first + i) % 128] for i in range(count))
+    assert chip.send_bytes(count) == bytes(registers[(first + i) % 128] for i in range(count))
 
 
 def test_two_reads_in_a_row_go_on_where_the_first_one_ended() -> None:
     chip = part()
-    chip.start(False, 0)
-    chip.write(0x04)
-    chip.start(True, 0)
-    assert chip.read(2) + chip.read(2) == bytes.fromhex("3eceb3f9")
+    chip.on_address(False, 0)
+    chip.receive_byte(0x04)
+    chip.on_address(True, 0)
+    assert chip.send_bytes(2) + chip.send_bytes(2) == bytes.fromhex("3eceb3f9")
 
 
 def test_a_silent_part_acknowledges_nothing_and_hears_nothing() -> None:
     samples = Samples()
     chip = part(samples, faults=PartFaults(no_answer=between(100, 200)))
-    assert chip.start(False, 99)
-    assert not chip.start(False, 100)
-    assert not chip.start(True, 199)
-    assert chip.start(True, 200)
+    assert chip.on_address(False, 99)
+    assert not chip.on_address(False, 100)
+    assert not chip.on_address(True, 199)
+    assert chip.on_address(True, 200)
 
 
 def test_a_conversion_that_ran_when_the_part_fell_silent_is_finished() -> None:
     # RST does not disturb a conversion nor its result (hardware.md 1.4).
     chip = part(faults=PartFaults(no_answer=between(1, TC_NS)))
     convert(chip, 0)
-    assert not chip.start(False, TC_NS - 1)
+    assert not chip.on_address(False, TC_NS - 1)
     assert counts(chip, TC_NS) == (1, 101)
 
 
@@ -216,11 +221,11 @@ def test_a_write_during_a_conversion_disturbs_nothing(mode: ReadDuringConversion
 
 
 def coefficients(chip: EmulatedMpl115a2, t_ns: int) -> bytes:
-    assert chip.start(False, t_ns)
-    assert chip.write(0x04)
-    assert chip.start(True, t_ns)
-    raw = chip.read(8)
-    chip.stop(t_ns)
+    assert chip.on_address(False, t_ns)
+    assert chip.receive_byte(0x04)
+    assert chip.on_address(True, t_ns)
+    raw = chip.send_bytes(8)
+    chip.on_stop(t_ns)
     return raw
 
 
@@ -230,7 +235,7 @@ def test_a_part_that_was_unplugged_comes_back_with_empty_registers() -> None:
     convert(chip, 0)
     assert counts(chip, TC_NS) == (1, 101)
     convert(chip, 2 * TC_NS - 1)
-    assert not chip.start(False, 2 * TC_NS)
+    assert not chip.on_address(False, 2 * TC_NS)
     assert counts(chip, 4 * TC_NS) == (0, 0)
     assert coefficients(chip, 4 * TC_NS).hex() == "3eceb3f9c51733c8", "it is the same part"
     convert(chip, 4 * TC_NS)
@@ -246,9 +251,9 @@ def test_a_part_that_nobody_asked_while_it_was_unplugged_is_empty_all_the_same()
 
 def test_a_replaced_part_is_another_one_from_then_on() -> None:
     faults = PartFaults(replaced=between(TC_NS, 2 * TC_NS))
-    chip = part(faults=faults, spare=lambda: Silicon(FORUM_CHIP, TC_NS, lambda _: (7, 700)))
+    chip = part(faults=faults, spare=lambda: EmulatedPart(FORUM_CHIP, TC_NS, lambda _: (7, 700)))
     convert(chip, 0)
-    assert not chip.start(False, TC_NS), "its channel is empty for a while"
+    assert not chip.on_address(False, TC_NS), "its channel is empty for a while"
     assert counts(chip, 2 * TC_NS) == (0, 0)
     assert coefficients(chip, 2 * TC_NS).hex() == "3591c0a2c6252c18"
     convert(chip, 2 * TC_NS)

@@ -10,11 +10,11 @@ import numpy.typing as npt
 import pytest
 
 from devices.emulation.ground.ground import Ground
-from devices.emulation.ground.grounds import Rolling, TraceLoad, make_ground, tile_positions_m
-from devices.emulation.ground.load_trace import PressedTrace
-from devices.emulation.ground.mill import Indentation
+from devices.emulation.ground.grounds import Rolling, TraceLoad, get_tile_positions_m, make_ground
+from devices.emulation.ground.indenter import IndentationProgramme
+from devices.emulation.ground.load_trace import TileLoad
 from devices.errors import SceneError, UsageError
-from devices.scene.file import Scene, load_scene
+from devices.scene.scene_file import Scene, load_scene
 from tests.builders.scenes import make_scene
 
 Floats = npt.NDArray[np.float64]
@@ -22,11 +22,13 @@ FOUR = ((0x70, 0), (0x70, 1), (0x70, 2), (0x70, 3))
 
 
 def ground_of(scene: Scene, *, seed: int = 0, lead_s: float = 1.0) -> Ground:
-    return make_ground(scene, seed=seed, lead_s=lead_s, pressed=None)
+    return make_ground(scene, seed=seed, lead_s=lead_s, tile_load=None)
 
 
 def cop_m(forces_n: Floats, scene: Scene) -> Floats:
-    return np.asarray(forces_n @ tile_positions_m(scene.tile) / forces_n.sum(axis=1, keepdims=True))
+    return np.asarray(
+        forces_n @ get_tile_positions_m(scene.tile) / forces_n.sum(axis=1, keepdims=True)
+    )
 
 
 def at(*t_s: float) -> Floats:
@@ -97,7 +99,7 @@ def test_who_stands_sways_along_the_array_and_no_farther_than_said() -> None:
 def test_who_stands_spreads_the_load_with_the_least_squares() -> None:
     scene = make_scene(ground={"kind": "plate"})
     forces_n = ground_of(scene).forces_n(np.linspace(2.0, 30.0, 50))
-    x_m = tile_positions_m(scene.tile)[:, 0]
+    x_m = get_tile_positions_m(scene.tile)[:, 0]
     rows = np.vstack([np.ones(4), x_m])
     expected = (np.linalg.pinv(rows) @ np.vstack([forces_n.sum(1), forces_n @ x_m])).T
     np.testing.assert_allclose(forces_n, expected, atol=1e-9)
@@ -229,9 +231,9 @@ def test_a_reference_tile_on_a_rolling_foot_bears_nothing() -> None:
 def test_a_recorded_load_is_linear_between_samples_and_zero_outside() -> None:
     forces_n = np.array([[0.0] * 4, [1.0, 2.0, 3.0, 4.0], [3.0, 2.0, 1.0, 0.0], [0.0] * 4])
     angle_rad = np.array([0.1, 0.1, 0.3, 0.3])
-    trace = PressedTrace(np.array([1.0, 1.01, 2.01, 2.02]), forces_n, angle_rad, 0, 0)
+    trace = TileLoad(np.array([1.0, 1.01, 2.01, 2.02]), forces_n, angle_rad, 0, 0)
     scene = make_scene(ground={"kind": "plate"})
-    made = make_ground(scene, seed=0, lead_s=1.0, pressed=trace)
+    made = make_ground(scene, seed=0, lead_s=1.0, tile_load=trace)
     assert isinstance(made, TraceLoad), "a recorded load wins over the scene's ground"
     assert made.duration_s == 2.02
     np.testing.assert_allclose(
@@ -245,20 +247,18 @@ def test_a_recorded_load_is_linear_between_samples_and_zero_outside() -> None:
 
 
 def test_a_recorded_load_is_over_when_it_is_over() -> None:
-    made = TraceLoad(PressedTrace(at(1.0, 2.0), np.array([[5.0], [6.0]]), None, 0, 0))
+    made = TraceLoad(TileLoad(at(1.0, 2.0), np.array([[5.0], [6.0]]), None, 0, 0))
     np.testing.assert_allclose(made.forces_n(at(0.9, 1.0, 2.0, 2.1)), [[0.0], [5.0], [6.0], [0.0]])
 
 
 def test_a_recorded_load_without_an_angle_has_none() -> None:
-    trace = PressedTrace(at(1.0, 2.0), np.zeros((2, 1)), None, 0, 0)
+    trace = TileLoad(at(1.0, 2.0), np.zeros((2, 1)), None, 0, 0)
     assert TraceLoad(trace).angle_rad(at(1.5)) is None
 
 
 def test_a_looped_load_comes_again_after_a_second_in_the_air() -> None:
-    trace = PressedTrace(
-        at(1.0, 2.0, 3.0), np.array([[5.0], [6.0], [7.0]]), at(0.1, 0.2, 0.3), 0, 0
-    )
-    made = TraceLoad(trace, 1.0, looped=True)
+    trace = TileLoad(at(1.0, 2.0, 3.0), np.array([[5.0], [6.0], [7.0]]), at(0.1, 0.2, 0.3), 0, 0)
+    made = TraceLoad(trace, 1.0, is_repeated=True)
     assert made.duration_s is None
     t_s = at(0.5, 1.0, 1.5, 2.0, 2.999, 3.2, 3.9)
     once = made.forces_n(t_s)
@@ -276,17 +276,17 @@ def test_a_looped_load_comes_again_after_a_second_in_the_air() -> None:
 
 
 @pytest.fixture
-def mill() -> Indentation:
+def mill() -> IndentationProgramme:
     made = ground_of(make_scene(FOUR[:2], ground={"kind": "indentation"}), lead_s=1.0)
-    assert isinstance(made, Indentation)
+    assert isinstance(made, IndentationProgramme)
     return made
 
 
-def programme(mill: Indentation) -> tuple[Floats, Floats, list[str], npt.NDArray[np.intp]]:
+def programme(mill: IndentationProgramme) -> tuple[Floats, Floats, list[str], npt.NDArray[np.intp]]:
     """Times in ms, forces, phases and pressed tiles of all of it."""
     t_s = (np.arange(round(mill.duration_s * 1000)) + 0.5) / 1000
-    phases = [mill.PHASES[i] for i in mill.phase(t_s).tolist()]
-    return t_s, mill.forces_n(t_s), phases, mill.pressed_tile(t_s)
+    phases = [mill.PHASES[i] for i in mill.find_phase_index(t_s).tolist()]
+    return t_s, mill.forces_n(t_s), phases, mill.find_indented_tile(t_s)
 
 
 def runs(phases: list[str]) -> list[tuple[str, int]]:
@@ -300,7 +300,7 @@ def runs(phases: list[str]) -> list[tuple[str, int]]:
     return found
 
 
-def test_each_tile_is_pressed_in_turn_and_alone(mill: Indentation) -> None:
+def test_each_tile_is_pressed_in_turn_and_alone(mill: IndentationProgramme) -> None:
     _, forces_n, _, tile = programme(mill)
     assert (np.count_nonzero(forces_n, axis=1) <= 1).all()
     for i in range(2):
@@ -311,7 +311,9 @@ def test_each_tile_is_pressed_in_turn_and_alone(mill: Indentation) -> None:
     assert mill.serials == ("T01", "T02")
 
 
-def test_a_tile_gets_four_slow_repeats_five_holds_and_fifteen_taps(mill: Indentation) -> None:
+def test_a_tile_gets_four_slow_repeats_five_holds_and_fifteen_taps(
+    mill: IndentationProgramme,
+) -> None:
     _, forces_n, phases, tile = programme(mill)
     of_first = [phase for phase, i in zip(phases, tile, strict=True) if i == 0]
     sequence = [phase for phase, _ in runs(of_first)]
@@ -332,39 +334,39 @@ def test_a_tile_gets_four_slow_repeats_five_holds_and_fifteen_taps(mill: Indenta
     assert lengths["unload"] == {4_000}
 
 
-def test_slow_strokes_go_up_and_down_at_a_constant_rate(mill: Indentation) -> None:
+def test_slow_strokes_go_up_and_down_at_a_constant_rate(mill: IndentationProgramme) -> None:
     _, forces_n, phases, tile = programme(mill)
     rows = [i for i, p in enumerate(phases) if p == "unload" and tile[i] == 0][:4_000]
     np.testing.assert_allclose(np.diff(forces_n[rows, 0]), -30.0 / 4_000, atol=1e-9)
 
 
-def test_last_comes_a_soak_without_load_at_two_temperatures(mill: Indentation) -> None:
+def test_last_comes_a_soak_without_load_at_two_temperatures(mill: IndentationProgramme) -> None:
     t_s, forces_n, phases, tile = programme(mill)
     soak = np.array([p == "soak" for p in phases])
     assert soak[-1]
     assert (np.diff(np.flatnonzero(soak)) == 1).all(), "once, and at the end"
     assert (forces_n[soak] == 0).all()
     assert (tile[soak] == -1).all()
-    assert t_s[soak][0] + 5 < mill.warm_from_s < mill.duration_s - 5
+    assert t_s[soak][0] + 5 < mill.temperature_step_s < mill.duration_s - 5
     assert mill.soak_k == 4.0
 
 
-def test_the_spindles_force_is_the_force_on_the_tile(mill: Indentation) -> None:
+def test_the_spindles_force_is_the_force_on_the_tile(mill: IndentationProgramme) -> None:
     t_s, forces_n, _, tile = programme(mill)
     for i in range(0, len(t_s), 37):
-        spindle_n = mill.spindle_n(float(t_s[i]))
+        spindle_n = mill.compute_spindle_force_n(float(t_s[i]))
         if tile[i] < 0:
             assert spindle_n is None
         else:
             assert spindle_n == pytest.approx(forces_n[i, tile[i]], abs=1e-9)
-    assert mill.spindle_n(mill.duration_s + 1) is None
+    assert mill.compute_spindle_force_n(mill.duration_s + 1) is None
     assert (mill.forces_n(at(mill.duration_s + 1)) == 0).all()
 
 
 def test_the_mill_does_what_the_scene_says() -> None:
     keys = {"kind": "indentation", "load_n": 12.0, "stroke_s": 0.5, "repeats": 2, "soak_k": -3.0}
     made = ground_of(make_scene(FOUR[:1], ground=keys), lead_s=0.0)
-    assert isinstance(made, Indentation)
+    assert isinstance(made, IndentationProgramme)
     _, forces_n, phases, _ = programme(made)
     assert forces_n.max() == pytest.approx(12.0, abs=0.03)
     assert [p for p, _ in runs(phases)].count("unload") == 2
@@ -374,7 +376,7 @@ def test_the_mill_does_what_the_scene_says() -> None:
 def test_the_mill_leaves_a_reference_tile_alone() -> None:
     scene = with_reference(make_scene(FOUR[:3], ground={"kind": "indentation"}), 1)
     made = ground_of(scene)
-    assert isinstance(made, Indentation)
+    assert isinstance(made, IndentationProgramme)
     _, forces_n, _, tile = programme(made)
     assert set(tile.tolist()) == {-1, 0, 2}
     assert (forces_n[:, 1] == 0).all()

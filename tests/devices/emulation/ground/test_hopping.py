@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from devices.clock import VirtualClock
 from devices.emulation.ground.hopping import HOPS, Hopping
 from devices.emulation.ground.hopping_leg import STEP_S
-from devices.emulation.world import Truth, World
+from devices.emulation.world import GroundTruth, World
 from devices.errors import SceneError
-from devices.scene.file import Scene, load_scene
+from devices.scene.scene_file import Scene, load_scene
 
 Floats = npt.NDArray[np.float64]
 BOTH = pytest.mark.parametrize("name", ["poppy", "mud"])
@@ -31,8 +31,8 @@ def changed(scene: Scene, **keys: Any) -> Scene:
     return Scene.model_validate(facts)
 
 
-def world_of(scene: Scene, *, seed: int = 0, looped: bool = False) -> World:
-    return World(scene, VirtualClock(), seed=seed, lead_s=LEAD_S, looped=looped)
+def world_of(scene: Scene, *, seed: int = 0, is_repeated: bool = False) -> World:
+    return World(scene, VirtualClock(), seed=seed, lead_s=LEAD_S, is_repeated=is_repeated)
 
 
 @cache
@@ -42,8 +42,8 @@ def hopping(name: str, seed: int = 0) -> tuple[World, Hopping]:
     return world, world.ground
 
 
-def truth_at(world: World, t_s: Floats) -> Truth:
-    return world.truth(world.epoch_ns + np.round(t_s * 1e9).astype(np.int64))
+def truth_at(world: World, t_s: Floats) -> GroundTruth:
+    return world.compute_truth(world.epoch_ns + np.round(t_s * 1e9).astype(np.int64))
 
 
 def all_of(ground: Hopping, step_s: float = STEP_S) -> Floats:
@@ -53,20 +53,20 @@ def all_of(ground: Hopping, step_s: float = STEP_S) -> Floats:
 
 def bound(ground: Hopping, t_s: Floats) -> npt.NDArray[np.bool_]:
     """In the ground, from first touch to last."""
-    stances = zip(ground.touch_s, ground.leave_s, strict=True)
+    stances = zip(ground.touch_down_s, ground.lift_off_s, strict=True)
     return np.asarray(np.any([(t_s >= a) & (t_s <= b) for a, b in stances], axis=0))
 
 
 @BOTH
 def test_the_leg_hops_three_times_and_is_in_the_air_before_between_and_after(name: str) -> None:
     world, ground = hopping(name)
-    assert len(ground.touch_s) == len(ground.leave_s) == HOPS == 3
+    assert len(ground.touch_down_s) == len(ground.lift_off_s) == HOPS == 3
     # Galileo: 143 ms for 10 cm
-    assert ground.touch_s[0] == pytest.approx(LEAD_S + (2 * 0.10 / 9.81) ** 0.5, abs=0.005)
-    flights_s = [b - a for a, b in zip(ground.leave_s, ground.touch_s[1:], strict=False)]
+    assert ground.touch_down_s[0] == pytest.approx(LEAD_S + (2 * 0.10 / 9.81) ** 0.5, abs=0.005)
+    flights_s = [b - a for a, b in zip(ground.lift_off_s, ground.touch_down_s[1:], strict=False)]
     assert min(flights_s) > 0.1
     assert ground.duration_s is not None
-    assert ground.duration_s - ground.leave_s[-1] >= 1.5
+    assert ground.duration_s - ground.lift_off_s[-1] >= 1.5
     t_s = all_of(ground)
     truth = truth_at(world, t_s)
     in_the_air = ~bound(ground, t_s)
@@ -78,21 +78,21 @@ def test_the_leg_hops_three_times_and_is_in_the_air_before_between_and_after(nam
 @BOTH
 def test_each_hop_reaches_about_10_cm_again(name: str) -> None:
     _, ground = hopping(name)
-    for begin, end in zip(ground.leave_s, [*ground.touch_s[1:], 9.0], strict=True):
+    for begin, end in zip(ground.lift_off_s, [*ground.touch_down_s[1:], 9.0], strict=True):
         flight = np.arange(begin, end, 0.001)
-        clear_m = -ground.depth_m(flight).max(axis=1)
+        clear_m = -ground.compute_depth_m(flight).max(axis=1)
         assert clear_m.max() == pytest.approx(0.10, abs=0.015)
 
 
 @BOTH
 def test_the_grounds_impulse_between_two_tops_is_weight_times_time(name: str) -> None:
     world, ground = hopping(name)
-    body = np.array([step.body_m_s for step in ground.recorded])
-    ankle = np.array([step.ankle_m_s for step in ground.recorded])
+    body = np.array([step.body_m_s for step in ground.recorded_steps])
+    ankle = np.array([step.ankle_m_s for step in ground.recorded_steps])
     momentum = 0.909 * (0.87 * body + 0.13 * ankle)
-    times = np.array([step.t_s for step in ground.recorded])
+    times = np.array([step.t_s for step in ground.recorded_steps])
     tops = [times[0]]
-    for begin, end in zip(ground.leave_s, [*ground.touch_s[1:], times[-1]], strict=True):
+    for begin, end in zip(ground.lift_off_s, [*ground.touch_down_s[1:], times[-1]], strict=True):
         flight = (times > begin) & (times <= end)
         tops.append(times[flight][np.abs(momentum[flight]).argmin()])
     for begin, end in pairwise(tops):
@@ -104,7 +104,7 @@ def test_the_grounds_impulse_between_two_tops_is_weight_times_time(name: str) ->
 @BOTH
 def test_standing_it_weighs_what_it_weighs(name: str) -> None:
     world, ground = hopping(name)
-    stand_s = np.linspace(ground.touch_s[0] + 0.45, ground.touch_s[0] + 0.49, 50)
+    stand_s = np.linspace(ground.touch_down_s[0] + 0.45, ground.touch_down_s[0] + 0.49, 50)
     assert truth_at(world, stand_s).true_plate_n.mean() == pytest.approx(WEIGHT_N, rel=0.15)
 
 
@@ -122,7 +122,9 @@ def test_a_plate_sees_domes_and_the_rest_of_the_sole(name: str) -> None:
     world, ground = hopping(name)
     t_s = all_of(ground)
     truth = truth_at(world, t_s)
-    np.testing.assert_allclose(truth.true_plate_n, truth.true_grf_n + ground.rest_n(t_s), atol=1e-9)
+    np.testing.assert_allclose(
+        truth.true_plate_n, truth.true_grf_n + ground.force_beside_domes_n(t_s), atol=1e-9
+    )
     upright = np.cos(ground.arc_rad - truth.true_angle_rad[:, None])
     np.testing.assert_allclose(
         truth.true_grf_n, (truth.true_force_n * upright).sum(axis=1), atol=1e-9
@@ -138,10 +140,10 @@ def test_only_mud_pulls_and_only_at_lift_off() -> None:
     t_s = all_of(ground)
     pulled = truth_at(world, t_s).true_plate_n < -0.5
     assert pulled.any()
-    last = np.any([(t_s > leave - 0.1) & (t_s <= leave) for leave in ground.leave_s], axis=0)
+    last = np.any([(t_s > leave - 0.1) & (t_s <= leave) for leave in ground.lift_off_s], axis=0)
     assert last[pulled].all()
     assert ground.forces_n(t_s[pulled]).max() < 1e-3, "then no dome bears anything"
-    rising = np.diff(ground.depth_m(t_s)[:, 4]) < 0
+    rising = np.diff(ground.compute_depth_m(t_s)[:, 4]) < 0
     assert rising[pulled[:-1]].all()
     without = world_of(changed(load_scene("mud"), suction_kpa=0.0))
     least_n = truth_at(without, t_s).true_plate_n.min()
@@ -152,7 +154,7 @@ def test_the_foot_sinks_about_5_cm_in_mud_and_less_in_poppy_seeds() -> None:
     sunk_m = {}
     for name in ("poppy", "mud"):
         _, ground = hopping(name)
-        sunk_m[name] = ground.depth_m(all_of(ground)).max()
+        sunk_m[name] = ground.compute_depth_m(all_of(ground)).max()
     assert sunk_m["mud"] == pytest.approx(0.05, abs=0.01)
     assert 0.01 < sunk_m["poppy"] < 0.04
 
@@ -160,14 +162,14 @@ def test_the_foot_sinks_about_5_cm_in_mud_and_less_in_poppy_seeds() -> None:
 def test_the_head_follows_the_depth_of_each_tile() -> None:
     world, ground = hopping("mud")
     t_s = all_of(ground, 0.001)
-    head_kpa, depth_m = ground.head_kpa(t_s), ground.depth_m(t_s)
+    head_kpa, depth_m = ground.compute_head_kpa(t_s), ground.compute_depth_m(t_s)
     np.testing.assert_allclose(head_kpa, 16.5 * np.maximum(depth_m, 0.0))
     assert (head_kpa[~bound(ground, t_s)] < 0.02).all()
     assert head_kpa.max() == pytest.approx(0.8, abs=0.2)
     poppy = hopping("poppy")[1]
-    assert (poppy.head_kpa(t_s) == 0).all(), "grains are no liquid"
-    surroundings = world._surroundings("any")
-    np.testing.assert_array_equal(surroundings.head_kpa(t_s), head_kpa)
+    assert (poppy.compute_head_kpa(t_s) == 0).all(), "grains are no liquid"
+    surroundings = world._make_surroundings("any")
+    np.testing.assert_array_equal(surroundings.compute_head_kpa(t_s), head_kpa)
 
 
 def test_the_reference_tile_bears_nothing_and_reads_the_atmosphere_plus_the_head() -> None:
@@ -178,25 +180,27 @@ def test_the_reference_tile_bears_nothing_and_reads_the_atmosphere_plus_the_head
     assert isinstance(ground, Hopping)
     t_s = all_of(ground, 0.01)
     assert (ground.forces_n(t_s)[:, 4] == 0).all()
-    read_kpa = [world._domes.pressure_kpa(4, float(t)) for t in t_s[t_s < 2.5]]
+    read_kpa = [world._domes.compute_pressure_kpa(4, float(t)) for t in t_s[t_s < 2.5]]
     # Linear between grid points of 0.5 ms, in which the foot sinks by 0.7 mm: 0.01 kPa
-    np.testing.assert_allclose(read_kpa, 99.7 + ground.head_kpa(t_s[t_s < 2.5])[:, 4], atol=0.01)
+    np.testing.assert_allclose(
+        read_kpa, 99.7 + ground.compute_head_kpa(t_s[t_s < 2.5])[:, 4], atol=0.01
+    )
 
 
 def test_mud_is_cold_from_the_first_touch_on() -> None:
     world, ground = hopping("mud")
-    surroundings = world._surroundings("any")
-    assert surroundings.chip_degc(ground.touch_s[0], 1.0, 4.0) == pytest.approx(21.0)
-    assert surroundings.chip_degc(ground.touch_s[0] + 1.0, 1.0, 4.0) == pytest.approx(
+    surroundings = world._make_surroundings("any")
+    assert surroundings.compute_chip_degc(ground.touch_down_s[0], 1.0, 4.0) == pytest.approx(21.0)
+    assert surroundings.compute_chip_degc(ground.touch_down_s[0] + 1.0, 1.0, 4.0) == pytest.approx(
         21.0 - 4.0 * (1 - np.exp(-1.0)), abs=1e-6
     )
-    assert hopping("poppy")[0]._surroundings("any").steady
+    assert hopping("poppy")[0]._make_surroundings("any").is_temperature_constant
 
 
 @BOTH
 def test_the_load_travels_forward_over_the_foot(name: str) -> None:
     world, ground = hopping(name)
-    for touch in ground.touch_s:
+    for touch in ground.touch_down_s:
         early, late = (
             truth_at(world, np.linspace(touch + a, touch + b, 50)).true_cop_x_m.mean()
             for a, b in ((0.01, 0.04), (0.42, 0.48))
@@ -239,7 +243,7 @@ def test_truth_is_the_same_however_its_times_are_split(name: str, cuts: list[int
 
 @BOTH
 def test_a_leg_that_is_dropped_again_and_again_does_the_same_each_time(name: str) -> None:
-    world, once = world_of(load_scene(name), looped=True), hopping(name)[1]
+    world, once = world_of(load_scene(name), is_repeated=True), hopping(name)[1]
     ground = world.ground
     assert isinstance(ground, Hopping)
     assert ground.duration_s is None

@@ -9,16 +9,18 @@ import numpy.typing as npt
 import pytest
 
 from devices.emulation.ground import hopping_leg
-from devices.emulation.ground.hopping_leg import LEG_M, HoppingLeg, Leg, Strip
+from devices.emulation.ground.hopping_leg import LEG_M, LegProperties, LegSimulation, Strip
 from devices.emulation.ground.soft_ground import GRAVITY_M_S2, SoftGround
 from devices.errors import SceneError
-from devices.scene.emulated import MudGround, PoppyGround
+from devices.scene.emulation_sections import MudGround, PoppyGround
 
 Floats = npt.NDArray[np.float64]
 
-LEG = Leg(0.909, 600.0, tuple(Strip(x_m, -0.149, 0.001) for x_m in (-0.02, -0.007, 0.007, 0.02)))
-POPPY = SoftGround.of(PoppyGround(kind="poppy"))
-MUD = SoftGround.of(MudGround(kind="mud"))
+LEG = LegProperties(
+    0.909, 600.0, tuple(Strip(x_m, -0.149, 0.001) for x_m in (-0.02, -0.007, 0.007, 0.02))
+)
+POPPY = SoftGround.from_scene(PoppyGround(kind="poppy"))
+MUD = SoftGround.from_scene(MudGround(kind="mud"))
 BOTH = pytest.mark.parametrize("ground", [POPPY, MUD], ids=["poppy", "mud"])
 
 
@@ -26,25 +28,25 @@ def upright(t_s: float) -> float:
     return 0.0
 
 
-def dropped(ground: SoftGround, *, stand_s: float = 2.0, leg: Leg = LEG) -> HoppingLeg:
+def dropped(ground: SoftGround, *, stand_s: float = 2.0, leg: LegProperties = LEG) -> LegSimulation:
     """Dropped from 10 cm, and left alone."""
-    hopping = HoppingLeg(leg, 0.10, 0.0)
-    hopping.fall(ground, upright)
-    hopping.stand(ground, upright, hopping.motion.t_s + stand_s)
+    hopping = LegSimulation(leg, 0.10, 0.0)
+    hopping.simulate_fall(ground, upright)
+    hopping.simulate_stance(ground, upright, hopping.motion.t_s + stand_s)
     return hopping
 
 
-def column(hopping: HoppingLeg, name: str) -> Floats:
-    return np.array([getattr(step, name) for step in hopping.recorded])
+def column(hopping: LegSimulation, name: str) -> Floats:
+    return np.array([getattr(step, name) for step in hopping.recorded_steps])
 
 
-def ground_n(hopping: HoppingLeg) -> Floats:
+def ground_n(hopping: LegSimulation) -> Floats:
     """Vertical force of the ground on an upright leg."""
     shares = [s.area_m2 * -s.z_m / s.radius_m for s in hopping.leg.strips]
-    return column(hopping, "stress_pa") @ shares + column(hopping, "rest_n")
+    return column(hopping, "stress_pa") @ shares + column(hopping, "force_beside_strips_n")
 
 
-def energy_j(hopping: HoppingLeg) -> Floats:
+def energy_j(hopping: LegSimulation) -> Floats:
     leg = hopping.leg
     pressed_m = LEG_M - (column(hopping, "body_m") - column(hopping, "ankle_m"))
     stiffness = np.where(pressed_m > 0, 1.0, hopping_leg._STOP) * leg.stiffness_n_m
@@ -59,10 +61,10 @@ def energy_j(hopping: HoppingLeg) -> Floats:
 
 @BOTH
 def test_it_falls_as_galileo_says(ground: SoftGround) -> None:
-    hopping = HoppingLeg(LEG, 0.10, 0.0)
-    hopping.fall(ground, upright)
+    hopping = LegSimulation(LEG, 0.10, 0.0)
+    hopping.simulate_fall(ground, upright)
     assert hopping.motion.t_s == pytest.approx((2 * 0.10 / 9.81) ** 0.5, abs=0.001)
-    assert hopping.rising_m_s(hopping.motion) == pytest.approx(
+    assert hopping.compute_rise_m_s(hopping.motion) == pytest.approx(
         -((2 * 9.81 * 0.10) ** 0.5), rel=0.01
     )
 
@@ -80,7 +82,7 @@ def test_without_push_off_energy_decreases(ground: SoftGround) -> None:
     energy = energy_j(hopping)
     # What the ground gives back is what it has stored: force squared over twice its stiffness.
     sole_m2 = sum(strip.area_m2 for strip in LEG.strips)
-    stiffness = ground.strength_pa_m * ground.unloading * sole_m2
+    stiffness = ground.strength_pa_m * ground.unloading_stiffness_ratio * sole_m2
     stored = ground_n(hopping).max() ** 2 / (2 * stiffness)
     later = np.maximum.accumulate(energy[::-1])[::-1]
     assert (later - energy).max() < 1.1 * stored + 0.005
@@ -109,34 +111,34 @@ def test_a_push_off_gets_it_as_high_as_it_should(ground: SoftGround) -> None:
     strokes = []
     for higher_m in (0.0, 0.02):
         hopping = dropped(ground, stand_s=0.5)
-        strokes.append(hopping.push_off(ground, upright, hopping.release_m + higher_m))
+        strokes.append(hopping.simulate_push_off(ground, upright, hopping.drop_centre_m + higher_m))
         assert ground_n(hopping)[-1] == pytest.approx(0.0, abs=1e-9)
-        hopping.rise(ground, upright)
-        top_m = hopping.centre_m(hopping.motion)
-        assert top_m == pytest.approx(hopping.release_m + higher_m, abs=0.003)
+        hopping.simulate_flight_up(ground, upright)
+        top_m = hopping.compute_centre_m(hopping.motion)
+        assert top_m == pytest.approx(hopping.drop_centre_m + higher_m, abs=0.003)
     assert strokes[1] > strokes[0] > 0.03
 
 
 def test_a_leg_that_is_held_too_fast_says_so() -> None:
-    glue = SoftGround.of(MudGround(kind="mud", suction_kpa=50.0))
+    glue = SoftGround.from_scene(MudGround(kind="mud", suction_kpa=50.0))
     hopping = dropped(glue, stand_s=0.5)
     with pytest.raises(SceneError, match="does not get out of this ground"):
-        hopping.push_off(glue, upright, hopping.release_m)
+        hopping.simulate_push_off(glue, upright, hopping.drop_centre_m)
 
 
 @pytest.mark.parametrize("suction_kpa", [8.0, 10.0, 20.0])
 def test_a_leg_that_stands_stretched_in_the_mud_has_not_hopped(suction_kpa: float) -> None:
     # As high as a stretched leg reaches without leaving: that is not a hop.
-    glue = SoftGround.of(MudGround(kind="mud", suction_kpa=suction_kpa))
+    glue = SoftGround.from_scene(MudGround(kind="mud", suction_kpa=suction_kpa))
     hopping = dropped(glue, stand_s=0.5)
     with contextlib.suppress(SceneError):  # that it does not get out is an honest answer, too
-        hopping.push_off(glue, upright, hopping.centre_m(hopping.motion) + 0.06)
+        hopping.simulate_push_off(glue, upright, hopping.compute_centre_m(hopping.motion) + 0.06)
         assert ground_n(hopping)[-1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_leg_that_is_too_soft_folds_up_and_says_so() -> None:
     with pytest.raises(SceneError, match="folds up") as caught:
-        dropped(POPPY, leg=Leg(20.0, 100.0, LEG.strips))
+        dropped(POPPY, leg=LegProperties(20.0, 100.0, LEG.strips))
     assert "leg_n_per_m" in caught.value.expected
 
 

@@ -16,8 +16,8 @@ from devices.emulation.ground.load_trace import (
     TOUCH_S,
     CopTransform,
     LoadTrace,
-    PressedTrace,
-    press,
+    TileLoad,
+    convert_to_tile_load,
 )
 from devices.errors import LoadTraceError, UsageError
 
@@ -54,13 +54,13 @@ def pressed(
     load_scale: float = 1.0,
     lead_s: float = 1.0,
     **cop: Any,
-) -> PressedTrace:
-    return press(
+) -> TileLoad:
+    return convert_to_tile_load(
         trace,
         positions_m,
         np.array([True] * len(positions_m) if bears is None else bears),
         load_scale=load_scale,
-        cop=CopTransform(**cop),
+        cop_transform=CopTransform(**cop),
         lead_s=lead_s,
     )
 
@@ -69,7 +69,7 @@ def shares(cop_m: tuple[float, float], positions_m: Floats) -> tuple[Floats, int
     """Shares of one newton with its COP at a place of the foot, and how many COPs were moved."""
     # One sample is its own mean, so the place is given as the offset.
     one = pressed(trace_of([1.0], [(0.0, 0.0)]), positions_m, offset_m=cop_m)
-    return one.forces_n[1], one.moved_to_edge
+    return one.forces_n[1], one.moved_samples
 
 
 def exhaustive(cop_m: Floats, positions_m: Floats) -> Floats | None:
@@ -168,27 +168,27 @@ def test_a_cop_on_a_corner_is_borne_by_the_tile_there_and_not_counted(tile: int)
 def test_each_moved_sample_is_counted_once_and_unloaded_ones_are_not() -> None:
     cop = [(0.0, 0.0), (0.2, 0.0), (0.0, 0.0), (-0.2, 0.0), (0.9, 0.0)]
     result = pressed(trace_of([10.0, 10.0, 10.0, 10.0, 0.0], cop))
-    assert result.moved_to_edge == 2
+    assert result.moved_samples == 2
 
 
 def test_a_line_of_tiles_drops_the_other_axis() -> None:
     straight = pressed(trace_of([10, 10], [(-0.01, 0.0), (0.01, 0.0)]), LINE)
     aslant = pressed(trace_of([10, 10], [(-0.01, -0.4), (0.01, 0.4)]), LINE)
     np.testing.assert_allclose(aslant.forces_n, straight.forces_n, atol=1e-9)
-    assert aslant.moved_to_edge == 0
+    assert aslant.moved_samples == 0
     np.testing.assert_allclose(straight.forces_n[1:-1] @ LINE[:, 0] / 10, [-0.01, 0.01], atol=1e-6)
 
 
 def test_a_line_of_tiles_beside_the_axis_drops_it_too() -> None:
     beside = LINE + np.array([0.0, 0.03])
     result = pressed(trace_of([10, 10], [(-0.01, 0.0), (0.01, 0.0)]), beside)
-    assert result.moved_to_edge == 0
+    assert result.moved_samples == 0
 
 
 def test_a_single_tile_bears_everything() -> None:
     result = pressed(trace_of([7.0, 9.0], [(0.0, 0.3), (0.1, -0.2)]), np.array([(0.02, 0.01)]))
     np.testing.assert_allclose(result.forces_n[1:-1, 0], [7.0, 9.0], atol=1e-6)
-    assert result.moved_to_edge == 0
+    assert result.moved_samples == 0
 
 
 def test_a_reference_tile_bears_nothing() -> None:
@@ -226,7 +226,7 @@ def test_the_cop_used_is_scaled_about_its_force_weighted_mean_and_then_moved() -
 def test_axes_of_the_trace_become_axes_of_the_foot(
     axes: str, x: tuple[int, int], y: tuple[int, int]
 ) -> None:
-    matrix = CopTransform(axes=axes).matrix()
+    matrix = CopTransform(axes=axes).make_axes_matrix()
     np.testing.assert_array_equal(matrix, [x, y])
     cop = np.array([(-0.01, -0.02), (0.01, 0.02)])
     result = pressed(trace_of([10, 10], cop), axes=axes)
@@ -249,7 +249,7 @@ def test_a_cop_may_be_missing_where_there_is_hardly_any_load() -> None:
     cop = [(NAN, NAN), (NAN, NAN), (-0.01, 0.0), (0.01, 0.0), (NAN, 0.0)]
     result = pressed(trace_of(fz, cop), load_scale=0.1)
     np.testing.assert_allclose(result.forces_n[1:-1].sum(axis=1), [0, 0.09, 10, 10, 0], atol=1e-6)
-    assert result.moved_to_edge == 0
+    assert result.moved_samples == 0
 
 
 @pytest.mark.parametrize("missing", [(NAN, NAN), (NAN, 0.0), (0.0, NAN)])
@@ -296,7 +296,7 @@ def test_cells_win_over_the_total_force() -> None:
     cells = [[1.0, 2.0, 3.0, 4.0], [4.0, 3.0, 2.0, 0.0]]
     result = pressed(trace_of([99.0, 99.0], [(0, 0)] * 2, cells), load_scale=2.0)
     np.testing.assert_allclose(result.forces_n[1:-1], 2 * np.array(cells))
-    assert result.moved_to_edge == 0
+    assert result.moved_samples == 0
 
 
 @pytest.mark.parametrize("n", [1, 3, 5])
@@ -320,16 +320,16 @@ def test_more_than_a_tile_bears_is_limited_and_counted_by_sample() -> None:
     cells = [[10.0, 121.0, 180.0, 0.0], [120.0, 120.0, 120.0, 120.0], [0.0, 0.0, 0.0, 120.1]]
     result = pressed(trace_of(cells_n=cells))
     assert FORCE_LIMIT_N == 120.0  # four times 30 N, the middle of paper III-A's range
-    assert result.limited == 2
+    assert result.limited_samples == 2
     np.testing.assert_allclose(
         result.forces_n[1:-1], [[10, 120, 120, 0], [120] * 4, [0, 0, 0, 120]], atol=1e-9
     )
 
 
 def test_a_load_is_scaled_before_it_is_limited() -> None:
-    assert pressed(trace_of(cells_n=[[800.0] * 4]), load_scale=0.05).limited == 0
-    assert pressed(trace_of([20_000.0], [(0, 0)]), load_scale=0.05).limited == 1
-    assert pressed(trace_of([4_000.0], [(0, 0)]), load_scale=0.05).limited == 0
+    assert pressed(trace_of(cells_n=[[800.0] * 4]), load_scale=0.05).limited_samples == 0
+    assert pressed(trace_of([20_000.0], [(0, 0)]), load_scale=0.05).limited_samples == 1
+    assert pressed(trace_of([4_000.0], [(0, 0)]), load_scale=0.05).limited_samples == 0
 
 
 @pytest.mark.parametrize("lead_s", [0.0, 1.0, 2.5])

@@ -8,17 +8,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from devices.emulation.parts import random_of
+from devices.emulation.parts import make_rng
 from devices.emulation.plates import force_plate as plates
-from devices.emulation.plates.clock import PlateClock
 from devices.emulation.plates.force_plate import ForcePlate
+from devices.emulation.plates.plate_clock import PlateClock
 
 Array = npt.NDArray[np.float64]
 STEP = plates.RANGE / 2 ** (plates.BITS - 1)
 
 
 def drawn(number: int = 0) -> ForcePlate:
-    return ForcePlate.drawn(random_of(f"plate {number}"), random_of(f"trial {number}"))
+    return ForcePlate.draw(make_rng(f"plate {number}"), make_rng(f"trial {number}"))
 
 
 def ideal() -> ForcePlate:
@@ -31,7 +31,7 @@ def constant(load: Array) -> object:
 
 
 def recorded(plate: ForcePlate, wrench: object, end_s: float = 4.0) -> tuple[Array, Array]:
-    return plate.record(wrench, end_s, random_of("noise"))  # type: ignore[arg-type]  # a function, typed where it is made
+    return plate.simulate_recording(wrench, end_s, make_rng("noise"))  # type: ignore[arg-type]  # a function, typed where it is made
 
 
 @pytest.mark.parametrize("load", range(6))
@@ -40,7 +40,7 @@ def test_each_load_is_seen_in_every_channel_as_the_plate_mixes_it(load: int) -> 
     wrench = np.zeros(6)
     wrench[load] = 0.4 * plates.RANGE[load]
     _, channels = recorded(plate, constant(wrench), 20.0)
-    expected = plate.mixing @ wrench + plate.offset
+    expected = plate.sensitivity @ wrench + plate.offset
     # Slow noise lasts 3 s: of 20 s its mean keeps about half of its deviation.
     assert channels.mean(axis=0) == pytest.approx(
         expected, abs=2 * plates.SLOW * plates.RANGE.max()
@@ -50,7 +50,7 @@ def test_each_load_is_seen_in_every_channel_as_the_plate_mixes_it(load: int) -> 
 
 def test_no_plate_mixes_more_than_its_data_sheet_allows() -> None:
     for number in range(50):
-        mixing = drawn(number).mixing
+        mixing = drawn(number).sensitivity
         off = mixing - np.diag(np.diag(mixing))
         assert (np.abs(np.diag(mixing) - 1.0) <= plates.GAIN).all()
         assert (np.abs(off[:, 2][:2]) <= plates.CROSSTALK_OF_VERTICAL).all()
@@ -103,7 +103,7 @@ def test_a_step_rings_at_the_plates_own_frequency() -> None:
 
 def test_its_clock_starts_late_and_goes_as_fast_as_it_drifts() -> None:
     clock = PlateClock(1000.0, start_s=0.25, drift_ppm=100.0)
-    time_s, t_s = clock.samples(100.25)
+    time_s, t_s = clock.compute_sample_times(100.25)
     assert len(time_s) == 100_010
     assert t_s[0] == 0.25
     assert (time_s[-1] - (t_s[-1] - t_s[0])) / (t_s[-1] - t_s[0]) == pytest.approx(1e-4, rel=1e-3)

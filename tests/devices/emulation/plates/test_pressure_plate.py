@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.emulation.ground.ground import Ground
-from devices.emulation.parts import random_of
+from devices.emulation.parts import make_rng
 from devices.emulation.plates import pressure_plate as plates
-from devices.emulation.plates.clock import PlateClock
-from devices.emulation.plates.pressure_plate import PressurePlate, patch_radius_m
-from devices.emulation.plates.underfoot import Underfoot
+from devices.emulation.plates.plate_clock import PlateClock
+from devices.emulation.plates.plate_load import PlateLoad
+from devices.emulation.plates.pressure_plate import PressurePlate, compute_patch_radius_m
 
 Array = npt.NDArray[np.float64]
 CELL_N = 1e3 * plates.PITCH_M**2
@@ -32,15 +32,15 @@ class Constant(Ground):
         return np.tile(self._force_n, (len(t_s), 1))
 
 
-def foot_of(*domes: tuple[float, float, float]) -> Underfoot:
+def foot_of(*domes: tuple[float, float, float]) -> PlateLoad:
     """Domes of (x in mm, y in mm, newtons)."""
     places_m = np.array([(1e-3 * x, 1e-3 * y, -0.1) for x, y, _ in domes])
-    return Underfoot(Constant(*(force_n for *_, force_n in domes)), places_m)
+    return PlateLoad(Constant(*(force_n for *_, force_n in domes)), places_m)
 
 
-def even(foot: Underfoot) -> PressurePlate:
+def even(foot: PlateLoad) -> PressurePlate:
     """A plate whose cells are all alike, with the foot right on its mark."""
-    plate = PressurePlate.drawn(foot.places_m, random_of("plate"), random_of("trial"))
+    plate = PressurePlate.draw(foot.dome_places_m, make_rng("plate"), make_rng("trial"))
     return replace(
         plate,
         clock=PlateClock(100.0, 0.0, 0.0),
@@ -50,8 +50,8 @@ def even(foot: Underfoot) -> PressurePlate:
     )
 
 
-def seen(plate: PressurePlate, foot: Underfoot, seconds: float = 1.0) -> Array:
-    return plate.record(foot, seconds, random_of("noise"))[1]
+def seen(plate: PressurePlate, foot: PlateLoad, seconds: float = 1.0) -> Array:
+    return plate.simulate_recording(foot, seconds, make_rng("noise"))[1]
 
 
 def cop_m(plate: PressurePlate, force_n: Array) -> Array:
@@ -88,7 +88,7 @@ def test_domes_that_share_a_load_have_its_middle_between_them() -> None:
 
 
 def test_a_patch_grows_with_the_cube_root_of_the_force_until_the_dome_is_flat() -> None:
-    (small_m, large_m, flat_m) = patch_radius_m(np.array([1.0, 8.0, 1e4]))
+    (small_m, large_m, flat_m) = compute_patch_radius_m(np.array([1.0, 8.0, 1e4]))
     assert large_m == pytest.approx(2.0 * small_m)
     # Johnson, Contact Mechanics, 4.22: a^3 = 3 P R / (4 E*)
     assert small_m == pytest.approx((0.75 * 5.5e-3 / 2.893e6) ** (1 / 3), rel=1e-3)
@@ -99,7 +99,7 @@ def test_the_foot_is_seen_where_it_was_put_and_as_it_was_turned() -> None:
     foot = foot_of((-20.0, 0.0, 5.0), (20.0, 0.0, 5.0))
     straight = even(foot)
     aslant = replace(straight, placed_m=np.array([0.010, 0.0]), turned_rad=np.pi / 6)
-    alone = Underfoot(Constant(0.0, 5.0), np.array([[-0.02, 0, -0.1], [0.02, 0, -0.1]]))
+    alone = PlateLoad(Constant(0.0, 5.0), np.array([[-0.02, 0, -0.1], [0.02, 0, -0.1]]))
     (cop,) = cop_m(straight, seen(aslant, alone).mean(axis=0, keepdims=True))
     expected = [0.010 + 0.020 * np.cos(np.pi / 6), 0.020 * np.sin(np.pi / 6)]
     assert cop == pytest.approx(expected, abs=1.5e-3)
@@ -115,7 +115,7 @@ def test_too_little_is_nothing_and_too_much_is_the_end() -> None:
 
 def test_readings_are_steps_and_cells_differ_as_stated() -> None:
     foot = foot_of((-100.0, -100.0, 5.0), (100.0, 100.0, 5.0))
-    plate = PressurePlate.drawn(foot.places_m, random_of("plate"), random_of("trial"))
+    plate = PressurePlate.draw(foot.dome_places_m, make_rng("plate"), make_rng("trial"))
     assert plate.gains.size > 2000
     assert plate.gains.std() / plate.gains.mean() == pytest.approx(plates.CELL_GAIN, rel=0.1)
     steps = seen(plate, foot) / (plates.STEP_KPA * CELL_N)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from service.identity import fingerprint_of
+from service.node_identity import compute_fingerprint
 from tests.service.cli.outcome import Outcome, Run
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, closed
@@ -37,7 +37,7 @@ def test_the_machine_that_asked_last_is_accepted_and_named(
     assert stranger.secret is not None
     outcome = accept("bench")
     assert (outcome.code, outcome.err) == (0, "")
-    assert fingerprint_of(stranger.secret) in outcome.out
+    assert compute_fingerprint(stranger.secret) in outcome.out
     stranger.connect()
 
 

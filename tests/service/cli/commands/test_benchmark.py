@@ -11,7 +11,7 @@ import pytest
 from devices.errors import FootTileError
 from service.estimation.calibration import Calibration
 from service.offline.benchmark import draws
-from service.offline.calibrations import find_calibration
+from service.offline.calibration_lookup import find_calibration
 from tests.service.cli.outcome import Run, scene_text, static_only
 
 pytestmark = pytest.mark.slow

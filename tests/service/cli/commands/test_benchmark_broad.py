@@ -9,7 +9,7 @@ import pytest
 
 from service.offline.benchmark.broad import run
 from service.offline.benchmark.broad.arrays import ArrayTask
-from service.offline.benchmark.broad.results import ArrayResult, Refusal
+from service.offline.benchmark.broad.results import ArrayResult, RefusedItem
 from tests.service.cli.outcome import Run
 from tests.service.offline.benchmark.broad.kept import made
 
@@ -48,7 +48,7 @@ def test_what_gave_no_result_is_named_and_code_3(
     from service.offline.benchmark.broad import run as broad_run
 
     def refused(task: ArrayTask) -> ArrayResult:
-        refusal = Refusal(what="calibration of T02", why="it drifts")
+        refusal = RefusedItem(what="calibration of T02", why="it drifts")
         return made(task).model_copy(update={"judged": {}, "refusals": (refusal,)})
 
     monkeypatch.setattr(broad_run, "run_array", refused)

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from storage.file_hash import FORMAT_KEY, FORMAT_WITHOUT_HASH
+from storage.parquet_hash import FORMAT_KEY, FORMAT_WITHOUT_HASH
 from tests.service.cli.outcome import Run, scene_text, static_only
 
 pytestmark = pytest.mark.slow
@@ -70,4 +70,4 @@ def test_an_assumed_scale_is_said_in_text_json_and_file(run: Run) -> None:
     assert json.loads(run(*arguments, "--json").out)["absolute_scale"] == "assumed"
     table = pq.read_table("paper.parquet")
     assert json.loads(table.schema.metadata[b"foottile.notes"])["absolute_scale"] == "assumed"
-    assert (table["estimate_status"].to_numpy() & 64 == 64).all()
+    assert (table["estimate_flags"].to_numpy() & 64 == 64).all()

@@ -12,13 +12,13 @@ import pytest
 from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from service.estimation.calibration import Calibration
-from service.estimation.fitting.bench.indentation import Indentation
-from service.estimation.fitting.weights_fit import fit_weights
-from service.estimation.weights import STANDARD_GRAVITY_M_S2, parse_weight, weight_labels
+from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2, make_weight_labels, parse_weight
+from service.estimation.fitting.rig.indentation import Indentation
+from service.estimation.fitting.weights_fit import fit_dead_weights
 from service.server import weighing, weighings
 from service.server.weighing import Action, Begin, Withdraw
-from service.sessions.calibration_file import calibration_of, write_calibration
-from storage.sessions.reader import SessionReader
+from service.sessions.calibration_file import parse_calibration, write_calibration
+from storage.sessions.reader import SealedFileReader
 from tests.service.cli.outcome import Run, scene_text, static_only
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import Running
@@ -41,11 +41,11 @@ def put_on(path: Path, grams: tuple[float, ...]) -> None:
 
 def follow(path: Path, weights: tuple[str, ...]) -> Indentation:
     """Tile T01 of a recording, with the steps that the guide has marked in it."""
-    with SessionReader(path) as session:
-        frames = [frames for frames, _ in session.batches()]
+    with SealedFileReader(path) as session:
+        frames = [frames for frames, _ in session.read_batches()]
         compensation = Compensation(session.info.tiles)
     t_ns = np.concatenate([piece.t_ns for piece in frames])
-    kpa = np.concatenate([compensation.readable_kpa(piece)[:, 0] for piece in frames])
+    kpa = np.concatenate([compensation.compute_usable_kpa(piece)[:, 0] for piece in frames])
     guide = weighing.Weighing("T01", weights)
     phase = np.full(len(t_ns), "", dtype="<U20")
     begins: list[int] = []
@@ -68,8 +68,8 @@ def follow(path: Path, weights: tuple[str, ...]) -> Indentation:
         kpa=kpa,
         reference_n=np.full(len(t_ns), np.nan),
         phase=phase,
-        under_spindle=phase != "",
-        tadc=np.full(len(t_ns), np.nan),
+        is_under_indenter=phase != "",
+        temperature_raw=np.full(len(t_ns), np.nan),
     )
 
 
@@ -79,15 +79,15 @@ def test_another_load_lies_within_the_interval_that_five_weights_state(run: Run)
         put_on(Path(f"{name}.csv"), grams)
         asked = ("--scene", "one.toml", "--load", f"{name}.csv", "--truth", "--no-estimates")
         assert run("simulate", *asked, "--out", f"{name}.parquet").code == 0
-    weights = weight_labels(FIVE.split(","), 0.5)
-    tile = fit_weights([follow(Path("five.parquet"), weights)])
+    weights = make_weight_labels(FIVE.split(","), 0.5)
+    tile = fit_dead_weights([follow(Path("five.parquet"), weights)])
     made = Calibration(name="five", reference="weights", date="2026-11-25", tiles=(tile,))
     write_calibration(Path("five.json"), made)
     asked_for = ("--calibration", "five.json", "--out", "estimated.parquet")
     assert run("estimate", "others.parquet", *asked_for).code == 0
     names = ("force_n", "force_sigma_n", "true_force_n")
-    with SessionReader(Path("estimated.parquet")) as session:
-        pieces = list(session.columns(*names))
+    with SealedFileReader(Path("estimated.parquet")) as session:
+        pieces = list(session.read_columns(*names))
     force_n, sigma_n, true_n = (
         np.concatenate([piece[name] for piece in pieces])[:, 0] for name in names
     )
@@ -121,7 +121,7 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
                 play.force_n = 0.0
             return super().push(t_ns, kpa)
 
-    monkeypatch.setattr(weighings, "Weighing", Followed)
+    monkeypatch.setattr(weighings, "WeighingProcedure", Followed)
     monkeypatch.setenv("FOOTTILE_TOKEN", tared.running.shown["Authorization"].split()[-1])
     asked: tuple[Any, ...] = ("--tile", "T01", "--weights", "10N,20N,40N,60N,80N")
     with Play(tared, alive=True) as play:
@@ -130,7 +130,7 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
             *("--server", running.url),
         )
     assert outcome.code == 0, outcome.err
-    found = calibration_of(Path("cal.json").read_bytes(), where="cal.json")
+    found = parse_calibration(Path("cal.json").read_bytes(), where="cal.json")
     facts = found.tiles[0].weights
     assert facts is not None
     assert [step.force_n for step in facts.steps] == [10.0, 20.0, 40.0, 60.0, 80.0]

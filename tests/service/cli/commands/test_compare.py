@@ -13,9 +13,9 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 
-from storage.checked_json import read_checked
+from storage.checksummed_json import read_checksummed_json
 from tests.service.cli.outcome import Run, scene_text
-from tests.storage.formats.tables.test_rosbag import Sample, write_bag1
+from tests.storage.formats.readers.test_rosbag import Sample, write_bag1
 
 pytestmark = pytest.mark.slow
 
@@ -93,7 +93,7 @@ def test_without_a_folder_it_is_kept_with_the_session(
         *("compare.json", "compare.md", "compare.png"),
         "series.parquet",
     }
-    assert read_checked(kept / "compare.json").is_proven
+    assert read_checksummed_json(kept / "compare.json").has_checksum
 
 
 def test_a_limit_that_is_missed_is_named_and_code_3_and_all_is_written(

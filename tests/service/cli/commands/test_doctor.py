@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from devices.scene.file import load_scene
+from devices.scene.scene_file import load_scene
 from tests.service.cli.outcome import Outcome, Run, faulty, scene_text
 
 Doctor = Callable[..., Outcome]

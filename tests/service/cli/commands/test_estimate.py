@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from storage.sessions.reader import SessionReader
+from storage.sessions.reader import SealedFileReader
 from tests.service.cli.outcome import Run, scene_text, static_only
 
 pytestmark = pytest.mark.slow
@@ -43,5 +43,5 @@ def test_a_part_whose_stored_estimates_are_damaged_is_estimated_again(run: Run) 
     outcome = run("estimate", "s.parquet", "--end-s", 2, "--out", "part.parquet", "--json")
     assert outcome.code == 0, outcome.err
     assert outcome.printed()["change"] is None
-    with SessionReader(Path("part.parquet")) as part:
-        assert part.has("grf_n")
+    with SealedFileReader(Path("part.parquet")) as part:
+        assert part.has_columns("grf_n")

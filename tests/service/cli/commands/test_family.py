@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from devices.errors import CalibrationError
-from service.offline.estimate import prepared
+from service.offline.estimate import preparation
 from tests.service.cli.outcome import Run, scene_text
 
 pytestmark = pytest.mark.slow
@@ -24,7 +24,7 @@ def test_a_session_is_estimated_with_a_bench_of_its_own_family(
         asked.append((options["family"], options["parts_seed"]))
         raise CalibrationError("no bench here")
 
-    monkeypatch.setattr(prepared, "find_calibration", no_bench)
+    monkeypatch.setattr(preparation, "find_calibration", no_bench)
     scene = tmp_path / "family.toml"
     scene.write_text(scene_text("standing") + f'\n[emulation]\nfamily = "{family}"\n')
     simulate = ("simulate", "--scene", scene, "--seconds", 0.5, "--parts-seed", 5)

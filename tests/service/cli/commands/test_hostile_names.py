@@ -13,7 +13,7 @@ import pytest
 from service.cli.table import SUMMARIES
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
-from storage.sessions.folder import Event, Part, Session, SessionFolder
+from storage.sessions.folder import Marker, Part, Session, SessionsFolder
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
 from tests.service.cli.outcome import Run
@@ -29,10 +29,10 @@ HOSTILE = (
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     """A folder whose session has a hostile text wherever a text can be."""
-    root, info = tmp_path / "data", make_array(boot_id=BOOT)
+    root, info = tmp_path / "data", make_array(stream_id=BOOT)
     folder = root / "journal" / "bench" / BOOT
     journal = Journal(folder, info)
-    journal.append(make_frames(100, status=7))
+    journal.append_new_frames(make_frames(100, tile_flags=7))
     journal.close()
     StreamNotes(array_info=info, next_seq=100).save(folder)
     kept = Session(
@@ -41,16 +41,16 @@ def data(tmp_path: Path) -> Path:
         node="bench",
         state="recording",
         started_t_ns=UTC_NS,
-        parts=(Part(boot_id=BOOT, seq_first=0),),
+        parts=(Part(stream_id=BOOT, seq_first=0),),
         scene="test",
         subject=HOSTILE,
         notes=HOSTILE,
         tags=(HOSTILE,),
-        events=(Event(id="0" * 12, label=HOSTILE, t_ns=UTC_NS),),
+        markers=(Marker(id="0" * 12, label=HOSTILE, t_ns=UTC_NS),),
         take="20200101T000000Z-00000b",
         problem=HOSTILE,
     )
-    SessionFolder(root / "sessions").save(kept)
+    SessionsFolder(root / "sessions").save(kept)
     return root
 
 

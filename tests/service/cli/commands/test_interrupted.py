@@ -79,13 +79,13 @@ def test_ctrl_c_is_said_and_leaves_no_file_and_no_process(
 @pytest.mark.parametrize(
     ("place", "arguments"),
     [
-        ("service.offline.export.export_of", "export s.parquet --format csv --out x.csv"),
-        ("storage.verify.data.verify", "verify ."),
-        ("service.sessions.recover.recover", "recover data"),
+        ("service.offline.export.make_sealed_export", "export s.parquet --format csv --out x.csv"),
+        ("storage.verify.data_folder.verify_path", "verify ."),
+        ("service.sessions.recovery.recover_folder", "recover data"),
         ("service.offline.estimate.session.estimate_session", "estimate s.parquet --out x.parquet"),
-        ("service.offline.doctor.diagnose", "doctor --bus emulated"),
+        ("service.offline.doctor.diagnose_bus", "doctor --bus emulated"),
         ("foottile.server.Server.sessions", "sessions"),
-        ("service.pull.pull", "pull 20200101T000000Z-000000 --out x"),
+        ("service.pull.pull_session", "pull 20200101T000000Z-000000 --out x"),
     ],
 )
 def test_ctrl_c_in_any_other_command_is_said_too(

@@ -146,8 +146,8 @@ def test_pull_brings_the_file_verified_and_at_once_the_second_time(
     assert len(table) == pulled["frames"]
     folder = tmp_path / session
     assert {path.name for path in folder.iterdir()} == {
-        *("frames.parquet", "session.json", "events.json", "ledger.json", "clock.parquet"),
-        "events.parquet",
+        *("frames.parquet", "session.json", "markers.json", "ledger.json", "clock.parquet"),
+        "markers.parquet",
     }
     before = (folder / "frames.parquet").stat().st_mtime_ns
     assert run("pull", session, "--server", demo.url, "--out", str(tmp_path)).returncode == 0

@@ -11,7 +11,7 @@ from tests.service.cli.outcome import Run
 from tests.service.offline.archives import IDS, recording, sealed
 
 PEAKS = "SELECT number, peak_grf_n, is_whole FROM stances ORDER BY number"
-MARKS = "SELECT label FROM events"
+MARKS = "SELECT label FROM markers"
 
 
 @pytest.fixture(scope="module")

@@ -7,33 +7,33 @@ from pathlib import Path
 
 import pytest
 
-from service.server.book import SessionBook, Trash
-from service.sessions.recover import recover
-from storage.durable import locked
-from storage.sessions.folder import Part, Session, SessionFolder, State
-from storage.verify.data import verdict_of, verify
+from service.server.session_store import SessionStore, Trash
+from service.sessions.recovery import recover_folder
+from storage.durable_files import lock_folder
+from storage.sessions.folder import Part, Session, SessionsFolder, SessionState
+from storage.verify.data_folder import find_verdict, verify_path
 from tests.builders.arrays import UTC_NS
 from tests.service.cli.outcome import Run
 
 ID, OTHER_ID = "20200101T000000Z-00000a", "20200101T000000Z-00000b"
 
 
-def put(data: Path, session_id: str = ID, state: State = "recording") -> Path:
+def put(data: Path, session_id: str = ID, state: SessionState = "recording") -> Path:
     session = Session(
         id=session_id,
         name="walk",
         node="bench",
         state=state,
         started_t_ns=UTC_NS,
-        parts=(Part(boot_id="a" * 32, seq_first=0, seq_last=9),),
+        parts=(Part(stream_id="a" * 32, seq_first=0, seq_last=9),),
         scene="test",
     )
-    folder = SessionFolder(data / "sessions")
+    folder = SessionsFolder(data / "sessions")
     folder.save(session)
-    return folder.path(session_id)
+    return folder.get_path(session_id)
 
 
-def renamed(data: Path, name: str, **facts: State) -> Path:
+def renamed(data: Path, name: str, **facts: SessionState) -> Path:
     path = put(data, **facts)
     return path.rename(path.with_name(name))
 
@@ -60,7 +60,7 @@ def test_a_renamed_folder_is_named_with_its_id_by_everybody(
         assert ID in text
         assert shown in text
         assert "\x1b" not in text
-    assert verdict_of(verify(data)) == "damaged"
+    assert find_verdict(verify_path(data)) == "damaged"
     assert files_in(data) == before
 
 
@@ -75,8 +75,8 @@ def test_a_copy_is_told_of_and_neither_is_merged_nor_deleted(
     listed = run("sessions", "--data", data)
     assert listed.out.count(ID) == 1
     assert f"is a copy of session {ID}" in listed.err
-    with locked(data):
-        recovery = recover(data, give_up=True)
+    with lock_folder(data):
+        recovery = recover_folder(data, abandon_missing=True)
     assert [found.session.id for found in recovery.sessions] == [ID]
     assert any("copy" in problem for problem in recovery.problems)
     assert files_in(data / "sessions" / name) == before
@@ -84,12 +84,12 @@ def test_a_copy_is_told_of_and_neither_is_merged_nor_deleted(
 
 @pytest.mark.parametrize(("state", "is_held"), [("sealed", False), ("recording", True)])
 def test_a_server_says_so_and_keeps_the_frames_that_a_renamed_session_may_need(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, state: State, is_held: bool
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, state: SessionState, is_held: bool
 ) -> None:
     renamed(tmp_path, "walk 3", state=state)
     (tmp_path / "sessions" / "holiday pictures").mkdir()
-    folder = SessionFolder(tmp_path / "sessions")
-    book = SessionBook(folder, Trash(tmp_path / "trash"), lambda _: None)
+    folder = SessionsFolder(tmp_path / "sessions")
+    book = SessionStore(folder, Trash(tmp_path / "trash"), lambda _: None)
     assert list(book.unreadable) == ["walk 3"]
     assert ID in book.unreadable["walk 3"]
     assert any("walk 3" in problem for problem in book.problems)
@@ -98,5 +98,5 @@ def test_a_server_says_so_and_keeps_the_frames_that_a_renamed_session_may_need(
     assert ID in caplog.text
     path = tmp_path / "sessions"
     (path / "walk 3").rename(path / ID)
-    again = SessionBook(folder, Trash(tmp_path / "trash"), lambda _: None)
-    assert (again.problems, again.get(ID).name) == ([], "walk")
+    again = SessionStore(folder, Trash(tmp_path / "trash"), lambda _: None)
+    assert (again.problems, again.get_session(ID).name) == ([], "walk")

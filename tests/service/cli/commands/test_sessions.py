@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from service.offline.simulate import START_NS
-from storage.schema import ESTIMATES, FRAMES, TRUTH
+from service.offline.simulation import START_NS
+from storage.schema import ESTIMATE_COLUMNS, MEASURED_COLUMNS, TRUTH_COLUMNS
 from tests.service.cli.outcome import Run, faulty, scene_text, static_only
 
 pytestmark = pytest.mark.slow
@@ -68,16 +68,20 @@ def test_frames_come_at_the_limit_of_the_bus(
 def test_a_session_has_raw_columns_then_estimates_then_truth(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "standing", "--seconds", 2, "--truth", "--out", "s.parquet")
     names = pq.read_schema(tmp_path / "s.parquet").names
-    expected = [flat for c in (*FRAMES, *ESTIMATES, *TRUTH) for flat in c.flat_names(4)]
+    expected = [
+        flat
+        for c in (*MEASURED_COLUMNS, *ESTIMATE_COLUMNS, *TRUTH_COLUMNS)
+        for flat in c.flat_names(4)
+    ]
     assert sorted(names) == sorted(expected)
     assert names[0] == "seq"
-    assert names.index("padc_0") < names.index("gauge_kpa_0")
+    assert names.index("pressure_raw_0") < names.index("gauge_kpa_0")
 
 
 def test_no_estimates_leaves_raw_frames_only(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
     names = pq.read_schema(tmp_path / "s.parquet").names
-    assert sorted(names) == sorted(flat for c in FRAMES for flat in c.flat_names(4))
+    assert sorted(names) == sorted(flat for c in MEASURED_COLUMNS for flat in c.flat_names(4))
 
 
 def test_bench_to_session_to_estimate_closes_on_a_quiet_dome(run: Run, tmp_path: Path) -> None:
@@ -165,7 +169,7 @@ def test_an_assumed_scale_is_said_on_the_terminal_and_in_the_file(run: Run, tmp_
     assert outcome.code == 0, outcome.err
     assert "assumed" in outcome.out
     table = pq.read_table(tmp_path / "e.parquet")
-    assert (table["estimate_status"].to_numpy() & 64 == 64).all()
+    assert (table["estimate_flags"].to_numpy() & 64 == 64).all()
     assert json.loads(table.schema.metadata[b"foottile.notes"])["absolute_scale"] == "assumed"
 
 
@@ -177,12 +181,12 @@ def test_a_fault_of_the_scene_is_null_and_flagged_while_the_others_go_on(
     outcome = run("simulate", "--scene", "faulty.toml", "--seconds", 3, "--out", "s.parquet")
     assert outcome.code == 0, outcome.err
     table = pq.read_table(tmp_path / "s.parquet")
-    silent = table["status_1"].to_numpy() & 1 == 1
+    silent = table["tile_flags_1"].to_numpy() & 1 == 1
     assert 0.4 < silent.mean() * 3 < 0.6
-    assert table["padc_1"].null_count == silent.sum()
+    assert table["pressure_raw_1"].null_count == silent.sum()
     assert table["grf_n"].null_count == silent.sum()
-    assert table["padc_0"].null_count == table["force_n_0"].null_count == 0
-    assert (table["estimate_status"].to_numpy()[silent] & 32 == 32).all()
+    assert table["pressure_raw_0"].null_count == table["force_n_0"].null_count == 0
+    assert (table["estimate_flags"].to_numpy()[silent] & 32 == 32).all()
 
 
 def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touch(
@@ -195,10 +199,10 @@ def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touc
     assert run(*simulate, "--truth").code == 0
     table = pq.read_table(tmp_path / "s.parquet")
     pressed = table["true_force_n_0"].to_numpy() == 110.0
-    wrapped = pressed & (table["padc_0"].to_numpy() > 900)
+    wrapped = pressed & (table["pressure_raw_0"].to_numpy() > 900)
     assert wrapped.sum() > 100
     assert (table["status_0"].to_numpy()[wrapped] & 16 == 16).all()
-    assert (table["estimate_status"].to_numpy()[pressed] & 1 == 1).all()
+    assert (table["estimate_flags"].to_numpy()[pressed] & 1 == 1).all()
     assert (table["force_n_0"].to_numpy()[pressed] > 15.0).all()  # as creep may have left it
     assert np.isnan(table["force_sigma_n_0"].to_numpy()[pressed]).all()
     # Without the model it is no force at all.
@@ -216,10 +220,10 @@ def test_a_rate_that_the_bus_cannot_keep_is_said_and_gives_exit_code_3(
     assert outcome.code == 3
     assert "slots were missed" in outcome.out
     table = pq.read_table(tmp_path / "s.parquet")
-    overrun = table["frame_status"].to_numpy() & 1 == 1
+    overrun = table["frame_flags"].to_numpy() & 1 == 1
     assert overrun.mean() > 0.5
     # What is lost is lost at the sensor: no frame is taken to be missing, and contact is seen.
-    assert (table["estimate_status"].to_numpy() & 8 == 0).mean() > 0.99
+    assert (table["estimate_flags"].to_numpy() & 8 == 0).mean() > 0.99
     assert table["contact"].to_numpy().max() == 1
 
 

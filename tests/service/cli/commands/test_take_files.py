@@ -10,7 +10,7 @@ from tests.service.cli.outcome import Run
 from tests.service.fake_node import NodeOf
 from tests.service.running import Running
 from tests.service.takes import Take, frames_of_long_ago
-from tests.storage.formats.written.readers import said_in
+from tests.storage.formats.writers.readers import said_in
 
 NOBODY = "0123456789ab"
 

@@ -16,13 +16,13 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from storage.checked_json import write_checked
+from storage.checksummed_json import write_checksummed_json
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.server_id import SERVER_ID_NAME, write_server_id
-from storage.sessions.file import SessionWriter
-from storage.sessions.folder import Part, Session, SessionFolder
-from storage.sessions.reader import SessionReader
+from storage.sessions.folder import Part, Session, SessionsFolder
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
 from tests.service.cli.outcome import Run
@@ -35,10 +35,10 @@ BOOT = "a" * 32
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     """A node's folder after a crash: a session was being recorded, frames 0 to 99 are there."""
-    root, info = tmp_path / "data", make_array(boot_id=BOOT)
+    root, info = tmp_path / "data", make_array(stream_id=BOOT)
     folder = root / "journal" / "bench" / BOOT
     journal = Journal(folder, info)
-    journal.append(make_frames(100, status=7))
+    journal.append_new_frames(make_frames(100, tile_flags=7))
     journal.close()
     StreamNotes(array_info=info, next_seq=100).save(folder)
     begun(root)
@@ -52,10 +52,10 @@ def begun(root: Path, session_id: str = ID, *, last: int | None = None) -> None:
         node="bench",
         state="recording",
         started_t_ns=UTC_NS,
-        parts=(Part(boot_id=BOOT, seq_first=0, seq_last=last),),
+        parts=(Part(stream_id=BOOT, seq_first=0, seq_last=last),),
         scene="test",
     )
-    SessionFolder(root / "sessions").save(kept)
+    SessionsFolder(root / "sessions").save(kept)
 
 
 def test_a_crash_is_recovered_and_proven(run: Run, data: Path) -> None:
@@ -178,12 +178,12 @@ def test_frames_of_no_session_are_recovered_if_asked(run: Run, data: Path) -> No
 def test_estimates_of_frames_out_of_order_are_refused(run: Run, data: Path, tmp_path: Path) -> None:
     run("recover", data)
     path = data / "sessions" / ID / "frames.parquet"
-    with SessionReader(path) as reader:
-        info, whole = reader.info, reader.frames()
+    with SealedFileReader(path) as reader:
+        info, whole = reader.info, reader.read_frames()
     mixed = tmp_path / "mixed.parquet"
-    with SessionWriter(mixed, info, {}) as writer:
-        writer.append(whole.rows(50, 60), {})
-        writer.append(whole.rows(0, 50), {})
+    with SealedFileWriter(mixed, info, {}) as writer:
+        writer.append_frames(whole.slice_rows(50, 60), {})
+        writer.append_frames(whole.slice_rows(0, 50), {})
     assert len(pq.read_table(mixed)) == 60
     out = tmp_path / "out.parquet"
     found = run("estimate", mixed, "--out", out, "--calibration", "paper-eq2-shape")
@@ -206,7 +206,7 @@ def test_an_export_says_what_it_is_of_and_proves_nothing(
     assert (said["export"], said["proves"], said["problems"]) == (to, [], [])
     assert f"session {ID}" in found.out
     sealed = data / "sessions" / ID / "frames.parquet"
-    with SessionReader(sealed) as reader:
+    with SealedFileReader(sealed) as reader:
         assert said["source"]["content_sha256"] == reader.content_sha256
     assert (said["source"]["start_s"], said["source"]["clock"]) == (0.1, "node")
     if to != "csv":  # of which any line may be the last
@@ -240,7 +240,7 @@ def test_every_other_file_of_a_data_folder_is_looked_at(run: Run, data: Path) ->
     run("recover", data)
     node = data / "nodes" / "bench"
     node.mkdir(parents=True)
-    write_checked(node / "tares.json", b'{"tares": []}')
+    write_checksummed_json(node / "tares.json", b'{"tares": []}')
     (node / "hello.json").write_text('{"older": 1}')
     (node / "tares.json.damaged-1").write_text("x")
     found = run("verify", data)
@@ -300,7 +300,7 @@ def test_verify_names_whatever_stands_in_the_place_of_a_file(
 ) -> None:
     run("recover", data)
     (data / "nodes" / "bench").mkdir(parents=True)
-    write_checked(data / "nodes" / "bench" / "hello.json", b'{"older": 1}')
+    write_checksummed_json(data / "nodes" / "bench" / "hello.json", b'{"older": 1}')
     write_server_id(data / SERVER_ID_NAME, "5" * 32)
     paths = [path for path in data.rglob("*") if path.is_file() and path.name != ".lock"]
     assert len(paths) == 10

@@ -12,10 +12,10 @@ from mpmath import mp, mpf
 
 from devices.frames import NOT_READ, FrameBatch
 from service.estimation.calibration import TileCalibration
-from service.estimation.ladder.plan import EstimationPlan
-from service.estimation.ladder.upper import BOUND_SIGMAS
-from service.estimation.models.outliers import FAR
-from tests.service.estimation.exact import lower, upper
+from service.estimation.models.outliers import OUTLIER_SIGMAS
+from service.estimation.pipeline.plan import EstimationPlan
+from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
+from tests.service.estimation.exact import sample_stage, smoothing_stage
 from tests.service.estimation.exact.digits import Exact
 
 DOMES = range(3)
@@ -31,7 +31,7 @@ def sampled_ns(frames: FrameBatch) -> list[list[int]]:
 
 def effects_of(plan: EstimationPlan) -> list[Any]:
     """Of every dome."""
-    return [plan.calibration.of(plan.info.tiles[i].serial).effects for i in DOMES]
+    return [plan.calibration.get_tile(plan.info.tiles[i].serial).effects for i in DOMES]
 
 
 def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
@@ -41,45 +41,47 @@ def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     base = [mpf(float(p)) for p in tare.baseline_kpa]
     noise = [mpf(float(p)) for p in tare.noise_kpa]
     t_ns, frame_ns = sampled_ns(frames), [int(t) for t in frames.t_mono_ns]
-    tadc, kpa = [], []
+    temperature_raw, kpa = [], []
     for i in range(4):
-        counts = [None if c == NOT_READ else int(c) for c in frames.tadc[:, i]]
+        counts = [None if c == NOT_READ else int(c) for c in frames.temperature_raw[:, i]]
         held = [next(c for c in reversed(counts[: k + 1]) if c is not None) for k in range(n)]
         words = plan.info.tiles[i].coefficient_words
-        tadc.append(held)
+        temperature_raw.append(held)
         kpa.append(
             [
-                None if status else lower.pressure_kpa(words, int(p), c)
-                for p, c, status in zip(frames.padc[:, i], held, frames.status[:, i], strict=True)
+                None if status else sample_stage.pressure_kpa(words, int(p), c)
+                for p, c, status in zip(
+                    frames.pressure_raw[:, i], held, frames.tile_flags[:, i], strict=True
+                )
             ]
         )
     for i in range(4):
         kpa[i] = [
-            _without_spike(kpa[i], k, run, mpf(FAR) * mp.sqrt(mpf(1.5)) * noise[i])
+            _without_spike(kpa[i], k, run, mpf(OUTLIER_SIGMAS) * mp.sqrt(mpf(1.5)) * noise[i])
             for k in range(n)
         ]
     gauge: list[list[Exact]] = [
         [None if p is None else p - base[i] for p in kpa[i]] for i in range(4)
     ]
-    around = lower.smoothed(gauge[3], frame_ns)
+    around = sample_stage.smoothed(gauge[3], frame_ns)
     effects = effects_of(plan)
     walls = [e.temperature.wall_per_kpa for e in effects]
     doubt = max(mpf(w.sigma) / mpf(w.value) for w in walls)
     felt = []
     for i in DOMES:
         warm = effects[i].temperature
-        counts = [mpf(c) for c in tadc[i]]
-        of_gas, rise = lower.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
+        counts = [mpf(c) for c in temperature_raw[i]]
+        of_gas, rise = sample_stage.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
         kpa_per_count = mpf(warm.kpa_per_k.value) / mpf(-5.35)
         lag_ns = mpf(warm.lag_s.value) * 10**9
-        away = counts[0] - mpf(float(tare.tadc_counts[i]))
+        away = counts[0] - mpf(float(tare.temperature_raw_counts[i]))
         away = away if abs(away) > 2 else mpf(0)
         wall = mpf(walls[i].value)
         passed = wall * base[i] / (1 + wall * base[i])
         dry: list[Exact] = []
         variance = []
         for k in range(n):
-            warmed = kpa_per_count * (of_gas[k] - mpf(float(tare.tadc_counts[i])))
+            warmed = kpa_per_count * (of_gas[k] - mpf(float(tare.temperature_raw_counts[i])))
             p, head = kpa[i][k], passed * around[k]
             dry.append(None if p is None else p / (1 + warmed / base[i]) - head)
             variance.append(
@@ -91,7 +93,7 @@ def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             )
         gauge[i] = [None if p is None else p - base[i] for p in dry]
         hot = effects[i].gas
-        entry = plan.calibration.of(plan.info.tiles[i].serial)
+        entry = plan.calibration.get_tile(plan.info.tiles[i].serial)
         # What was read beyond the chip's end is a guess; the least and the most may have been.
         high = mpf(entry.range_kpa[1])
         end = max(mpf(115), base[i] + high)
@@ -109,8 +111,8 @@ def felt_by(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             _farthest(p, low, most_hot) if low is not None else p
             for p, low in zip(taken, least, strict=True)
         ]
-        guess = lower.gas(taken, t_ns[i], *heats)
-        elsewise = lower.gas(other, t_ns[i], *heats, end_hot)
+        guess = sample_stage.gas(taken, t_ns[i], *heats)
+        elsewise = sample_stage.gas(other, t_ns[i], *heats, end_hot)
         settled = list(guess)
         part = (mpf(hot.gamma.value) - 1) / mpf(hot.gamma.value)
         for k in range(n):
@@ -167,7 +169,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         return [None if None in row else list(row) for row in zip(*columns, strict=True)]
 
     sampled = [sum(row) // len(felt) for row in zip(*t_ns[: len(DOMES)], strict=True)]
-    together: list[Any] = upper.denoised(
+    together: list[Any] = smoothing_stage.denoised(
         [None if row is None else mp.fsum(row) for row in of_all(usable)],
         [None if row is None else mp.norm(row) for row in of_all([of.single for of in felt])],
         sampled,
@@ -175,7 +177,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         frame_ns,
         run,
         plan.lag_ns - 1,
-        plan.noise_left.mean(axis=0),
+        plan.variance_inflation.mean(axis=0),
     )
     within = [None if each is None else each[4] for each in together]
     for i in DOMES:
@@ -183,7 +185,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         apparent, single, beyond, own = of.apparent, of.single, of.beyond, of.own
         heat_n, unseen_heat_n, guess_n = of.heat_n, of.unseen_heat_n, of.guess_n
         most_n, end_n = of.most_n, of.end_n
-        averaged: list[Any] = upper.denoised(
+        averaged: list[Any] = smoothing_stage.denoised(
             usable[i],
             single,
             t_ns[i],
@@ -191,7 +193,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             frame_ns,
             run,
             plan.lag_ns - 1,
-            plan.noise_left[i],
+            plan.variance_inflation[i],
             within,
         )
         smooth = [f if a is None else a[0] for f, a in zip(apparent, averaged, strict=True)]
@@ -199,16 +201,16 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         parts, taus_s = ([mpf(p.value) for p in x] for x in (curve.part, curve.tau_s))
         flows = effects[i].hysteresis.flow
         branch = mpf(flows.part.value), mpf(flows.stress_n.value), mpf(flows.power.value)
-        sprung = upper.flow(smooth, frame_ns, *branch, guess_n)
-        unlooped = upper.hysteresis(sprung, loop, guess_n)
-        force_n = upper.rubber(unlooped, frame_ns, parts, taus_s, guess_n)
+        sprung = smoothing_stage.flow(smooth, frame_ns, *branch, guess_n)
+        unlooped = smoothing_stage.hysteresis(sprung, loop, guess_n)
+        force_n = smoothing_stage.rubber(unlooped, frame_ns, parts, taus_s, guess_n)
         borne = [
             None if g is None else _farthest(g, f, most_n)
             for f, g in zip(apparent, guess_n, strict=True)
         ]
-        sprung = upper.flow(smooth, frame_ns, *branch, borne, end_n)
-        unlooped = upper.hysteresis(sprung, loop, borne)
-        else_n = upper.rubber(unlooped, frame_ns, parts, taus_s, borne, end_n)
+        sprung = smoothing_stage.flow(smooth, frame_ns, *branch, borne, end_n)
+        unlooped = smoothing_stage.hysteresis(sprung, loop, borne)
+        else_n = smoothing_stage.rubber(unlooped, frame_ns, parts, taus_s, borne, end_n)
         crept_n: list[Exact] = [
             None if f is None else 0 if b else (other_n - f) / mp.sqrt(3)
             for f, other_n, b in zip(force_n, else_n, beyond, strict=True)
@@ -242,7 +244,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
                 for a, s in zip(averaged, single, strict=True)
             ]
         )
-    for of_tile, bend_n in zip(errors, upper.shared_bend(bends, of_bends), strict=True):
+    for of_tile, bend_n in zip(errors, smoothing_stage.shared_bend(bends, of_bends), strict=True):
         of_tile.append(bend_n)
     return SimpleNamespace(
         gauge_kpa=gauge, force_n=forces, stated_n=stated, is_bound=bounds, errors=errors

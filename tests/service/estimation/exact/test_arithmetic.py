@@ -16,17 +16,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
-from devices.frames import NOT_READ, FrameBatch, TileStatus
-from service.estimation.calibration import TileCalibration, paper_eq2_shape
+from devices.frames import NOT_READ, FrameBatch, TileFlag
+from service.estimation.calibration import TileCalibration, make_paper_eq2_preset
 from service.estimation.estimates import Estimates
-from service.estimation.ladder.plan import EstimationPlan, make_plan
-from service.estimation.ladder.upper import BOUND_SIGMAS
+from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
 from tests.builders.calibrations import make_calibration, make_tare, newton_tile
 from tests.builders.estimates import estimate
 from tests.builders.frames import loaded_frames
 from tests.service.estimation.exact.digits import apart
-from tests.service.estimation.exact.lower import pressure_kpa
+from tests.service.estimation.exact.sample_stage import pressure_kpa
 
 GOAL_N = 1e-9
 GOAL_M = 1e-11
@@ -88,16 +88,22 @@ def reference(plan: EstimationPlan, frames: FrameBatch, row: int) -> Reference:
     forces: list[Any] = []
     sigmas: list[Any] = []
     for i, tile in enumerate(plan.info.tiles):
-        padc, tadc = int(frames.padc[row, i]), int(frames.tadc[row, i])
-        absolute = pressure_kpa(tile.coefficient_words, padc, tadc)
-        faulty = int(frames.status[row, i]) & (1 | 2 | 8 | 32) or NOT_READ in (padc, tadc)
+        pressure_raw, temperature_raw = (
+            int(frames.pressure_raw[row, i]),
+            int(frames.temperature_raw[row, i]),
+        )
+        absolute = pressure_kpa(tile.coefficient_words, pressure_raw, temperature_raw)
+        faulty = int(frames.tile_flags[row, i]) & (1 | 2 | 8 | 32) or NOT_READ in (
+            pressure_raw,
+            temperature_raw,
+        )
         gauge = None if faulty or absolute is None else absolute - mpf(plan.tare.baseline_kpa[i])
         if gauge is None or gauge < -10:  # no foot pulls like that
             gauges.append(gauge)
             forces.append(None)
             sigmas.append(None)
             continue
-        entry = plan.calibration.of(tile.serial)
+        entry = plan.calibration.get_tile(tile.serial)
         force, slope, curve_sigma = tile_force(entry, gauge)
         reading = mpf(float(plan.tare.noise_kpa[i])) ** 2
         reading += mpf(float(plan.tare.baseline_sigma_kpa[i])) ** 2
@@ -126,7 +132,7 @@ def entries() -> list[TileCalibration]:
     """The paper's preset, a fit as the bench makes it, one as fitted, and a hard one."""
     covariance = ((4e-3, 1e-3, -2e-3), (1e-3, 2e-3, 0.0), (-2e-3, 0.0, 3e-3))
     return [
-        paper_eq2_shape().tiles[0].model_copy(update={"serial": "T01"}),
+        make_paper_eq2_preset().tiles[0].model_copy(update={"serial": "T01"}),
         newton_tile(
             "T02",
             coefficients=(0.0, 13.25, 1.0 / 3.0, 4.7),
@@ -168,7 +174,7 @@ def plan_with(*chips: tuple[int, int, int, int]) -> EstimationPlan:
         baseline_sigma_kpa=[0.0071, 0.0073, 0.007, 0.0069],
         noise_kpa=[0.165, 0.171, 0.163, 0.168],
         # Not known, so that any temperature will do: `tests/service/estimation/watch` has the rest.
-        tadc_counts=np.nan,
+        temperature_raw_counts=np.nan,
     )
     calibration = make_calibration(*entries())
     plan = make_plan(info, calibration, tare, models=("unwrap", "static"))
@@ -176,11 +182,16 @@ def plan_with(*chips: tuple[int, int, int, int]) -> EstimationPlan:
 
 
 def counts(rows: list[tuple[Any, Any, Any]]) -> FrameBatch:
-    """Frames of (padc, tadc, status) rows; single numbers hold for all four tiles."""
-    padc, tadc, status = (
+    """Frames of (pressure_raw, temperature_raw, status) rows; a single number holds for 4 tiles."""
+    pressure_raw, temperature_raw, status = (
         np.array([np.broadcast_to(row[k], 4) for row in rows], dtype=np.int64) for k in range(3)
     )
-    return loaded_frames(np.zeros((len(rows), 4)), padc=padc, tadc=tadc, status=status)
+    return loaded_frames(
+        np.zeros((len(rows), 4)),
+        pressure_raw=pressure_raw,
+        temperature_raw=temperature_raw,
+        tile_flags=status,
+    )
 
 
 def worst(plan: EstimationPlan, frames: FrameBatch, e: Estimates) -> dict[str, float]:
@@ -204,7 +215,7 @@ def worst(plan: EstimationPlan, frames: FrameBatch, e: Estimates) -> dict[str, f
 
 
 def pressed(*counts_of_load: int) -> tuple[int, ...]:
-    """`padc` of the four tiles this many counts above their baselines."""
+    """`pressure_raw` of the four tiles this many counts above their baselines."""
     unloaded = (380, 287, 369, 302)
     return tuple(u - c for u, c in zip(unloaded, counts_of_load, strict=True))
 
@@ -242,11 +253,13 @@ def test_a_hard_case_is_within_a_nanonewton(case: str) -> None:
     assert errors["gauge_kpa"] < 1e-10
 
 
-@pytest.mark.parametrize("padc", [0, 1, 300, 511, 512, 777, 1022])
-@pytest.mark.parametrize("tadc", [0, 511, 512, 1023])
-def test_extreme_coefficients_are_within_a_nanonewton(padc: int, tadc: int) -> None:
+@pytest.mark.parametrize("pressure_raw", [0, 1, 300, 511, 512, 777, 1022])
+@pytest.mark.parametrize("temperature_raw", [0, 511, 512, 1023])
+def test_extreme_coefficients_are_within_a_nanonewton(
+    pressure_raw: int, temperature_raw: int
+) -> None:
     plan = plan_with(STEEPEST_PART, FLATTEST_PART, FLATTEST_PART, STEEPEST_PART)
-    frames = counts([(padc, tadc, 0)])
+    frames = counts([(pressure_raw, temperature_raw, 0)])
     errors = worst(plan, frames, estimate(plan, frames))
     assert max(errors[name] for name in ("force_n", "force_sigma_n", "grf_n")) < GOAL_N
 
@@ -282,4 +295,4 @@ def test_the_reference_knows_the_data_sheets_own_example() -> None:
 
 
 def test_a_faulty_tile_is_faulty_for_the_reference_by_the_same_bits() -> None:
-    assert TileStatus.UNUSABLE == 1 | 2 | 8 | 32
+    assert TileFlag.UNUSABLE == 1 | 2 | 8 | 32

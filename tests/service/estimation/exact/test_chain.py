@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from devices.frames import NOT_READ, FrameBatch, TileStatus
+from devices.frames import NOT_READ, FrameBatch, TileFlag
 from service.estimation.effects import FlowEffect, Parameter
-from service.estimation.estimates import EstimateStatus
-from service.estimation.ladder.chosen import MODELS
-from service.estimation.ladder.plan import EstimationPlan, make_plan
-from service.estimation.ladder.upper import BOUND_SIGMAS
+from service.estimation.estimates import EstimateFlag
+from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.plan import EstimationPlan, make_plan
+from service.estimation.pipeline.smoothing_stage import BOUND_SIGMAS
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
 from tests.builders.estimates import estimate
@@ -66,9 +66,9 @@ def plan() -> EstimationPlan:
         baseline_kpa=[100.30127, 99.87654321, 101.7, 98.0 + 1 / 3],
         baseline_sigma_kpa=[0.0071, 0.0073, 0.007, 0.0069],
         noise_kpa=[0.165, 0.171, 0.163, 0.168],
-        tadc_counts=[507.3, 506.7, 507.0, 1522 / 3],
+        temperature_raw_counts=[507.3, 506.7, 507.0, 1522 / 3],
     )
-    return make_plan(info, make_calibration(*tiles), tare, models=MODELS, lag_ms=LAG_MS)
+    return make_plan(info, make_calibration(*tiles), tare, models=MODEL_NAMES, lag_ms=LAG_MS)
 
 
 def eventful(seed: int) -> tuple[FrameBatch, list[int]]:
@@ -82,17 +82,21 @@ def eventful(seed: int) -> tuple[FrameBatch, list[int]]:
     load[20, 1] -= 14.0
     load[44:46, 2] = 200.0
     load[:, 3] = np.linspace(0, 6, ROWS)
-    padc = np.array(UNLOADED_COUNTS) - np.rint(load).astype(int)
-    tadc = 507 - np.arange(ROWS)[:, None] // 9 + rng.integers(0, 2, padc.shape)
-    status = np.zeros(padc.shape, dtype=int)
-    padc[25, 0], tadc[25, 0], status[25, 0] = NOT_READ, NOT_READ, TileStatus.NO_ANSWER
+    pressure_raw = np.array(UNLOADED_COUNTS) - np.rint(load).astype(int)
+    temperature_raw = 507 - np.arange(ROWS)[:, None] // 9 + rng.integers(0, 2, pressure_raw.shape)
+    status = np.zeros(pressure_raw.shape, dtype=int)
+    pressure_raw[25, 0], temperature_raw[25, 0], status[25, 0] = (
+        NOT_READ,
+        NOT_READ,
+        TileFlag.NO_ANSWER,
+    )
     steps_ns = np.full(ROWS, 1_838_235)
     steps_ns[38] = 60 * 10**9
     frames = loaded_frames(
-        np.zeros(padc.shape),
-        padc=padc,
-        tadc=tadc,
-        status=status,
+        np.zeros(pressure_raw.shape),
+        pressure_raw=pressure_raw,
+        temperature_raw=temperature_raw,
+        tile_flags=status,
         t_mono_ns=np.cumsum(steps_ns),
         sample_offset_us=np.tile([0, 431, 862, 1293], (ROWS, 1)),
     )
@@ -102,7 +106,7 @@ def eventful(seed: int) -> tuple[FrameBatch, list[int]]:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int) -> None:
     frames, run = eventful(seed)
-    e = estimate(plan, *(frames.rows(i, i + 11) for i in range(0, ROWS, 11)))
+    e = estimate(plan, *(frames.slice_rows(i, i + 11) for i in range(0, ROWS, 11)))
     exact = chain(plan, frames, run)
     for i in range(4):
         assert digits.apart(e.gauge_kpa[:, i], exact.gauge_kpa[i]) < 1e-10
@@ -126,7 +130,7 @@ def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int)
         total = mp.fsum(row[i] for i in known)
         doubt = sigma_of([exact.errors[i] for i in known], k, one * len(known))
         least.append(total - mpf(BOUND_SIGMAS) * doubt)
-    assert digits.apart(e.grf_at_least_n, least) < 1e-9
+    assert digits.apart(e.grf_lower_bound_n, least) < 1e-9
     assert None in grf
     stated = np.flatnonzero(np.isfinite(e.cop_x_m)).tolist()
     assert len(stated) > 20
@@ -139,6 +143,6 @@ def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int)
             for k, at in zip(stated, centre, strict=True)
         ]
         assert digits.apart(getattr(e, f"cop_sigma_{name}_m")[stated], sigma_m) < 1e-11
-    flags = EstimateStatus.OUTLIER_REPLACED, EstimateStatus.GAP, EstimateStatus.SATURATED
-    for flag in (*flags, EstimateStatus.TILE_MISSING, EstimateStatus.AFTER_SATURATION):
-        assert (e.estimate_status & flag).any(), flag
+    flags = EstimateFlag.OUTLIER_REPLACED, EstimateFlag.GAP, EstimateFlag.SATURATED
+    for flag in (*flags, EstimateFlag.TILE_MISSING, EstimateFlag.AFTER_SATURATION):
+        assert (e.estimate_flags & flag).any(), flag

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from mpmath import mpf
 
 from service.estimation.models import ambient, denoise, flow, gas, hysteresis, rubber, temperature
-from service.estimation.tare.noise import left_by_mean
+from service.estimation.tare.correlated_noise import compute_variance_inflation
 from tests.builders.averages import denoised
 from tests.builders.readings import through
-from tests.service.estimation.exact import digits, lower, upper
+from tests.service.estimation.exact import digits, sample_stage, smoothing_stage
 
 GOAL = 1e-9
 NAN = float("nan")
@@ -45,10 +45,12 @@ def test_gas_is_within_a_micropascal(gamma: float, tau_s: float, seed: int) -> N
     rng = np.random.default_rng(seed)
     kpa = with_holes(rng, 100.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = wild_instants(rng, 40)
-    model = gas.Gas(*(np.array([x]) for x in (gamma, tau_s, 0.00124, 100.1)))
-    found = through(gas.settled, model.laws(), gas.at_rest(1), kpa, t_ns, NAN)
+    model = gas.GasModel(*(np.array([x]) for x in (gamma, tau_s, 0.00124, 100.1)))
+    found = through(
+        gas.compute_isothermal_pressure, model.to_records(), gas.initial_state(1), kpa, t_ns, NAN
+    )
     parameters = (mpf(gamma), mpf(tau_s), mpf(0.00124), mpf(100.1))
-    expected = lower.gas(digits.exact(kpa), t_ns.tolist(), *parameters)
+    expected = sample_stage.gas(digits.exact(kpa), t_ns.tolist(), *parameters)
     assert digits.apart(found[:, None], expected) < GOAL
 
 
@@ -64,10 +66,10 @@ def test_rubber_is_within_a_nanonewton(
     rng = np.random.default_rng(seed)
     apparent_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = wild_instants(rng, 40)
-    model = rubber.Rubber(np.array([parts]), np.array([taus_s]))
+    model = rubber.CreepModel(np.array([parts]), np.array([taus_s]))
     seen = apparent_n, t_ns, NAN, NAN
-    found = through(rubber.compensated, model.laws(), rubber.at_rest(1), *seen)
-    expected = upper.rubber(
+    found = through(rubber.compensate, model.to_records(), rubber.initial_state(1), *seen)
+    expected = smoothing_stage.rubber(
         digits.exact(apparent_n),
         t_ns.tolist(),
         [mpf(g) for g in parts],
@@ -90,10 +92,10 @@ def test_flow_is_within_a_nanonewton(
     rng = np.random.default_rng(seed)
     apparent_n = with_holes(rng, 3.0 + np.cumsum(rng.normal(0, swing_n, 40)))
     t_ns = wild_instants(rng, 40)
-    model = flow.Flow(np.array([part]), np.array([stress_n]), np.array([power]))
+    model = flow.FlowModel(np.array([part]), np.array([stress_n]), np.array([power]))
     seen = apparent_n, t_ns, NAN, NAN
-    found = through(flow.compensated, model.laws(), flow.at_rest(1), *seen)
-    expected = upper.flow(
+    found = through(flow.compensate, model.to_records(), flow.initial_state(1), *seen)
+    expected = smoothing_stage.flow(
         digits.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n), mpf(power)
     )
     assert digits.apart(found[:, None], expected) < GOAL
@@ -112,10 +114,10 @@ def test_hysteresis_is_within_a_nanonewton(
     apparent_n = with_holes(
         rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40))
     )
-    model = hysteresis.Hysteresis(np.array([parts], dtype=float))
-    state = hysteresis.at_rest(1)
-    found = through(hysteresis.compensated, model.laws(), state, apparent_n, NAN)
-    expected = upper.hysteresis(digits.exact(apparent_n), [mpf(w) for w in parts])
+    model = hysteresis.HysteresisModel(np.array([parts], dtype=float))
+    state = hysteresis.initial_state(1)
+    found = through(hysteresis.compensate, model.to_records(), state, apparent_n, NAN)
+    expected = smoothing_stage.hysteresis(digits.exact(apparent_n), [mpf(w) for w in parts])
     assert digits.apart(found[:, None], expected) < GOAL * max(1.0, swing_n)
 
 
@@ -123,10 +125,12 @@ def test_hysteresis_is_within_a_nanonewton(
 @given(lag_s=st.sampled_from([-30.0, -2.0, -0.3, 0.0, 1e-9, 0.3, 3.3, 30.0, 1e9]), seed=seeds)
 def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    tadc = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
+    temperature_raw = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
     t_ns = wild_instants(rng, 60)
-    found = temperature.followed(tadc[:, None], t_ns[:, None], np.array([lag_s]))
-    exactly = lower.temperature(digits.exact(tadc), t_ns.tolist(), mpf(lag_s))
+    found = temperature.compute_gas_temperatures(
+        temperature_raw[:, None], t_ns[:, None], np.array([lag_s])
+    )
+    exactly = sample_stage.temperature(digits.exact(temperature_raw), t_ns.tolist(), mpf(lag_s))
     for column, expected in zip(found, exactly, strict=True):
         assert digits.apart(column, expected) < 1e-9
 
@@ -137,8 +141,8 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kpa = with_holes(rng, rng.normal(0, 1.0, 60))
     t_ns = wild_instants(rng, 60)
-    found = through(ambient.around, None, ambient.at_rest(), kpa, t_ns)
-    expected = lower.smoothed(digits.exact(kpa), t_ns.tolist())
+    found = through(ambient.update_ambient_pressure, None, ambient.initial_state(), kpa, t_ns)
+    expected = sample_stage.smoothed(digits.exact(kpa), t_ns.tolist())
     assert digits.apart(found[:, None], expected) < GOAL
 
 
@@ -148,8 +152,8 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
 def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -> None:
     rng = np.random.default_rng([look_ms, len(kind)])
     n = 90
-    readings = np.maximum(np.arange(denoise.AVERAGED_MAX + 1), 1)
-    noise_left = left_by_mean(np.array([lasts]), np.array([6.0]), readings)
+    readings = np.maximum(np.arange(denoise.WINDOW_READINGS_MAX + 1), 1)
+    noise_left = compute_variance_inflation(np.array([lasts]), np.array([6.0]), readings)
     swing_n = {"still": 0.0, "moving": 25.0, "uneven": 5.0, "few": 1.0, "crowded": 0.0}[kind]
     values = 30.0 + swing_n * np.sin(np.arange(n) / 9.0) + rng.normal(0, 0.3, n)
     steps_ns = np.full(n, 2_000_000)
@@ -172,7 +176,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
         look_ms * 1_000_000,
         noise_left[None, :],
     )
-    found = upper.denoised(
+    found = smoothing_stage.denoised(
         digits.exact(column),
         [mpf(0.3)] * n,
         t_ns.tolist(),

@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 
 from service.estimation.effects import WALL_PER_KPA, Effects
-from service.estimation.fitting.bench.indentation import Indentation
+from service.estimation.fitting.dome_model import DomeModel, compute_pressures
 from service.estimation.fitting.effects_fit import fit_effects
-from service.estimation.fitting.fit import fit_tile
-from service.estimation.fitting.model import DomeModel, pressed
+from service.estimation.fitting.rig.indentation import Indentation
+from service.estimation.fitting.static_fit import fit_static_curve
 from service.estimation.models.hysteresis import WIDTHS_N
 
 STEP_S = 0.00184
@@ -49,7 +49,7 @@ def programme(
 def pressed_by_model(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     """Pressures whose parameters are those above."""
     part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
-    kpa = pressed(
+    kpa = compute_pressures(
         t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, part, creep_s, loop,
         WIDTHS_N, 0.0, 1.0, 4.0,
     )  # fmt: skip
@@ -63,7 +63,7 @@ def flowing(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         CURVE, SCALE_KPA, BASE_KPA, WALL_PER_KPA, GAMMA, TAU_S, part, creep_s, loop, FLOW_PART,
         FLOW_N, FLOW_POWER,
     )  # fmt: skip
-    return np.asarray(model.pressed(t_s, force_n)[:, 0])
+    return np.asarray(model.compute_pressures(t_s, force_n)[:, 0])
 
 
 def recorded(
@@ -100,10 +100,10 @@ def recorded(
         kpa=kpa[0] + gain[loading] * (kpa - kpa[0]) + rng.normal(0, NOISE_KPA, len(t_s)),
         reference_n=force_n + rng.normal(0, 0.02, len(t_s)),
         phase=phase,
-        under_spindle=phase != "soak",
-        tadc=np.full(len(t_s), 498.0),
+        is_under_indenter=phase != "soak",
+        temperature_raw=np.full(len(t_s), 498.0),
     )
 
 
 def found_in(recording: Indentation) -> Effects:
-    return fit_effects([recording], fit_tile(recording))
+    return fit_effects([recording], fit_static_curve(recording))

@@ -1,4 +1,4 @@
-"""`least_squares`: against closed forms, against scipy's trust region, and between bounds."""
+"""`minimize_squares`: against closed forms, against scipy's trust region, and between bounds."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.estimation.effects import WALL_PER_KPA
-from service.estimation.fitting.effects_fit import curve_over_range, loadings
-from service.estimation.fitting.fit import fit_tile
-from service.estimation.fitting.least_squares import least_squares
-from service.estimation.fitting.model import DomeModel
+from service.estimation.fitting.dome_model import DomeModel
+from service.estimation.fitting.effects_fit import collect_loadings, convert_curve_to_range
+from service.estimation.fitting.least_squares import minimize_squares
 from service.estimation.fitting.output_error import OutputErrorProblem
-from service.estimation.fitting.unknowns import Parts, told_s, unknowns_of
+from service.estimation.fitting.static_fit import fit_static_curve
+from service.estimation.fitting.unknowns import FittedEffects, compute_creep_range_s, list_unknowns
 from tests.service.estimation.fitting.recordings import recorded
 
 _WIDE = np.full(3, 100.0)
@@ -25,7 +25,7 @@ _WIDE = np.full(3, 100.0)
 def test_a_linear_problem_is_solved_as_by_its_normal_equations(seed: int) -> None:
     rng = np.random.default_rng(seed)
     design, y = rng.normal(size=(40, 3)), rng.normal(size=40)
-    found = least_squares(lambda x: design @ x - y, np.zeros(3), -_WIDE, _WIDE, np.ones(3))
+    found = minimize_squares(lambda x: design @ x - y, np.zeros(3), -_WIDE, _WIDE, np.ones(3))
     exact, *_ = np.linalg.lstsq(design, y, rcond=None)
     sigma = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
     assert (np.abs(found.x - exact) < 0.02 * sigma).all()
@@ -48,7 +48,7 @@ def test_between_bounds_it_finds_what_scipy_finds_and_says_which_hold(seed: int)
     def off(x: np.ndarray) -> np.ndarray:
         return (curve(x) - y) / 0.05
 
-    found = least_squares(off, np.ones(3), low, high, np.ones(3))
+    found = minimize_squares(off, np.ones(3), low, high, np.ones(3))
     inside = found.x.clip(low + 1e-9, high - 1e-9)
     other = scipy.optimize.least_squares(off, inside, bounds=(low, high))
     assert found.residual @ found.residual <= 2.0 * other.cost + 2e-3
@@ -58,7 +58,7 @@ def test_between_bounds_it_finds_what_scipy_finds_and_says_which_hold(seed: int)
 
 
 def test_it_gets_out_of_a_bent_valley() -> None:
-    found = least_squares(
+    found = minimize_squares(
         lambda x: np.array([100.0 * (x[1] - x[0] ** 2), 10.0 * (1.0 - x[0])]),
         np.array([-1.2, 1.0]), -_WIDE[:2], _WIDE[:2], np.ones(2),
     )  # fmt: skip
@@ -68,16 +68,18 @@ def test_it_gets_out_of_a_bent_valley() -> None:
 @pytest.mark.slow
 def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma() -> None:
     recording = recorded(seed=0)
-    tile = fit_tile(recording)
-    points, baseline_kpa = loadings([recording])
+    tile = fit_static_curve(recording)
+    points, baseline_kpa = collect_loadings([recording])
     static = DomeModel(
-        curve_over_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, WALL_PER_KPA
+        convert_curve_to_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, WALL_PER_KPA
     )
     problem = OutputErrorProblem(points, static)
-    fit = problem.fit(Parts(terms=2, flow=False))
-    unknowns = unknowns_of(Parts(terms=2, flow=False), static.curve, told_s(points))
-    likely = np.concatenate([each.likely for each in unknowns])
-    within = np.concatenate([np.full(len(each.likely), each.within) for each in unknowns])
+    fit = problem.fit(FittedEffects(terms=2, flow=False))
+    unknowns = list_unknowns(
+        FittedEffects(terms=2, flow=False), static.curve, compute_creep_range_s(points)
+    )
+    likely = np.concatenate([each.prior for each in unknowns])
+    within = np.concatenate([np.full(len(each.prior), each.prior_sigma) for each in unknowns])
     model = fit.model
     x = np.concatenate(
         [
@@ -95,7 +97,9 @@ def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma()
             at[:3], static.scale_kpa, baseline_kpa, WALL_PER_KPA, late_s=at[3], gamma=at[4],
             tau_s=np.exp(at[5]), part=at[6:8], creep_s=np.exp(at[8:10]), loop=at[10:],
         )  # fmt: skip
-        return np.concatenate([problem.residual(tried, fit.scatter), (at - likely) / within])
+        return np.concatenate(
+            [problem.compute_residual(tried, fit.scatter), (at - likely) / within]
+        )
 
     other = scipy.optimize.least_squares(
         residual, np.zeros(len(x)), ftol=1e-12, xtol=1e-12, gtol=1e-12,

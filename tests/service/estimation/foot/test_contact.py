@@ -7,9 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.foot.contact import ContactRule, ContactState, has_lasted, seeming
+from service.estimation.foot.contact import (
+    ContactState,
+    ContactThresholds,
+    is_debounced,
+    update_candidate,
+)
 
-RULE = ContactRule(on_n=5.0, off_n=3.0, min_ns=10_000_000)
+RULE = ContactThresholds(on_n=5.0, off_n=3.0, min_ns=10_000_000)
 MS = 1_000_000
 
 
@@ -25,12 +30,12 @@ def contact_of(
     t_ns = np.array(t_ms if t_ms is not None else range(0, 2 * n, 2), dtype=np.int64) * MS
     states, since_ns, loaded = ContactState.array(1), np.empty(n, np.int64), []
     for i, force_n in enumerate(grf_n):
-        seeming(RULE.on_n, RULE.off_n, states[0], float(force_n), t_ns[i], i in gaps)
+        update_candidate(RULE.on_n, RULE.off_n, states[0], float(force_n), t_ns[i], i in gaps)
         since_ns[i] = states["since_ns"][0]
         loaded.append(int(states["is_loaded"][0]))
     contact, out = 0, []
     for i in range(n):
-        if has_lasted(since_ns, t_ns, i, n, RULE.min_ns, lag_ms * MS):
+        if is_debounced(since_ns, t_ns, i, n, RULE.min_ns, lag_ms * MS):
             contact = loaded[i]
         out.append(contact)
     return out

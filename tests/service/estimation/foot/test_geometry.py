@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from devices.frames import ServoInfo
 from service.estimation.foot.geometry import (
-    axes_rad,
-    grid_indices,
-    hull,
-    lost_by_tilt,
-    rad_per_count,
-    to_ground_x_m,
+    compute_grid_indices,
+    compute_hull,
+    compute_rad_per_count,
+    compute_tile_axes_rad,
+    compute_tilt_loss,
+    transform_to_ground_x_m,
 )
 from tests.builders.arrays import make_servo
 
@@ -27,14 +27,14 @@ points = st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=8, u
 
 def beyond_m(positions: list[tuple[float, float]], point: tuple[float, float]) -> float:
     """How far a point lies outside the hull; zero or less inside."""
-    normals, offsets_m = hull(np.array(positions))
+    normals, offsets_m = compute_hull(np.array(positions))
     assert normals.shape == (len(offsets_m), 2)
     np.testing.assert_allclose(np.hypot(*normals.T), 1.0, atol=1e-12)
     return float((normals @ np.array(point) - offsets_m).max(initial=-np.inf))
 
 
 def angle_at(info: ServoInfo, counts: float) -> float:
-    return (counts - info.zero_counts) * rad_per_count(info)
+    return (counts - info.zero_counts) * compute_rad_per_count(info)
 
 
 # --- hull -----------------------------------------------------------------------------------------
@@ -80,7 +80,7 @@ def test_a_single_tile_has_no_edge_to_be_beyond() -> None:
 
 def test_tiles_a_micrometre_out_of_line_are_in_line() -> None:
     crooked = [(0.0, 0.0), (0.01, 4e-7), (0.02, -4e-7)]
-    assert len(hull(np.array(crooked))[0]) == 2
+    assert len(compute_hull(np.array(crooked))[0]) == 2
 
 
 # --- grid -----------------------------------------------------------------------------------------
@@ -88,7 +88,7 @@ def test_tiles_a_micrometre_out_of_line_are_in_line() -> None:
 
 def test_grid_indices_count_from_one_along_each_axis() -> None:
     positions = np.array([(0.0, 0.0), (0.01, 0.0), (0.0, 0.02), (0.01, 0.02)])
-    grid = grid_indices(positions)
+    grid = compute_grid_indices(positions)
     assert grid is not None
     assert grid[0].tolist() == [1.0, 2.0, 1.0, 2.0]
     assert grid[1].tolist() == [1.0, 1.0, 2.0, 2.0]
@@ -100,7 +100,7 @@ def test_tiles_of_a_grid_have_their_indices_in_whatever_order_they_are_listed(
 ) -> None:
     places = [(i, j) for i in range(1, columns + 1) for j in range(1, rows + 1)]
     random.shuffle(places)
-    grid = grid_indices(np.array([(0.013 * i - 0.1, 0.02 * j) for i, j in places]))
+    grid = compute_grid_indices(np.array([(0.013 * i - 0.1, 0.02 * j) for i, j in places]))
     assert grid is not None
     assert list(zip(*(axis.tolist() for axis in grid), strict=True)) == places
 
@@ -114,7 +114,7 @@ def test_tiles_of_a_grid_have_their_indices_in_whatever_order_they_are_listed(
     ],
 )
 def test_tiles_that_fill_no_grid_have_no_indices(positions: list[tuple[float, float]]) -> None:
-    assert grid_indices(np.array(positions)) is None
+    assert compute_grid_indices(np.array(positions)) is None
 
 
 # --- angle ----------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ def test_unknown_counts_have_no_angle() -> None:
 
 
 def ground_x_m(x_m: float, z_m: float, angle: float, travel: float | None) -> float:
-    return float(to_ground_x_m(x_m, z_m, angle, math.nan if travel is None else travel))
+    return float(transform_to_ground_x_m(x_m, z_m, angle, math.nan if travel is None else travel))
 
 
 @given(st.floats(-math.pi / 2, math.pi / 2))
@@ -186,12 +186,14 @@ def test_where_the_ankle_goes_unknown_the_ground_frame_is_unknown() -> None:
 def test_tiles_on_an_arc_push_along_its_radii_and_on_a_plane_along_the_segment() -> None:
     arc_rad = np.array([-0.14, -0.047, 0.047, 0.14])
     arc_m = 0.15 * np.stack([np.sin(arc_rad), 0 * arc_rad, -np.cos(arc_rad)], axis=1)
-    assert lost_by_tilt(axes_rad(arc_m)) == pytest.approx(1.0 - np.cos(arc_rad), rel=0.05, abs=1e-5)
+    assert compute_tilt_loss(compute_tile_axes_rad(arc_m)) == pytest.approx(
+        1.0 - np.cos(arc_rad), rel=0.05, abs=1e-5
+    )
     flat_m = arc_m * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.15]
-    assert lost_by_tilt(axes_rad(flat_m)) == pytest.approx(np.zeros(4), abs=1e-12)
+    assert compute_tilt_loss(compute_tile_axes_rad(flat_m)) == pytest.approx(np.zeros(4), abs=1e-12)
 
 
 @pytest.mark.parametrize("x_m", [[0.0], [0.0, 0.02], [0.0, 0.0, 0.02, 0.02]])
 def test_too_few_places_do_not_show_how_a_sole_is_curved(x_m: list[float]) -> None:
     positions_m = np.array([[x, 0.01 * i, -0.15 + x] for i, x in enumerate(x_m)])
-    assert (axes_rad(positions_m) == 0.0).all()
+    assert (compute_tile_axes_rad(positions_m) == 0.0).all()

@@ -10,9 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
+from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameFlag
 from service.estimation.estimate import Estimator
-from service.estimation.foot.kinematics import ServoReading, carry, counts_at
+from service.estimation.foot.kinematics import (
+    ServoReading,
+    interpolate_servo_counts,
+    store_servo_reading,
+)
 from service.estimation.records import RecordArray
 from tests.builders.arrays import array_at, make_servo
 from tests.builders.estimates import newton_plan
@@ -21,13 +25,13 @@ from tests.builders.frames import loaded_frames
 TURN = 4096
 MS = 1_000_000
 US = 1000
-STALE = FrameStatus.SERVO_STALE
+STALE = FrameFlag.SERVO_STALE
 
 
 def carried(
     t_ns: Sequence[int],
     readings: Sequence[tuple[int, int] | None],
-    status: Sequence[int] | None = None,
+    frame_flags: Sequence[int] | None = None,
     tiles: int = 1,
 ) -> FrameBatch:
     """Frames at `t_ns`, each with a reading (instant, counts) or none."""
@@ -38,7 +42,7 @@ def carried(
         "servo_age_us": [
             -1 if r is None else (t - r[0]) // US for t, r in zip(t_ns, readings, strict=True)
         ],
-        "frame_status": [0] * n if status is None else status,
+        "frame_flags": [0] * n if frame_flags is None else frame_flags,
     }
     return loaded_frames(np.zeros((n, tiles)), **columns)
 
@@ -47,13 +51,13 @@ def readings_of(frames: FrameBatch, broken: Sequence[bool]) -> RecordArray[Servo
     """Store the servo readings of frames, some of them after a gap."""
     readings = ServoReading.array(len(frames))
     for i, after_gap in enumerate(broken):
-        carry(
+        store_servo_reading(
             readings,
             i,
             frames.t_mono_ns[i],
             int(frames.servo_counts[i]),
             int(frames.servo_age_us[i]),
-            frames.frame_status[i],
+            frames.frame_flags[i],
             TURN,
             bool(after_gap),
         )
@@ -65,7 +69,7 @@ def positions(
 ) -> list[float]:
     readings = readings_of(frames, [False] * len(frames) if broken is None else broken)
     n = len(frames)
-    return [float(counts_at(readings, i, n, round(lag_ms * MS))) for i in range(n)]
+    return [float(interpolate_servo_counts(readings, i, n, round(lag_ms * MS))) for i in range(n)]
 
 
 # Frames every 2 ms; readings at 0 and 8 ms, each known half a millisecond later.
@@ -102,7 +106,7 @@ def test_a_reading_that_was_on_its_way_is_the_one_before() -> None:
 
 
 def test_a_stale_position_is_unknown_and_nothing_reaches_across_it() -> None:
-    frames = carried(T_NS, SLOW, status=[0, 0, STALE, STALE, 0, 0])
+    frames = carried(T_NS, SLOW, frame_flags=[0, 0, STALE, STALE, 0, 0])
     expected = [100, 100, np.nan, np.nan, 900, 900]
     assert positions(frames, 100) == pytest.approx(expected, nan_ok=True)
 
@@ -142,7 +146,7 @@ def test_ages_cut_to_microseconds_make_no_new_readings() -> None:
 
 
 def loop(readings: RecordArray[ServoReading], lag_ns: int) -> list[float]:
-    """What `counts_at` says, frame by frame."""
+    """What `interpolate_servo_counts` says, frame by frame."""
     result = []
     n = len(readings["t_ns"])
     for i in range(n):
@@ -186,7 +190,7 @@ def test_any_readings_give_what_a_loop_over_the_frames_gives(
         t_mono_ns=t_ns,
         servo_counts=drawn(st.sampled_from([NO_SERVO_COUNTS, -5, 0, 7, 7, 7, 900, 4095])),
         servo_age_us=drawn(st.integers(-1, 3) | st.integers(0, 12_000)),
-        frame_status=drawn(st.sampled_from([0] * 8 + [STALE])),
+        frame_flags=drawn(st.sampled_from([0] * 8 + [STALE])),
     )
     broken = data.draw(st.lists(st.sampled_from([False] * 8 + [True]), min_size=n, max_size=n))
     expected = loop(readings_of(frames, broken), lag_ms * MS)
@@ -221,7 +225,7 @@ def test_an_estimate_turns_with_the_servo_between_its_readings() -> None:
     plan = newton_plan(array_at([(0.0, 0.0, -0.15), (0.02, 0.0, -0.15)], servo=servo), lag_ms=6)
     frames = carried(T_NS, SLOW, tiles=2)
     estimator = Estimator(plan)
-    estimates, last = estimator.step(frames), estimator.finish()
+    estimates, last = estimator.process_frames(frames), estimator.finish()
     assert last is not None
     angle_rad = np.concatenate([estimates.angle_rad, last.angle_rad])
     expected = -0.1 * 2 * np.pi * np.array([0, 300, 500, 700, 800, 800]) / TURN

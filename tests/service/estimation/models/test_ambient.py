@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from service.estimation.models.ambient import SMOOTHING_S, around, at_rest
+from service.estimation.models.ambient import SMOOTHING_S, initial_state, update_ambient_pressure
 from tests.builders.arrays import array_at
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import newton_plan
@@ -21,7 +21,9 @@ from tests.builders.readings import through
 def head(kpa: Any, t_s: Any) -> np.ndarray:
     """Averaged pressure around the foot."""
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    return through(around, None, at_rest(), np.asarray(kpa, dtype=float), t_ns)
+    return through(
+        update_ambient_pressure, None, initial_state(), np.asarray(kpa, dtype=float), t_ns
+    )
 
 
 def test_water_that_comes_at_once_is_known_after_thirty_milliseconds_to_two_thirds() -> None:
@@ -56,10 +58,10 @@ def test_a_dome_passes_on_what_its_wall_gives_way_to() -> None:
     tiles = [newton_tile("T01", effects=make_effects())]
     bare = array_at([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], references=[1])
     plan = newton_plan(bare, models=("static", "ambient"), tiles=tiles)
-    assert plan.ladder.ambient is not None
+    assert plan.model_set.ambient is not None
     give = 0.0013 * plan.baseline_kpa[0]
-    assert plan.ladder.ambient.transmitted_fraction == pytest.approx([give / (1 + give)])
-    assert plan.ladder.ambient.relative_sigma == pytest.approx(0.0002 / 0.0013)
+    assert plan.model_set.ambient.transmitted_fraction == pytest.approx([give / (1 + give)])
+    assert plan.model_set.ambient.relative_sigma == pytest.approx(0.0002 / 0.0013)
     with pytest.raises(UsageError, match="bare reference tile"):
         newton_plan(array_at([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)
 
@@ -67,9 +69,9 @@ def test_a_dome_passes_on_what_its_wall_gives_way_to() -> None:
 def test_a_bare_tile_that_falls_silent_is_believed_for_a_fifth_of_a_second() -> None:
     t_ns = np.arange(300, dtype=np.int64) * 2_000_000
     kpa = np.where(np.arange(300) < 100, 1.0, np.nan)
-    state = at_rest()
-    head_kpa = through(around, None, state, kpa, t_ns)
+    state = initial_state()
+    head_kpa = through(update_ambient_pressure, None, state, kpa, t_ns)
     assert head_kpa[:200] == pytest.approx(1.0)
     assert np.isnan(head_kpa[200:]).all()
-    later = through(around, None, state, 2.0, t_ns[-1] + t_ns[1:10])
+    later = through(update_ambient_pressure, None, state, 2.0, t_ns[-1] + t_ns[1:10])
     assert np.isfinite(later).all(), "and again as soon as it speaks"

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.ladder.upper import BORNE
 from service.estimation.models.denoise import (
-    AGREE,
-    AVERAGED_MAX,
-    REACHES,
-    share_bend,
+    AGREEMENT_SIGMAS,
+    WINDOW_REACHES,
+    WINDOW_READINGS_MAX,
+    estimate_smoothing_errors,
 )
-from service.estimation.tare.noise import left_by_mean
+from service.estimation.pipeline.smoothing_stage import TILE_FORCE
+from service.estimation.tare.correlated_noise import compute_variance_inflation
 from tests.builders.averages import denoised
 
 SIGMA_N, PERIOD_NS = 0.3, 1_838_235
@@ -45,7 +45,7 @@ def averaged(
         (frame_ns if at_ns is None else np.asarray(at_ns))[:, None].copy(),
         np.zeros(n, dtype=np.int64) if run is None else np.asarray(run),
         round(look_ms * 1e6),
-        np.ones((1, AVERAGED_MAX + 1)) if noise_left is None else noise_left[None, :],
+        np.ones((1, WINDOW_READINGS_MAX + 1)) if noise_left is None else noise_left[None, :],
     )
     return out[:, 0], left[:, 0]
 
@@ -111,8 +111,8 @@ def lasting_noise(n: int, part: float, readings: float, seed: int) -> np.ndarray
 def test_what_lasts_of_the_noise_is_not_averaged_away_and_it_says_so(
     look_ms: float, part: float, readings: float
 ) -> None:
-    counts = np.maximum(np.arange(AVERAGED_MAX + 1), 1)
-    lasting = left_by_mean(np.array([part]), np.array([readings]), counts)
+    counts = np.maximum(np.arange(WINDOW_READINGS_MAX + 1), 1)
+    lasting = compute_variance_inflation(np.array([part]), np.array([readings]), counts)
 
     def of_what_it_says(noise_left: np.ndarray | None) -> float:
         found = [averaged(c, look_ms=look_ms, noise_left=noise_left) for c in courses]
@@ -181,7 +181,7 @@ def test_it_looks_ahead_no_further_than_it_may_and_back_a_quarter_of_a_second() 
     moved = np.flatnonzero(averaged(other)[0] != averaged(values)[0])
     # 10 ms are five frames of 1.84 ms, 250 ms are 136, of which 128 are the longest reach.
     assert moved.min() == 195
-    assert 300 < moved.max() <= 200 + REACHES[-1]
+    assert 300 < moved.max() <= 200 + WINDOW_REACHES[-1]
 
 
 def test_values_are_those_of_the_instants_asked_for() -> None:
@@ -222,16 +222,16 @@ def test_any_instants_give_finite_values_among_the_readings(t_ns: list[int], see
     values = 30.0 + noise(len(t_ns), seed)
     out, left = averaged(values, t_ns=np.cumsum(t_ns))
     # Of a window of many, a little less: what it averages away is less than a reading's noise.
-    assert np.abs(out - values).max() <= AGREE * SIGMA_N + 1e-9
+    assert np.abs(out - values).max() <= AGREEMENT_SIGMAS * SIGMA_N + 1e-9
     assert (left > 0.0).all()
 
 
 def shared_bend(bend_n: np.ndarray, noise_n: np.ndarray) -> np.ndarray:
     """What of the bends of tiles, (n, tiles), is in all of them."""
-    tiles = np.zeros(bend_n.shape, BORNE)
+    tiles = np.zeros(bend_n.shape, TILE_FORCE)
     tiles["window_difference_n"], tiles["window_difference_sigma_n"] = bend_n, noise_n
     for frame in tiles:
-        share_bend(frame)
+        estimate_smoothing_errors(frame)
     return tiles["smoothing_error_n"]
 
 
@@ -265,7 +265,7 @@ def test_a_load_that_shakes_all_tiles_makes_their_sum_less_certain_and_a_still_o
         sampled_ns,
         np.zeros(n, dtype=np.int64),
         100_000_000,
-        np.ones((tiles, AVERAGED_MAX + 1)),
+        np.ones((tiles, WINDOW_READINGS_MAX + 1)),
     )
     off_n = (out - load_n[:, None]).sum(axis=1)
     own_n2 = (SIGMA_N**2 * left).sum(axis=1)

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from service.estimation.effects import PART_MOST
+from service.estimation.effects import FLOW_FRACTION_MAX
 from service.estimation.models import flow
-from service.estimation.models.flow import STROKE_N_PER_S, Flow
+from service.estimation.models.flow import STROKE_N_PER_S, FlowModel
 from tests.builders.readings import through
 
 PART, STRESS_N = 0.08, 0.3
@@ -30,10 +30,10 @@ def compensated(
     borne_n: float = math.nan,
     away_n: float = math.nan,
 ) -> np.ndarray:
-    model = Flow(np.array([part]), np.array([stress_n]), np.array([power]))
+    model = FlowModel(np.array([part]), np.array([stress_n]), np.array([power]))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     seen = np.asarray(apparent_n, dtype=float), t_ns, borne_n, away_n
-    return through(flow.compensated, model.laws(), flow.at_rest(1), *seen)
+    return through(flow.compensate, model.to_records(), flow.initial_state(1), *seen)
 
 
 def borne_by_branch(t_s: np.ndarray, force_n: np.ndarray, power: float) -> np.ndarray:
@@ -87,7 +87,7 @@ def test_of_a_force_that_comes_at_once_the_branch_bears_its_part_and_then_lets_g
 @given(
     force_n=st.lists(st.floats(-5.0, 60.0), min_size=1, max_size=40),
     steps_s=st.lists(st.sampled_from([0.0, 1e-9, 0.002, 0.1, 60.0]), min_size=40, max_size=40),
-    part=st.sampled_from([0.0, 1e-9, 0.08, PART_MOST]),
+    part=st.sampled_from([0.0, 1e-9, 0.08, FLOW_FRACTION_MAX]),
     stress_n=st.sampled_from([0.02, 0.3, 2.0]),
     power=st.sampled_from([2.0, 4.0, 6.5]),
 )

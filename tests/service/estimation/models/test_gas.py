@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.estimation.models import gas
-from service.estimation.models.gas import RESTART, Gas
+from service.estimation.models.gas import RESTART_TIME_CONSTANTS, GasModel
 from tests.builders.readings import through
 
 GAMMA, TAU_S, WALL, BASE_KPA = 1.28, 0.011, 0.00124, 100.0
@@ -20,10 +20,17 @@ GAMMA_TAU_S = GAMMA * TAU_S
 
 
 def settled(kpa: Any, t_s: Any, *, gamma: float = GAMMA, wall: float = WALL) -> np.ndarray:
-    model = Gas(*(np.array([x]) for x in (gamma, TAU_S, wall, BASE_KPA)))
+    model = GasModel(*(np.array([x]) for x in (gamma, TAU_S, wall, BASE_KPA)))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     kpa = np.asarray(kpa, dtype=float)
-    return through(gas.settled, model.laws(), gas.at_rest(1), kpa, t_ns, math.nan)
+    return through(
+        gas.compute_isothermal_pressure,
+        model.to_records(),
+        gas.initial_state(1),
+        kpa,
+        t_ns,
+        math.nan,
+    )
 
 
 def given_way(kpa: Any, warm: Any) -> Any:
@@ -61,7 +68,7 @@ def test_how_often_a_change_was_sampled_does_not_matter(cuts: list[float], ratio
 
 
 def test_after_a_gap_of_five_time_constants_it_begins_in_equilibrium() -> None:
-    longest_s = RESTART * GAMMA_TAU_S
+    longest_s = RESTART_TIME_CONSTANTS * GAMMA_TAU_S
     for gap_s, restarts in ((0.999 * longest_s, False), (1.001 * longest_s, True), (60.0, True)):
         out = settled([100.0, 100.0, 110.0], [0.0, 0.002, 0.002 + gap_s])
         assert (out[-1] == 110.0) == restarts

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.estimation.models import hysteresis
-from service.estimation.models.hysteresis import OPENS, WIDTHS_N
+from service.estimation.models.hysteresis import LOOP_OPENING, WIDTHS_N
 from tests.builders.readings import through
 
 PART = (0.05, 0.04, 0.03)
@@ -22,7 +22,7 @@ def looped(force_n: list[float], part: tuple[float, ...]) -> list[float]:
     apparent = []
     for force in force_n:
         for m, width in enumerate(WIDTHS_N):
-            half = min(width, OPENS * force) if force > 0.0 else 0.0
+            half = min(width, LOOP_OPENING * force) if force > 0.0 else 0.0
             if plays[m] < force - half:
                 plays[m] = force - half
             elif plays[m] > force + half:
@@ -32,9 +32,9 @@ def looped(force_n: list[float], part: tuple[float, ...]) -> list[float]:
 
 
 def compensated(apparent_n: list[float], part: tuple[float, ...] = PART) -> np.ndarray:
-    laws = hysteresis.Hysteresis(np.array([part])).laws()
+    laws = hysteresis.HysteresisModel(np.array([part])).to_records()
     felt_n = np.array(apparent_n, dtype=float)
-    return through(hysteresis.compensated, laws, hysteresis.at_rest(1), felt_n, math.nan)
+    return through(hysteresis.compensate, laws, hysteresis.initial_state(1), felt_n, math.nan)
 
 
 @given(
@@ -49,8 +49,8 @@ def test_forces_come_back_from_what_is_felt_of_them(
 
 def test_on_the_first_way_up_the_plays_lag_by_as_much_as_they_have_opened() -> None:
     # All open at 0.4 F until the narrowest is at its width, which is at 1.5 N.
-    force_n = np.linspace(0.0, WIDTHS_N[0] / OPENS, 20)
-    apparent_n = force_n * (1 - OPENS * sum(PART))
+    force_n = np.linspace(0.0, WIDTHS_N[0] / LOOP_OPENING, 20)
+    apparent_n = force_n * (1 - LOOP_OPENING * sum(PART))
     assert compensated(apparent_n.tolist()) == pytest.approx(force_n, abs=1e-12)
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.outliers import spikes
+from service.estimation.models.outliers import find_outliers
 
 NOISE_KPA = 0.165
 
@@ -17,7 +17,7 @@ NOISE_KPA = 0.165
 def mended(kpa: list[float], noise_kpa: float = NOISE_KPA) -> tuple[list[float], list[int]]:
     """Readings with outliers replaced, and where there were any."""
     column = np.array(kpa, dtype=float)
-    found = np.flatnonzero(spikes(column[:, None], np.array([noise_kpa])))
+    found = np.flatnonzero(find_outliers(column[:, None], np.array([noise_kpa])))
     out = column.copy()
     out[found] = 0.5 * (column[found - 1] + column[found + 1])
     return out.tolist(), found.tolist()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.skew import at_frame, at_rest
+from service.estimation.models.skew import initial_state, interpolate_to_frame
 
 PERIOD_NS = 2_000_000
 
@@ -18,9 +18,9 @@ PERIOD_NS = 2_000_000
 def lined_up(
     values: list[float], t_ns: list[int], frame_t_ns: list[int], broken: Sequence[int] = ()
 ) -> list[float]:
-    state = at_rest(1)[0]
+    state = initial_state(1)[0]
     frames = enumerate(zip(values, t_ns, frame_t_ns, strict=True))
-    return [float(at_frame(state, *frame, i in broken)) for i, frame in frames]
+    return [float(interpolate_to_frame(state, *frame, i in broken)) for i, frame in frames]
 
 
 @given(

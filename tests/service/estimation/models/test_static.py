@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.calibration import TileCalibration, paper_eq2_shape
+from service.estimation.calibration import TileCalibration, make_paper_eq2_preset
 from service.estimation.models.static import StaticCurves, StaticForce
 from tests.builders.calibrations import newton_tile
 
@@ -32,7 +32,7 @@ def by_definition_n(gauge_kpa: float) -> float:
 
 
 def at(tile: TileCalibration, *gauge_kpa: float) -> StaticForce:
-    return StaticCurves([tile]).force(np.array(gauge_kpa)[:, None])
+    return StaticCurves([tile]).compute_forces(np.array(gauge_kpa)[:, None])
 
 
 @given(st.floats(0, 15))
@@ -148,11 +148,11 @@ def test_every_tile_has_its_own_curve() -> None:
     curves = StaticCurves(
         [
             newton_tile("T01", **CURVE),
-            paper_eq2_shape().of("T02"),
+            make_paper_eq2_preset().get_tile("T02"),
             newton_tile("T03"),
         ]
     )
-    force_n = curves.force(np.array([[7.0, 15.0, 13 / 1023]])).force_n
+    force_n = curves.compute_forces(np.array([[7.0, 15.0, 13 / 1023]])).force_n
     assert force_n[0] == pytest.approx([by_definition_n(7.0), 30.0, 0.1])
 
 

@@ -11,36 +11,42 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.estimation.models.temperature import (
-    NOISE_COUNTS,
-    SETTLE_S,
-    Temperature,
-    at_rest,
-    at_tare,
-    noise_counts,
+    READING_NOISE_COUNTS,
+    STARTUP_S,
+    TemperatureModel,
+    compute_gas_noise_counts,
+    initial_state,
+    refer_to_tare_temperature,
 )
 from tests.builders.readings import through
 
 LAG_S, LAG_SIGMA_S, KPA_PER_COUNT, BASE_KPA, TARE = 3.0, 0.3, -0.056, 100.0, 480.0
 
 
-def model(*, lag_s: float = LAG_S, kpa_per_count: float = KPA_PER_COUNT) -> Temperature:
+def model(*, lag_s: float = LAG_S, kpa_per_count: float = KPA_PER_COUNT) -> TemperatureModel:
     values = (kpa_per_count, 0.02, lag_s, LAG_SIGMA_S, TARE, BASE_KPA)
     per_count, relative, lag, lag_sigma, tare, base = (np.array([x]) for x in values)
-    return Temperature(per_count, relative, lag, lag_sigma, tare, base, 0.002)
+    return TemperatureModel(per_count, relative, lag, lag_sigma, tare, base, 0.002)
 
 
-def taken_back(of: Temperature, kpa: Any, tadc: Any, t_ns: Any) -> tuple[np.ndarray, np.ndarray]:
+def taken_back(
+    of: TemperatureModel, kpa: Any, temperature_raw: Any, t_ns: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """Pressures as they would be at the tare's temperature, and their uncertainty."""
-    out, sigma_kpa = through(at_tare, of.laws(), at_rest(1), kpa, tadc, t_ns).T
+    out, sigma_kpa = through(
+        refer_to_tare_temperature, of.to_records(), initial_state(1), kpa, temperature_raw, t_ns
+    ).T
     return out, sigma_kpa
 
 
 def followed(
-    tadc: Any, t_s: Any, kpa: float = BASE_KPA, **changes: float
+    temperature_raw: Any, t_s: Any, kpa: float = BASE_KPA, **changes: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Counts of the gas that the corrected pressures show, and their uncertainty."""
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    out, sigma_kpa = taken_back(model(**changes), kpa, np.asarray(tadc, dtype=float), t_ns)
+    out, sigma_kpa = taken_back(
+        model(**changes), kpa, np.asarray(temperature_raw, dtype=float), t_ns
+    )
     per_count = changes.get("kpa_per_count", KPA_PER_COUNT)
     return TARE + BASE_KPA / per_count * (kpa / out - 1), sigma_kpa
 
@@ -48,7 +54,7 @@ def followed(
 def test_behind_a_chip_that_warms_evenly_the_gas_is_late_by_its_lag() -> None:
     # lag x' = chip - x: behind by rate lag (1 - exp(-t/lag)); irregular steps are no matter.
     rng = np.random.default_rng(0)
-    still_s = np.linspace(0.0, 2 * SETTLE_S, 50)
+    still_s = np.linspace(0.0, 2 * STARTUP_S, 50)
     ramp_s = np.cumsum(rng.choice([0.001, 0.002, 0.3], 100))
     chip = np.concatenate([np.full(50, TARE), TARE - 2.0 * ramp_s])
     counts, _ = followed(chip, np.concatenate([still_s, still_s[-1] + ramp_s]))
@@ -70,10 +76,12 @@ def test_a_gas_that_leads_its_chip_is_where_an_even_rise_will_have_brought_the_c
 def test_noise_of_a_chip_that_is_behind_its_gas_stays_below_that_of_a_reading(lag_s: float) -> None:
     rng = np.random.default_rng(1)
     t_s = np.arange(0.0, 200.0, 0.002)
-    counts, sigma_kpa = followed(TARE + rng.normal(0, NOISE_COUNTS, len(t_s)), t_s, lag_s=lag_s)
+    counts, sigma_kpa = followed(
+        TARE + rng.normal(0, READING_NOISE_COUNTS, len(t_s)), t_s, lag_s=lag_s
+    )
     left = counts[10_000:].std()
-    assert left < NOISE_COUNTS
-    assert left == pytest.approx(noise_counts(np.array([lag_s]), 0.002)[0], rel=0.2)
+    assert left < READING_NOISE_COUNTS
+    assert left == pytest.approx(compute_gas_noise_counts(np.array([lag_s]), 0.002)[0], rel=0.2)
     assert np.median(sigma_kpa) >= 0.95 * abs(KPA_PER_COUNT) * left
 
 
@@ -105,8 +113,8 @@ def test_pressure_is_taken_back_in_proportion_to_itself() -> None:
 
 def test_at_first_the_gas_is_taken_to_be_as_warm_as_the_mean_of_its_chip() -> None:
     # Noise of the first count would otherwise stay for the whole lag.
-    tadc = TARE + np.array([8.0, *np.tile([-1.0, 1.0], 120)])
-    counts, _ = followed(tadc, 0.002 * np.arange(241))
+    temperature_raw = TARE + np.array([8.0, *np.tile([-1.0, 1.0], 120)])
+    counts, _ = followed(temperature_raw, 0.002 * np.arange(241))
     assert abs(counts[-1] - TARE) < 0.1
 
 
@@ -149,17 +157,17 @@ def test_counts_below_absolute_zero_are_none() -> None:
 
 
 @given(
-    tadc=st.lists(st.integers(0, 1023), min_size=1, max_size=40),
+    temperature_raw=st.lists(st.integers(0, 1023), min_size=1, max_size=40),
     step_s=st.sampled_from([0.0, 1e-9, 0.002, 1.0, 60.0, 1e6]),
     lag_s=st.sampled_from([0.0, 1e-9, 0.3, 30.0, 1e9]),
 )
 def test_the_gas_is_never_outside_what_its_chip_has_been(
-    tadc: list[int], step_s: float, lag_s: float
+    temperature_raw: list[int], step_s: float, lag_s: float
 ) -> None:
-    t_s = step_s * np.arange(len(tadc))
-    counts, _ = followed(tadc, t_s, lag_s=lag_s, kpa_per_count=-0.05)
-    assert (counts >= min(tadc) - 1e-9).all()
-    assert (counts <= max(tadc) + 1e-9).all()
+    t_s = step_s * np.arange(len(temperature_raw))
+    counts, _ = followed(temperature_raw, t_s, lag_s=lag_s, kpa_per_count=-0.05)
+    assert (counts >= min(temperature_raw) - 1e-9).all()
+    assert (counts <= max(temperature_raw) + 1e-9).all()
 
 
 def test_an_estimate_that_begins_away_from_the_tares_temperature_says_that_it_does_not_know() -> (

@@ -9,47 +9,51 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.chips.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
-from service.estimation.models.unwrap import unwrapped as taken_back
+from devices.chips.mpl115a2 import Coefficients, compensate_kpa, compute_kpa_per_padc
+from service.estimation.models.unwrap import unwrap_pressure as taken_back
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 
 DATA_SHEET_PART = Coefficients.from_words(DATA_SHEET_CHIP)
 FORUM_PART = Coefficients.from_words(FORUM_CHIP)
 
 
-def kpa(counts: float, tadc: int, c: Coefficients) -> float:
+def kpa(counts: float, temperature_raw: int, c: Coefficients) -> float:
     """Data sheet eq. 1 and 2, written out once more; takes counts below zero too."""
-    return (c.a0 + (c.b1 + c.c12 * tadc) * counts + c.b2 * tadc) * 65 / 1023 + 50
+    return (
+        c.a0 + (c.b1 + c.c12 * temperature_raw) * counts + c.b2 * temperature_raw
+    ) * 65 / 1023 + 50
 
 
-def unwrapped(padc: int, tadc: int, c: Coefficients) -> float:
-    at_face_value = float(compensate_kpa(padc, tadc, c.a0, c.b1, c.b2, c.c12))
-    return float(taken_back(at_face_value, float(kpa_per_padc(tadc, c.b1, c.c12))))
+def unwrapped(pressure_raw: int, temperature_raw: int, c: Coefficients) -> float:
+    at_face_value = float(compensate_kpa(pressure_raw, temperature_raw, c.a0, c.b1, c.b2, c.c12))
+    return float(
+        taken_back(at_face_value, float(compute_kpa_per_padc(temperature_raw, c.b1, c.c12)))
+    )
 
 
 @given(
     past_zero=st.integers(1, 200),
-    tadc=st.integers(440, 560),
+    temperature_raw=st.integers(440, 560),
     part=st.sampled_from([DATA_SHEET_PART, FORUM_PART]),
 )
 def test_a_count_that_fell_through_zero_is_taken_back_below_zero(
-    past_zero: int, tadc: int, part: Coefficients
+    past_zero: int, temperature_raw: int, part: Coefficients
 ) -> None:
-    pressure = unwrapped(1024 - past_zero, tadc, part)
-    assert abs(pressure - kpa(-past_zero, tadc, part)) < 1e-9
+    pressure = unwrapped(1024 - past_zero, temperature_raw, part)
+    assert abs(pressure - kpa(-past_zero, temperature_raw, part)) < 1e-9
     assert pressure > 120.0
 
 
 @given(
-    padc=st.integers(0, 740),
-    tadc=st.integers(440, 560),
+    pressure_raw=st.integers(0, 740),
+    temperature_raw=st.integers(440, 560),
     part=st.sampled_from([DATA_SHEET_PART, FORUM_PART]),
 )
 def test_a_count_of_the_chips_range_is_left_as_it_is(
-    padc: int, tadc: int, part: Coefficients
+    pressure_raw: int, temperature_raw: int, part: Coefficients
 ) -> None:
-    assert unwrapped(padc, tadc, part) == float(
-        compensate_kpa(padc, tadc, part.a0, part.b1, part.b2, part.c12)
+    assert unwrapped(pressure_raw, temperature_raw, part) == float(
+        compensate_kpa(pressure_raw, temperature_raw, part.a0, part.b1, part.b2, part.c12)
     )
 
 

@@ -9,14 +9,14 @@ import pytest
 
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.tare.tare import (
+    TEMPERATURE_CHANGE_MAX_COUNTS,
     TREND_OVER_NS,
     TREND_SPAN_MIN_NS,
-    WARMED_COUNTS,
     Tare,
-    expected_shift_kpa,
+    compute_thermal_shift_kpa,
+    compute_warming_k,
+    fit_trend,
     has_warmed,
-    trend,
-    warmer_k,
 )
 from tests.builders.arrays import UTC_NS
 from tests.builders.calibrations import make_tare
@@ -28,14 +28,14 @@ def tare(
     hours: float = 0.0,
     *,
     kpa: Sequence[float] = (100.0, 96.0),
-    tadc: Sequence[float] = (480.0, 500.0),
+    temperature_raw: Sequence[float] = (480.0, 500.0),
     sigma_kpa: float = 0.01,
 ) -> Tare:
     return make_tare(
         len(kpa),
         baseline_kpa=kpa,
         baseline_sigma_kpa=sigma_kpa,
-        tadc_counts=tadc,
+        temperature_raw_counts=temperature_raw,
         t_ns=UTC_NS + round(hours * HOUR_NS),
         source="unloaded",
     )
@@ -43,27 +43,30 @@ def tare(
 
 def test_five_kelvin_are_27_counts_less_and_1_7_kilopascals_more() -> None:
     # 100 kPa sealed at 298 K: 0.3356 kPa/K
-    warmer = warmer_k(tare(), np.array([480.0 - 26.75, 500.0]))
+    warmer = compute_warming_k(tare(), np.array([480.0 - 26.75, 500.0]))
     assert warmer == pytest.approx([5.0, 0.0])
-    assert expected_shift_kpa(tare(), warmer) == pytest.approx([500.0 / 298.0, 0.0])
+    assert compute_thermal_shift_kpa(tare(), warmer) == pytest.approx([500.0 / 298.0, 0.0])
 
 
 def test_a_tile_has_warmed_once_its_chip_has_moved_by_more_than_the_bound() -> None:
-    at, beyond = WARMED_COUNTS, WARMED_COUNTS + 0.5
+    at, beyond = TEMPERATURE_CHANGE_MAX_COUNTS, TEMPERATURE_CHANGE_MAX_COUNTS + 0.5
     assert has_warmed(tare(), [480.0 - at, 500.0 + at]).tolist() == [False, False]
     assert has_warmed(tare(), [480.0 - beyond, 500.0 + beyond]).tolist() == [True, True]
     assert has_warmed(tare(), [[480.0, np.nan], [400.0, 500.0]]).tolist() == [
         [False, False],
         [True, False],
     ]
-    unknown = tare(tadc=(np.nan, 500.0))
+    unknown = tare(temperature_raw=(np.nan, 500.0))
     assert has_warmed(unknown, [0.0, 0.0]).tolist() == [False, True]
 
 
 def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
     # +0.3 kPa and -2 counts an hour on T01, nothing on T02
-    tares = [tare(h, kpa=(100 + 0.3 * h, 96.0), tadc=(480 - 2 * h, 500.0)) for h in (0, 0.5, 2, 3)]
-    found = trend(tares, tiles=2)
+    tares = [
+        tare(h, kpa=(100 + 0.3 * h, 96.0), temperature_raw=(480 - 2 * h, 500.0))
+        for h in (0, 0.5, 2, 3)
+    ]
+    found = fit_trend(tares, tiles=2)
     assert found.kpa_per_hour == pytest.approx([0.3, 0.0], abs=1e-9)
     assert found.kelvin_per_hour == pytest.approx([-2.0 / TADC_PER_KELVIN, 0.0], abs=1e-9)
     # least squares: sigma / sqrt(sum of squared distances from the mean of 1.375 h)
@@ -74,14 +77,14 @@ def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
 def test_a_trend_needs_ten_minutes_and_two_tares() -> None:
     short = (TREND_SPAN_MIN_NS - 1e9) / HOUR_NS
     for tares in ([], [tare()], [tare(), tare(short)], [tare(), tare()]):
-        found = trend(tares, tiles=2)
+        found = fit_trend(tares, tiles=2)
         for values in (found.kpa_per_hour, found.sigma_kpa_per_hour, found.kelvin_per_hour):
             assert np.isnan(values).tolist() == [True, True]
-    assert np.isfinite(trend([tare(), tare(short + 1 / 60)], tiles=2).kpa_per_hour).all()
+    assert np.isfinite(fit_trend([tare(), tare(short + 1 / 60)], tiles=2).kpa_per_hour).all()
 
 
 def test_a_tare_of_unknown_temperature_leaves_the_pressure_trend() -> None:
-    found = trend([tare(tadc=(np.nan, np.nan)), tare(1.0)], tiles=2)
+    found = fit_trend([tare(temperature_raw=(np.nan, np.nan)), tare(1.0)], tiles=2)
     assert np.isfinite(found.kpa_per_hour).all()
     assert np.isnan(found.kelvin_per_hour).all()
 
@@ -89,4 +92,4 @@ def test_a_tare_of_unknown_temperature_leaves_the_pressure_trend() -> None:
 def test_what_was_before_the_last_hours_does_not_count() -> None:
     old = TREND_OVER_NS / HOUR_NS + 1.5
     tares = [tare(-old, kpa=(50.0, 50.0)), tare(-1.0), tare(0.0, kpa=(100.5, 96.0))]
-    assert trend(tares, tiles=2).kpa_per_hour == pytest.approx([0.5, 0.0], abs=1e-9)
+    assert fit_trend(tares, tiles=2).kpa_per_hour == pytest.approx([0.5, 0.0], abs=1e-9)

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch
-from service.estimation.calibration import Calibration, paper_eq2_shape
-from service.estimation.tare.automatic import LOOK_BACK_NS, WINDOW_NS, newest_unloaded_tare
+from service.estimation.calibration import Calibration, make_paper_eq2_preset
+from service.estimation.tare.automatic import HISTORY_NS, WINDOW_NS, compute_newest_unloaded_tare
 from service.estimation.tare.tare import Tare
-from service.estimation.tare.unloaded import FRAMES_MIN, TareFrames
+from service.estimation.tare.unloaded_windows import FRAMES_MIN, TareFrames
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_calibration, make_tare, newton_tile
 from tests.builders.frames import loaded_frames
@@ -39,7 +39,7 @@ def flight_of(
     if calibration is None:
         calibration = make_calibration(*(newton_tile(s, **bench) for s in info.serials))
     seen = TareFrames(frames, Compensation(info.tiles), calibration, info.serials)
-    return newest_unloaded_tare(seen, present=present)
+    return compute_newest_unloaded_tare(seen, present=present)
 
 
 def present(counts: float = 0.0, *, tiles: int = 2, noise_counts: float = 1.0) -> Tare:
@@ -91,7 +91,7 @@ def test_the_newest_window_of_a_foot_in_the_air_is_taken() -> None:
     assert tare.t_ns == frames.t_ns[-1]
     assert tare.frames == WINDOW + 1
     assert tare.end_s - tare.begin_s == pytest.approx(WINDOW_NS * 1e-9)
-    rows = 500 - frames.padc[-tare.frames :].astype(np.float64)
+    rows = 500 - frames.pressure_raw[-tare.frames :].astype(np.float64)
     expected_kpa = UNLOADED_KPA + rows.mean(axis=0) * COUNT_KPA
     assert tare.baseline_kpa == pytest.approx(expected_kpa, abs=1e-9)
 
@@ -147,13 +147,13 @@ def test_where_the_frames_begin_in_time_does_not_matter() -> None:
     one, two = flight_of(frames), flight_of(later)
     assert one.baseline_kpa.tobytes() == two.baseline_kpa.tobytes()
     assert two.t_ns - one.t_ns == 10**15
-    assert LOOK_BACK_NS >= 4 * WINDOW_NS
+    assert HISTORY_NS >= 4 * WINDOW_NS
 
 
 def test_a_preset_without_a_bench_takes_what_is_lowest() -> None:
     frames = loaded_frames(stretches(["pressed", "unloaded", "moving"]))
     for before in (None, present()):
-        tare = flight_of(frames, calibration=paper_eq2_shape(), present=before)
+        tare = flight_of(frames, calibration=make_paper_eq2_preset(), present=before)
         assert 1.0 <= tare.begin_s < tare.end_s <= 2.0
         assert_unloaded(tare)
 
@@ -206,7 +206,7 @@ def test_a_foot_that_moves_all_the_time_is_refused(hertz: float, known: str) -> 
     frames = loaded_frames(noise(3000) + (10.0 * np.sin(2 * np.pi * hertz * t_s))[:, None])
     options: dict[str, Any] = {"present": None if known == "bench" else present()}
     if known == "preset and present":
-        options["calibration"] = paper_eq2_shape()
+        options["calibration"] = make_paper_eq2_preset()
     with pytest.raises(TareError, match=MOVED) as caught:
         flight_of(frames, **options)
     assert "Lift the foot" in caught.value.remedy
@@ -218,7 +218,7 @@ def test_with_a_preset_and_without_a_tare_a_foot_that_moves_is_refused_too(hertz
     t_s = np.arange(3000) / RATE_HZ
     frames = loaded_frames(noise(3000) + (20.0 + 20.0 * np.sin(2 * np.pi * hertz * t_s))[:, None])
     with pytest.raises(TareError, match=MOVED):
-        flight_of(frames, calibration=paper_eq2_shape())
+        flight_of(frames, calibration=make_paper_eq2_preset())
 
 
 @pytest.mark.parametrize("newtons_per_second", [1.0, -1.0])
@@ -286,7 +286,9 @@ def test_a_tile_that_hangs_is_refused_by_name() -> None:
 def test_while_the_temperature_moves_there_is_no_tare_because_the_gas_is_behind() -> None:
     frames = loaded_frames(noise(1000))
     fall = np.linspace(0.0, 10.0, 1000)[:, None].astype(np.uint16)
-    moving = replace(frames, tadc=frames.tadc + fall * np.array([0, 1], dtype=np.uint16))
+    moving = replace(
+        frames, temperature_raw=frames.temperature_raw + fall * np.array([0, 1], dtype=np.uint16)
+    )
     with pytest.raises(TareError, match=r"temperature of tile T02 has moved by \d+ counts") as one:
         flight_of(moving, present=present())
     assert "Wait" in one.value.remedy

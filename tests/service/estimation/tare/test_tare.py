@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
-from devices.frames import FrameBatch, FrameStatus, TileStatus
-from service.estimation.calibration import Calibration, paper_eq2_shape
+from devices.frames import FrameBatch, FrameFlag, TileFlag
+from service.estimation.calibration import Calibration, make_paper_eq2_preset
 from service.estimation.tare.tare import Tare
-from service.estimation.tare.unloaded import take_tare, window_begins
+from service.estimation.tare.unloaded_windows import compute_recording_tare, compute_window_starts
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, UNLOADED_KPA, array_at, make_array
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.frames import loaded_frames
@@ -43,7 +43,7 @@ def tare_of(
     if calibration is None:
         bench = ({"noise_kpa": QUIET_KPA} if interval_s is not None else {}) | bench
         calibration = make_calibration(*(newton_tile(s, **bench) for s in info.serials))
-    return take_tare(
+    return compute_recording_tare(
         frames, Compensation(info.tiles), calibration, info.serials, interval_s=interval_s
     )
 
@@ -86,22 +86,22 @@ def test_a_reading_that_never_moves_still_has_the_noise_of_rounding() -> None:
 
 def test_the_temperature_is_the_mean_of_the_readings_that_count() -> None:
     # T01 warms by two counts halfway; T02 does so too, but was not readable before
-    tadc = np.full((100, 2), 480)
-    tadc[50:] = 478
+    temperature_raw = np.full((100, 2), 480)
+    temperature_raw[50:] = 478
     forces_n = noise_counts(100, 2)
     forces_n[:50, 1] = np.nan
-    tare = tare_of(loaded_frames(forces_n, tadc=tadc), (0.0, 1.0))
-    assert tare.tadc_counts == pytest.approx([479.0, 478.0], abs=1e-12)
+    tare = tare_of(loaded_frames(forces_n, temperature_raw=temperature_raw), (0.0, 1.0))
+    assert tare.temperature_raw_counts == pytest.approx([479.0, 478.0], abs=1e-12)
 
 
 @pytest.mark.parametrize(
     "bit",
-    [TileStatus.NO_ANSWER, TileStatus.STALE, TileStatus.IMPLAUSIBLE, TileStatus.NOT_CONVERTED],
+    [TileFlag.NO_ANSWER, TileFlag.STALE, TileFlag.IMPLAUSIBLE, TileFlag.NOT_CONVERTED],
 )
-def test_readings_of_a_faulty_tile_are_left_out(bit: TileStatus) -> None:
+def test_readings_of_a_faulty_tile_are_left_out(bit: TileFlag) -> None:
     forces_n, status = np.zeros((100, 2)), np.zeros((100, 2))
     forces_n[::4, 1], status[::4, 1] = 400.0, bit
-    tare = tare_of(loaded_frames(forces_n, status=status), (0.0, 1.0))
+    tare = tare_of(loaded_frames(forces_n, tile_flags=status), (0.0, 1.0))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=1e-12)
     assert tare.baseline_sigma_kpa[1] == pytest.approx(COUNT_KPA / np.sqrt(12 * 75))
 
@@ -112,15 +112,16 @@ def test_counts_that_were_not_read_are_left_out_whatever_their_status_says() -> 
     forces_n = np.zeros((100, 2))
     forces_n[::4, 1] = np.nan
     frames = loaded_frames(forces_n)
-    tare = tare_of(replace(frames, status=np.zeros_like(frames.status)), (0.0, 1.0))
+    tare = tare_of(replace(frames, tile_flags=np.zeros_like(frames.tile_flags)), (0.0, 1.0))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=1e-12)
 
 
 def test_a_tile_that_is_silent_half_of_the_time_has_the_noise_of_its_other_half() -> None:
-    # The data sheet's part: a count is 0.1255 kPa at tadc 500, c12 makes it depend on tadc.
+    # The data sheet's part: a count is 0.1255 kPa at temperature_raw 500; c12 makes it depend on
+    # temperature_raw.
     info = array_at(PAIR[:1], chips=[DATA_SHEET_CHIP])
     forces_n = np.tile([[1.0], [np.nan], [-1.0], [np.nan]], (50, 1))
-    tare = take_tare(
+    tare = compute_recording_tare(
         loaded_frames(forces_n),
         Compensation(info.tiles),
         make_calibration(newton_tile("T01")),
@@ -154,7 +155,10 @@ def test_a_tare_does_not_depend_on_how_frames_lie_in_memory(seed: int, tiles: in
     frames = loaded_frames(noise_counts(99, tiles, seed))
     other = replace(
         frames,
-        **{name: np.asfortranarray(getattr(frames, name)) for name in ("padc", "tadc", "status")},
+        **{
+            name: np.asfortranarray(getattr(frames, name))
+            for name in ("pressure_raw", "temperature_raw", "tile_flags")
+        },
     )
     one, two = tare_of(frames, (0.0, 1.0)), tare_of(other, (0.0, 1.0))
     assert one.baseline_kpa.tobytes() == two.baseline_kpa.tobytes()
@@ -166,14 +170,14 @@ def test_a_tare_does_not_depend_on_how_frames_lie_in_memory(seed: int, tiles: in
 
 def lead(n: int, first: int) -> np.ndarray:
     """Frame status with the lead bit in the `first` frames, among others that do not matter."""
-    return np.where(np.arange(n) < first, FrameStatus.LEAD, 0) | FrameStatus.SERVO_STALE
+    return np.where(np.arange(n) < first, FrameFlag.LEAD, 0) | FrameFlag.SERVO_STALE
 
 
 def test_the_lead_is_the_tare_if_no_interval_is_named() -> None:
     forces_n = np.full((300, 2), 20.0)
     forces_n[:120] = 5.0  # wherever the tile lies in the lead, that is its baseline
     forces_n[:120] += np.tile([[1.0], [-1.0]], (60, 1))
-    tare = tare_of(loaded_frames(forces_n, frame_status=lead(300, 120)))
+    tare = tare_of(loaded_frames(forces_n, frame_flags=lead(300, 120)))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA + 5 * COUNT_KPA] * 2, abs=1e-12)
     assert (tare.source, tare.frames) == ("lead", 120)
 
@@ -193,7 +197,7 @@ def test_a_tile_that_hangs_is_not_tared_by_itself(readings: int) -> None:
     forces_n = noise_counts(300, 2)
     forces_n[:readings, 1] = 2.0
     forces_n[readings:120, 1] = np.nan
-    frames = loaded_frames(forces_n, frame_status=lead(300, 120))
+    frames = loaded_frames(forces_n, frame_flags=lead(300, 120))
     with pytest.raises(TareError, match=rf"T02 gave 498 counts {readings} times") as caught:
         tare_of(frames)
     assert "plug" in caught.value.remedy
@@ -202,10 +206,10 @@ def test_a_tile_that_hangs_is_not_tared_by_itself(readings: int) -> None:
 
 
 def test_a_tile_without_noise_on_the_bench_may_stand_still_in_the_lead() -> None:
-    frames = loaded_frames(np.zeros((120, 2)), frame_status=lead(120, 120))
+    frames = loaded_frames(np.zeros((120, 2)), frame_flags=lead(120, 120))
     assert tare_of(frames, noise_kpa=0.29 * COUNT_KPA).source == "lead"
     with pytest.raises(TareError, match="in a row"):
-        tare_of(frames, calibration=paper_eq2_shape())
+        tare_of(frames, calibration=make_paper_eq2_preset())
 
 
 def test_frames_marked_as_lead_later_on_are_none() -> None:
@@ -214,15 +218,15 @@ def test_frames_marked_as_lead_later_on_are_none() -> None:
     forces_n = noise_counts(1000, 2)
     forces_n[300:500] += 30.0
     first, status = loaded_frames(forces_n), lead(1000, 200)
-    again = np.where((np.arange(1000) >= 300) & (np.arange(1000) < 500), FrameStatus.LEAD, 0)
-    tare = tare_of(replace(first, frame_status=(status | again).astype(np.uint8)))
+    again = np.where((np.arange(1000) >= 300) & (np.arange(1000) < 500), FrameFlag.LEAD, 0)
+    tare = tare_of(replace(first, frame_flags=(status | again).astype(np.uint8)))
     assert (tare.source, tare.frames) == ("lead", 200)
-    tare = tare_of(replace(first, frame_status=again.astype(np.uint8)))
+    tare = tare_of(replace(first, frame_flags=again.astype(np.uint8)))
     assert (tare.source, tare.begin_s) == ("recognised", 0.0)
 
 
 def test_a_named_interval_wins_over_the_lead() -> None:
-    frames = loaded_frames(np.zeros((300, 2)), frame_status=lead(300, 120))
+    frames = loaded_frames(np.zeros((300, 2)), frame_flags=lead(300, 120))
     assert tare_of(frames, (0.3, 0.5)).source == "interval"
 
 
@@ -244,7 +248,7 @@ def test_a_tile_that_seems_loaded_is_no_tare_even_if_somebody_says_so(how: str) 
     def take(*counts: float) -> Tare:
         forces_n = np.tile(counts, (100, 1))
         forces_n += np.tile([[1.0], [-1.0]], (50, 1))
-        frames = loaded_frames(forces_n, frame_status=lead(100, 100))
+        frames = loaded_frames(forces_n, frame_flags=lead(100, 100))
         return tare_of(frames, (0.0, 0.1) if how == "interval" else None)
 
     assert take(23.0, -60.0).source == how
@@ -256,7 +260,7 @@ def test_a_tile_that_seems_loaded_is_no_tare_even_if_somebody_says_so(how: str) 
 
 def test_a_preset_does_not_know_what_an_unloaded_tile_reads() -> None:
     loaded = loaded_frames(np.full((100, 2), 60.0) + noise_counts(100, 2))
-    assert tare_of(loaded, (0.0, 0.1), calibration=paper_eq2_shape()).source == "interval"
+    assert tare_of(loaded, (0.0, 0.1), calibration=make_paper_eq2_preset()).source == "interval"
 
 
 def stretches(kinds: list[str]) -> np.ndarray:
@@ -305,7 +309,7 @@ def test_no_loaded_moving_or_faulty_stretch_is_recognised_as_unloaded(kinds: lis
 def test_a_leg_that_stands_still_is_not_in_flight() -> None:
     # The paper's leg weighs 8.92 N (0.909 kg): 2.23 N on each of four tiles, which by eq. 2 at the
     # assumed scale is 1.41 kPa, 11 counts. It stands for two seconds, then is lifted for two.
-    paper = paper_eq2_shape().tiles[0]
+    paper = make_paper_eq2_preset().tiles[0]
     slope_n_per_kpa = paper.f_scale_n * 0.5702 / 15.0
     counts = 8.92 / 4 / slope_n_per_kpa / COUNT_KPA
     forces_n = noise_counts(2000, 4)
@@ -355,7 +359,7 @@ def test_one_tile_without_a_bench_baseline_is_enough_to_recognise_nothing() -> N
 
 def test_a_calibration_without_bench_baselines_cannot_recognise_anything() -> None:
     with pytest.raises(TareError, match=r"paper-eq2-shape .*--tare-s"):
-        tare_of(loaded_frames(np.zeros((500, 2))), calibration=paper_eq2_shape())
+        tare_of(loaded_frames(np.zeros((500, 2))), calibration=make_paper_eq2_preset())
 
 
 def test_a_baseline_may_have_drifted_by_some_kelvin_since_the_bench() -> None:
@@ -379,9 +383,9 @@ def test_of_a_frame_or_two_there_is_no_tare_and_nothing_else_to_complain_of(n: i
 
 def test_a_tile_that_never_answers_is_no_tare_and_nothing_else_to_complain_of() -> None:
     status = np.zeros((60, 2))
-    status[:, 1] = TileStatus.NO_ANSWER
+    status[:, 1] = TileFlag.NO_ANSWER
     with pytest.raises(TareError):
-        tare_of(loaded_frames(noise_counts(60, 2), status=status))
+        tare_of(loaded_frames(noise_counts(60, 2), tile_flags=status))
 
 
 # --- windows --------------------------------------------------------------------------------------
@@ -399,11 +403,11 @@ def test_windows_are_those_of_the_lattice_that_hold_a_frame(
     since_ns = np.cumsum([0, *steps_ns])
     lattice = np.arange(begin_ns % step_ns, since_ns[-1] + 1, step_ns)
     held = [at for at in lattice.tolist() if ((since_ns >= at) & (since_ns < at + length_ns)).any()]
-    found = window_begins(since_ns, begin_ns, step_ns, length_ns).tolist()
+    found = compute_window_starts(since_ns, begin_ns, step_ns, length_ns).tolist()
     assert set(held) <= set(found) <= set(lattice.tolist())
 
 
 @pytest.mark.parametrize("gap_ns", [10**12, 10**18])
 def test_a_clock_that_was_set_makes_no_windows(gap_ns: int) -> None:
     since_ns = np.array([0, 10, 20, gap_ns, gap_ns + 10])
-    assert len(window_begins(since_ns, 0, 5, 10)) < 20
+    assert len(compute_window_starts(since_ns, 0, 5, 10)) < 20

@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from service.offline.archive.finding import find_sessions
-from service.offline.archive.query import ask
-from service.offline.archive.sealed import EVENTS, SESSIONS
-from storage.sessions.reader import SessionReader
+from service.offline.archive.query import run_query
+from service.offline.archive.session_search import find_sessions
+from service.offline.archive.session_tables import MARKERS_SCHEMA, SESSIONS_SCHEMA
+from storage.sessions.reader import SealedFileReader
 from tests.service.offline.archives import IDS, recording, sealed
 
 PEAKS_N = {0: (20.0, 30.0, 40.0), 1: (24.0, 34.0, 44.0, 54.0), 2: (50.0, 50.0, 50.0)}
@@ -42,7 +42,7 @@ def data(made: Path, tmp_path: Path) -> Path:
 
 
 def answer(sql: str, *places: Path) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = ask(find_sessions([str(p) for p in places]), sql).to_pylist()
+    rows: list[dict[str, Any]] = run_query(find_sessions([str(p) for p in places]), sql).to_pylist()
     return rows
 
 
@@ -61,19 +61,20 @@ def test_sessions_marks_and_frames_are_views_of_what_is_in_the_folders(made: Pat
     assert "no estimates" in sessions[3]["problem"]
     counted = answer("SELECT session_id, count(*) AS n FROM frames GROUP BY 1 ORDER BY 1", made)
     assert [row["n"] for row in counted] == [row["frames"] for row in sessions]
-    marks = answer("SELECT session_id, label FROM events ORDER BY 1", made)
+    marks = answer("SELECT session_id, label FROM markers ORDER BY 1", made)
     assert marks == [{"session_id": session_id, "label": "=off"} for session_id in IDS[:4]]
 
 
 def test_frames_have_the_numbers_of_the_sealed_file(made: Path) -> None:
-    with SessionReader(made / "sessions" / IDS[1] / "frames.parquet") as session:
-        (columns,) = session.columns("t_ns", "padc", "grf_n")
-    rows = ask(
+    with SealedFileReader(made / "sessions" / IDS[1] / "frames.parquet") as session:
+        (columns,) = session.read_columns("t_ns", "pressure_raw", "grf_n")
+    rows = run_query(
         find_sessions([str(made)]),
-        f"SELECT t_ns, padc_1, grf_n FROM frames WHERE session_id = '{IDS[1]}' ORDER BY t_ns",  # noqa: S608  # our own words
+        "SELECT t_ns, pressure_raw_1, grf_n FROM frames "  # noqa: S608  # our own words
+        f"WHERE session_id = '{IDS[1]}' ORDER BY t_ns",
     )
     assert rows["t_ns"].to_pylist() == columns["t_ns"].tolist()
-    assert rows["padc_1"].to_pylist() == columns["padc"][:, 1].tolist()
+    assert rows["pressure_raw_1"].to_pylist() == columns["pressure_raw"][:, 1].tolist()
     assert rows["grf_n"].to_pylist() == columns["grf_n"].tolist()
 
 
@@ -105,8 +106,8 @@ def test_what_is_recorded_or_damaged_is_left_out_and_named(data: Path) -> None:
         file.write(b"more")
     shutil.copytree(sessions / IDS[3], sessions / IDS[5])
     archive = find_sessions([str(data)])
-    assert [session.id for session in archive.sessions] == [IDS[3]]
-    left_out = {Path(place).name: reason for place, reason in archive.left_out.items()}
+    assert [session.session_id for session in archive.sessions] == [IDS[3]]
+    left_out = {Path(place).name: reason for place, reason in archive.left_out_reasons.items()}
     assert left_out == {
         IDS[0]: "damaged: frames.parquet is missing",
         IDS[1]: "damaged: session.json was changed: its text does not match its hash",
@@ -121,7 +122,9 @@ def test_a_session_that_is_there_twice_counts_once_and_the_other_is_named(
 ) -> None:
     archive = find_sessions([str(made), str(data)])
     assert len(archive.sessions) == 4
-    assert set(archive.left_out) == {str(data / "sessions" / session_id) for session_id in IDS[:4]}
+    assert set(archive.left_out_reasons) == {
+        str(data / "sessions" / session_id) for session_id in IDS[:4]
+    }
 
 
 def test_a_damaged_page_is_an_error_and_no_number(data: Path) -> None:
@@ -145,8 +148,8 @@ def test_a_damaged_footer_leaves_the_session_out_of_frames_and_sessions(data: Pa
     path.write_bytes(content)
     archive = find_sessions([str(data)])
     sql = "SELECT DISTINCT session_id FROM frames JOIN sessions USING (session_id) ORDER BY 1"
-    assert [row["session_id"] for row in ask(archive, sql).to_pylist()] == list(IDS[1:4])
-    assert list(archive.left_out) == [str(data / "sessions" / IDS[0])]
+    assert [row["session_id"] for row in run_query(archive, sql).to_pylist()] == list(IDS[1:4])
+    assert list(archive.left_out_reasons) == [str(data / "sessions" / IDS[0])]
 
 
 def test_stances_that_an_older_session_lacks_are_made_and_kept(data: Path) -> None:
@@ -202,9 +205,9 @@ def test_only_what_a_question_is_about_is_read(made: Path, monkeypatch: pytest.M
     archive = find_sessions([str(made)])
     # `frames` is a column here, and `stances` a text: neither is opened.
     monkeypatch.setattr(type(archive), "frames", None)
-    monkeypatch.setattr(type(archive), "stances_table", None)
+    monkeypatch.setattr(type(archive), "make_stance_table", None)
     sql = "SELECT sum(frames) AS n, 'stances' AS text FROM sessions"
-    (row,) = ask(archive, sql).to_pylist()
+    (row,) = run_query(archive, sql).to_pylist()
     assert isinstance(row["n"], int)
 
 
@@ -226,5 +229,5 @@ def test_the_first_example_and_its_variant_find_the_third_hops(made: Path) -> No
 
 
 def test_every_column_of_sessions_and_events_is_documented() -> None:
-    for name in (*SESSIONS.names, *EVENTS.names):
+    for name in (*SESSIONS_SCHEMA.names, *MARKERS_SCHEMA.names):
         assert f"`{name}`" in DOCUMENT, name

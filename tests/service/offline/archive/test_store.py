@@ -13,14 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError
-from service.offline.archive import places
-from service.offline.archive.finding import find_sessions
+from service.offline.archive import locations
+from service.offline.archive.job_runner import run_jobs
 from service.offline.archive.jobs import Job, Outcome, run_job
-from service.offline.archive.places import sessions_in
-from service.offline.archive.plan import outcomes
-from service.offline.archive.query import ask
-from service.offline.archive.tasks import EstimateTask, Task, VerifyTask
-from service.offline.processes import GoesOn, spread
+from service.offline.archive.locations import find_session_locations
+from service.offline.archive.query import run_query
+from service.offline.archive.session_search import find_sessions
+from service.offline.archive.tasks import EstimateTask, SessionTask, VerifyTask
+from service.offline.process_pool import Unfinished, map_in_processes
 from tests.service.offline.archive.stores import BUCKET, BadWay, Store
 from tests.service.offline.archives import IDS, long_session
 from tests.service.sessions.pieces import calibration
@@ -33,14 +33,14 @@ STATIC = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=
 def store(archive: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     with Store(monkeypatch) as started:
         started.put(archive / "sessions", "2026/sessions")
-        places._s3.cache_clear()
+        locations._make_s3_filesystem.cache_clear()
         yield started
-    places._s3.cache_clear()
+    locations._make_s3_filesystem.cache_clear()
 
 
-def ran(task: Task, out: str | None, *wanted: str) -> dict[str, Outcome]:
-    jobs = [Job(place, task, out) for place in sessions_in(wanted)]
-    return {each.name: each for each in outcomes(jobs, partial(spread, jobs=1))}
+def ran(task: SessionTask, out: str | None, *wanted: str) -> dict[str, Outcome]:
+    jobs = [Job(place, task, out) for place in find_session_locations(wanted)]
+    return {each.name: each for each in run_jobs(jobs, partial(map_in_processes, process_count=1))}
 
 
 def test_sessions_of_a_store_are_worked_on_and_results_put_back(
@@ -68,10 +68,10 @@ def test_pieces_of_a_long_session_are_in_the_store_until_it_is_there(
     long = long_session(tmp_path / "raw" / "long.parquet")
     store.put(tmp_path / "raw", "long")
     task, out = replace(STATIC, calibration=calibration()), f"s3://{BUCKET}/estimated"
-    (place,) = sessions_in([f"s3://{BUCKET}/long/long.parquet"])
+    (place,) = find_session_locations([f"s3://{BUCKET}/long/long.parquet"])
     job = Job(place, replace(task, piece_frames=1), out)
-    assert isinstance(run_job(job), GoesOn)
-    (found,) = outcomes([job], partial(spread, jobs=1))
+    assert isinstance(run_job(job), Unfinished)
+    (found,) = run_jobs([job], partial(map_in_processes, process_count=1))
     assert found.state == "made", found.reason
     ran(task, str(tmp_path / "out"), str(long))
     there = store.content("estimated/long")
@@ -101,13 +101,13 @@ def test_a_store_that_refuses_and_breaks_off_costs_time_and_nothing_else(
 
     with BadWay(store, trouble) as way:
         monkeypatch.setenv("AWS_ENDPOINT_URL", way.endpoint)
-        places._s3.cache_clear()
+        locations._make_s3_filesystem.cache_clear()
         made = ran(STATIC, f"s3://{BUCKET}/badly", f"s3://{BUCKET}/2026")
         assert {each.state for each in made.values()} == {"made"}, made
         assert way.refused >= 3
         assert way.cut >= 1
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{store.host}:{store.port}")
-    places._s3.cache_clear()
+    locations._make_s3_filesystem.cache_clear()
     ran(STATIC, f"s3://{BUCKET}/well", f"s3://{BUCKET}/2026")
     assert store.content("badly") == store.content("well")
 
@@ -117,14 +117,14 @@ def test_a_session_that_a_store_will_not_give_fails_alone_and_the_next_run_makes
 ) -> None:
     out, asked = f"s3://{BUCKET}/proofs", f"s3://{BUCKET}/2026"
     closed: set[str] = set()
-    monkeypatch.setattr(places, "_S3_ATTEMPTS", 2)
+    monkeypatch.setattr(locations, "_S3_ATTEMPTS", 2)
 
     def trouble(number: int, method: str, path: str) -> str:
         return "slow down" if any(name in path for name in closed) else "pass"
 
     with BadWay(store, trouble) as way:
         monkeypatch.setenv("AWS_ENDPOINT_URL", way.endpoint)
-        places._s3.cache_clear()
+        locations._make_s3_filesystem.cache_clear()
         closed.add(f"{IDS[1]}/frames.parquet")
         found = ran(VerifyTask(), out, asked)
         assert {name for name, each in found.items() if each.state == "failed"} == {IDS[1]}
@@ -153,14 +153,16 @@ def test_questions_to_a_store_read_what_they_are_about_and_answer_as_for_folders
     ):
         (mirror := tmp_path / f"mirror{number}").mkdir()
         found = find_sessions([f"s3://{BUCKET}/2026"], mirror)
-        assert list(found.left_out.values()) == ["damaged: frames.parquet is missing"]
-        assert ask(found, sql).equals(ask(find_sessions([str(archive)]), sql)), sql
+        assert list(found.left_out_reasons.values()) == ["damaged: frames.parquet is missing"]
+        assert run_query(found, sql).equals(run_query(find_sessions([str(archive)]), sql)), sql
         copied = list(mirror.rglob("frames.parquet"))
         assert len(copied) == (1 if "stances" in sql else 0)  # of the one without its own
     both = find_sessions([f"s3://{BUCKET}/2026", str(archive)], tmp_path / "mirror0")
     assert len(both.sessions) == 3
     mixed = [f"s3://{BUCKET}/2026/sessions/{IDS[0]}", f"{archive}/sessions/{IDS[3]}"]
-    of_two = ask(find_sessions(mixed, tmp_path / "mirror1"), "SELECT count(*) AS n FROM frames")
+    of_two = run_query(
+        find_sessions(mixed, tmp_path / "mirror1"), "SELECT count(*) AS n FROM frames"
+    )
     assert of_two.to_pylist() == [{"n": 800}]
 
 
@@ -176,4 +178,4 @@ def test_a_damaged_page_in_a_store_is_an_error_and_no_number(
         sink.write(bytes(content))
     found = find_sessions([f"s3://{BUCKET}/2026"], tmp_path)
     with pytest.raises(FileFormatError, match="frames cannot be read"):
-        ask(found, "SELECT sum(grf_n) FROM frames")
+        run_query(found, "SELECT sum(grf_n) FROM frames")

@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from service.offline.processes import GoesOn
+from service.offline.process_pool import Unfinished
 
 
 def squared(number: int) -> int:
@@ -19,11 +19,11 @@ def raising(number: int) -> int:
     return number
 
 
-def counted(path: Path) -> int | GoesOn:
+def counted(path: Path) -> int | Unfinished:
     """Goes on as often as its name says, then says how often it was called."""
     calls = 1 + (int(path.read_text()) if path.exists() else 0)
     path.write_text(str(calls))
-    return calls if calls > int(path.name) else GoesOn()
+    return calls if calls > int(path.name) else Unfinished()
 
 
 def killed_once(marker: Path) -> str:

@@ -7,7 +7,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.signal import lfilter
 
 from devices.arrays import Floats
-from service.offline.compare.signals import Signal
+from service.offline.compare.signals import ForceSignal
 
 OURS_HZ, REFERENCE_HZ = 447.0, 1000.0
 
@@ -50,7 +50,7 @@ def seen(
     offset_n: float = 0.0,
     scale: float = 1.0,
     noise: float = 1.0,
-) -> tuple[Signal, Signal]:
+) -> tuple[ForceSignal, ForceSignal]:
     """Our force and the reference's: `ours = scale (reference - offset)`, the lag at half time."""
     t_s = np.arange(0.0, gait.seconds, 1.0 / OURS_HZ)
     true_n = gait.at(t_s)
@@ -63,4 +63,4 @@ def seen(
     read_n = offset_n + gait.at(at_s) / scale
     read_n += noise * 0.3 * rng.normal(size=len(at_s))
     clock_s = at_s + lag_s + 1e-6 * drift_ppm * (at_s - 0.5 * gait.seconds)
-    return Signal(t_s, own_n), Signal(clock_s, read_n)
+    return ForceSignal(t_s, own_n), ForceSignal(clock_s, read_n)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from devices.arrays import Floats
-from service.offline.compare.align import Alignment
-from service.offline.compare.blocks import Estimate
-from service.offline.compare.pairs import Reference
-from service.offline.compare.signals import Signal
+from service.offline.compare.alignment import Alignment
+from service.offline.compare.block_covariance import UncertainValue
+from service.offline.compare.paired_frames import ReferenceSignals
+from service.offline.compare.signals import ForceSignal
 
 BEGAN_NS = 1_577_836_800_000_000_000
 HZ = 500
@@ -29,7 +29,7 @@ def columns(force_n: Floats, hz: float = HZ, **given: Any) -> dict[str, Any]:
         "cop_y_m": np.where(force_n > 3.0, -0.02, np.nan),
         "cop_sigma_x_m": np.full(n, 0.001),
         "cop_sigma_y_m": np.full(n, 0.001),
-        "estimate_status": np.zeros(n, dtype=np.uint16),
+        "estimate_flags": np.zeros(n, dtype=np.uint16),
     }
     return made | given
 
@@ -43,20 +43,20 @@ def half_sines(peaks_n: list[float], hz: float = HZ) -> Floats:
 
 def same_clock(lag_s: float = 0.0, lag_sigma_s: float = 0.0) -> Alignment:
     """An alignment that is known beforehand."""
-    sure = Estimate(0.0, 0.0, 10.0)
+    sure = UncertainValue(0.0, 0.0, 10.0)
     return Alignment(
-        lag_s=Estimate(lag_s, lag_sigma_s, 10.0),
+        lag_s=UncertainValue(lag_s, lag_sigma_s, 10.0),
         drift_ppm=sure,
         offset_n=sure,
-        scale=Estimate(1.0, 0.0, 10.0),
-        at_s=0.0,
+        scale=UncertainValue(1.0, 0.0, 10.0),
+        mid_t_s=0.0,
         covariance=np.diag([lag_sigma_s**2, 0.0]),
         residual_n=0.0,
-        blocks=10,
+        block_count=10,
         ambiguity=None,
     )
 
 
-def reference(force_n: Floats, hz: float = HZ, cop_m: Floats | None = None) -> Reference:
+def reference(force_n: Floats, hz: float = HZ, cop_m: Floats | None = None) -> ReferenceSignals:
     """A reference whose clock began with ours."""
-    return Reference(Signal(np.arange(len(force_n)) / hz, force_n), cop_m)
+    return ReferenceSignals(ForceSignal(np.arange(len(force_n)) / hz, force_n), cop_m)

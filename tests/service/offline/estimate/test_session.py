@@ -12,17 +12,17 @@ import pytest
 from service.offline.estimate.request import EstimateRequest
 from service.offline.estimate.session import estimate_session
 from service.sessions.pipeline import EstimateStream
-from service.sessions.stances import stances_of_session
-from storage.formats.export import content_of
+from service.sessions.stances import load_stances
+from storage.formats.export import make_frame_source
 from storage.formats.slice import Slice
-from storage.schema import ESTIMATES
-from storage.sessions.file import SessionWriter
-from storage.sessions.reader import SessionReader
+from storage.schema import ESTIMATE_COLUMNS
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS
 from tests.service.sessions.pieces import array, calibration, frames, hopping, options
 from tests.storage.formats.exports import export
 
-NAMES = [column.name for column in ESTIMATES]
+NAMES = [column.name for column in ESTIMATE_COLUMNS]
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +30,14 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session without estimates, with the calibration for them."""
     path = tmp_path_factory.mktemp("raw") / "raw.parquet"
     notes = {"calibration": calibration().model_dump(mode="json")}
-    with SessionWriter(path, array(), notes) as writer:
-        writer.append(frames(hopping(3000, loaded_from=300), lead=200), {})
+    with SealedFileWriter(path, array(), notes) as writer:
+        writer.append_frames(frames(hopping(3000, loaded_from=300), lead=200), {})
     return path
 
 
-def estimated(source: Path, out: Path, *, exact: bool = False) -> SessionReader:
-    estimate_session(source, out, request(exact=exact), remark=lambda _: None)
-    return SessionReader(out)
+def estimated(source: Path, out: Path, *, exact: bool = False) -> SealedFileReader:
+    estimate_session(source, out, request(exact=exact), on_remark=lambda _: None)
+    return SealedFileReader(out)
 
 
 def request(*, exact: bool = False, tare_s: tuple[float, float] | None = None) -> EstimateRequest:
@@ -51,8 +51,8 @@ def request(*, exact: bool = False, tare_s: tuple[float, float] | None = None) -
     )
 
 
-def estimates_of(reader: SessionReader) -> dict[str, np.ndarray]:
-    pieces = list(reader.columns(*NAMES))
+def estimates_of(reader: SealedFileReader) -> dict[str, np.ndarray]:
+    pieces = list(reader.read_columns(*NAMES))
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in NAMES}
 
 
@@ -79,7 +79,7 @@ def test_what_is_in_the_file_is_what_was_computed_rounded_to_the_steps_it_states
 ) -> None:
     batch = frames(hopping(3000, loaded_from=300), lead=200)
     stream = EstimateStream(array(), options(models=("static", "denoise"), lag_ms=100.0))
-    pieces = [columns for _, columns in stream.run([(batch, {})])]
+    pieces = [columns for _, columns in stream.estimate_batches([(batch, {})])]
     computed = {name: np.concatenate([piece[name] for piece in pieces]) for name in NAMES}
     with estimated(raw, tmp_path / "s.parquet") as reader:
         found, steps = estimates_of(reader), reader.notes["rounded_to"]
@@ -91,7 +91,7 @@ def test_what_is_in_the_file_is_what_was_computed_rounded_to_the_steps_it_states
         ):
             flat = f"{name}_{i}" if len(values) > 1 else name
             assert said[flat] == steps.get(flat, 0.0)
-            whole = np.floor if name == "grf_at_least_n" else np.rint
+            whole = np.floor if name == "grf_lower_bound_n" else np.rint
             expected = whole(one / steps[flat]) * steps[flat] + 0.0 if flat in steps else one
             np.testing.assert_array_equal(other, expected.astype(other.dtype), err_msg=flat)
 
@@ -104,11 +104,11 @@ def test_a_session_estimated_in_its_folder_has_its_stances_beside_it(
         pass
     path = tmp_path / "stances.parquet"
     written = path.read_bytes()
-    hops = stances_of_session(tmp_path).to_pylist()
+    hops = load_stances(tmp_path).to_pylist()
     assert len(hops) == 90  # 2700 frames with a hop every 30
     assert all(hop["peak_grf_n"] > 30.0 for hop in hops)
     path.unlink()
-    stances_of_session(tmp_path, keep=True)
+    load_stances(tmp_path, store=True)
     assert path.read_bytes() == written
     with estimated(raw, tmp_path / "lone.parquet"):
         pass
@@ -117,8 +117,8 @@ def test_a_session_estimated_in_its_folder_has_its_stances_beside_it(
 
 def test_exports_say_to_what_their_columns_were_rounded(raw: Path, tmp_path: Path) -> None:
     with estimated(raw, tmp_path / "s.parquet") as reader:
-        columns = [column.name for column in ESTIMATES]
-        content = content_of(reader.batches(*columns))
+        columns = [column.name for column in ESTIMATE_COLUMNS]
+        content = make_frame_source(reader.read_batches(*columns))
         part = Slice(columns=("grf_n", "contact"))
         out = tmp_path / "export.parquet"
         out.write_bytes(b"".join(export(content, reader.info, reader.notes, "parquet", part)))
@@ -145,18 +145,18 @@ def _is_estimate(flat: str) -> bool:
     return any(flat.startswith(name) for name in NAMES)
 
 
-def _fields(reader: SessionReader) -> list[Any]:
+def _fields(reader: SealedFileReader) -> list[Any]:
     return list(reader.footer.schema)
 
 
 def test_the_interval_of_the_tare_is_in_the_time_of_the_session_and_can_be_given_back(
     raw: Path, tmp_path: Path
 ) -> None:
-    once = estimate_session(raw, tmp_path / "once.parquet", request(), remark=lambda _: None)
+    once = estimate_session(raw, tmp_path / "once.parquet", request(), on_remark=lambda _: None)
     begin_s, end_s = once.tare_s
     assert 0.0 <= begin_s < end_s
     given = request(tare_s=(max(0.0, begin_s - 1e-4), end_s + 1e-4))
-    again = estimate_session(raw, tmp_path / "again.parquet", given, remark=lambda _: None)
+    again = estimate_session(raw, tmp_path / "again.parquet", given, on_remark=lambda _: None)
     np.testing.assert_array_equal(again.plan.tare.baseline_kpa, once.plan.tare.baseline_kpa)
     assert again.tare_s == once.tare_s
 
@@ -168,12 +168,12 @@ def test_after_a_loaded_tare_the_ground_pulls_for_as_long_as_the_foot_is_unloade
     forces_n = load_n[:, None] + np.random.default_rng(0).normal(0.0, 0.5, (2500, 2))
     raw, out = tmp_path / "raw.parquet", tmp_path / "out.parquet"
     notes = {"calibration": calibration().model_dump(mode="json")}
-    with SessionWriter(raw, array(), notes) as writer:
-        writer.append(frames(forces_n, lead=400), {})
+    with SealedFileWriter(raw, array(), notes) as writer:
+        writer.append_frames(frames(forces_n, lead=400), {})
     found = [
-        estimate_session(raw, out, request(tare_s=tare_s), remark=lambda _: None).findings.pull
+        estimate_session(raw, out, request(tare_s=tare_s), on_remark=lambda _: None).findings.pull
         for tare_s in ((0.1, 0.9), (600 * PERIOD_NS * 1e-9, 900 * PERIOD_NS * 1e-9))
     ]
     assert found[0].duration_s == 0.0
-    assert found[1].most_n == pytest.approx(12.0, abs=4.0)
+    assert found[1].greatest_n == pytest.approx(12.0, abs=4.0)
     assert found[1].duration_s == pytest.approx(1500 * PERIOD_NS * 1e-9, rel=0.05)

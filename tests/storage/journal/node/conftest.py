@@ -19,10 +19,10 @@ from tests.storage.journal.node.leg import Start
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(node_journal, "SYNC_S", 0.02)
-    monkeypatch.setattr(node_journal, "_TIDY_S", 0.02)
-    monkeypatch.setattr(node_journal, "_AGAIN_S", 0.02)
-    monkeypatch.setattr(retention, "_WEIGH_S", 0.02)
+    monkeypatch.setattr(node_journal, "SYNC_INTERVAL_S", 0.02)
+    monkeypatch.setattr(node_journal, "_CLEANUP_INTERVAL_S", 0.02)
+    monkeypatch.setattr(node_journal, "_RETRY_INTERVAL_S", 0.02)
+    monkeypatch.setattr(retention, "_BUDGET_CHECK_INTERVAL_S", 0.02)
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
     def begin(**options: Any) -> NodeJournal:
         running.append(NodeJournal(tmp_path, "leg", **options))
-        running[-1].start()
+        running[-1].start_writer()
         return running[-1]
 
     yield begin
@@ -50,4 +50,4 @@ def journal(start: Start) -> NodeJournal:
 @pytest.fixture
 def stream(journal: NodeJournal) -> NodeStream:
     """Its stream, of which nothing has been taken yet."""
-    return journal.begin(make_array())
+    return journal.begin_stream(make_array())

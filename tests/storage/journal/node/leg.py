@@ -17,7 +17,7 @@ Start = Callable[..., NodeJournal]
 def fill(journal: NodeJournal, stream: NodeStream, first: int, last: int) -> None:
     """Take frames `first` to `last`, ten in a batch."""
     for begin in range(first, last + 1, 10):
-        journal.put(stream, message(begin, min(begin + 9, last)))
+        journal.queue_batch(stream, message(begin, min(begin + 9, last)))
 
 
 def store(journal: NodeJournal, stream: NodeStream, first: int, last: int) -> None:
@@ -28,7 +28,7 @@ def store(journal: NodeJournal, stream: NodeStream, first: int, last: int) -> No
 
 def given(stream: NodeStream, first: int, last: int) -> list[int]:
     """First numbers of the batches that it gives for these frames."""
-    return [batch.seq_first for batch in stream.batches(first, last)]
+    return [batch.seq_first for batch in stream.read_batches(first, last)]
 
 
 def killed(journal: NodeJournal, folder: Path) -> Path:

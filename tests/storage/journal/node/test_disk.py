@@ -44,21 +44,23 @@ def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_whe
     reason: str,
     words: str,
 ) -> None:
-    monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
+    monkeypatch.setattr(node_journal, "MAX_WAITING_BYTES", 20_000)
     fill(journal, stream, 0, 49)
     until(lambda: stream.stored.last == 49 and stream.is_synced)
 
     with monkeypatch.context() as patch:
-        patch.setattr(segment_writer, "write_all", refusing(OSError, number, os.strerror(number)))
+        patch.setattr(
+            segment_writer, "write_all_or_none", refusing(OSError, number, os.strerror(number))
+        )
         fill(journal, stream, 50, 69)
-        until(lambda: journal.troubles)
-        assert words in journal.troubles[0]
+        until(lambda: journal.warnings)
+        assert words in journal.warnings[0]
         fill(journal, stream, 70, 999)
         lost = stream.lost.by_reason[reason]
         assert next(iter(lost))[0] == 50
-        assert stream.held.count + lost.count == 1000
+        assert stream.available.count + lost.count == 1000
         assert given(stream, 990, 999) == [990]  # the live picture, and what still waits
-    until(lambda: journal.troubles == ())
+    until(lambda: journal.warnings == ())
     until(lambda: stream.stored.last == 999)
     assert stream.stored.count + stream.lost.by_reason[reason].count == 1000
 
@@ -66,7 +68,7 @@ def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_whe
 def test_a_slow_disk_holds_up_nobody_and_what_does_not_fit_is_named(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
+    monkeypatch.setattr(node_journal, "MAX_WAITING_BYTES", 20_000)
     go_on = threading.Event()
     stuck = threading.Event()
 
@@ -79,10 +81,10 @@ def test_a_slow_disk_holds_up_nobody_and_what_does_not_fit_is_named(
     assert stuck.wait(5.0)
     fill(journal, stream, 10, 999)
     assert stream.lost.by_reason["disk_slow"].count > 500
-    assert stream.recent(990)
+    assert stream.recent_batches(990)
     go_on.set()
     until(lambda: stream.stored.last == 999)
-    assert stream.stored.count + stream.lost.all.count == 1000
+    assert stream.stored.count + stream.lost.numbers.count == 1000
 
 
 def test_what_the_disk_could_not_sync_is_written_once_more(
@@ -103,17 +105,17 @@ def test_what_the_disk_could_not_sync_is_written_once_more(
 def test_frames_that_the_disk_could_not_sync_are_given_all_the_while(
     journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disown = Journal.disown
+    disown = Journal.invalidate
     seen: list[tuple[Intervals, list[int]]] = []
 
     def then_looked_at(journal_: Journal, numbers: Intervals) -> None:
         disown(journal_, numbers)
-        seen.append((stream.held, given(stream, 0, 49)))
+        seen.append((stream.available, given(stream, 0, 49)))
 
-    monkeypatch.setattr(Journal, "disown", then_looked_at)
+    monkeypatch.setattr(Journal, "invalidate", then_looked_at)
     before_each_sync_of_frames(monkeypatch, failing_once(lambda: None, *IO_ERROR))
     fill(journal, stream, 0, 49)
-    until(lambda: seen and stream.held.last == 49 and stream.is_synced)
+    until(lambda: seen and stream.available.last == 49 and stream.is_synced)
     held, batches = seen[0]
     assert (held.first, held.count) == (0, 10 * len(batches))
     assert batches == list(range(0, held.count, 10))
@@ -124,7 +126,7 @@ def test_frames_that_turn_out_damaged_are_named_and_given_no_more(
     journal: NodeJournal, stream: NodeStream
 ) -> None:
     store(journal, stream, 0, 49)
-    journal.damaged(stream, Intervals([(20, 29)]))
+    journal.report_damage(stream, Intervals([(20, 29)]))
     until(lambda: stream.lost.by_reason.get("corrupt") == Intervals([(20, 29)]))
     assert given(stream, 0, 49) == [0, 10, 30, 40]
 
@@ -151,17 +153,17 @@ def test_over_the_bound_of_memory_the_oldest_goes_first_of_whichever_stream(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stream that ended while the disk took nothing does not leave the next one without room."""
-    monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
+    monkeypatch.setattr(node_journal, "MAX_WAITING_BYTES", 20_000)
 
-    monkeypatch.setattr(segment_writer, "write_all", refusing(*NO_SPACE))
+    monkeypatch.setattr(segment_writer, "write_all_or_none", refusing(*NO_SPACE))
     journal = start()
-    before = journal.begin(make_array())
+    before = journal.begin_stream(make_array())
     fill(journal, before, 0, 149)
-    until(lambda: journal.troubles)
-    present = journal.begin(make_array(boot_id="1" * 32))
+    until(lambda: journal.warnings)
+    present = journal.begin_stream(make_array(stream_id="1" * 32))
     fill(journal, present, 0, 99)
-    assert present.held == Intervals([(0, 99)])
-    assert "disk_full" in before.lost.as_pairs()
+    assert present.available == Intervals([(0, 99)])
+    assert "disk_full" in before.lost.to_pairs()
     fill(journal, present, 100, 499)
-    assert not before.held
-    assert present.held.last == 499
+    assert not before.available
+    assert present.available.last == 499

@@ -17,11 +17,11 @@ from devices.errors import DamagedFileError
 from devices.frames import FrameBatch
 from storage.journal.node import in_flight
 from storage.journal.node.in_flight import (
-    ROWS,
-    InFlight,
-    delete_in_flight,
-    open_in_flight,
-    read_in_flight,
+    ROW_COUNT,
+    InFlightWriter,
+    create_in_flight_writer,
+    delete_in_flight_file,
+    read_in_flight_frames,
 )
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
@@ -30,29 +30,29 @@ from tests.storage.stream import frames, take_in_flight
 
 
 def found(folder: Path) -> FrameBatch:
-    left = read_in_flight(folder)
+    left = read_in_flight_frames(folder)
     assert left is not None
     assert left[1] is not None
     return left[1]
 
 
-@pytest.mark.parametrize("last", [0, 9, ROWS - 1, ROWS, 3 * ROWS + 17])
+@pytest.mark.parametrize("last", [0, 9, ROW_COUNT - 1, ROW_COUNT, 3 * ROW_COUNT + 17])
 def test_the_newest_frames_are_there_whatever_came_before(tmp_path: Path, last: int) -> None:
-    take_in_flight(tmp_path / "stream", frames(max(0, last - ROWS - 50), last))
-    assert_same_bits(found(tmp_path / "stream"), frames(max(0, last - ROWS + 1), last))
+    take_in_flight(tmp_path / "stream", frames(max(0, last - ROW_COUNT - 50), last))
+    assert_same_bits(found(tmp_path / "stream"), frames(max(0, last - ROW_COUNT + 1), last))
 
 
 def test_the_array_is_known_before_the_first_frame(tmp_path: Path) -> None:
-    InFlight(tmp_path, make_array(3)).close()
-    assert read_in_flight(tmp_path) == (make_array(3), None)
+    InFlightWriter(tmp_path, make_array(3)).close()
+    assert read_in_flight_frames(tmp_path) == (make_array(3), None)
 
 
 def test_after_another_start_of_the_machine_nothing_is_trusted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     take_in_flight(tmp_path, frames(0, 99))
-    monkeypatch.setattr(in_flight, "kernel_boot_id", lambda: "another start")
-    assert read_in_flight(tmp_path) is None
+    monkeypatch.setattr(in_flight, "read_kernel_boot_id", lambda: "another start")
+    assert read_in_flight_frames(tmp_path) is None
 
 
 @settings(max_examples=60)
@@ -65,12 +65,12 @@ def test_a_damaged_row_ends_what_is_trusted_and_never_gives_another_frame(
     take_in_flight(folder, frames(0, 199))
     path = folder / "in_flight"
     content = bytearray(path.read_bytes())
-    begin = len(content) - ROWS * ((len(content) - 1000) // ROWS)
+    begin = len(content) - ROW_COUNT * ((len(content) - 1000) // ROW_COUNT)
     at = data.draw(st.integers(0, min(len(content) - 1, begin + 20_000)))
     content[at : at + 3] = data.draw(st.binary(min_size=3, max_size=3))
     path.write_bytes(content)
     try:
-        left = read_in_flight(folder)
+        left = read_in_flight_frames(folder)
     except DamagedFileError:
         return
     if left is None or left[1] is None:
@@ -87,22 +87,22 @@ def test_a_full_disk_is_known_at_once_and_leaves_nothing_behind(
     """Without room that is reserved, the first write to a mapped page would end the process."""
 
     monkeypatch.setattr(os, "posix_fallocate", refusing(*NO_SPACE))
-    assert open_in_flight(tmp_path, make_array()) is None
+    assert create_in_flight_writer(tmp_path, make_array()) is None
     assert list(tmp_path.iterdir()) == []
-    assert open_in_flight(None, make_array()) is None
+    assert create_in_flight_writer(None, make_array()) is None
 
 
 def test_what_is_no_such_file_is_nothing(tmp_path: Path) -> None:
-    assert read_in_flight(tmp_path) is None
+    assert read_in_flight_frames(tmp_path) is None
     for content in (b"", bytes(5000)):  # begun, and nothing written yet
         (tmp_path / "in_flight").write_bytes(content)
-        assert read_in_flight(tmp_path) is None
+        assert read_in_flight_frames(tmp_path) is None
     for content in (b"FootTile", b"FootTile in flight 2".ljust(5000)):
         (tmp_path / "in_flight").write_bytes(content)
         with pytest.raises(DamagedFileError, match="in_flight"):
-            read_in_flight(tmp_path)
-    delete_in_flight(tmp_path)
-    delete_in_flight(tmp_path)
+            read_in_flight_frames(tmp_path)
+    delete_in_flight_file(tmp_path)
+    delete_in_flight_file(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -113,9 +113,9 @@ import json, sys
 from pathlib import Path
 from devices.acquisition import FrameRow
 from devices.frames import ArrayInfo
-from storage.journal.node.in_flight import InFlight
+from storage.journal.node.in_flight import InFlightWriter
 info = ArrayInfo.model_validate_json(sys.stdin.readline())
-keeper = InFlight(Path(sys.argv[1]), info)
+keeper = InFlightWriter(Path(sys.argv[1]), info)
 for seq in range(10_000_000):
     row = FrameRow(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
     keeper.put(row)
@@ -141,5 +141,5 @@ for seq in range(10_000_000):
     said = int(rest[-1]) if rest else said
     batch = found(tmp_path)
     assert int(batch.seq[-1]) >= said
-    assert len(batch) in (ROWS, ROWS - 1)  # it may have been in the midst of a row
+    assert len(batch) in (ROW_COUNT, ROW_COUNT - 1)  # it may have been in the midst of a row
     np.testing.assert_array_equal(batch.t_ns, batch.seq.astype(np.int64) + 1)

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from devices.errors import StorageError
-from devices.frames import TileStatus
-from storage.checked_json import read_checked, write_checked
+from devices.frames import TileFlag
+from storage.checksummed_json import read_checksummed_json, write_checksummed_json
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.node import in_flight, retention
@@ -33,9 +33,13 @@ def test_a_stream_that_ended_in_order_is_known_to_its_end_after_a_restart(
     journal.close()
     again = start()
     (found,) = again.streams
-    assert (found.next_seq, found.notes.unsynced_tail_max, found.is_settled) == (100, 0, True)
-    assert found.held == Intervals([(0, 99)])
-    assert again.begin(make_array(boot_id="1" * 32)).notes.number == found.notes.number + 1
+    assert (found.next_seq, found.notes.max_lost_tail_frames, found.is_complete_on_disk) == (
+        100,
+        0,
+        True,
+    )
+    assert found.available == Intervals([(0, 99)])
+    assert again.begin_stream(make_array(stream_id="1" * 32)).notes.number == found.notes.number + 1
 
 
 def test_a_killed_node_has_lost_nothing(
@@ -44,17 +48,17 @@ def test_a_killed_node_has_lost_nothing(
     """What was in the pipe, or in a batch that was being filled, was in flight."""
     store(journal, stream, 0, 99)
     batch = frames(0, 117)
-    batch.padc[110] = 0  # out of range, which is flagged when a batch is whole
+    batch.pressure_raw[110] = 0  # out of range, which is flagged when a batch is whole
     take_in_flight(stream.folder, batch)
     again = NodeJournal(killed(journal, tmp_path), "leg")
-    again.start()
+    again.start_writer()
     (found,) = again.streams
-    assert (found.next_seq, found.notes.unsynced_tail_max) == (118, 0)
-    assert again.settle()
+    assert (found.next_seq, found.notes.max_lost_tail_frames) == (118, 0)
+    assert again.wait_until_on_disk()
     assert found.stored == Intervals([(0, 117)])
     assert found.journal is not None
-    rescued = next(found.journal.read(110, 110))
-    assert (rescued.status & TileStatus.OVER_RANGE).all()
+    rescued = next(found.journal.read_frames(110, 110))
+    assert (rescued.tile_flags & TileFlag.OVER_RANGE).all()
     assert not (found.folder / "in_flight").exists()
     again.close()
 
@@ -65,11 +69,11 @@ def test_a_power_cut_costs_what_was_not_synced_and_says_how_much_that_may_be(
     store(journal, stream, 0, 99)
     take_in_flight(stream.folder, frames(0, 117))
     folder = killed(journal, tmp_path)
-    monkeypatch.setattr(in_flight, "kernel_boot_id", lambda: "another start of the machine")
+    monkeypatch.setattr(in_flight, "read_kernel_boot_id", lambda: "another start of the machine")
     again = NodeJournal(folder, "leg")
     (found,) = again.streams
     assert found.next_seq == 100
-    assert found.notes.unsynced_tail_max == 0.5 * 500 + 17
+    assert found.notes.max_lost_tail_frames == 0.5 * 500 + 17
     again.close()
 
 
@@ -82,7 +86,7 @@ def test_a_disk_that_was_slower_than_the_promise_widens_the_bound(
         until(lambda: (n := StreamNotes.load(stream.folder)) and n.sync_max_s > 0.6)
     folder = killed(journal, tmp_path)
     again = NodeJournal(folder, "leg")
-    assert again.streams[0].notes.unsynced_tail_max > 0.6 * 500
+    assert again.streams[0].notes.max_lost_tail_frames > 0.6 * 500
     again.close()
 
 
@@ -90,11 +94,11 @@ def test_killed_before_its_notes_were_written_a_stream_is_found_by_what_was_in_f
     start: Start, tmp_path: Path
 ) -> None:
     folder = tmp_path / "journal" / "leg" / ("2" * 32)
-    take_in_flight(folder, frames(0, 5), make_array(boot_id="2" * 32))
+    take_in_flight(folder, frames(0, 5), make_array(stream_id="2" * 32))
     journal = start()
     (found,) = journal.streams
-    assert (found.boot_id, found.next_seq) == ("2" * 32, 6)
-    assert journal.settle()
+    assert (found.stream_id, found.next_seq) == ("2" * 32, 6)
+    assert journal.wait_until_on_disk()
     assert found.stored == Intervals([(0, 5)])
 
 
@@ -104,14 +108,14 @@ def test_recovery_writes_what_was_in_flight_and_drops_nothing(
     store(journal, stream, 0, 99)
     take_in_flight(stream.folder, frames(0, 117))
     folder = killed(journal, tmp_path)
-    monkeypatch.setattr(retention, "RING_NS", 0)
-    monkeypatch.setattr(node_journal, "BUDGET_BYTES", 0)
-    node_journal.settle_left_over(folder)
+    monkeypatch.setattr(retention, "RING_DURATION_NS", 0)
+    monkeypatch.setattr(node_journal, "DEFAULT_BUDGET_BYTES", 0)
+    node_journal.recover_node_journals(folder)
     notes = StreamNotes.load(folder / "journal" / "leg" / ("0" * 32))
     assert notes is not None
     assert notes.next_seq == 118
     with closing(Journal.open(folder / "journal" / "leg" / ("0" * 32))) as found:
-        assert found.held == Intervals([(0, 117)])
+        assert found.stored == Intervals([(0, 117)])
     assert not list(folder.rglob("in_flight"))
 
 
@@ -121,10 +125,10 @@ def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
     """Its last batches never came through the pipe; the node itself lives on."""
     fill(journal, stream, 0, 89)
     take_in_flight(stream.folder, frames(0, 99))
-    stream.end()
-    assert journal.settle()
+    stream.mark_ended()
+    assert journal.wait_until_on_disk()
     assert stream.stored == Intervals([(0, 99)])
-    assert (stream.next_seq, stream.lost.as_pairs()) == (100, {})
+    assert (stream.next_seq, stream.lost.to_pairs()) == (100, {})
 
 
 def test_frames_in_flight_that_cannot_be_read_are_set_aside_and_bounded_while_the_node_lives_on(
@@ -135,11 +139,11 @@ def test_frames_in_flight_that_cannot_be_read_are_set_aside_and_bounded_while_th
     path = stream.folder / in_flight.IN_FLIGHT_FILE
     damaged = b"X" + path.read_bytes()[1:]
     path.write_bytes(damaged)
-    stream.end()
-    assert journal.settle()
+    stream.mark_ended()
+    assert journal.wait_until_on_disk()
     notes = StreamNotes.load(stream.folder)
     assert notes is not None
-    assert (notes.next_seq, notes.unsynced_tail_max) == (90, 0.5 * 500 + 17)
+    assert (notes.next_seq, notes.max_lost_tail_frames) == (90, 0.5 * 500 + 17)
     assert path.with_name("in_flight.damaged-1").read_bytes() == damaged
     assert "in_flight.damaged-1" in " ".join(journal.problems)
 
@@ -151,10 +155,10 @@ def test_frames_in_flight_that_cannot_be_read_now_are_waited_for(
     take_in_flight(stream.folder, frames(0, 99))
     with monkeypatch.context() as patched:
         refuse = refusing(StorageError, "cannot be read: Too many open files")
-        patched.setattr(in_flight, "read_in_flight", refuse)
-        stream.end()
-        assert not journal.settle(0.2)
-    assert journal.settle()
+        patched.setattr(in_flight, "read_in_flight_frames", refuse)
+        stream.mark_ended()
+        assert not journal.wait_until_on_disk(0.2)
+    assert journal.wait_until_on_disk()
     assert stream.stored == Intervals([(0, 99)])
 
 
@@ -162,11 +166,11 @@ def test_notes_of_a_later_version_stay_and_their_stream_is_left_out(
     start: Start, tmp_path: Path
 ) -> None:
     journal = start()
-    fill(journal, journal.begin(make_array()), 0, 99)
+    fill(journal, journal.begin_stream(make_array()), 0, 99)
     journal.close()
     path = tmp_path / "journal" / "leg" / ("0" * 32) / "stream.json"
-    said = json.loads(read_checked(path).text) | {"clock_steps": 3}
-    write_checked(path, json.dumps(said).encode())
+    said = json.loads(read_checksummed_json(path).text) | {"clock_steps": 3}
+    write_checksummed_json(path, json.dumps(said).encode())
     before = path.read_bytes()
     again = start()
     assert again.streams == []
@@ -184,13 +188,13 @@ def test_streams_are_in_order_even_if_the_notes_of_one_are_damaged(
     journal = start()
     names = ["f" * 32, "a" * 32, "c" * 32]
     for number, name in enumerate(names):
-        stream = journal.begin(make_array(boot_id=name))
+        stream = journal.begin_stream(make_array(stream_id=name))
         fill(journal, stream, 1000 * number, 1000 * number + 99)  # later by their instants
         until(lambda stream=stream: stream.stored.count == 100)  # type: ignore[misc]  # bound here
     journal.close()
     (tmp_path / "journal" / "leg" / names[damaged] / "stream.json").write_bytes(b"{")
     again = start()
-    assert [stream.boot_id for stream in again.streams] == names
+    assert [stream.stream_id for stream in again.streams] == names
     numbers = [stream.notes.number for stream in again.streams]
     assert numbers == sorted(set(numbers))
     assert "stream.json.damaged-1" in " ".join(again.problems)

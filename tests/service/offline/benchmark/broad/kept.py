@@ -6,9 +6,15 @@ from typing import Any
 
 from service.offline.accuracy import PHASES
 from service.offline.benchmark.broad.arrays import CONDITIONS, HEAVY, SCENES, ArrayTask
-from service.offline.benchmark.broad.results import ArrayResult, Judged, Phase, Tile, key_of
+from service.offline.benchmark.broad.results import (
+    ArrayResult,
+    CaseResult,
+    PhaseCounts,
+    TileResult,
+    make_case_key,
+)
 
-TILE = Tile(
+TILE = TileResult(
     serial="T01",
     drawn={"gamma": 1.3},
     effect_n={"gas": 0.3, "rubber": 0.3, "hysteresis": 0.05},
@@ -20,9 +26,9 @@ TILE = Tile(
 )
 
 
-def judged(**changes: Any) -> Judged:
+def judged(**changes: Any) -> CaseResult:
     """A hundred frames of each phase with an error of 0.1 N, as stated."""
-    phase = Phase(frames=100, within=95, sigma2=1.0, error2=1.0)
+    phase = PhaseCounts(frames=100, within=95, sigma2=1.0, error2=1.0)
     numbers: dict[str, Any] = {
         "frames": 400,
         "grf_mae_n": 0.1,
@@ -44,10 +50,10 @@ def judged(**changes: Any) -> Judged:
         "seconds": 3600.0,
         "alarms": 0,
     }
-    return Judged(**(numbers | changes))
+    return CaseResult(**(numbers | changes))
 
 
-def result(number: int = 0, tiles: tuple[Tile, ...] = (TILE,), **changes: Any) -> ArrayResult:
+def result(number: int = 0, tiles: tuple[TileResult, ...] = (TILE,), **changes: Any) -> ArrayResult:
     """An array that is the same in every scene; `changes` are of what was judged."""
     places = [(scene, condition) for condition in CONDITIONS for scene in SCENES]
     return ArrayResult(
@@ -59,7 +65,7 @@ def result(number: int = 0, tiles: tuple[Tile, ...] = (TILE,), **changes: Any) -
         cpu_scenes_s=10.0,
         tiles=tiles,
         judged={
-            key_of(scene, condition, mode): judged(**changes)
+            make_case_key(scene, condition, mode): judged(**changes)
             for scene, condition in [*places, ("poppy", HEAVY)]
             for mode in ("live", "offline")
         },

@@ -10,12 +10,12 @@ import pytest
 from service.offline.benchmark.broad import run
 from service.offline.benchmark.broad.arrays import ArrayTask, run_array
 from service.offline.benchmark.broad.results import (
-    code_id,
-    path_of,
+    get_result_path,
+    hash_project_code,
     read_result,
     write_result,
 )
-from service.offline.benchmark.broad.run import BroadOptions, run_broad
+from service.offline.benchmark.broad.run import BroadOptions, run_broad_benchmark
 from tests.service.offline.benchmark.broad.kept import made, result
 
 
@@ -34,14 +34,14 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.fixture
 def options(tmp_path: Path) -> BroadOptions:
-    return BroadOptions(arrays=3, seeds="development", jobs=1, folder=tmp_path)
+    return BroadOptions(arrays=3, seeds="development", process_count=1, folder=tmp_path)
 
 
 def test_what_it_will_cost_is_said_after_the_first_array(
     asked: list[int], options: BroadOptions
 ) -> None:
     said: list[str] = []
-    bench = run_broad(options, said.append)
+    bench = run_broad_benchmark(options, said.append)
     assert asked == [0, 1, 2]
     assert [r.number for r in bench.results] == [0, 1, 2]
     assert said[0] == "1 of 3 arrays"
@@ -52,9 +52,9 @@ def test_what_it_will_cost_is_said_after_the_first_array(
 def test_a_run_that_was_broken_off_goes_on_and_says_the_cost_at_once(
     asked: list[int], options: BroadOptions
 ) -> None:
-    run_broad(replace(options, arrays=2), lambda _: None)
+    run_broad_benchmark(replace(options, arrays=2), lambda _: None)
     said: list[str] = []
-    bench = run_broad(replace(options, arrays=4), said.append)
+    bench = run_broad_benchmark(replace(options, arrays=4), said.append)
     assert asked == [0, 1, 2, 3]
     assert len(bench.results) == 4
     assert said[0] == "2 of 4 arrays are there already"
@@ -64,10 +64,10 @@ def test_a_run_that_was_broken_off_goes_on_and_says_the_cost_at_once(
 def test_an_array_that_was_written_in_part_is_run_again(
     asked: list[int], options: BroadOptions
 ) -> None:
-    run_broad(options, lambda _: None)
-    path = path_of(options.folder, "development", 1)
+    run_broad_benchmark(options, lambda _: None)
+    path = get_result_path(options.folder, "development", 1)
     path.write_bytes(path.read_bytes()[:-40])
-    run_broad(options, lambda _: None)
+    run_broad_benchmark(options, lambda _: None)
     assert asked == [0, 1, 2, 1]
 
 
@@ -75,27 +75,27 @@ def test_arrays_of_other_code_or_other_seeds_or_another_repeatability_do_not_cou
     asked: list[int], options: BroadOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = replace(options, arrays=1)
-    run_broad(one, lambda _: None)
-    run_broad(replace(one, seeds="judgement"), lambda _: None)
-    run_broad(replace(one, repeatability=0.03), lambda _: None)
+    run_broad_benchmark(one, lambda _: None)
+    run_broad_benchmark(replace(one, seeds="judgement"), lambda _: None)
+    run_broad_benchmark(replace(one, repeatability=0.03), lambda _: None)
     assert asked == [0, 0, 0]
-    run_broad(replace(one, repeatability=0.03), lambda _: None)
+    run_broad_benchmark(replace(one, repeatability=0.03), lambda _: None)
     assert asked == [0, 0, 0]
-    monkeypatch.setattr(run, "code_id", lambda: "another code")
-    run_broad(replace(one, repeatability=0.03), lambda _: None)
+    monkeypatch.setattr(run, "hash_project_code", lambda: "another code")
+    run_broad_benchmark(replace(one, repeatability=0.03), lambda _: None)
     assert asked == [0, 0, 0, 0]
 
 
 def test_a_result_that_was_kept_is_the_same_result(tmp_path: Path) -> None:
     (tmp_path / "arrays").mkdir()
     write_result(tmp_path, result(7))
-    assert read_result(path_of(tmp_path, "development", 7)) == result(7)
-    assert read_result(path_of(tmp_path, "development", 8)) is None
+    assert read_result(get_result_path(tmp_path, "development", 7)) == result(7)
+    assert read_result(get_result_path(tmp_path, "development", 8)) is None
 
 
 def test_the_code_has_an_id_that_stays() -> None:
-    assert code_id() == code_id()
-    assert len(code_id()) == 16
+    assert hash_project_code() == hash_project_code()
+    assert len(hash_project_code()) == 16
 
 
 def test_seeds_of_development_and_of_judgement_never_meet() -> None:

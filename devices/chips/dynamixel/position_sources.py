@@ -1,0 +1,165 @@
+"""Sources of a servo's newest position, to be stored with each frame.
+
+On a real clock a separate thread reads the servo, so that its silence does not delay the tiles. On
+virtual time no thread may run beside the tile loop, so the servo is read in lock-step: at every
+instant at which a reading was due, on a separate clock of the servo's line. A frame gets a value
+only if its answer was complete by then.
+"""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from types import TracebackType
+from typing import Self
+
+from devices.chips.dynamixel.driver import DynamixelServo
+from devices.chips.dynamixel.position_reading import PositionReading
+from devices.chips.dynamixel.turn_unwrapping import TurnUnwrapper
+from devices.clock import Clock
+from devices.errors import ServoError, ServoSetupError
+
+_RECENT = 16
+"""Recent readings, for long frames: 64 tiles take 16 ms, a fast servo 1 ms."""
+
+
+class _ServoSourceBase(ABC):
+    """Base class of servos that are read at fixed intervals."""
+
+    def __init__(self, servo: DynamixelServo, clock: Clock, *, rate_hz: float) -> None:
+        self.failed_readings = 0
+        """Number of failed readings: silence, garbage, or an error status."""
+        self.is_turn_known = True
+        """True if the number of whole turns in the last returned position is known."""
+        self._servo = servo
+        self._clock = clock
+        self._period_ns = round(1e9 / rate_hz)
+        self._turns = TurnUnwrapper()
+        self._last_error = ""
+        self._newest_is_turn_known = True
+
+    @property
+    def warning(self) -> str:
+        """Present warning about the servo; empty if it works."""
+        if self._last_error:
+            return self._last_error
+        if self._newest_is_turn_known:
+            return ""
+        return (
+            "the servo restarted, or its count leapt, and which turn it counts from is not known: "
+            "there is no angle. Bring the joint into the turn of zero_counts, and start the node "
+            "again"
+        )
+
+    def _read_position(self) -> PositionReading | None:
+        """Read the servo once; None if it failed, which `trouble` explains."""
+        try:
+            reading = self._turns.unwrap(self._servo.read_position())
+        except ServoError as error:
+            self.failed_readings += 1
+            self._last_error = str(error)
+            if isinstance(error, ServoSetupError):
+                self._discard_readings()
+            return None
+        self._last_error, self._newest_is_turn_known = "", reading.is_turn_known
+        return reading
+
+    @abstractmethod
+    def _discard_readings(self) -> None:
+        """Discard readings from before the servo went away."""
+
+    @property
+    def stale_after_ns(self) -> int:
+        """Age in ns above which a position is stale: three intervals, to tolerate a late answer."""
+        return 3 * self._period_ns
+
+
+class VirtualTimeServoSource(_ServoSourceBase):
+    """Servo source for virtual time: readings at fixed intervals on the servo line's clock.
+
+    A silent servo blocks it, so do not use it in a real loop.
+    """
+
+    def __init__(self, servo: DynamixelServo, line_clock: Clock, *, rate_hz: float) -> None:
+        super().__init__(servo, line_clock, rate_hz=rate_hz)
+        self._due_ns = line_clock.now_ns()
+        self._newest: PositionReading | None = None
+        self._pending: deque[PositionReading] = deque()
+
+    def find_latest_position(self, t_mono_ns: int) -> tuple[int, int] | None:
+        """Return the newest position known at `t_mono_ns`, and its instant; None before the first.
+
+        Performs all readings that were due by then.
+        """
+        while self._due_ns <= t_mono_ns:
+            self._clock.sleep_until_ns(self._due_ns)
+            reading = self._read_position()
+            if reading is not None:
+                self._pending.append(reading)
+            self._due_ns = max(self._due_ns + self._period_ns, self._clock.now_ns())
+        while self._pending and self._pending[0].answered_ns <= t_mono_ns:
+            self._newest = self._pending.popleft()
+        if self._newest is None:
+            return None
+        self.is_turn_known = self._newest.is_turn_known
+        return self._newest.counts, self._newest.t_mono_ns
+
+    def _discard_readings(self) -> None:
+        self._newest = None
+        self._pending.clear()
+
+
+class ThreadedServoSource(_ServoSourceBase):
+    """Servo source for a real clock: a thread reads the servo at a fixed rate.
+
+    Context manager: the thread runs within the block.
+    """
+
+    def __init__(self, servo: DynamixelServo, clock: Clock, *, rate_hz: float) -> None:
+        super().__init__(servo, clock, rate_hz=rate_hz)
+        self._recent: tuple[PositionReading, ...] = ()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="servo", daemon=True)
+
+    def find_latest_position(self, t_mono_ns: int) -> tuple[int, int] | None:
+        """Return the newest position sampled by `t_mono_ns`, and its instant; None if none exists.
+
+        The thread continues during a frame, so newer readings may exist: they belong to the next
+        frame. If all are newer, return the oldest, with age 0.
+        """
+        recent = self._recent
+        if not recent:
+            return None
+        reading = next((r for r in recent if r.t_mono_ns <= t_mono_ns), recent[-1])
+        self.is_turn_known = reading.is_turn_known
+        return reading.counts, min(reading.t_mono_ns, t_mono_ns)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _discard_readings(self) -> None:
+        self._recent = ()
+
+    def _run(self) -> None:
+        due_ns = self._clock.now_ns()
+        while not self._stop.is_set():
+            reading = self._read_position()
+            if reading is not None:
+                # Replaced atomically, newest first.
+                self._recent = (reading, *self._recent[: _RECENT - 1])
+            else:
+                # A missing port fails at once: do not spin.
+                self._stop.wait(self._period_ns * 1e-9)
+            due_ns = max(due_ns + self._period_ns, self._clock.now_ns())
+            self._clock.sleep_until_ns(due_ns)

@@ -1,0 +1,236 @@
+"""Dome physics: contact force in, gas pressure on the chip out.
+
+Signal chain (hardware.md 9): contact force -> creep of the rubber -> hysteresis -> volume of the
+bubble -> gas temperature -> absolute pressure; the equations are in `dome_equations`.
+
+Pressures of all domes are computed in chunks on a fine time grid, and interpolated at the sample
+instants: the result does not depend on the chunks or on the times of the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.emulation.dome_equations import (
+    GasState,
+    ViscousBranches,
+    apply_creep,
+    apply_play_hysteresis,
+    apply_viscous_flow,
+    compute_gas_kpa,
+    compute_static_kpa,
+)
+from devices.emulation.parts import DomeProperties, make_rng
+from devices.emulation.surroundings import Surroundings
+from devices.scene.emulation_sections import EmulationSection
+
+GRID_S = 0.0005
+"""Grid interval. Linear interpolation of pressure is off by 0.01 kPa in a tap of 20 ms."""
+_CHUNK_POINTS = 100  # grid points of a chunk, 50 ms: short, so that no transfer waits for long
+_STORED_POINTS = 2000  # grid points stored behind the latest requested one
+_LAG_POINTS = 20_000  # grid points, 10 s: lag beyond which coarse steps are used
+_COARSE_POINTS = 40  # grid points of a coarse step, 20 ms
+
+_KELVIN = 273.15
+_PLAY_WIDTHS_N = np.array([0.5, 1.0, 2.0, 4.0])
+_FLOW_N_PER_S = 7.5  # rate of force at which the viscous loop has its stated width: 30 N in 4 s
+_UNLOADED_N = 0.05  # below it a dome is untouched: the next contact is a new loading
+
+
+class DomeLoad(Protocol):
+    """Load on the domes."""
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """Compute the force on each dome along its axis, (len(t_s), domes), never negative."""
+
+
+class Domes:
+    """All domes of a foot under one load, integrated forward in chunks.
+
+    A place may be `bare`: its chip has no dome, and senses the surroundings. In real time a long
+    lag is integrated in coarse steps, for example after the machine slept.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[DomeProperties],
+        serials: Sequence[str],
+        load: DomeLoad,
+        scene: EmulationSection,
+        surroundings: Surroundings,
+        *,
+        label: str,
+        bare: Sequence[bool] = (),
+        in_real_time: bool = False,
+    ) -> None:
+        self._with_effects = partial(Domes, parts, serials, load, label=label, bare=bare)
+        self._bare = np.flatnonzero(bare)
+        self._parts = parts
+        self._load = load
+        self._scene = scene
+        self._surroundings = surroundings
+        self._in_real_time = in_real_time
+        self._seal_k = scene.ambient_degc + _KELVIN
+        drifted = [
+            make_rng(f"gain drift/{label}/{serial}").uniform(-1.0, 1.0) for serial in serials
+        ]
+        stiffening = np.array([part.stiffening for part in parts])
+        self._stiffening = stiffening * (1.0 + scene.gain_drift * np.array(drifted))
+        self._knee_n = np.array([part.knee_n for part in parts])
+        self._loading_rngs = [make_rng(f"loading/{label}/{serial}") for serial in serials]
+        self._loading_gain = np.ones(len(parts))
+        self._last_force_n = np.zeros(len(parts))
+        self._rubber = _RubberModel(parts)
+        self._gas = GasState.from_parts(parts, self._seal_k)
+
+        self._next = 0  # grid index of the first point that is not computed
+        self._latest_index = 0  # the highest requested grid index
+        # Chunks by number; older ones stay for late requests, so that a driver's delay does not
+        # change the physics.
+        self._chunks: dict[int, Floats] = {}
+        self._compute_until(0)  # compile before the first sample
+
+    def with_effects(self, scene: EmulationSection, surroundings: Surroundings) -> Domes:
+        """Create the same domes under the same load, from its first instant, with other effects."""
+        return self._with_effects(scene, surroundings)
+
+    def compute_pressure_kpa(self, dome: int, t_s: float) -> float:
+        """Compute the absolute gas pressure of one dome, or around a bare chip.
+
+        Times may go back by up to a second from the latest requested one.
+
+        Raises:
+            ValueError: `t_s` is too far back.
+        """
+        position = t_s / GRID_S
+        index = int(position)
+        if index > self._latest_index:
+            self._latest_index = index
+        if index + 1 >= self._next:
+            self._compute_until(index + 1)
+        try:
+            low, high = self._get_grid_kpa(index, dome), self._get_grid_kpa(index + 1, dome)
+        except KeyError:
+            raise ValueError(f"dome pressure at {t_s} s was asked for too late") from None
+        return low + (position - index) * (high - low)
+
+    def _get_grid_kpa(self, index: int, dome: int) -> float:
+        number, row = divmod(index, _CHUNK_POINTS)
+        return float(self._chunks[number][row, dome])
+
+    def _compute_until(self, index: int) -> None:
+        """Compute chunks up to grid point `index`; delete old ones."""
+        if self._in_real_time and index - self._next > _LAG_POINTS:
+            self._integrate_coarsely((index - _STORED_POINTS) // _CHUNK_POINTS)
+        while index >= self._next:
+            self._chunks[self._next // _CHUNK_POINTS] = self._compute_chunk(_CHUNK_POINTS, 1)
+            self._next += _CHUNK_POINTS
+        oldest = (self._latest_index - _STORED_POINTS) // _CHUNK_POINTS
+        for number in [number for number in self._chunks if number < oldest]:
+            del self._chunks[number]
+
+    def _integrate_coarsely(self, to_piece: int) -> None:
+        """Integrate to a chunk in coarse steps. The chunks stored after that are fine again."""
+        points, rest = divmod(to_piece * _CHUNK_POINTS - self._next, _COARSE_POINTS)
+        for points_now, stride in ((points, _COARSE_POINTS), (rest, 1)):
+            if points_now:
+                self._compute_chunk(points_now, stride)
+                self._next += points_now * stride
+
+    def _compute_chunk(self, points: int, stride: int) -> Floats:
+        """Compute the pressures of `points` grid points from the next one on, `stride` apart."""
+        steps = self._next + stride * np.arange(points, dtype=np.float64)
+        t_s: Floats = GRID_S * steps
+        force_n = np.ascontiguousarray(self._load.forces_n(t_s))
+        apparent_n = self._rubber.compute_apparent_force_n(force_n, stride * GRID_S, self._scene)
+        lost = (
+            self._stiffening
+            * np.log1p(apparent_n / self._knee_n)
+            * self._draw_loading_gains(force_n)
+        )
+        kpa = self._compute_gas_kpa(t_s, 1.0 - lost, stride * GRID_S)
+        around_kpa = self._surroundings.compute_bare_kpa(t_s)
+        kpa[:, self._bare] = np.broadcast_to(around_kpa, kpa.shape)[:, self._bare]
+        self._last_force_n = force_n[-1]
+        return kpa
+
+    def _draw_loading_gains(self, force_n: Floats) -> Floats:
+        """Compute gains: a separate one for every loading, drawn at the contact."""
+        gains = np.ones_like(force_n)
+        if self._scene.repeatability == 0.0:
+            return gains
+        for dome in range(force_n.shape[1]):
+            f = np.concatenate([[self._last_force_n[dome]], force_n[:, dome]])
+            touched = np.flatnonzero((f[:-1] <= _UNLOADED_N) & (f[1:] > _UNLOADED_N))
+            start = 0
+            for index in touched.tolist():
+                gains[start:index, dome] = self._loading_gain[dome]
+                draw = self._loading_rngs[dome].standard_normal()
+                self._loading_gain[dome] = 1.0 + self._scene.repeatability * draw
+                start = index
+            gains[start:, dome] = self._loading_gain[dome]
+        return gains
+
+    def _compute_gas_kpa(self, t_s: Floats, volume: Floats, step_s: float) -> Floats:
+        """Compute the pressure of the sealed gas at a relative volume of the unstretched bubble."""
+        wall_k = np.stack(
+            [
+                self._surroundings.compute_gas_wall_degc(t_s, part.chip_lag_s, part.gas_lag_s)
+                + _KELVIN
+                for part in self._parts
+            ],
+            axis=1,
+        )
+        head_kpa = np.broadcast_to(self._surroundings.compute_head_kpa(t_s), wall_k.shape).copy()
+        if not self._scene.gas:
+            return np.asarray(compute_static_kpa(wall_k, volume, head_kpa, self._gas.constants))
+        gas = self._gas
+        decay = np.exp(-step_s * gas.rates_per_s)
+        gain = gas.weights * (1 - decay) / -np.log(decay)
+        return np.asarray(
+            compute_gas_kpa(
+                wall_k, volume, head_kpa, gas.constants, gain, decay, gas.modes_k, gas.last_ln_p
+            )
+        )
+
+
+class _RubberModel:
+    """Rubber model with its state: creep, hysteresis loop, viscous branch."""
+
+    def __init__(self, parts: Sequence[DomeProperties]) -> None:
+        terms = max(len(part.creep_s) for part in parts)
+        self._creep_parts = np.zeros((len(parts), terms))
+        self._creep_s = np.ones((len(parts), terms))
+        for dome, part in enumerate(parts):
+            self._creep_parts[dome, : len(part.creep_s)] = part.creep_parts
+            self._creep_s[dome, : len(part.creep_s)] = part.creep_s
+        self._crept_n = np.zeros((len(parts), terms))
+        self._last_force_n = np.zeros(len(parts))
+        self._play_weights = np.array([part.loop_n for part in parts]) / _PLAY_WIDTHS_N.sum()
+        self._play_n = np.zeros((len(parts), len(_PLAY_WIDTHS_N)))
+        self._flow = ViscousBranches.from_parts(parts, _FLOW_N_PER_S)
+
+    def compute_apparent_force_n(
+        self, force_n: Floats, step_s: float, scene: EmulationSection
+    ) -> Floats:
+        """Compute the force that compresses the bubble, (times, domes)."""
+        if scene.rubber:
+            decay = np.exp(-step_s / self._creep_s)
+            mean = (1 - decay) * self._creep_s / step_s
+            last_n, self._last_force_n = self._last_force_n, force_n[-1].copy()
+            force_n = apply_creep(force_n, last_n, self._creep_parts, decay, mean, self._crept_n)
+        if scene.hysteresis:
+            force_n = apply_play_hysteresis(
+                force_n, _PLAY_WIDTHS_N, self._play_weights, self._play_n
+            )
+            flow = self._flow
+            if flow.has_any:
+                force_n = apply_viscous_flow(
+                    force_n, flow.constants, step_s, flow.last_n, flow.branch_n
+                )
+        return force_n

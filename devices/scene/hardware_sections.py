@@ -1,0 +1,163 @@
+"""Sections of a scene file for the hardware: bus, tiles, servo, reference force, recovery lines."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from devices.chips.dynamixel.firmwares import FIRMWARES
+from devices.chips.tca9548a import ADDRESSES, CHANNELS
+from devices.scene.field_types import GpioLineNumber, Name, Number, Position, Positive, SceneSection
+
+EMULATED = "emulated"
+"""Name of an emulated bus or port."""
+
+ScheduleName = Literal["simultaneous", "pipelined", "per_mux", "sequential"]
+AnySchedule = Literal["auto", ScheduleName]
+
+
+class ArraySection(SceneSection):
+    """`[array]`: the bus and its schedule."""
+
+    bus: str = EMULATED
+    """Device such as /dev/i2c-1, or "emulated"."""
+    scl_hz: Annotated[float, Field(ge=10_000, le=1_000_000)] = 400_000.0
+    """Bus clock of the emulation; on hardware it is set in config.txt. The bounds catch kHz."""
+    schedule: AnySchedule = "auto"
+    """Order of transfers (`devices.array.schedules`); "auto": the best for these tiles."""
+    wait_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """Wait of the driver for a conversion. Absent: each part's conversion time, measured at
+    start-up. Too short a wait gives stale results."""
+    temperature_every: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Interval in frames at which temperature is read; other frames save two bytes a tile."""
+    broadcast_channels: Annotated[int, Field(ge=1, le=64)] = 8
+    """Largest number of channels open at once: one part has to sink the current of all pull-ups
+    (TCA9548A data sheet 9.2.1)."""
+    conversion_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """Emulation only: conversion time of every part. Absent: drawn for each part."""
+
+
+class TileSection(SceneSection):
+    """`[[tile]]`: a tile, its mux channel and its position in the foot frame."""
+
+    serial: Name
+    mux: int
+    channel: int
+    x_m: Position
+    y_m: Position
+    z_m: Position
+    reference: bool = False
+    """True for a bare tile that measures the surroundings: no load, excluded from all sums."""
+
+    @field_validator("mux")
+    @classmethod
+    def _mux_exists(cls, mux: int) -> int:
+        if mux not in ADDRESSES:
+            raise ValueError(f"0x{mux:02x} is no TCA9548A address, which are 0x70 to 0x77")
+        return mux
+
+    @field_validator("channel")
+    @classmethod
+    def _channel_exists(cls, channel: int) -> int:
+        if channel not in CHANNELS:
+            raise ValueError(f"{channel} is no channel of a TCA9548A, which are 0 to 7")
+        return channel
+
+
+class ServoSection(SceneSection):
+    """`[servo]`: the Dynamixel servo whose position is stored with the frames."""
+
+    port: str = EMULATED
+    """Device such as /dev/ttyUSB0, or "emulated"."""
+    model: Literal["MX-28", "MX-64"] = "MX-64"
+    protocol: Literal[1, 2] = 2
+    """Protocol version of its firmware; the factory's is 1."""
+    id: Annotated[int, Field(ge=0)] = 1
+    baudrate: Annotated[int, Field(gt=0)] = 1_000_000
+    rate_hz: Positive = 100.0
+    """Rate at which the position is read."""
+    sign: Literal[-1, 1] = 1
+    zero_counts: Annotated[int, Field(ge=-(2**28), le=2**28)] = 2048
+    ratio: Number = 1.0
+    """Turns of the segment per turn of the servo."""
+    ankle_travel_m_per_rad: Number | None = None
+    """Forward travel of the ankle per radian of the segment; absent: not known."""
+
+    @field_validator("sign", "protocol", mode="before")
+    @classmethod
+    def _is_a_number(cls, value: object) -> object:
+        if isinstance(value, bool):  # true equals 1, and would pass
+            raise ValueError(f"{value} is no number")  # noqa: TRY004  # pydantic's
+        return value
+
+    @field_validator("id")
+    @classmethod
+    def _id_exists(cls, servo_id: int, info: ValidationInfo) -> int:
+        protocol = info.data.get("protocol", 2)
+        highest = FIRMWARES[protocol].protocol.max_servo_id
+        if servo_id > highest:
+            raise ValueError(
+                f"{servo_id} is no servo id of protocol {protocol}; expected 0 to {highest}"
+            )
+        return servo_id
+
+    @field_validator("ratio")
+    @classmethod
+    def _ratio_turns_the_segment(cls, ratio: float) -> float:
+        if ratio == 0.0:
+            raise ValueError("0 would never turn the segment")
+        return ratio
+
+
+class ReferenceSection(SceneSection):
+    """`[reference]`: the force sensor of a calibration rig, read through an MCP3208 on SPI.
+
+    Force is (volts - zero_v) * n_per_v. Neither has a default: both have to be measured with this
+    sensor and amplifier.
+    """
+
+    port: str = EMULATED
+    """Device such as /dev/spidev0.0, or "emulated"."""
+    channel: Annotated[int, Field(ge=0, le=7)] = 0
+    """Input of the converter."""
+    vref_v: Annotated[float, Field(ge=0.25, le=5.5)] = 3.3
+    """Voltage at the converter's VREF: its full scale."""
+    zero_v: Number
+    """Voltage without a force. It must be off the rails, to differ from a broken wire."""
+    n_per_v: Number
+    """Newtons per volt; negative if a push lowers the voltage."""
+
+    @field_validator("n_per_v")
+    @classmethod
+    def _a_volt_is_a_force(cls, n_per_v: float) -> float:
+        if n_per_v == 0.0:
+            raise ValueError("0 would make every voltage 0 N")
+        return n_per_v
+
+    @model_validator(mode="after")
+    def _zero_can_be_read(self) -> Self:
+        if not 0.0 < self.zero_v < self.vref_v:
+            raise ValueError(
+                f"zero_v = {self.zero_v:g} is not between the rails, 0 and vref_v = "
+                f"{self.vref_v:g}; shift the amplifier's output off the rail"
+            )
+        return self
+
+
+class RecoverySection(SceneSection):
+    """`[recovery]`: GPIO lines of a Raspberry Pi that free a stuck bus."""
+
+    gpiochip: str = "/dev/gpiochip0"
+    scl_line: GpioLineNumber = 3
+    sda_line: GpioLineNumber = 2
+    reset_line: GpioLineNumber | None = None
+    """RESET of all multiplexers; absent: not wired."""
+    i2c_function: Annotated[str, Field(pattern=r"^a[0-8]$")] = "a0"
+    """Pin function of SDA and SCL to restore, as named by `pinctrl`; "a3" on a Pi 5."""
+
+    @model_validator(mode="after")
+    def _lines_differ(self) -> Self:
+        if len({self.scl_line, self.sda_line, self.reset_line}) < 3:
+            raise ValueError("scl_line, sda_line and reset_line have to be different lines")
+        return self

@@ -1,0 +1,144 @@
+"""Shared parts of routes: server state, files, entity tags, documented problems."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import Depends, Header, Request
+from fastapi.responses import FileResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from devices.errors import StateError, UnknownError
+from service.api.problems import MEDIA_TYPE, Problem
+from service.server.server import Server
+from storage.formats.slice import SECONDS_MAX
+from storage.formats.writers.parquet import PARQUET
+from storage.sessions.folder import IdempotencyRecord, Session
+
+_SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
+
+
+def problem_responses(**meanings: str) -> dict[int | str, dict[str, Any]]:
+    """Return OpenAPI entries of a route's problems: `problem_responses(_404="No such node.")`."""
+    return {
+        int(status.removeprefix("_")): {"description": meaning, **_SCHEMA}
+        for status, meaning in meanings.items()
+    }
+
+
+def require_file(path: Path) -> Path:
+    """Return the path of a sealed session's file if the file exists.
+
+    Raises:
+        UnknownError: it does not exist.
+    """
+    if not path.is_file():
+        raise UnknownError(f"the file {path.name} is missing", where=str(path))
+    return path
+
+
+_LAST_MODIFIED_RANGE_S = (-62_135_596_800, 253_402_300_799)
+"""First second of the year 1 and last one of 9999: `Last-Modified` can state no others."""
+
+
+def file_response(path: Path, **options: Any) -> FileResponse:
+    """Answer with a file as it is, whatever its date; some file systems know years beyond 9999."""
+    found = path.stat()
+    fields = list(found)
+    fields[stat.ST_MTIME] = min(
+        max(fields[stat.ST_MTIME], _LAST_MODIFIED_RANGE_S[0]), _LAST_MODIFIED_RANGE_S[1]
+    )
+    return FileResponse(path, stat_result=os.stat_result(fields), **options)
+
+
+def stored_table_response(session: Session, path: Path) -> FileResponse:
+    """Answer with a session's stored table as it is.
+
+    Raises:
+        StateError: it is written when the session is sealed.
+        UnknownError: the file does not exist.
+    """
+    if session.sha256 is None:
+        raise StateError(
+            f"session {session.id} is {session.state}, and {path.name} is not written yet",
+            remedy="Stop it, or ask for format=json",
+        )
+    return file_response(
+        require_file(path), media_type=PARQUET.media_type, filename=f"{session.id}.{path.name}"
+    )
+
+
+def _server(request: Request) -> Server:
+    server: Server = request.app.state.server
+    return server
+
+
+class SecondsQuery(BaseModel):
+    """Time interval of a session."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    start_s: Annotated[float, Field(ge=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
+        default=None, description="Seconds after the first frame."
+    )
+    end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
+        default=None, description="End, not included, in seconds after the first frame."
+    )
+
+
+def has_matching_etag(request: Request, tag: str) -> bool:
+    """Return whether If-None-Match names this entity tag, given without quotes."""
+    header = request.headers.get("if-none-match", "")
+    return any(t.strip().removeprefix("W/") in (f'"{tag}"', "*") for t in header.split(","))
+
+
+ServerState = Annotated[Server, Depends(_server)]
+
+CHANGED = problem_responses(_412="It was changed meanwhile: its revision is not that in If-Match.")
+FULL = problem_responses(_507="The data folder cannot be written.")
+
+IfMatch = Annotated[
+    str | None,
+    Header(description="Revision that you have seen (`said`); else the change is refused."),
+]
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        description="Key of your choice, new for each recording: a repeated request with the same"
+        " key is answered with the result of the first one, and creates nothing. The "
+        "key is stored with its session.",
+        pattern=r"^[!-~]{1,200}$",
+        examples=["8e03978e-40d5-43dd-bc93-6894a57f9324"],
+    ),
+]
+
+
+def parse_if_match(if_match: str | None) -> str | None:
+    """Return the revision in an `If-Match`, with or without quotes; None for `*` or no header."""
+    revision = (if_match or "").strip().removeprefix("W/").strip('"')
+    return None if revision in ("", "*") else revision
+
+
+def make_idempotency_record(
+    key: str | None, kind: str, body: BaseModel
+) -> IdempotencyRecord | None:
+    """Return the record of a request with its key; None without a key.
+
+    Args:
+        key: its `Idempotency-Key`, with or without quotes.
+        kind: kind of the request.
+        body: parsed body, so that its spelling does not matter.
+    """
+    if key is None:
+        return None
+    return IdempotencyRecord(
+        key=_digest(key.strip('"')), request=_digest(f"{kind} {body.model_dump_json()}")
+    )
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

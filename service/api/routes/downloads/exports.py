@@ -1,0 +1,111 @@
+"""Files made on request: entity tags, names, and streaming."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import AsyncIterator, Generator
+
+import pyarrow as pa
+from fastapi import Response
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
+
+from devices.errors import UnknownError, UsageError
+from service.api.routes.downloads.data_query import ExportQuery
+from service.server.server import Server
+from service.version import SOFTWARE_VERSION
+from storage.clock.file import CLOCK_NAME
+from storage.formats.markers import PlacedMarkers
+from storage.formats.slice import Slice
+from storage.parquet_hash import compute_sha256
+from storage.sessions.folder import Session
+
+Chunks = Generator[bytes, None, None]
+_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9.-]+")
+_NAME_LENGTH = 60
+
+
+def require_frames(session: Session) -> Session:
+    """Return the session if its frames can be read.
+
+    Raises:
+        UnknownError: it was sealed without frames, or its file is damaged.
+    """
+    if session.state == "sealed" and session.sha256 is None:
+        raise UnknownError(f"session {session.id}: {session.problem}")
+    return session
+
+
+async def compute_export_etag(session: Session, query: ExportQuery, server: Server) -> str:
+    """Return an entity tag of everything that an export of a session depends on."""
+    beside = ""
+    if query.clock_name == "server" or query.has_markers:  # markers are placed by the clocks
+        beside = await run_in_threadpool(_clock_hash, session, server)
+    if query.has_markers:
+        beside += "".join(event.model_dump_json() for event in session.markers)
+    if session.sha256 is not None:
+        content = f"{session.sha256}|{pa.__version__}"
+    else:
+        recorded = server.recorder.get_ledger(session.id).recorded
+        content = f"{session.id}|{session.state}|{recorded}"
+    text = f"{content}|{query.canonical_text}|{beside}|{SOFTWARE_VERSION}"
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def marker_headers(marks: list[PlacedMarkers]) -> dict[str, str]:
+    """Return the header with the number of markers in the file."""
+    total = sum(len(each.markers) for each in marks)
+    left_out = sum(len(each.excluded) for each in marks)
+    return {"Foottile-Marks": f"placed={total - left_out}, left-out={left_out}"}
+
+
+def make_file_stem(name: str, id_: str, part: Slice) -> str:
+    """Return a file's name without extension: the trial's name and id, and the seconds in it.
+
+    Letters of the name that are not in every file system's alphabet are dashes.
+    """
+    name = _NOT_IN_NAMES.sub("-", name)[:_NAME_LENGTH].strip("-.")
+    ends = [None if at_s is None else f"{at_s:.3f}s" for at_s in (part.start_s, part.end_s)]
+    seconds = f"{ends[0] or 'begin'}-to-{ends[1] or 'end'}" if any(ends) else ""
+    return "_".join(word for word in (name, id_, seconds) if word)
+
+
+async def export_response(
+    chunks: Chunks, query: ExportQuery, stem: str, headers: dict[str, str]
+) -> Response:
+    """Answer with chunks, which are closed even if the client disconnects.
+
+    Args:
+        chunks: content of the file.
+        query: query of the request.
+        stem: file name without extension.
+        headers: further headers.
+    """
+    # The first chunk now: an invalid query is then an answer, not a broken download.
+    first = await run_in_threadpool(next, chunks, None)
+    if first is None:
+        raise UsageError("the session has no frames")
+    headers["Content-Disposition"] = f'attachment; filename="{stem}.{query.format_spec.ending}"'
+    return StreamingResponse(
+        iterate_chunks(chunks, first), headers=headers, media_type=query.format_spec.media_type
+    )
+
+
+async def iterate_chunks(chunks: Chunks, first: bytes = b"") -> AsyncIterator[bytes]:
+    """Yield chunks as they are made, and close their generator even if the client disconnects."""
+    try:
+        if first:
+            yield first
+        async for chunk in iterate_in_threadpool(chunks):
+            if chunk:
+                yield chunk
+    finally:
+        chunks.close()
+
+
+def _clock_hash(session: Session, server: Server) -> str:
+    path = server.sessions.folder.get_path(session.id) / CLOCK_NAME
+    if session.sha256 is not None and path.is_file():
+        return compute_sha256(path)
+    return hashlib.sha256(repr(session.clock).encode()).hexdigest()

@@ -1,0 +1,90 @@
+"""Limits of fault detection for an array's tiles.
+
+Before the models: counts that repeat, and clipping below the chip's end. After them: the error of
+the baseline, by the corrected pressure and by warmth that no model corrects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from devices.arrays import Bools, Floats
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import TADC_PER_KELVIN
+from devices.frames import ArrayInfo
+from service.estimation.calibration import Calibration
+from service.estimation.fault_detection import baseline_loss
+from service.estimation.fault_detection import stuck as stuck_readings
+from service.estimation.tare.tare import Tare, compute_thermal_shift_kpa
+
+UNLOADED_BAND_SIGMAS = 4.0
+"""Distance from the baseline within which a tile is unloaded, in sigmas of a reading."""
+
+
+@dataclass(frozen=True)
+class FaultLimits:
+    """Limits over an array's tiles; the last two over load-bearing tiles only.
+
+    Attributes:
+        stuck_check_max_kpa: absolute pressure above which a healthy chip may stand still.
+        unloaded_band_kpa: distance from the baseline within which a tile counts as unloaded.
+        stuck: limits of equal counts in a row.
+        asymmetry: asymmetry for `baseline_loss.update_baseline_error`.
+        thermal_kpa_per_count: shift of the baseline for a raw temperature count; None if a model
+            corrects it.
+    """
+
+    stuck_check_max_kpa: Floats
+    unloaded_band_kpa: Floats
+    stuck: stuck_readings.StuckLimits
+    asymmetry: Floats
+    thermal_kpa_per_count: Floats | None
+
+
+def make_fault_limits(
+    info: ArrayInfo,
+    calibration: Calibration,
+    tare: Tare,
+    chip_max_kpa: Floats,
+    *,
+    is_gas_corrected: Bools,
+    has_thermal_drift: bool,
+) -> FaultLimits:
+    """Compute the limits.
+
+    Args:
+        info: the array.
+        calibration: of its tiles.
+        tare: in force.
+        chip_max_kpa: (bearing tiles,), absolute pressure above which a chip saturates.
+        is_gas_corrected: (bearing tiles,), whether the tile's gas is corrected.
+        has_thermal_drift: whether no model corrects the temperature.
+    """
+    tiles = info.tiles
+    bearing = np.flatnonzero([not tile.reference for tile in tiles])
+    end_kpa = np.full(len(tiles), np.inf)
+    end_kpa[bearing] = chip_max_kpa
+    counts = np.where(np.isfinite(tare.temperature_raw_counts), tare.temperature_raw_counts, 500.0)
+    count_kpa = np.abs(Compensation(tiles).compute_kpa_per_count(counts))
+    # A lost tare has no noise; no tile is checked then, since no pressure is above its baseline.
+    noise = np.zeros(len(tiles))
+    np.divide(
+        tare.noise_kpa, count_kpa, out=noise, where=(count_kpa > 0.0) & np.isfinite(tare.noise_kpa)
+    )
+    unloaded_kpa = UNLOADED_BAND_SIGMAS * np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
+    per_count = compute_thermal_shift_kpa(tare, np.ones(len(tiles)) / TADC_PER_KELVIN)[bearing]
+    for at, column in enumerate(bearing):
+        entry = calibration.find_tile(tiles[column].serial)
+        if entry is not None and entry.effects.temperature is not None:
+            per_count[at] = entry.effects.temperature.kpa_per_k.value / TADC_PER_KELVIN
+    return FaultLimits(
+        stuck_check_max_kpa=end_kpa,
+        unloaded_band_kpa=unloaded_kpa,
+        stuck=stuck_readings.make_stuck_limits(noise, info.nominal_rate_hz),
+        asymmetry=np.where(
+            is_gas_corrected, baseline_loss.LEAK_ASYMMETRY, baseline_loss.LEAK_ASYMMETRY_WITHOUT_GAS
+        ),
+        thermal_kpa_per_count=per_count if has_thermal_drift else None,
+    )

@@ -1,0 +1,246 @@
+"""Stuck tiles: the raw pressure stays the same for longer than its noise allows.
+
+However a load moves, the chance that a reading equals the previous count is at most that of noise
+centred on that count. The share of equal neighbours is learnt while a tile is unloaded, where
+nothing else moves it; that includes correlated noise. So is the share of steps by two counts,
+because a tile that wavers between two counts may yet be quiet in the middle of one. A light load
+must not pass for noise, so the tare's noise counts as well. From these follows the number of equal
+counts in a row that occurs once in `HOURS` by chance. A tile whose noise is far below a count may
+repeat for ever: it is accepted, unless it stays at a load while the others are loaded and unloaded
+again and again.
+
+A repeated count is no measurement of this instant, so the force is unknown: NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Protocol
+
+import numpy as np
+
+from devices.arrays import Floats, Ints
+from devices.jit import jit_cached
+from service.estimation.records import KernelRecord, RecordArray
+
+FALSE_ALARM_HOURS = 100.0
+"""Mean time between false alarms of a healthy array with the learnt share of repeats."""
+PRIOR_CORRELATION_S = 0.010
+"""Correlation time of the noise that is assumed at first."""
+PRIOR_PAIRS = 50
+"""Weight of that assumption, in pairs of readings."""
+NOISE_WITHOUT_OUTLIERS = 0.75
+"""Part of the tare's noise without its outliers (hardware.md 1.3)."""
+SHARE_MARGIN_SIGMAS = 2.0
+"""Margin on the learnt shares, in standard deviations."""
+SHARE_STEPS = 256
+"""Number of steps of the share in the tables of limits."""
+RUN_LENGTH_MIN = 8
+"""Longest run that is never judged."""
+PAIRS_MAX = 1 << 14
+"""Number of pairs after which the older ones count half."""
+LOADINGS_OF_OTHERS = 5
+"""Mean loadings of the other tiles after which a loaded tile without noise is stuck."""
+UNLIMITED = 1 << 40
+_STEP_MIN, _STEP_MAX = 0.02, 20.0
+
+
+class StuckState(KernelRecord):
+    """State of a tile."""
+
+    pressure_raw: int  # last count; -1 before the first
+    run_length: int  # number of equal counts in a row
+    toggles_at_start: int  # of all tiles, when the run began
+    was_unloaded: int  # 1: the last reading was
+    unloaded_pairs: int  # consecutive unloaded readings
+    equal_pairs: int  # of these
+    double_step_pairs: int  # of these, two counts apart
+    is_loaded: int
+
+
+class StuckParams(KernelRecord):
+    """Parameters of a tile, as in `StuckLimits`."""
+
+    equal_share: float
+    double_step_share: float
+    run_max: int
+
+
+class RunLimits(Protocol):
+    """Record with the array's limits of equal counts in a row, as in `StuckLimits`."""
+
+    run_max_by_equal: Ints
+    run_max_by_double_step: Ints
+
+
+def initial_state(tiles: int) -> RecordArray[StuckState]:
+    """Make the states before the first reading, (tiles,)."""
+    return StuckState.array(tiles, pressure_raw=-1)
+
+
+def compute_run_limits(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
+    """Compute the limits of equal counts in a row.
+
+    Neighbours whose difference has the standard deviation d, in counts, are equal or two counts
+    apart with chances that are solved for d. Noise of d / sqrt(2) then repeats with erf(1 / 2d) at
+    most.
+
+    Returns:
+        Limits by the share of equal neighbours in 0 to `SHARE_STEPS`, and by that of double steps.
+    """
+    chance = 1.0 / (FALSE_ALARM_HOURS * 3600.0 * rate_hz * tiles)
+    most = []
+    for at_most in _compute_repeat_chances():
+        run = 1.0 + np.ceil(math.log(chance) / np.log(np.minimum(at_most, 1.0 - 1e-15)))
+        most.append(np.minimum(run, UNLIMITED).astype(np.int64))
+    return most[0], most[1]
+
+
+@cache  # computed at every tare, during which a server sends no frames
+def _compute_repeat_chances() -> tuple[Floats, Floats]:
+    """Compute the largest chance of a repeat, by either share (see `limits`)."""
+    shares = np.arange(SHARE_STEPS + 1) / SHARE_STEPS
+    steps = np.geomspace(_STEP_MAX, _STEP_MIN, 2000)
+    by_repeats = np.interp(shares, compute_share_apart(steps, 0), steps)
+    twos = compute_share_apart(steps, 2)
+    rising = slice(int(np.argmax(twos)), None)  # with much noise they are few again
+    by_twos = np.interp(shares, twos[rising][::-1], steps[rising][::-1])
+    by_twos[0] = _STEP_MIN
+    at_most = [np.array([math.erf(0.5 / d) for d in step]) for step in (by_repeats, by_twos)]
+    return at_most[0], at_most[1]
+
+
+def compute_share_apart(step_sigma_counts: Floats, counts: int) -> Floats:
+    """Compute the share of neighbours `counts` apart by the standard deviation of their difference.
+
+    Rounding makes a difference of d counts one of n with the chance 1 - |d - n|.
+    """
+    ends = (counts + np.array([[-1.0], [0.0], [1.0]])) / step_sigma_counts
+    below = 0.5 * (1.0 + np.array([[math.erf(e / math.sqrt(2.0)) for e in row] for row in ends]))
+    density = np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi)
+    low, high = np.diff(below, axis=0)
+    mean_low, mean_high = -np.diff(density, axis=0) * step_sigma_counts
+    one_side = (1 - counts) * low + mean_low + (1 + counts) * high - mean_high
+    return np.asarray(one_side if counts == 0 else 2.0 * one_side)
+
+
+def compute_step_sigma(noise_counts: Floats, correlation: float) -> Floats:
+    """Compute the standard deviation of steps from noise and neighbours' correlation."""
+    # Rounding adds noise, but no change of the count.
+    latent = np.sqrt(np.maximum(noise_counts**2 - 1.0 / 12.0, 0.0))
+    return np.maximum(
+        NOISE_WITHOUT_OUTLIERS * latent * math.sqrt(2.0 * (1.0 - correlation)), _STEP_MIN
+    )
+
+
+@dataclass(frozen=True)
+class StuckLimits:
+    """Limits of equal counts in a row.
+
+    Attributes:
+        equal_share: (tiles,), prior share of equal neighbours.
+        double_step_share: (tiles,), prior share of neighbours two counts apart.
+        run_max: (tiles,), limit for white noise as at the tare.
+        run_max_by_equal: (`SHARE_STEPS` + 1,), limit by the share of equal neighbours.
+        run_max_by_double_step: (`SHARE_STEPS` + 1,), limit by the share of double steps.
+    """
+
+    equal_share: Floats
+    double_step_share: Floats
+    run_max: Ints
+    run_max_by_equal: Ints
+    run_max_by_double_step: Ints
+
+    def to_records(self) -> RecordArray[StuckParams]:
+        """Make the kernel's parameters, (tiles,)."""
+        return StuckParams.array(
+            len(self.equal_share),
+            equal_share=self.equal_share,
+            double_step_share=self.double_step_share,
+            run_max=self.run_max,
+        )
+
+
+def make_stuck_limits(noise_counts: Floats, rate_hz: float) -> StuckLimits:
+    """Compute the limits from the noise at the tare, in counts with outliers and rounding."""
+    by_equal, by_double_step = compute_run_limits(rate_hz, len(noise_counts))
+    supposed = compute_step_sigma(noise_counts, math.exp(-1.0 / (rate_hz * PRIOR_CORRELATION_S)))
+    white = np.ceil(
+        compute_share_apart(compute_step_sigma(noise_counts, 0.0), 0) * SHARE_STEPS
+    ).astype(np.int64)
+    return StuckLimits(
+        equal_share=compute_share_apart(supposed, 0),
+        double_step_share=compute_share_apart(supposed, 2),
+        run_max=by_equal[np.minimum(white, SHARE_STEPS)],
+        run_max_by_equal=by_equal,
+        run_max_by_double_step=by_double_step,
+    )
+
+
+@jit_cached
+def update_stuck(
+    limits: RunLimits,
+    params: StuckParams,
+    state: StuckState,
+    pressure_raw: int,
+    above_kpa: float,
+    unloaded_band_kpa: float,
+    load_toggles: int,
+    tiles: int,
+) -> tuple[bool, int]:
+    """Return whether a reading is a repeat that noise does not explain, and the new toggle count.
+
+    Args:
+        limits: of the array.
+        params: of the tile.
+        state: after the tile's readings before; updated.
+        pressure_raw: count.
+        above_kpa: pressure above the baseline; NaN where none was readable, or where it is so great
+            that a healthy chip may stand still.
+        unloaded_band_kpa: distance from the baseline within which a tile counts as unloaded.
+        load_toggles: number of loadings and unloadings of all tiles before.
+        tiles: number of tiles.
+    """
+    if math.isnan(above_kpa):
+        state.was_unloaded = 0
+        return False, load_toggles
+    step = abs(pressure_raw - state.pressure_raw)
+    unloaded = abs(above_kpa) < unloaded_band_kpa
+    is_loaded = 1 if above_kpa > 2.0 * unloaded_band_kpa else (0 if unloaded else state.is_loaded)
+    if is_loaded != state.is_loaded:
+        load_toggles += 1
+        state.is_loaded = is_loaded
+    if step == 0:
+        state.run_length += 1
+    else:
+        state.pressure_raw, state.run_length = pressure_raw, 1
+        state.toggles_at_start = load_toggles
+    stuck = False
+    if state.run_length > RUN_LENGTH_MIN:
+        weight = PRIOR_PAIRS + state.unloaded_pairs
+        share = (PRIOR_PAIRS * params.equal_share + state.equal_pairs) / weight
+        share += SHARE_MARGIN_SIGMAS * math.sqrt(share * (1.0 - share) / weight)
+        two = (PRIOR_PAIRS * params.double_step_share + state.double_step_pairs) / weight
+        two -= SHARE_MARGIN_SIGMAS * math.sqrt(two * (1.0 - two) / weight)
+        limit = max(
+            params.run_max,
+            limits.run_max_by_equal[min(math.ceil(share * SHARE_STEPS), SHARE_STEPS)],
+            limits.run_max_by_double_step[max(int(two * SHARE_STEPS), 0)],
+        )
+        others = load_toggles - state.toggles_at_start
+        stays_loaded = (
+            is_loaded == 1 and tiles > 1 and others >= 2 * LOADINGS_OF_OTHERS * (tiles - 1)
+        )
+        stuck = state.run_length >= limit or stays_loaded
+    if unloaded and state.was_unloaded == 1 and not stuck:
+        state.unloaded_pairs += 1
+        state.equal_pairs += 1 if step == 0 else 0
+        state.double_step_pairs += 1 if step == 2 else 0
+        if state.unloaded_pairs > PAIRS_MAX:
+            state.unloaded_pairs //= 2
+            state.equal_pairs //= 2
+            state.double_step_pairs //= 2
+    state.was_unloaded = 1 if unloaded else 0
+    return stuck, load_toggles

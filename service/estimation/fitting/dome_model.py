@@ -1,0 +1,219 @@
+"""Forward model of a dome: reference force in, pressure out.
+
+The models of an estimate in the opposite direction, sample by sample: creep, loop, curve, gas. A
+fit in this direction leaves the noise in the pressure; a fit of the inverse would explain it away
+(gamma = 46).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from devices.arrays import Floats
+from devices.jit import jit_cached
+from service.estimation.models.flow import step_branch_stress
+from service.estimation.models.hysteresis import WIDTHS_N, step_play
+from service.estimation.models.rubber import compute_creep_weights
+
+_NEWTON_STEPS = 30  # a bound; it ends when a step is below `_CLOSE`
+_GAS_STEPS = 30  # likewise; two are the rule
+_CLOSE = 1e-10
+"""Step at which the iteration ends: the next one would be its square."""
+_FLAT = 1e-5
+"""Argument below which a difference of exponentials is computed by its series."""
+_FLATTEST = 0.05
+"""Least slope of a trial cubic, as a part of the slope at zero."""
+
+
+@dataclass(frozen=True)
+class DomeModel:
+    """Parameters of one tile; the defaults are those of the static curve alone.
+
+    Attributes:
+        curve: c1, c2, c3 of force over x = gauge / `scale_kpa`.
+        scale_kpa: end of the curve.
+        baseline_kpa: absolute pressure unloaded.
+        wall_per_kpa: compliance of the wall, part of the volume for a kPa.
+        gamma: ratio of heat capacities; 1 for no gas effect.
+        tau_s: the gas' time constant.
+        part: (terms,), fractions of the creep.
+        creep_s: (terms,), its time constants.
+        loop: (plays,), weights of the plays of half widths `WIDTHS_N`.
+        flow_part: fraction of the viscous branch; 0 for none.
+        flow_n: force on it during a slow stroke.
+        flow_power: exponent of its flow over that force.
+        late_s: delay of the tile's samples behind their instants. Forces passed to
+            `compute_pressures` have to be those at the delayed instants, from `interpolate_force`.
+    """
+
+    curve: Floats
+    scale_kpa: float
+    baseline_kpa: float
+    wall_per_kpa: float
+    gamma: float = 1.0
+    tau_s: float = 1.0
+    part: Floats = field(default_factory=lambda: np.zeros(0))
+    creep_s: Floats = field(default_factory=lambda: np.zeros(0))
+    loop: Floats = field(default_factory=lambda: np.zeros(0))
+    flow_part: float = 0.0
+    flow_n: float = 1.0
+    flow_power: float = 4.0
+    late_s: float = 0.0
+
+    def compute_pressures(self, t_s: Floats, force_n: Floats) -> Floats:
+        """Compute pressures with these parameters; see the function `compute_pressures`."""
+        return compute_pressures(
+            t_s,
+            force_n,
+            self.curve,
+            self.scale_kpa,
+            self.baseline_kpa,
+            self.gamma,
+            self.tau_s,
+            self.wall_per_kpa,
+            self.part,
+            self.creep_s,
+            self.loop,
+            WIDTHS_N[: len(self.loop)],
+            self.flow_part,
+            self.flow_n,
+            self.flow_power,
+        )
+
+
+def interpolate_force(t_s: Floats, force_n: Floats) -> Callable[[Floats], Floats]:
+    """Make a smooth, monotone interpolator of a reference's readings, constant beyond them.
+
+    Along straight lines a fit of the delay would stop at every reading, where they have a corner.
+    """
+    between = PchipInterpolator(t_s, force_n)
+    first_s, last_s = t_s[0], t_s[-1]
+    return lambda at_s: np.asarray(between(np.clip(at_s, first_s, last_s)))
+
+
+@jit_cached
+def _solve_heated_pressure(
+    static: float,
+    baseline_kpa: float,
+    ln_before: float,
+    warm: float,
+    h: float,
+    k: float,
+    wall: float,
+) -> tuple[float, float]:
+    """Solve for the pressure of a gas that would cool to `static`, and its temperature ratio.
+
+    Newton's method in the logarithm of the pressure (model `gas`).
+    """
+    ln_static = math.log(static)
+    ln_p = ln_before
+    p = math.exp(ln_p)
+    now = warm
+    for _ in range(_GAS_STEPS):
+        x = h - k * (ln_p - ln_before)
+        decay = math.exp(-x)
+        mean = (1.0 - decay) / x if abs(x) > _FLAT else 1.0 - 0.5 * x
+        slope = (mean - decay) / x if abs(x) > _FLAT else 0.5 - x / 3.0
+        now = warm * decay + h * mean
+        rise = k * (warm * decay + h * slope) / now  # d ln T / d ln p
+        iso = p / now
+        inner, outer = 1.0 + wall * (iso - baseline_kpa), 1.0 + wall * (p - baseline_kpa)
+        give = wall * (iso * (1.0 - rise) / inner - p / outer)  # derivative of the wall's share
+        step = (ln_static + math.log(now * inner / outer) - ln_p) / (1.0 - rise - give)
+        ln_p += step
+        p = math.exp(ln_p)
+        if abs(step) < _CLOSE:
+            break
+    return p, now
+
+
+@jit_cached
+def compute_pressures(
+    t_s: Floats,
+    force_n: Floats,
+    curve: Floats,
+    scale_kpa: float,
+    baseline_kpa: float,
+    gamma: float,
+    tau_s: float,
+    wall: float,
+    part: Floats,
+    creep_s: Floats,
+    loop: Floats,
+    widths: Floats,
+    flow_part: float,
+    flow_n: float,
+    flow_power: float,
+) -> Floats:
+    """Compute the pressures of one tile under forces that are linear between instants.
+
+    Args:
+        t_s: (n,) instants.
+        force_n: (n,) forces on the dome.
+        curve: this and the others as in `DomeModel`.
+        scale_kpa: end of the curve.
+        baseline_kpa: pressure unloaded.
+        gamma: ratio of heat capacities.
+        tau_s: the gas' time constant.
+        wall: compliance of the wall.
+        part: fractions of the creep.
+        creep_s: its time constants.
+        loop: weights of the plays.
+        widths: their half widths.
+        flow_part: fraction of the viscous branch.
+        flow_n: force on it during a slow stroke.
+        flow_power: exponent of its flow.
+
+    Returns:
+        (n, 3): pressure, pressure without the gas' heat, and the force less the apparent force.
+    """
+    n = len(t_s)
+    out = np.empty((n, 3))
+    crept = np.zeros(len(part))
+    plays = np.zeros(len(loop))
+    c1, c2, c3 = curve[0], curve[1], curve[2]
+    flattest = _FLATTEST * c1
+    k = (gamma - 1.0) / gamma
+    x, warm, force, time = 0.0, 1.0, 0.0, t_s[0]
+    stress, through = 0.0, 0.0
+    ln_p = math.log(baseline_kpa)
+    for i in range(n):
+        dt = t_s[i] - time
+        apparent = force_n[i]
+        for m in range(len(part)):
+            decay, of_before, of_now = compute_creep_weights(dt / creep_s[m])
+            crept[m] = decay * crept[m] + of_before * force + of_now * force_n[i]
+            apparent -= part[m] * (force_n[i] - crept[m])
+        lag = 0.0
+        for m in range(len(loop)):
+            plays[m] = step_play(apparent, widths[m], plays[m])
+            lag += loop[m] * (plays[m] - apparent)
+        apparent += lag
+        if flow_part > 0.0:
+            stress = step_branch_stress(
+                stress, flow_part, flow_n, flow_power, apparent - through, dt
+            )
+            through = apparent
+            apparent -= stress
+        for _ in range(_NEWTON_STEPS):
+            inside = min(max(x, 0.0), 1.0)
+            slope = max(flattest, c1 + inside * (2.0 * c2 + 3.0 * c3 * inside))
+            value = inside * (c1 + inside * (c2 + inside * c3)) + (x - inside) * slope
+            step = (apparent - value) / slope
+            x += step
+            if abs(step) < _CLOSE:
+                break
+        static = baseline_kpa + x * scale_kpa
+        p = static * warm
+        if gamma > 1.0:
+            p, warm = _solve_heated_pressure(
+                static, baseline_kpa, ln_p, warm, dt / (gamma * tau_s), k, wall
+            )
+        out[i, 0], out[i, 1], out[i, 2] = p, static, force_n[i] - apparent
+        ln_p, force, time = math.log(p), force_n[i], t_s[i]
+    return out

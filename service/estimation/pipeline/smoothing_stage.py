@@ -1,0 +1,336 @@
+"""Smoothing stage: apparent forces to forces on every dome, within the look-ahead.
+
+Order of the models: denoise, flow, hysteresis, rubber. Loop and creep are removed in the opposite
+order in which the dome makes them, and after the noise, because both have a state. Sums over tiles
+add them one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from devices.arrays import Floats
+from devices.jit import jit_cached, jit_inlined
+from service.estimation.models import denoise, flow, hysteresis, rubber
+from service.estimation.pipeline.frame_buffer import FrameBuffer, TileSample
+from service.estimation.pipeline.params import FootParams, KernelParams, TileParams
+from service.estimation.pipeline.saturation import UNIFORM_SIGMA, is_after_long_gap, worst_case
+from service.estimation.pipeline.state import DomeState, TileState
+from service.estimation.records import KernelRecord, RecordArray
+
+BOUND_SIGMAS = 2.33
+"""Distance of a stated bound in standard uncertainties: one in a hundred is above the truth."""
+N_COMMON = 8
+"""Number of errors that all tiles share: remaining errors of gas and rubber corrections, state of
+gas and of rubber after saturation or gaps, smoothing of the load, thermal drift, delay of the rig's
+reference, and direction of the ground's force (along the tiles' axes or along the segment)."""
+
+
+class TileForce(KernelRecord):
+    """Force on a tile in one frame."""
+
+    # While saturated: least force if nothing is uncertain. NaN where unknown, or without load.
+    force_n: float
+    sigma_n: float  # standard uncertainty of the force
+    sigma_independent_n: float  # its part that is independent between tiles
+    sigma_common_n: Annotated[Floats, (N_COMMON,)]  # signed errors that all tiles share
+    is_saturated: int  # 1: the force is a lower bound
+    noise_n: float  # noise after averaging
+    window_difference_n: float  # average less that of a window of half the length
+    window_difference_sigma_n: float  # standard deviation of that by noise
+    smoothing_error_n: float  # load removed by averaging, as far as the sum of tiles shows
+    vertical_fraction: float  # part of the force that is vertical
+    weight: float  # in a sum over tiles
+
+
+TILE_FORCE = TileForce.dtype()
+
+
+@jit_inlined
+def compute_tile_forces(
+    params: KernelParams,
+    tile_states: RecordArray[TileState],
+    buffer: FrameBuffer,
+    i: int,
+    rows: tuple[int, int],
+    windows: denoise.WindowScratch,
+    forces: RecordArray[TileForce],
+) -> bool:
+    """Compute the forces on the tiles in row `i`.
+
+    Args:
+        params: of the estimate.
+        tile_states: (tiles,), updated.
+        buffer: with all rows that windows reach.
+        i: row.
+        rows: oldest and newest that windows may reach.
+        windows: scratch of `denoise`.
+        forces: (tiles,), the answer.
+
+    Returns:
+        Whether saturation or gaps before leave more uncertainty than the noise of a reading, in any
+        tile.
+    """
+    foot_params, n = params.foot[0], len(tile_states)
+    for j in range(n):
+        force = forces[j]
+        is_load_bearing = params.tiles[j].is_load_bearing == 1
+        force.force_n = buffer.samples[i, j].apparent_n if is_load_bearing else math.nan
+        force.noise_n, force.smoothing_error_n = buffer.noise_n[i, j], 0.0
+    if foot_params.has_denoise == 1:
+        denoise_forces(params, buffer, i, rows, windows, forces)
+    unsettled = False
+    for j in range(n):
+        tile_params, sample = params.tiles[j], buffer.samples[i, j]
+        if tile_params.is_load_bearing == 1:
+            at_ns = (
+                buffer.t_mono_ns[i]
+                if _is_at_frame_instant(foot_params)
+                else buffer.sampled_ns[i, j]
+            )
+            alt_n = _correct_force(
+                foot_params, tile_params, tile_states[j], sample, forces[j], at_ns
+            )
+            unsettled = unsettled or (sample.is_saturated == 0 and alt_n > buffer.noise_n[i, j])
+    return unsettled
+
+
+@jit_cached
+def _is_at_frame_instant(foot_params: FootParams) -> bool:
+    """Return whether averages are evaluated at the frame's instant instead of each tile's."""
+    return bool(foot_params.has_skew == 1 and foot_params.has_denoise == 1)
+
+
+@jit_cached
+def _correct_force(
+    foot_params: FootParams,
+    tile_params: TileParams,
+    tile_state: TileState,
+    sample: TileSample,
+    force: TileForce,
+    at_ns: int,
+) -> float:
+    """Correct a tile's averaged force in place; return its sigma by saturation and gaps, in N."""
+    averaged_n, dome_alt_n = force.force_n, 0.0
+    force_n = averaged_n
+    if foot_params.has_hysteresis == 1 or foot_params.has_rubber == 1:
+        force_n, dome_alt_n = _remove_hysteresis_and_creep(
+            foot_params, tile_params, tile_state, sample, averaged_n, at_ns
+        )
+    rate = _update_rise_rate(tile_state, force_n, at_ns)
+    independent_n = math.sqrt(
+        force.noise_n**2
+        + sample.systematic_sigma_n**2
+        + (rate * tile_params.sample_delay_sigma_s) ** 2
+    )
+    common_n = force.sigma_common_n
+    common_n[0] = sample.gas_error_n
+    common_n[1] = tile_params.rubber_misfit * (force_n - averaged_n)
+    common_n[2], common_n[3] = sample.gas_alt_error_n, dome_alt_n
+    common_n[4], common_n[5] = force.smoothing_error_n, sample.thermal_error_n
+    common_n[6] = rate * tile_params.sample_delay_common_sigma_s
+    common_n[7] = tile_params.tilt_loss * force_n
+    variance = independent_n**2
+    for part in range(N_COMMON - 1):
+        variance += common_n[part] ** 2
+    force.force_n, force.sigma_independent_n = force_n, independent_n
+    force.sigma_n, force.is_saturated = math.sqrt(variance), sample.is_saturated
+    _apply_mount_gain(tile_params, force)
+    return math.sqrt(sample.gas_alt_error_n**2 + dome_alt_n**2)
+
+
+@jit_cached
+def _apply_mount_gain(tile_params: TileParams, force: TileForce) -> None:
+    """Convert newtons of the dome to newtons of the ground on the tile's part of the foot."""
+    gain, gain_sigma = tile_params.mount_gain, tile_params.mount_gain_sigma
+    if gain == 1.0 and gain_sigma == 0.0:
+        return
+    of_gain_n = gain_sigma * force.force_n
+    force.force_n *= gain
+    force.sigma_independent_n = math.hypot(gain * force.sigma_independent_n, of_gain_n)
+    force.sigma_n = math.hypot(gain * force.sigma_n, of_gain_n)
+    for part in range(N_COMMON):
+        force.sigma_common_n[part] *= gain
+
+
+@jit_inlined
+def denoise_forces(
+    params: KernelParams,
+    buffer: FrameBuffer,
+    i: int,
+    rows: tuple[int, int],
+    windows: denoise.WindowScratch,
+    forces: RecordArray[TileForce],
+) -> None:
+    """Replace the forces of row `i` by denoised ones.
+
+    Windows of the sum of all tiles bound those of each. Tiles bear the same load: its changes
+    exceed the noise of their sum before they exceed the noise of any one, and a little smoothing in
+    each tile would add up in the GRF.
+    """
+    foot_params, n, within = params.foot[0], len(params.tiles), denoise.ALL_ROWS
+    columns = buffer.usable_n, buffer.noise_n, buffer.sampled_ns, buffer.run
+    at_frame, frame_ns = _is_at_frame_instant(foot_params), buffer.t_mono_ns[i]
+    if foot_params.n_load_bearing > 1 and not math.isnan(buffer.usable_n[i, n]):
+        at_ns = frame_ns if at_frame else buffer.sampled_ns[i, n]
+        _, within = denoise.average_sample(
+            columns, i, n, at_ns, rows, foot_params.variance_inflation, within, windows
+        )
+    for j in range(n):
+        force, tile_params = forces[j], params.tiles[j]
+        force.window_difference_n = math.nan
+        if tile_params.is_load_bearing == 0 or math.isnan(buffer.usable_n[i, j]):
+            continue
+        at_ns = frame_ns if at_frame else buffer.sampled_ns[i, j]
+        inflation = tile_params.variance_inflation
+        (force.force_n, variance, force.window_difference_n, difference_variance), _ = (
+            denoise.average_sample(columns, i, j, at_ns, rows, inflation, within, windows)
+        )
+        force.window_difference_sigma_n = force.noise_n * math.sqrt(difference_variance)
+        force.noise_n *= math.sqrt(variance)
+    denoise.estimate_smoothing_errors(forces)
+
+
+@jit_cached
+def _remove_hysteresis_and_creep(
+    foot_params: FootParams,
+    tile_params: TileParams,
+    tile_state: TileState,
+    sample: TileSample,
+    force_n: float,
+    at_ns: int,
+) -> tuple[float, float]:
+    """Return the force without loop and creep, and its sigma by saturation and gaps before."""
+    is_saturated, had_gap = sample.is_saturated == 1, False
+    if foot_params.has_rubber == 1:
+        last = tile_state.dome.rubber
+        had_gap = not math.isnan(last.force_n) and is_after_long_gap(at_ns, last.t_ns)
+    elif foot_params.has_flow == 1:
+        last_of_flow = tile_state.dome.flow
+        had_gap = not math.isnan(last_of_flow.force_n) and is_after_long_gap(
+            at_ns, last_of_flow.t_ns
+        )
+    had_gap = had_gap and not math.isnan(force_n)
+    state_force_n = sample.extrapolated_n if is_saturated else math.nan
+    if tile_state.has_dome_alt == 0 and not is_saturated and not had_gap:
+        found_n = _invert_dome_models(
+            foot_params, tile_params, tile_state.dome, force_n, at_ns, state_force_n, math.nan
+        )
+        return found_n, 0.0
+    if tile_state.has_dome_alt == 0:
+        _copy_dome_state(tile_state.dome, tile_state.dome_alt)
+    found_n = _invert_dome_models(
+        foot_params, tile_params, tile_state.dome, force_n, at_ns, state_force_n, math.nan
+    )
+    bounds = tile_params.saturation
+    if is_saturated:
+        state_force_n = worst_case(sample.extrapolated_n, sample.apparent_n, bounds.force_max_n)
+    alt_n = _invert_dome_models(
+        foot_params, tile_params, tile_state.dome_alt, force_n, at_ns, state_force_n,
+        bounds.range_end_n,
+    )  # fmt: skip
+    is_same = _is_same_dome_state(foot_params, tile_state.dome, tile_state.dome_alt)
+    tile_state.has_dome_alt = 0 if is_same else 1
+    if is_saturated:
+        return alt_n if alt_n < found_n else found_n, 0.0
+    return found_n, UNIFORM_SIGMA * (alt_n - found_n)
+
+
+@jit_cached
+def _invert_dome_models(
+    foot_params: FootParams,
+    tile_params: TileParams,
+    dome_state: DomeState,
+    force_n: float,
+    at_ns: int,
+    state_force_n: float,
+    gap_force_n: float,
+) -> float:
+    if foot_params.has_flow == 1:
+        force_n = flow.compensate(
+            tile_params.flow, dome_state.flow, force_n, at_ns, state_force_n, gap_force_n
+        )
+    if foot_params.has_hysteresis == 1:
+        force_n = hysteresis.compensate(
+            tile_params.hysteresis, dome_state.hysteresis, force_n, state_force_n
+        )
+    if foot_params.has_rubber == 1:
+        force_n = rubber.compensate(
+            tile_params.rubber, dome_state.rubber, force_n, at_ns, state_force_n, gap_force_n
+        )
+    return force_n
+
+
+@jit_cached
+def _copy_dome_state(dome_state: DomeState, to: DomeState) -> None:
+    to.flow.stress_n, to.flow.force_n, to.flow.t_ns = (
+        dome_state.flow.stress_n,
+        dome_state.flow.force_n,
+        dome_state.flow.t_ns,
+    )
+    to.rubber.force_n, to.rubber.t_ns = dome_state.rubber.force_n, dome_state.rubber.t_ns
+    for m in range(len(dome_state.rubber.crept_n)):
+        to.rubber.crept_n[m] = dome_state.rubber.crept_n[m]
+    for m in range(len(dome_state.hysteresis.plays_n)):
+        to.hysteresis.plays_n[m] = dome_state.hysteresis.plays_n[m]
+
+
+@jit_cached
+def _is_same_dome_state(foot_params: FootParams, one: DomeState, other: DomeState) -> bool:
+    """Return whether two states are equal in the models that are named."""
+    for m in range(len(one.hysteresis.plays_n)):
+        if one.hysteresis.plays_n[m] != other.hysteresis.plays_n[m]:
+            return False
+    if foot_params.has_flow == 1 and (
+        one.flow.stress_n != other.flow.stress_n
+        or one.flow.force_n != other.flow.force_n
+        or one.flow.t_ns != other.flow.t_ns
+    ):
+        return False
+    if foot_params.has_rubber == 0:
+        return True
+    for m in range(len(one.rubber.crept_n)):
+        if one.rubber.crept_n[m] != other.rubber.crept_n[m]:
+            return False
+    forces = one.rubber.force_n == other.rubber.force_n
+    return bool(forces and one.rubber.t_ns == other.rubber.t_ns)
+
+
+@jit_cached
+def _update_rise_rate(tile_state: TileState, force_n: float, at_ns: int) -> float:
+    """Return the rise of the force since the frame before in N/s; 0 where unknown."""
+    rise_n = force_n - tile_state.previous_force_n
+    step_s = 1e-9 * (at_ns - tile_state.previous_force_ns)
+    known = tile_state.has_previous_force == 1 and math.isfinite(rise_n) and step_s > 0.0
+    tile_state.previous_force_n, tile_state.previous_force_ns = force_n, at_ns
+    tile_state.has_previous_force = 1
+    return rise_n / step_s if known else 0.0
+
+
+@jit_inlined
+def compute_weighted_sum_sigma(forces: RecordArray[TileForce]) -> float:
+    """Return the sigma of a sum over tiles by `weight`.
+
+    Independent parts add as squares, common ones with their sign. A tile of weight 0 may be
+    unknown.
+    """
+    variance = 0.0
+    shared = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # `PARTS`, in registers
+    for j in range(len(forces)):
+        weight, common_n = forces[j].weight, forces[j].sigma_common_n
+        if weight != 0.0:
+            variance += (weight * forces[j].sigma_independent_n) ** 2
+            shared = (
+                shared[0] + weight * common_n[0],
+                shared[1] + weight * common_n[1],
+                shared[2] + weight * common_n[2],
+                shared[3] + weight * common_n[3],
+                shared[4] + weight * common_n[4],
+                shared[5] + weight * common_n[5],
+                shared[6] + weight * common_n[6],
+                shared[7] + weight * common_n[7],
+            )
+    for part in range(N_COMMON):
+        variance += shared[part] * shared[part]
+    return math.sqrt(variance)

@@ -1,0 +1,331 @@
+"""Detection of unloaded windows, and checks of a baseline.
+
+A standing foot is as quiet as one in the air, but it presses. So of all quiet windows only those
+count in which no tile reads higher than in the lowest window.
+
+The tare of a recording comes from an interval that the user names, else from frames marked as lead,
+else from a window recognised as unloaded. Else there is none, which is an error: a wrong baseline
+gives a wrong force that looks right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from devices.arrays import Bools, Floats, Times
+from devices.chips.compensation import Compensation
+from devices.errors import TareError
+from devices.frames import FrameBatch, FrameFlag
+from devices.temperature_hold import hold_temperature
+from service.estimation.calibration import Calibration
+from service.estimation.tare.correlated_noise import (
+    compute_variance_inflation,
+    fit_correlated_noise,
+)
+from service.estimation.tare.tare import Tare, TareSource
+
+FRAMES_MIN = 20  # fewer do not tell noise from drift
+NEAR_BASELINE_KPA = 1.5
+"""Largest distance of an unloaded bubble from its baseline in the rig: 5 K, by p0 / T0."""
+LOADED_KPA = 3.0
+"""Distance above the rig baseline, 10 K by p0 / T0, from which a tile counts as loaded, even if the
+user or a flag marks it as unloaded."""
+QUIET_FACTOR = 1.5
+"""Largest scatter of an unloaded tile over that in the rig."""
+STILL_SIGMAS = 4.0
+"""Largest difference of a window's halves, or from the lowest window, in sigmas."""
+STUCK_SCATTER_MAX_COUNTS = 0.5
+"""Scatter in counts above which a healthy chip does not read the same count twenty times."""
+
+
+@dataclass(frozen=True)
+class QuietWindow:
+    """Window in which every tile is quiet and still.
+
+    Attributes:
+        rows: rows of the frames.
+        mean_kpa: (tiles,), mean pressures.
+        sigma_kpa: (tiles,), their standard uncertainty.
+    """
+
+    rows: slice
+    mean_kpa: Floats
+    sigma_kpa: Floats
+
+
+class TareFrames:
+    """Frames in order, with their pressures and the rig data of their tiles.
+
+    Args:
+        frames: n frames.
+        compensation: of the array's chips.
+        calibration: of its tiles, with baselines in the rig.
+        serials: of the tiles, in order.
+
+    Attributes:
+        kpa: (n, tiles), absolute pressures; NaN where a tile gave none.
+        since_ns: (n,), from the first frame.
+        rig_baseline_kpa: (tiles,), baselines in the rig; NaN where unknown.
+        rig_noise_kpa: (tiles,), standard deviations of a reading there; likewise.
+        is_calibrated: (tiles,), False for bare tiles, which bear no load.
+    """
+
+    def __init__(
+        self,
+        frames: FrameBatch,
+        compensation: Compensation,
+        calibration: Calibration,
+        serials: tuple[str, ...],
+    ) -> None:
+        self.frames, _ = hold_temperature(frames)
+        self.serials = serials
+        self.kpa = compensation.compute_usable_kpa(self.frames)
+        self.since_ns = frames.t_ns - frames.t_ns[:1]
+        entries = [calibration.find_tile(serial) for serial in serials]
+        self.rig_baseline_kpa = np.array(
+            [e.baseline_kpa if e else None for e in entries], dtype=float
+        )
+        self.rig_noise_kpa = np.array([e.noise_kpa if e else None for e in entries], dtype=float)
+        self.is_calibrated = np.array([entry is not None for entry in entries])
+        self._compensation = compensation
+
+    @property
+    def has_rig_baselines(self) -> bool:
+        """True if the calibration has the unloaded baselines of all tiles."""
+        known = np.isfinite(self.rig_baseline_kpa) & np.isfinite(self.rig_noise_kpa)
+        return bool(self.is_calibrated.any() and known[self.is_calibrated].all())
+
+    @property
+    def step_noise_kpa(self) -> Floats:
+        """Noise (tiles,) from differences of successive frames, which slow motion hardly changes.
+
+        NaN where there are none.
+        """
+        steps_kpa = np.diff(self.kpa, axis=0)
+        noise_kpa = np.full(steps_kpa.shape[1], np.nan)
+        known = np.isfinite(steps_kpa).any(axis=0)  # of nothing numpy takes no deviation
+        noise_kpa[known] = np.nanstd(steps_kpa[:, known], axis=0) / np.sqrt(2.0)
+        return noise_kpa
+
+    def find_quiet_windows(
+        self, spans: Iterable[tuple[int, int]], noise_kpa: Floats
+    ) -> list[QuietWindow]:
+        """Return the windows among `spans` in which every tile is quiet and still.
+
+        Args:
+            spans: first row, and row after the last, of each window.
+            noise_kpa: (tiles,), noise of an unloaded tile.
+        """
+        found = []
+        for first, end in spans:
+            kpa, n = self.kpa[first:end], end - first
+            if n < FRAMES_MIN or not np.isfinite(kpa).all():
+                continue
+            sigma_kpa = noise_kpa / np.sqrt(n)
+            drift_kpa = kpa[: n // 2].mean(axis=0) - kpa[n // 2 :].mean(axis=0)
+            quiet = kpa.std(axis=0, ddof=1) < QUIET_FACTOR * noise_kpa
+            # Each half has sqrt(2) times the mean's uncertainty, so their difference has twice it.
+            still = np.abs(drift_kpa) < STILL_SIGMAS * 2.0 * sigma_kpa
+            if (quiet & still).all():
+                found.append(QuietWindow(slice(first, end), kpa.mean(axis=0), sigma_kpa))
+        return found
+
+    def compute_tare(self, rows: Bools | slice, source: TareSource) -> Tare:
+        """Compute the tare from the frames of `rows`.
+
+        Raises:
+            TareError: a tile has fewer than `MIN_FRAMES` readable frames among them.
+        """
+        kpa = self.kpa[rows]
+        readable = np.isfinite(kpa).sum(axis=0)
+        for serial, count in zip(self.serials, readable, strict=True):
+            if count < FRAMES_MIN:
+                raise TareError(
+                    f"tile {serial} has {count} readable frames in the interval",
+                    expected=f"at least {FRAMES_MIN}",
+                    remedy="Name another interval with --tare-s BEGIN,END",
+                )
+        temperature_raw_counts = np.nanmean(
+            np.where(np.isfinite(kpa), self.frames.temperature_raw[rows], np.nan), axis=0
+        )
+        # A perfectly quiet reading is still rounded to a count.
+        noise_kpa = np.maximum(
+            np.nanstd(kpa, axis=0, ddof=1), self.compute_rounding_sigma_kpa(temperature_raw_counts)
+        )
+        t_s = self.since_ns[rows] * 1e-9
+        part, readings = fit_correlated_noise(kpa)
+        return Tare(
+            baseline_kpa=np.nanmean(kpa, axis=0),
+            baseline_sigma_kpa=noise_kpa
+            * np.sqrt(compute_variance_inflation(part, readings, readable) / readable),
+            noise_kpa=noise_kpa,
+            temperature_raw_counts=temperature_raw_counts,
+            t_ns=int(self.frames.t_ns[rows][-1]),
+            begin_s=float(t_s[0]),
+            end_s=float(t_s[-1]),
+            frames=len(kpa),
+            source=source,
+            noise_lasting=part,
+            noise_lasting_s=readings * float(np.median(np.diff(t_s))),
+        )
+
+    def compute_rounding_sigma_kpa(self, temperature_counts: Floats) -> Floats:
+        """Return the standard uncertainty of rounding to a count, (tiles,)."""
+        return self._compensation.compute_quantization_sigma_kpa(temperature_counts)
+
+    def reject_loaded(self, tare: Tare) -> None:
+        """Reject a tare under load, which would make every later force too small.
+
+        A colder tile reads less than in the rig, and no load does that: only more is rejected.
+
+        Raises:
+            TareError: a tile is far above its rig baseline, where that is known.
+        """
+        for serial, baseline_kpa, bench_kpa in zip(
+            self.serials, tare.baseline_kpa, self.rig_baseline_kpa, strict=True
+        ):
+            if baseline_kpa > bench_kpa + LOADED_KPA:
+                raise TareError(
+                    f"tile {serial} reads {baseline_kpa:.2f} kPa in the interval, and "
+                    f"{bench_kpa:.2f} kPa unloaded on the bench: it seems to be loaded",
+                    expected=f"at most {LOADED_KPA} kPa more",
+                    remedy="Name an unloaded interval with --tare-s BEGIN,END, or calibrate at "
+                    "this temperature",
+                )
+
+    def reject_stuck(self, tare: Tare, rows: Bools | slice) -> None:
+        """Reject a baseline with half of its counts equal in a row, unless the rig showed no noise.
+
+        Raises:
+            TareError: a tile repeated one count, as a stuck chip does.
+        """
+        count_kpa = np.sqrt(12.0) * self.compute_rounding_sigma_kpa(tare.temperature_raw_counts)
+        readable = np.isfinite(self.kpa[rows])
+        for i in np.flatnonzero(~(self.rig_noise_kpa <= STUCK_SCATTER_MAX_COUNTS * count_kpa)):
+            pressure_raw = self.frames.pressure_raw[rows][readable[:, i], i]
+            begins = np.flatnonzero(np.diff(pressure_raw, prepend=pressure_raw[0] ^ 1))
+            lengths = np.diff(begins, append=len(pressure_raw))
+            longest = int(np.argmax(lengths))
+            if lengths[longest] < max(FRAMES_MIN, len(pressure_raw) / 2):
+                continue
+            raise TareError(
+                f"tile {self.serials[i]} gave {pressure_raw[begins[longest]]} counts "
+                f"{lengths[longest]} times in a row, of {len(pressure_raw)}",
+                expected="readings that scatter, as those of a part that converts do",
+                remedy="It seems to hang: unplug it and plug it in again, then tare",
+            )
+
+
+def compute_window_starts(since_ns: Times, begin_ns: int, step_ns: int, length_ns: int) -> Times:
+    """Return the starts of the windows with at least one frame, (windows,), rising, from 0 on.
+
+    Windows start every step before and after one instant. A long gap, or a step of the clock, has
+    no windows, so their number is bounded by that of the frames.
+
+    Args:
+        since_ns: (n,), of frames, rising.
+        begin_ns: of one window.
+        step_ns: from window to window; above 0.
+        length_ns: of a window.
+    """
+    last = np.unique((since_ns - begin_ns) // step_ns)
+    numbers = np.unique(last[:, None] - np.arange(-(-length_ns // step_ns)))
+    begins_ns = begin_ns + step_ns * numbers
+    return np.asarray(begins_ns[(begins_ns >= 0) & (begins_ns <= since_ns[-1])], dtype=np.int64)
+
+
+def select_lowest_windows(windows: list[QuietWindow]) -> list[QuietWindow]:
+    """Return the windows in which no tile exceeds the lowest window by more than chance."""
+    lowest_kpa = np.min([window.mean_kpa for window in windows], axis=0, initial=np.inf)
+    return [
+        window
+        for window in windows
+        # The difference of two means is uncertain by sqrt(2) times one.
+        if (window.mean_kpa < lowest_kpa + STILL_SIGMAS * np.sqrt(2.0) * window.sigma_kpa).all()
+    ]
+
+
+RECOGNITION_SPAN_NS = 60_000_000_000
+"""Time from the beginning of a recording that is searched for an unloaded window."""
+WINDOW_NS = 500_000_000  # longer than in flight: a recording begins at rest
+
+
+def compute_recording_tare(
+    frames: FrameBatch,
+    compensation: Compensation,
+    calibration: Calibration,
+    serials: tuple[str, ...],
+    *,
+    interval_s: tuple[float, float] | None = None,
+) -> Tare:
+    """Compute the tare of a recording from its first frames.
+
+    Args:
+        frames: frames from the first of the recording on.
+        compensation: of the array's chips.
+        calibration: of its tiles, with baselines in the rig.
+        serials: of the tiles, in order.
+        interval_s: the user's interval, in seconds from the first frame.
+
+    Raises:
+        TareError: the interval holds too few readable frames, or none can be recognised.
+    """
+    if interval_s is not None:
+        begin_s, end_s = interval_s
+        seen = TareFrames(frames, compensation, calibration, serials)
+        t_s = seen.since_ns * 1e-9
+        rows = (t_s >= begin_s) & (t_s <= end_s)
+        tare = seen.compute_tare(rows, "interval")
+        seen.reject_loaded(tare)
+        seen.reject_stuck(tare, rows)
+        return tare
+    lead = np.logical_and.accumulate((frames.frame_flags & FrameFlag.LEAD) != 0)
+    if lead[0]:
+        seen = TareFrames(frames, compensation, calibration, serials)
+        tare = seen.compute_tare(lead, "lead")
+        seen.reject_loaded(tare)
+        seen.reject_stuck(tare, lead)
+        return tare
+    # The result must not depend on the number of frames passed.
+    last_ns = frames.t_ns[0] + RECOGNITION_SPAN_NS
+    frames = frames.slice_rows(0, int(np.searchsorted(frames.t_ns, last_ns, side="right")))
+    seen = TareFrames(frames, compensation, calibration, serials)
+    found = _find_unloaded_rows(seen, calibration)
+    tare = seen.compute_tare(found, "recognised")
+    seen.reject_stuck(tare, found)
+    return tare
+
+
+def _find_unloaded_rows(seen: TareFrames, calibration: Calibration) -> slice:
+    """Return the rows of the first half second with every tile quiet, still, and near its baseline.
+
+    Raises:
+        TareError: there is none, or the rig baselines are unknown.
+    """
+    if not seen.has_rig_baselines:
+        raise TareError(
+            f"calibration {calibration.name} does not say where an unloaded tile lies",
+            remedy="Name an unloaded interval with --tare-s BEGIN,END",
+        )
+    # A bare tile is not calibrated: it may read anything, with the noise that it shows.
+    noise_kpa = np.where(seen.is_calibrated, seen.rig_noise_kpa, seen.step_noise_kpa)
+    begins_ns = compute_window_starts(seen.since_ns, 0, WINDOW_NS // 2, WINDOW_NS)
+    firsts, ends = np.searchsorted(seen.since_ns, [begins_ns, begins_ns + WINDOW_NS])
+    windows = seen.find_quiet_windows(zip(firsts.tolist(), ends.tolist(), strict=True), noise_kpa)
+    near = [
+        window
+        for window in windows
+        if not (np.abs(window.mean_kpa - seen.rig_baseline_kpa) >= NEAR_BASELINE_KPA).any()
+    ]
+    low = select_lowest_windows(near)
+    if not low:
+        raise TareError(
+            "no interval can be recognised as unloaded",
+            expected=f"{WINDOW_NS / 1e9:g} s in which every tile is quiet and within "
+            f"{NEAR_BASELINE_KPA} kPa of its baseline on the bench",
+            remedy="Name an unloaded interval with --tare-s BEGIN,END",
+        )
+    return low[0].rows

@@ -1,0 +1,342 @@
+"""Running node: acquisition process, journal on disk, local recording, and publisher."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+from devices.errors import FootTileError
+from service.node.acquisition_process import (
+    AcquiredBatch,
+    AcquisitionEnded,
+    AcquisitionMessage,
+    AcquisitionProcess,
+    AcquisitionStarted,
+    ArrayHealth,
+    WaitingForArray,
+)
+from service.node.frame_sender import NodeCallbacks
+from service.node.local_recording import LocalRecording
+from service.node.options import NodeOptions
+from service.node.publisher import Publisher
+from service.node.secrets import ServerSecrets
+from service.node.server_connection import make_hello
+from service.protocol import NodeStatus, RetentionMessage
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.retention_requests import RetentionRequest
+from storage.journal.node.stream import NodeStream
+
+_POLL_S = 0.02
+"""Poll interval while waiting for delivery."""
+_DELIVERY_TIMEOUT_S = 3.0
+"""Timeout of delivery to the server when the node stops."""
+_POLLS_WITHOUT_LINK_MAX = 50
+"""Polls without a link, a second in all, that end the wait for delivery."""
+_PROBLEMS_MAX, _PROBLEM_LENGTH = 20, 400
+"""Limits of the journal's problems in a status message; the node reports all problems locally."""
+_WARNINGS_INTERVAL_S = 0.5
+"""Interval of checks for changed warnings."""
+_STALL_S = 2.0
+"""Time without a batch after which acquisition counts as stalled; a batch takes 25 ms."""
+
+
+@dataclass(frozen=True)
+class NodeOutcome:
+    """Outcome of a node's run, for the frames of sessions.
+
+    Attributes:
+        undelivered_frames: frames on the node's disk that the server has not acknowledged.
+        lost_frames: frames of sessions that are on no disk of node or server.
+        recorded_session_id: id of the local session; None: no recording, or not sealed.
+        is_lossy: True if that session is not complete.
+    """
+
+    undelivered_frames: int = 0
+    lost_frames: int = 0
+    recorded_session_id: str | None = None
+    is_lossy: bool = False
+
+
+async def run_node(
+    options: NodeOptions, *, stop: asyncio.Event, report: Callable[[str], None]
+) -> NodeOutcome:
+    """Acquire frames, journal them and publish them until `stop`.
+
+    Args:
+        options: options of the node.
+        stop: ends the node in order.
+        report: called with messages about link, disk and array.
+
+    Raises:
+        FootTileError: the array cannot be opened or failed for good, or another node uses the
+            folder.
+    """
+    rig = options.rig_options
+    journal = await asyncio.to_thread(NodeJournal, options.node_folder, rig.node_name)
+    try:
+        node = RunningNode(options, journal, report)
+        journal.start_writer()  # only now, when the retention for local sessions is set
+        try:
+            return await node.run_until(stop)
+        finally:
+            await node.close()
+    finally:
+        await asyncio.to_thread(journal.close)
+
+
+class RunningNode:
+    """Running node: connects acquisition, journal, recording and publisher."""
+
+    def __init__(
+        self, options: NodeOptions, journal: NodeJournal, report: Callable[[str], None]
+    ) -> None:
+        self._options = options
+        self._journal = journal
+        self._report = report
+        self._recording = LocalRecording(
+            options.node_folder,
+            options.rig_options.node_name,
+            journal,
+            session_name=options.session_name,
+            calibration=options.calibration,
+            scene_content=options.rig_options.scene.model_dump(mode="json"),
+            is_emulated=options.rig_options.is_emulated,
+            report=report,
+        )
+        for problem in journal.problems:
+            report(problem)
+        self._health = ArrayHealth()
+        self._current_stream: NodeStream | None = None
+        self._messages: asyncio.Queue[AcquisitionMessage] = asyncio.Queue()
+        self._last_message_s = math.inf
+        """Time of the last message from acquisition; infinite before the first."""
+        self._publisher: Publisher | None = None
+        self._publishing: asyncio.Task[None] | None = None
+        self._reported_warnings: tuple[str, ...] = ()
+        self._is_closing = False
+        loop = asyncio.get_running_loop()
+        self._acquisition = AcquisitionProcess(
+            replace(options.rig_options, journals_folder=journal.folder),
+            lambda message: _enqueue_message(loop, self._messages, message),
+        )
+
+    async def run_until(self, stop: asyncio.Event) -> NodeOutcome:
+        """Run until stopped, or until the array fails for good."""
+        stopping = asyncio.create_task(stop.wait())
+        tasks: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._report_warnings())]
+        try:
+            started = await self._await_array(stopping)
+            if started is None:
+                return NodeOutcome()
+            stopping.add_done_callback(lambda _: self._acquisition.request_stop())
+            await self._begin_stream(started)
+            sealing = asyncio.create_task(asyncio.to_thread(self._seal_earlier_sessions))
+            tasks.append(sealing)
+            if self._options.server_url is not None:
+                self._start_publisher(self._options.server_url)
+            while not isinstance(message := await self._messages.get(), AcquisitionEnded):
+                self._last_message_s = time.monotonic()
+                if isinstance(message, AcquisitionStarted):
+                    self._report("the tiles have a new description: a new stream begins")
+                    await self._begin_stream(message)
+                elif isinstance(message, AcquiredBatch) and self._current_stream is not None:
+                    self._store_batch(self._current_stream, message)
+            if self._current_stream is not None:
+                self._current_stream.mark_ended()
+            await self._wait_for_delivery()
+            # A session sealed before all frames are on disk would lack those in flight.
+            outcome = NodeOutcome(is_lossy=self._options.session_name is not None)
+            if await asyncio.to_thread(self._journal.wait_until_on_disk):
+                outcome = await asyncio.to_thread(self._make_outcome)
+            else:
+                self._report("the disk does not take the last frames: nothing is sealed yet")
+            if message.error is not None:
+                raise message.error
+            return outcome
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _await_array(self, stopping: asyncio.Task[bool]) -> AcquisitionStarted | None:
+        """Wait until the array is open; return None if the node is stopped before."""
+        reported = ""
+        while True:
+            message = asyncio.create_task(self._messages.get())
+            await asyncio.wait({message, stopping}, return_when=asyncio.FIRST_COMPLETED)
+            if not message.done():
+                message.cancel()
+                return None
+            match message.result():
+                case AcquisitionStarted() as started:
+                    return started
+                case WaitingForArray(problem):
+                    if problem != reported:
+                        self._report(f"waits for the array, and asks again each second: {problem}")
+                    reported = problem
+                case AcquisitionEnded(error) if error is not None:
+                    raise error
+                case _:
+                    return None
+
+    def _on_publisher_end(self, task: asyncio.Task[None]) -> None:
+        """End the node if the publisher ended unexpectedly."""
+        if not self._is_closing:
+            error = None if task.cancelled() else task.exception()
+            self._messages.put_nowait(
+                AcquisitionEnded(error or FootTileError("the publisher has ended"))
+            )
+
+    async def close(self) -> None:
+        """End publisher and acquisition."""
+        self._is_closing = True
+        if self._publishing is not None:
+            self._publishing.cancel()
+            await asyncio.gather(self._publishing, return_exceptions=True)
+        await asyncio.to_thread(self._acquisition.close)
+
+    async def _begin_stream(self, started: AcquisitionStarted) -> None:
+        info = started.info
+        self._report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s")
+        for remark in started.startup_messages:
+            self._report(remark)
+        self._current_stream = self._journal.begin_stream(info)
+        await asyncio.to_thread(self._recording.add_stream, self._current_stream)
+        if self._publisher is not None:
+            self._publisher.reconnect_for_new_stream()
+
+    def _store_batch(self, stream: NodeStream, message: AcquiredBatch) -> None:
+        self._journal.queue_batch(stream, message.encoded_batch, message.missed_slots)
+        self._health = message.health
+        if self._publisher is not None:
+            self._publisher.notify_new_frames()
+        for notice in message.warning_changes:
+            self._report(notice)
+
+    def _start_publisher(self, server: str) -> None:
+        self._publisher = Publisher(
+            server,
+            NodeCallbacks(
+                get_present_stream=self._get_present_stream,
+                get_streams=lambda: {stream.stream_id: stream for stream in self._journal.streams},
+                make_hello=lambda: make_hello(
+                    self._options, self._journal, self._get_present_stream()
+                ),
+                get_secret=ServerSecrets(self._journal.folder, self._report).get_or_create_secret,
+                make_status=self._make_status,
+                on_retention_request=self._on_retention_request,
+                on_damaged_frames=self._journal.report_damage,
+            ),
+            token=self._options.token,
+            ca_path=self._options.ca_path,
+            report=self._report,
+        )
+        self._publishing = asyncio.create_task(self._publisher.publish_forever())
+        self._publishing.add_done_callback(self._on_publisher_end)
+
+    def _get_present_stream(self) -> NodeStream:
+        if self._current_stream is None:
+            raise RuntimeError("no stream has begun")
+        return self._current_stream
+
+    def _make_status(self, backlog_frames: int) -> NodeStatus:
+        return NodeStatus(
+            missed_slots=self._get_present_stream().missed_slots,
+            backlog_frames=backlog_frames,
+            warnings=(
+                *self._stall_warnings(),
+                *self._health.warnings,
+                *self._journal.warnings,
+                *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
+            ),
+            counts={serial: dict(counts) for serial, counts in self._health.fault_counts.items()},
+        )
+
+    def _on_retention_request(
+        self, server_id: str, wanted: RetentionMessage, known: tuple[str, ...]
+    ) -> None:
+        streams = {stream.stream_id: stream.numbers for stream in wanted.streams}
+        wants = RetentionRequest(streams=streams, recording=wanted.recording, known=known)
+        self._journal.update_retention_request(server_id, wants)
+
+    def _stall_warnings(self) -> tuple[str, ...]:
+        """Return a warning if acquisition is stalled; this process and its link go on."""
+        silent_s = time.monotonic() - self._last_message_s
+        if silent_s < _STALL_S:
+            return ()
+        return (f"acquisition is held up; no frames for {silent_s:.0f} s",)
+
+    async def _report_warnings(self) -> None:
+        """Report stalls of acquisition and problems of the disk, and their end."""
+        while True:
+            await asyncio.sleep(_WARNINGS_INTERVAL_S)
+            troubles = (*self._stall_warnings(), *self._journal.warnings)
+            kinds = tuple(trouble.partition(";")[0] for trouble in troubles)
+            for kind in kinds:
+                if kind not in self._reported_warnings:
+                    self._report(kind)
+            for kind in self._reported_warnings:
+                if kind not in kinds:
+                    self._report(f"no longer: {kind}")
+            self._reported_warnings = kinds
+
+    async def _wait_for_delivery(self) -> None:
+        """Wait for the server, if connected, to acknowledge all frames, within a timeout."""
+        publisher = self._publisher
+        if publisher is None:
+            return
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_DELIVERY_TIMEOUT_S):
+                away = 0
+                while (
+                    self._count_undelivered(counts_unneeded=True) and away < _POLLS_WITHOUT_LINK_MAX
+                ):
+                    away = 0 if publisher.is_connected else away + 1
+                    await asyncio.sleep(_POLL_S)
+
+    def _count_undelivered(self, *, counts_unneeded: bool = False) -> int:
+        streams = self._journal.streams
+        if counts_unneeded and self._current_stream is not None:
+            present = self._current_stream
+            behind = (present.available - present.acked).count
+            return behind + sum(
+                self._journal.undelivered_numbers(stream).count
+                for stream in streams
+                if stream != present
+            )
+        return sum(self._journal.undelivered_numbers(stream).count for stream in streams)
+
+    def _seal_earlier_sessions(self) -> None:
+        if self._journal.wait_until_on_disk():
+            self._recording.seal_earlier_sessions()
+
+    def _make_outcome(self) -> NodeOutcome:
+        recorded, is_lossy = self._recording.stop_and_seal()
+        lost = 0
+        for stream in self._journal.streams:
+            wanted = self._journal.retention_requests.required_numbers_of(stream.stream_id)
+            lost += sum(numbers.count for numbers in stream.lost.restricted_to(wanted).values())
+        return NodeOutcome(
+            undelivered_frames=self._count_undelivered()
+            if self._options.server_url is not None
+            else 0,
+            lost_frames=lost,
+            recorded_session_id=recorded,
+            is_lossy=is_lossy,
+        )
+
+
+def _enqueue_message(
+    loop: asyncio.AbstractEventLoop,
+    messages: asyncio.Queue[AcquisitionMessage],
+    message: AcquisitionMessage,
+) -> None:
+    try:
+        loop.call_soon_threadsafe(messages.put_nowait, message)
+    except RuntimeError:  # the event loop has ended
+        return

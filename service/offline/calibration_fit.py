@@ -1,0 +1,272 @@
+"""Fit of a calibration to the indentation recordings in sealed sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import PRESSURE_MIN_KPA
+from devices.errors import CalibrationError
+from devices.frames import NOT_READ, FrameBatch
+from devices.temperature_hold import hold_temperature
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.effects import Parameter
+from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.rig.indentation import Indentation, select_loaded
+from service.estimation.fitting.rig.weight_holds import has_weights
+from service.estimation.fitting.sample_delay import DEFAULT_REFERENCE_DELAY, separate_delays
+from service.estimation.fitting.static_fit import fit_static_curve
+from service.estimation.fitting.weights_fit import fit_dead_weights
+from service.offline.rig_markers import RigProgramme, read_rig_programme
+from storage.sessions.reader import SealedFileReader
+
+
+@dataclass(frozen=True)
+class TileRecording:
+    """Recording of one tile in one file, with its chip and stream."""
+
+    indentation: Indentation
+    coefficient_words: tuple[int, int, int, int]
+    stream_id: str
+    seq_range: tuple[int, int]
+    """First and last frame."""
+
+
+def fit_calibration(
+    recordings: Mapping[str, Sequence[TileRecording]],
+    *,
+    name: str,
+    reference_name: str,
+    reference_delay: Parameter = DEFAULT_REFERENCE_DELAY,
+    on_progress: Callable[[str], None] = lambda message: None,
+) -> Calibration:
+    """Fit a calibration of every loaded tile.
+
+    Repeats of a tile may be in several files, each with its own baseline and reference zero. A file
+    with only a soak counts for every tile that is loaded in another file. A tile without a valid
+    curve is left out, with the reason in `refused`.
+
+    Args:
+        recordings: recordings by serial.
+        name: display name.
+        reference_name: name of the force sensor.
+        reference_delay: delay of its readings behind the force, in seconds.
+        on_progress: called with the result of every tile.
+
+    Raises:
+        CalibrationError: no tile has a curve.
+    """
+    tiles: list[TileCalibration] = []
+    refused: dict[str, str] = {}
+    for number, (serial, pressed) in enumerate(recordings.items(), start=1):
+        try:
+            tiles.append(_fit_tile(pressed, reference_delay))
+            found = _describe_fit(tiles[-1])
+        except CalibrationError as error:
+            if len(recordings) == 1:
+                raise
+            refused[serial] = str(error)
+            found = "refused"
+        on_progress(f"tile {serial}, {number} of {len(recordings)}: {found}")
+    if not tiles:
+        raise CalibrationError(
+            "no tile has a curve: "
+            + "; ".join(f"{serial}: {reason}" for serial, reason in refused.items())
+        )
+    apart = separate_delays([tile.effects for tile in tiles], reference_delay)
+    tiles = [
+        tile.model_copy(update={"effects": effects})
+        for tile, effects in zip(tiles, apart, strict=True)
+    ]
+    newest_ns = max(
+        int(pressed.indentation.t_ns[-1]) for all_of in recordings.values() for pressed in all_of
+    )
+    return Calibration(
+        name=name,
+        reference=reference_name,
+        date=datetime.fromtimestamp(newest_ns // 1_000_000_000, tz=UTC).isoformat(),
+        tiles=tuple(tiles),
+        refused=refused,
+    )
+
+
+def read_indentations(paths: Sequence[Path]) -> dict[str, list[TileRecording]]:
+    """Read every tile's recordings, by serial.
+
+    Raises:
+        FileFormatError: a file is no session.
+        CalibrationError: a file is no indentation recording, a serial has two chips, or frames
+            occur twice.
+    """
+    found: dict[str, list[TileRecording]] = {}
+    for path in paths:
+        with SealedFileReader(path) as session:
+            chips = {tile.serial: tile.coefficient_words for tile in session.info.tiles}
+            indentations, seq = _split_by_tile(session)
+            for indentation in indentations:
+                pressed = TileRecording(
+                    indentation, chips[indentation.serial], session.info.stream_id, seq
+                )
+                others = found.setdefault(indentation.serial, [])
+                for other in others:
+                    _reject_contradiction(other, pressed)
+                others.append(pressed)
+    # Tiles that were only soaked have no data to fit.
+    bench = {
+        serial: recordings
+        for serial, recordings in sorted(found.items())
+        if select_loaded([pressed.indentation for pressed in recordings])
+    }
+    if not bench:
+        raise CalibrationError(
+            "no tile is loaded in any of the recordings",
+            where=", ".join(str(path) for path in paths),
+            expected="phases load and unload, with pressed_tile naming a tile",
+        )
+    return bench
+
+
+def _reject_contradiction(first: TileRecording, second: TileRecording) -> None:
+    serial, files = (
+        first.indentation.serial,
+        f"{first.indentation.where} and {second.indentation.where}",
+    )
+    if first.coefficient_words != second.coefficient_words:
+        raise CalibrationError(
+            f"tile {serial} has another chip in each of two recordings: coefficients "
+            f"{first.coefficient_words} and {second.coefficient_words}",
+            where=files,
+            remedy="Give the replaced part a serial of its own, and calibrate each by itself",
+        )
+    # A repeat counted twice would look like good repeatability.
+    if (
+        first.stream_id == second.stream_id
+        and first.seq_range[0] <= second.seq_range[1]
+        and second.seq_range[0] <= first.seq_range[1]
+    ):
+        raise CalibrationError(
+            f"tile {serial}: the same frames occur twice",
+            where=files,
+            remedy="Name each recording once",
+        )
+
+
+def _fit_tile(pressed: Sequence[TileRecording], delay: Parameter) -> TileCalibration:
+    recordings = [each.indentation for each in pressed]
+    weighted = [has_weights(recording) for recording in select_loaded(recordings)]
+    if any(weighted):
+        if not all(weighted):
+            raise CalibrationError(
+                "one recording uses dead weights, another one an indenter",
+                where=", ".join(recording.where for recording in recordings),
+                remedy="Calibrate from one kind of recording",
+            )
+        tile = fit_dead_weights(select_loaded(recordings))
+        return tile.model_copy(update={"coefficient_words": pressed[0].coefficient_words})
+    tile = fit_static_curve(*select_loaded(recordings))
+    return tile.model_copy(
+        update={
+            "coefficient_words": pressed[0].coefficient_words,
+            "effects": fit_effects(recordings, tile, delay),
+        }
+    )
+
+
+def _describe_fit(tile: TileCalibration) -> str:
+    """Describe a tile's fit in one line."""
+    effects = tile.effects
+    found = [f"curve to {tile.range_kpa[1]:.1f} kPa"]
+    if (facts := tile.weights) is not None:
+        last = facts.band_95[-1]
+        return (
+            f"{found[0]} from {len(facts.steps)} weights, "
+            f"{last.force_n:.1f} +-{last.new_loading_n:.1f} N (95 %) at its end"
+        )
+    if (gas := effects.gas) is not None:
+        found.append(f"gas {gas.gamma.value:.2f} in {1e3 * gas.tau_s.value:.0f} ms")
+    if (rubber := effects.rubber) is not None:
+        terms = zip(rubber.part, rubber.tau_s, strict=True)
+        each = (f"{100 * part.value:.1f} % in {tau.value:.2g} s" for part, tau in terms)
+        found.append("creep " + " and ".join(each))
+    if (loop := effects.hysteresis) is not None:
+        flows = "" if loop.flow is None else f", {loop.flow.stress_n.value:.2f} N of it flows"
+        found.append(f"loop{flows}")
+    if (warm := effects.temperature) is not None:
+        found.append(f"{warm.kpa_per_k.value:.3f} kPa/K")
+    return ", ".join([*found, *(f"no {name}" for name in effects.refused)])
+
+
+def _read_marked_programme(session: SealedFileReader) -> RigProgramme:
+    """Read the programme from the markers of a server's recording.
+
+    Raises:
+        CalibrationError: there is none, or the recording has a gap.
+    """
+    notes = session.notes.get("session")
+    if isinstance(notes, dict) and len(notes.get("parts") or ()) > 1:
+        raise CalibrationError(
+            "the node was restarted while it was recorded",
+            where=str(session.path),
+            expected="a recording in one part",
+            remedy="Record again",
+        )
+    marked = read_rig_programme(session)
+    if marked is None:
+        raise CalibrationError(
+            "not an indentation recording",
+            where=str(session.path),
+            expected="columns pressed_tile and phase beside reference_force_n, or marks such as "
+            "`T01 load`",
+            remedy="Record one with a rig, or `foottile simulate --scene indentation`",
+        )
+    return marked
+
+
+def _split_by_tile(session: SealedFileReader) -> tuple[list[Indentation], tuple[int, int]]:
+    """Split a rig recording by tile; also return its first and last seq."""
+    has_columns = session.has_columns("pressed_tile", "phase")
+    marked = None if has_columns else _read_marked_programme(session)
+    pieces = list(session.read_batches(*(("pressed_tile", "phase") if has_columns else ())))
+    frames = FrameBatch.concatenate([frames for frames, _ in pieces])
+    if marked is None:
+        pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
+        phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
+    else:
+        pressed, phase = marked
+    # A recording with only a soak counts for all tiles.
+    only_soak = bool((phase == "soak").any()) and not np.isin(pressed, session.info.serials).any()
+    held, _ = hold_temperature(frames)
+    readable_kpa = Compensation(session.info.tiles).compute_usable_kpa(held)
+    # A count that wrapped around reads as almost no pressure (model `unwrap`): the tile was
+    # loaded beyond its chip's range.
+    kpa = np.where(readable_kpa < PRESSURE_MIN_KPA, np.inf, readable_kpa)
+    tiles = [
+        Indentation(
+            serial=serial,
+            where=str(session.path),
+            t_ns=frames.t_ns,
+            kpa=kpa[:, i],
+            reference_n=frames.reference_force_n.astype(np.float64),
+            phase=phase,
+            is_under_indenter=pressed == serial,
+            temperature_raw=np.where(
+                held.temperature_raw[:, i] == NOT_READ,
+                np.nan,
+                held.temperature_raw[:, i].astype(np.float64),
+            ),
+        )
+        for i, serial in enumerate(session.info.serials)
+        if (pressed == serial).any() or only_soak
+    ]
+    if not tiles:
+        raise CalibrationError(
+            "no tile of the array is loaded in the recording",
+            where=str(session.path),
+            expected="pressed_tile naming one of " + ", ".join(session.info.serials),
+        )
+    return tiles, (int(frames.seq[0]), int(frames.seq[-1]))

@@ -1,0 +1,395 @@
+"""Protocol between node and server, `foottile.v1`: messages, checksums, close codes.
+
+    node                                  server
+    identify (its name)              -->
+                                     <--  challenge (a nonce)
+    proof, hello (stored frames)     -->
+                                     <--  welcome (missing frames, retention request)
+    stream, then Arrow messages      -->
+                                     <--  ack (frames on the server's disk)
+                                     <--  wanted (retention request)
+    probe                            <->  probe        eight at a time, for the clocks' offset
+    clock, status, lost              -->
+
+Text messages are JSON with a `type`; a binary message is a record batch (`storage.wire`) of the
+stream named last. The newest frames are sent first; older frames that the server misses, of this
+stream and of earlier ones, follow. The node retains all frames that a session needs until they are
+acknowledged; a new connection begins with identify again. Frames may arrive twice and in any order:
+a server stores each (stream, seq) once.
+
+A node proves that it is the machine that had its name before: `service.node_identity`.
+
+Every message has a CRC-32 (zlib), because neither websockets nor Arrow detect a flipped bit: the
+last four bytes of a binary message, little endian, over all before; the last field of a text
+message, `"crc32"` with eight hex digits, over the text before its comma. A message with a wrong
+CRC-32 ends the connection, and its content is sent again.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from enum import IntEnum
+from typing import Annotated, Literal, Self, TypeVar
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+
+from devices.errors import FileFormatError, LinkError
+from devices.frames import ArrayInfo
+from devices.types import Count, Identifier, OffsetNs, Seq, StrictModel, Text, TMonoNs, TNs
+from service.estimation.calibration import Calibration
+from service.private_paths import strip_private_folders
+from service.scene_content import SceneContent
+from storage.intervals import NO_END
+
+_T = TypeVar("_T")
+
+SUBPROTOCOL = "foottile.v1"
+PROTOCOL = 3
+INGEST_PATH = "/api/v1/ingest"
+LIVE_PATH = "/api/v1/live"
+MESSAGE_BYTES_MAX = 1 << 20
+"""Longest message that either side accepts. A batch of 64 tiles is 0.1 MB."""
+LINK_TIMEOUT_S = 5.0
+"""Timeout of the link: a side closes it after receiving nothing for so long."""
+PROBES_PER_MEASUREMENT = 8
+_REASON_BYTES_MAX = 123
+_CRC_BYTES = 4
+_TEXT_WITH_CRC = re.compile(r'(\{.*),"crc32":"([0-9a-f]{8})"\}', re.DOTALL)
+
+_INTERVALS_MAX = 1 << 14
+"""Most intervals in a list: a gap every ten seconds for two days."""
+_STREAMS_MAX = 256
+_REASONS_MAX = 32
+_WARNINGS_MAX = 1000
+UNCERTAINTY_MAX_NS = 60_000_000_000
+"""Longest round trip, halved, of a usable probe."""
+STREAM_ID_PATTERN = r"[0-9a-f]{32}"
+_SeqOrEnd = Annotated[int, Field(ge=0, le=NO_END)]
+"""Frame number, or the end after the last possible one."""
+
+StreamId = Annotated[str, Field(pattern=f"^{STREAM_ID_PATTERN}$")]
+"""Id of a stream."""
+_Hex256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class LinkCloseCode(IntEnum):
+    """Close codes of foottile's websockets (4000 to 4999 are private to the application)."""
+
+    POLICY = 1008
+    TOO_BIG = 1009
+    BUG = 1011
+    RESTART = 1012
+    TRY_LATER = 1013
+    REFUSED = 4001
+    """Valid message, invalid content."""
+    WRONG_VERSION = 4002
+    MALFORMED = 4004
+    """Message damaged in transit."""
+    SILENT = 4005
+    TOO_SLOW = 4008
+    NAME_TAKEN = 4009
+    SUPERSEDED = 4010
+    NO_STREAM = 4011
+    """A requested stream does not exist, or no longer."""
+    UNREADABLE = 4012
+    """Stored frames cannot be read, permanently."""
+    WRONG_IDENTITY = 4013
+    """The node's name belongs to another machine, until a person accepts this one."""
+
+
+class CloseConnection(Exception):  # noqa: N818  # no error: how a connection ends
+    """Request of a connection's handler to close it with a code and a reason."""
+
+    def __init__(self, code: LinkCloseCode, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason
+
+
+def _check_rising(pairs: tuple[tuple[int, int | None], ...]) -> tuple[tuple[int, int | None], ...]:
+    end: int | None = -1
+    for first, last in pairs:
+        if end is None or first <= end or (last is not None and last < first):
+            raise ValueError("intervals must be rising and not empty")
+        end = last
+    return pairs
+
+
+def _check_none_empty(
+    pairs: tuple[tuple[int, int | None], ...],
+) -> tuple[tuple[int, int | None], ...]:
+    if any(last is not None and last < first for first, last in pairs):
+        raise ValueError("an interval is empty")
+    return pairs
+
+
+SeqIntervals = Annotated[
+    tuple[tuple[Seq, Seq], ...], Field(max_length=_INTERVALS_MAX), AfterValidator(_check_rising)
+]
+"""Frame numbers as closed intervals, in order."""
+SeqIntervalsByReason = Annotated[
+    dict[Annotated[str, Field(pattern=r"^[a-z_]{1,40}$")], SeqIntervals],
+    Field(max_length=_REASONS_MAX),
+]
+
+
+class Identify(StrictModel):
+    """First message: name of the connecting node."""
+
+    type: Literal["identify"] = "identify"
+    protocol: Count
+    node: Identifier
+
+
+class Challenge(StrictModel):
+    """Request for a proof that the node is the machine that had its name before."""
+
+    type: Literal["challenge"] = "challenge"
+    protocol: Count
+    server_id: Identifier
+    """Name of the server's data folder: a node shares one secret with each."""
+    nonce: _Hex256
+    """Random, for this connection only."""
+    is_known: bool
+    """True if the server has a secret of this node; else it accepts the secret that the node sends.
+    """
+
+
+class Proof(StrictModel):
+    """Answer to `challenge`. A node whose disk cannot store a secret sends neither field."""
+
+    type: Literal["proof"] = "proof"
+    proof: _Hex256 | None = None
+    """`service.node_identity.make_proof`."""
+    secret: _Hex256 | None = None
+    """The secret itself: at first contact, or where a person has to accept this machine."""
+
+
+class EarlierStream(StrictModel):
+    """Ended stream of which the node still stores frames, or has lost some."""
+
+    array_info: ArrayInfo
+    stored: SeqIntervals
+    """Frames stored on the node."""
+    next_seq: Seq
+    """Number after the last known frame."""
+    lost: SeqIntervalsByReason = Field(default={})
+    """Frames lost on the node, by reason."""
+    max_lost_tail_frames: Count = 0
+    """Upper bound of further frames at the end, lost in a power failure. 0: the stream ended in
+    order, or its process was killed, which loses no frames."""
+    missed_slots: Count = 0
+    t_ns_first: TNs = 0
+    """Instant of the oldest stored frame, in the node's UTC."""
+
+
+class Hello(StrictModel):
+    """Description of the node and of its streams."""
+
+    type: Literal["hello"] = "hello"
+    protocol: Count
+    array_info: ArrayInfo
+    stored: SeqIntervals
+    """Frames of the present stream stored on the node."""
+    next_seq: Seq
+    """Number of the next frame."""
+    t_mono_ns: TMonoNs
+    """CLOCK_MONOTONIC of the node when it composed this message."""
+    lost: SeqIntervalsByReason = Field(default={})
+    """Lost frames of the present stream, by reason."""
+    t_ns_first: TNs = 0
+    """Instant of the oldest stored frame of the present stream, in the node's UTC; 0: none."""
+    scene: SceneContent
+    """Content of the scene file."""
+    emulated: bool
+    calibration: Calibration | None
+    calibration_problem: Text | None
+    """Reason why there is no calibration."""
+    earlier: Annotated[tuple[EarlierStream, ...], Field(max_length=_STREAMS_MAX)] = ()
+    """Earlier streams, oldest first."""
+    has_more: bool = False
+    """True if further earlier streams did not fit. They are announced once these are delivered."""
+
+
+class StreamNumbers(StrictModel):
+    """Frame numbers of one stream."""
+
+    stream_id: StreamId
+    numbers: Annotated[
+        tuple[tuple[_SeqOrEnd, _SeqOrEnd | None], ...],
+        Field(max_length=2 * _INTERVALS_MAX),
+        AfterValidator(_check_none_empty),
+    ]
+    """Intervals, the most urgent first. An interval without an end includes all future frames."""
+
+
+class RetentionMessage(StrictModel):
+    """Retention request: frames for the node to retain until acknowledged, whatever their age."""
+
+    type: Literal["wanted"] = "wanted"
+    streams: tuple[StreamNumbers, ...]
+    """Frames of sessions that are not yet sealed, by stream."""
+    recording: bool
+    """True while a session is being recorded: a new stream belongs to it from its first frame on.
+    """
+
+
+class Welcome(StrictModel):
+    """Acceptance of the node, with the frames that the server misses and a retention request."""
+
+    type: Literal["welcome"] = "welcome"
+    protocol: Count
+    missing: tuple[StreamNumbers, ...]
+    """Missing frames: of the present stream all that the node stores and the server does not, of
+    earlier ones those of sessions. The present stream's last interval has no end."""
+    retention: RetentionMessage
+
+
+class Ack(StrictModel):
+    """Acknowledgement that frames are on the server's disk: the node may delete them."""
+
+    type: Literal["ack"] = "ack"
+    stream_id: StreamId
+    seq_first: Seq
+    seq_last: Seq
+
+    @model_validator(mode="after")
+    def _is_not_empty(self) -> Self:
+        if self.seq_last < self.seq_first:
+            raise ValueError("the interval is empty")
+        return self
+
+
+class StreamSelect(StrictModel):
+    """Selection of the stream of all following frames."""
+
+    type: Literal["stream"] = "stream"
+    stream_id: StreamId
+
+
+class ClockProbe(StrictModel):
+    """Request for the server's clock, and its answer."""
+
+    type: Literal["probe"] = "probe"
+    id: Seq
+    server_t_ns: TNs | None = None
+    """The server's UTC; None in the request."""
+
+
+class ClockSample(StrictModel):
+    """Clock offset by the best of eight probes. A failed measurement is not sent."""
+
+    type: Literal["clock"] = "clock"
+    t_mono_ns: TMonoNs
+    server_minus_node_ns: OffsetNs
+    """The server's UTC minus the `t_ns` of a frame at the same instant."""
+    uncertainty_ns: Annotated[int, Field(ge=0, le=UNCERTAINTY_MAX_NS)]
+    """Half the round trip, which contains the server's reading."""
+
+
+class LossReport(StrictModel):
+    """All lost frames of a stream; sent whenever they change."""
+
+    type: Literal["lost"] = "lost"
+    stream_id: StreamId
+    lost: SeqIntervalsByReason
+
+
+class NodeStatus(StrictModel):
+    """Counters and warnings of the node; each second."""
+
+    type: Literal["status"] = "status"
+    missed_slots: Count
+    backlog_frames: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Backlog: frames still to be sent after the newest ones."""
+    warnings: Annotated[tuple[Text, ...], Field(max_length=_WARNINGS_MAX)] = ()
+    """Present warnings about the array or the node's disk."""
+    counts: Annotated[
+        dict[Identifier, Annotated[dict[Identifier, Count], Field(max_length=_REASONS_MAX)]],
+        Field(max_length=_WARNINGS_MAX),
+    ] = Field(default={})
+    """Fault counts of this stream, by serial and reason."""
+
+
+NodeMessage = (
+    Identify | Proof | Hello | StreamSelect | ClockProbe | ClockSample | NodeStatus | LossReport
+)
+ServerMessage = Challenge | Welcome | Ack | RetentionMessage | ClockProbe
+NODE_MESSAGES: TypeAdapter[NodeMessage] = TypeAdapter(
+    Annotated[NodeMessage, Field(discriminator="type")]
+)
+SERVER_MESSAGES: TypeAdapter[ServerMessage] = TypeAdapter(
+    Annotated[ServerMessage, Field(discriminator="type")]
+)
+
+
+def parse_message(messages: TypeAdapter[_T], text: str) -> _T:
+    """Parse and validate a message.
+
+    Args:
+        messages: `NODE_MESSAGES` or `SERVER_MESSAGES`.
+        text: JSON without its checksum.
+
+    Raises:
+        LinkError: it is no such message, or a value is out of bounds.
+    """
+    try:
+        # Strict: true is not 1, and "1" neither.
+        return messages.validate_json(text, strict=True)
+    except ValidationError as error:
+        complaint = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        where = ".".join(str(part) for part in complaint["loc"])
+        raise LinkError(f"message not understood: {where}: {complaint['msg']}") from error
+
+
+def encode_message(message: BaseModel) -> str:
+    """Encode a message as JSON with its checksum."""
+    body = message.model_dump_json()[:-1]
+    return f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}'
+
+
+def strip_text_crc(text: str | bytes) -> str:
+    """Verify the checksum of a text message and return the JSON without it.
+
+    Raises:
+        LinkError: the checksum is wrong or missing.
+    """
+    text = text.decode(errors="replace") if isinstance(text, bytes) else text
+    found = _TEXT_WITH_CRC.fullmatch(text)
+    if found is None or int(found[2], 16) != zlib.crc32(found[1].encode()):
+        raise LinkError("a message was damaged on its way", expected="the CRC-32 of its text")
+    return found[1] + "}"
+
+
+def append_crc(payload: bytes) -> bytes:
+    """Append the checksum to encoded frames, for a binary message."""
+    return payload + zlib.crc32(payload).to_bytes(_CRC_BYTES, "little")
+
+
+def strip_binary_crc(message: bytes) -> bytes:
+    """Verify the checksum of a binary message and return the encoded frames.
+
+    Raises:
+        FileFormatError: the checksum is wrong or missing.
+    """
+    payload, check = message[:-_CRC_BYTES], message[-_CRC_BYTES:]
+    if len(check) < _CRC_BYTES or zlib.crc32(payload) != int.from_bytes(check, "little"):
+        raise FileFormatError(
+            "a message of frames was damaged on its way", expected="the CRC-32 of its bytes"
+        )
+    return payload
+
+
+def format_close_reason(text: str) -> str:
+    """Format a reason for a close frame and a log: 123 bytes (RFC 6455 5.5) in one line."""
+    text = strip_private_folders(text)
+    plain = "".join(char if char.isprintable() else "?" for char in text[:_REASON_BYTES_MAX])
+    return plain.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")

@@ -1,0 +1,240 @@
+"""Broadcast of summaries to the subscribers of the live page.
+
+Subscribers of the same nodes at the same rate share a rate group: its update is summarized, encoded
+and framed once per tick, and written to each without waiting. A subscriber that has not read the
+last update gets nothing more: its updates are merged until it reads, or until it is disconnected.
+Others are not affected.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
+
+from websockets.frames import Frame, Opcode
+
+from service.protocol import CloseConnection, LinkCloseCode
+from service.server.broadcast.force_history import ForceHistory
+from service.server.broadcast.force_span import summarize_force
+from service.server.broadcast.summary import PendingUpdate, encode_json, summarize_frames
+from service.server.broadcast.tile_history import TileHistory
+from service.server.estimates.node_estimator import EstimatedBatch
+from service.server.node import ServerNode
+from service.server_clock import server_utc_ns
+
+RATES_HZ = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0)
+"""Update rates; a requested rate is rounded down."""
+TOO_SLOW_S = 10.0
+"""Timeout of a subscriber that does not read; it may reconnect."""
+_WRITES_PER_TURN = 64
+"""Subscribers written to before other tasks of the event loop run."""
+
+
+class SubscriberSocket(Protocol):
+    """Websocket with writes that do not wait."""
+
+    @property
+    def is_writable(self) -> bool:
+        """True if all earlier writes are sent, up to the transport buffer (64 KiB)."""
+
+    def write_framed(self, framed: bytes) -> None:
+        """Write whole frames of the websocket protocol; nothing if it is closed."""
+
+
+class Subscriber:
+    """One subscriber."""
+
+    def __init__(self, socket: SubscriberSocket) -> None:
+        self.disconnected: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        """Future with the reason, as an exception, once it has to be disconnected."""
+        self._socket = socket
+        self._backlog: PendingUpdate | None = None
+        self._backlog_since_s = 0.0
+
+    def send_tick(self, tick: Tick, now_s: float) -> None:
+        """Write the update with the backlog, or add it to the backlog."""
+        is_ready = self._socket.is_writable
+        if self._backlog is None:
+            if is_ready:
+                self._socket.write_framed(tick.framed)
+                return
+            self._backlog, self._backlog_since_s = PendingUpdate(), now_s
+        self._backlog.put_back(tick.update)
+        if is_ready:
+            self._socket.write_framed(
+                frame_texts(self._backlog.pop_update().encode_messages(tick.ages_ms))
+            )
+            self._backlog = None
+        elif now_s - self._backlog_since_s > TOO_SLOW_S:
+            self.disconnect(CloseConnection(LinkCloseCode.TOO_SLOW, "this client does not read"))
+
+    def disconnect(self, reason: Exception) -> None:
+        """Request that the subscriber is disconnected."""
+        if not self.disconnected.done():
+            self.disconnected.set_exception(reason)
+
+
+class Tick:
+    """Update for all subscribers of a rate group, encoded once."""
+
+    def __init__(self, summary: PendingUpdate, ages_ms: Mapping[str, float]) -> None:
+        self.update, self.ages_ms = summary.pop_update(), ages_ms
+        self.framed = frame_texts(self.update.encode_messages(ages_ms))
+
+
+class RateGroup:
+    """Subscribers of the same nodes at the same rate."""
+
+    def __init__(
+        self, node_filter: str | None, rate_hz: float, nodes: Mapping[str, ServerNode]
+    ) -> None:
+        self.subscribers: set[Subscriber] = set()
+        self._pending = PendingUpdate(node_filter)
+        self._has_pending = asyncio.Event()
+        self._rate_hz = rate_hz
+        self._nodes = nodes
+
+    def pending_update(self) -> PendingUpdate:
+        """Return the content of the next tick, for additions, and schedule the tick."""
+        self._has_pending.set()
+        return self._pending
+
+    async def run(self) -> None:
+        """Send updates at the group's rate until cancelled."""
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        while True:
+            await self._has_pending.wait()
+            self._has_pending.clear()
+            due_s = max(due_s + 1.0 / self._rate_hz, loop.time())
+            try:
+                await self.send_update(loop.time())
+            except Exception as error:
+                # An encoding error affects one group only: its subscribers may reconnect.
+                for viewer in self.subscribers:
+                    viewer.disconnect(error)
+            await asyncio.sleep(due_s - loop.time())
+
+    async def send_update(self, now_s: float) -> None:
+        """Send the pending update to all subscribers."""
+        if not self._pending:
+            return
+        tick = Tick(self._pending, _newest_frame_ages_ms(self._nodes.values()))
+        for count, viewer in enumerate(tuple(self.subscribers), 1):
+            if viewer in self.subscribers:  # it may have left meanwhile
+                viewer.send_tick(tick, now_s)
+            if count % _WRITES_PER_TURN == 0:
+                await asyncio.sleep(0)
+
+
+class Broadcaster:
+    """All subscribers of a server, and the last minute of each node; used from one event loop."""
+
+    def __init__(self) -> None:
+        self._groups: dict[tuple[str | None, float], tuple[RateGroup, asyncio.Task[None]]] = {}
+        self._nodes: dict[str, ServerNode] = {}
+        """Nodes that have sent frames."""
+        self._force_histories: dict[str, ForceHistory] = {}
+        self._tile_histories: dict[str, TileHistory] = {}
+
+    @property
+    def subscriber_count(self) -> int:
+        """Number of subscribers."""
+        return sum(len(feed.subscribers) for feed, _ in self._groups.values())
+
+    def subscribe(
+        self, socket: SubscriberSocket, rate_hz: float, node_filter: str | None = None
+    ) -> Subscriber:
+        """Add a subscriber to events from now on, of all nodes or one.
+
+        Args:
+            socket: websocket of the subscriber.
+            rate_hz: greatest update rate, 1 to 60.
+            node_filter: node of interest; None: all.
+        """
+        key = node_filter, max(rate for rate in RATES_HZ if rate <= rate_hz)
+        if key not in self._groups:
+            feed = RateGroup(*key, self._nodes)
+            self._groups[key] = feed, asyncio.create_task(feed.run())
+        viewer = Subscriber(socket)
+        self._groups[key][0].subscribers.add(viewer)
+        return viewer
+
+    def unsubscribe(self, subscriber: Subscriber) -> None:
+        """Remove a subscriber."""
+        for key, (feed, task) in list(self._groups.items()):
+            feed.subscribers.discard(subscriber)
+            if not feed.subscribers:
+                task.cancel()
+                del self._groups[key]
+
+    def send_notice(self, message: Mapping[str, Any]) -> None:
+        """Send a message to all subscribers with the next update."""
+        if self._groups:
+            text = encode_json(message)
+            for summary in self._pending_updates():
+                summary.add_notice(text)
+
+    def send_progress(
+        self, node: str, progress_by_session: Mapping[str, Mapping[str, Any]]
+    ) -> None:
+        """Send the progress of sessions of a node to all subscribers, by id."""
+        for summary in self._pending_updates():
+            summary.add_progress(node, progress_by_session)
+
+    def add_frames(self, node: ServerNode, due: list[EstimatedBatch]) -> None:
+        """Add estimated frames of a node to its history and to the next updates."""
+        self._nodes[node.name] = node
+        for frames, columns in due:
+            node.published_t_ns = int(frames.t_ns[-1])
+            span = summarize_force(frames, columns)
+            self._force_histories.setdefault(node.name, ForceHistory()).add_span(
+                node.stream_id, span
+            )
+            self._get_tile_history(node, frames.tile_count).add_frames(span, columns)
+            if self._groups:
+                piece = summarize_frames(node.stream_id, span, frames, columns)
+                for summary in self._pending_updates():
+                    summary.add_frames(node.name, piece)
+
+    def force_history(self, node: ServerNode) -> ForceHistory:
+        """Return the force history of a node's present stream."""
+        recent = self._force_histories.get(node.name)
+        return (
+            recent if recent is not None and recent.stream_id == node.stream_id else ForceHistory()
+        )
+
+    def tile_history(self, node: ServerNode) -> TileHistory:
+        """Return the tile history of a node's present stream."""
+        return self._get_tile_history(node, len(node.info.tiles))
+
+    def _get_tile_history(self, node: ServerNode, tiles: int) -> TileHistory:
+        recent = self._tile_histories.get(node.name)
+        if recent is None or (recent.stream_id, recent.tile_count) != (node.stream_id, tiles):
+            recent = self._tile_histories[node.name] = TileHistory(node.stream_id, tiles)
+        return recent
+
+    def newest_frame_age_ms(self, node: ServerNode) -> float | None:
+        """Return the age of the newest frame of a node's present stream; None if unknown."""
+        has_frames = node.last_seq is not None
+        return _newest_frame_ages_ms([node]).get(node.name) if has_frames else None
+
+    def _pending_updates(self) -> list[PendingUpdate]:
+        return [feed.pending_update() for feed, _ in self._groups.values()]
+
+
+def frame_texts(texts: Iterable[str]) -> bytes:
+    """Encode texts as websocket messages of a server (RFC 6455), one behind the other."""
+    return b"".join(
+        Frame(Opcode.TEXT, text.encode()).serialize(mask=False, extensions=()) for text in texts
+    )
+
+
+def _newest_frame_ages_ms(nodes: Iterable[ServerNode]) -> dict[str, float]:
+    now_t_ns = server_utc_ns()
+    return {
+        node.name: (now_t_ns - node.to_server_t_ns(node.published_t_ns)) * 1e-6
+        for node in nodes
+        if node.clock_offset is not None and node.published_t_ns is not None
+    }

@@ -1,0 +1,85 @@
+"""GRF of a node over the last minute, for a page that is opened now.
+
+Spans with minimum and maximum, so that no peak hides. The newest ones are kept as they were
+published, so that live messages continue them without a seam; older ones are merged. Memory is
+bounded: 130 kB, and 50 kB for the newest.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+
+from service.server.broadcast.force_span import ForceSpan
+
+SECONDS_MAX = 60.0
+SPAN_PERIOD_NS = 1_000_000_000 // 30
+"""Least distance between the begins of merged spans: no plot of a minute is finer."""
+_AS_PUBLISHED_NS = 2_000_000_000
+_AS_PUBLISHED_MAX = 128
+_MERGED_MAX = int(SECONDS_MAX * 1e9) // SPAN_PERIOD_NS + 2
+_ROW = np.dtype(
+    [
+        *((name, np.int64) for name in ("seq_first", "seq", "n", "t_ns_first", "t_ns")),
+        *((name, float) for name in ForceSpan._fields if name.startswith("grf_")),
+    ]
+)
+
+
+class ForceHistory:
+    """GRF over the last minute of a node's present stream."""
+
+    def __init__(self) -> None:
+        self.stream_id = ""
+        self._as_published: deque[ForceSpan] = deque()
+        self._last_merged: ForceSpan | None = None
+        """Newest merged span, to which more may be added."""
+        self._merged = np.zeros(_MERGED_MAX, _ROW)
+        self._count = 0
+        """Number of spans ever written to the ring `_merge_to_bins`."""
+
+    def add_span(self, stream_id: str, span: ForceSpan) -> None:
+        """Add frames that are published now.
+
+        Args:
+            stream_id: stream of the frames; another one clears the history.
+            span: newer than those before.
+        """
+        if stream_id != self.stream_id:
+            self.stream_id, self._last_merged, self._count = stream_id, None, 0
+            self._as_published.clear()
+        self._as_published.append(span)
+        while (
+            span.t_ns - self._as_published[0].t_ns > _AS_PUBLISHED_NS
+            or len(self._as_published) > _AS_PUBLISHED_MAX
+        ):
+            self._merge(self._as_published.popleft())
+
+    def get_spans(self, seconds: float, before_seq: int | None = None) -> npt.NDArray[np.void]:
+        """Return the newest seconds, with the fields of `ForceSpan`, oldest first.
+
+        Args:
+            seconds: counted back from the newest frame.
+            before_seq: only spans that end before this number.
+        """
+        first = max(0, self._count - _MERGED_MAX)
+        older = self._merged[np.arange(first, self._count) % _MERGED_MAX]
+        newer = [*([] if self._last_merged is None else [self._last_merged]), *self._as_published]
+        rows = np.concatenate([older, np.array(newer, _ROW)])
+        if before_seq is not None:
+            rows = rows[rows["seq"] < before_seq]
+        if len(rows):
+            rows = rows[rows["t_ns"] > rows["t_ns"][-1] - int(seconds * 1e9)]
+        return rows
+
+    def _merge(self, span: ForceSpan) -> None:
+        before = self._last_merged
+        if before is not None:
+            if span.t_ns_first - before.t_ns_first < SPAN_PERIOD_NS:
+                self._last_merged = before.join(span)
+                return
+            self._merged[self._count % _MERGED_MAX] = before
+            self._count += 1
+        self._last_merged = span

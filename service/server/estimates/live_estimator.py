@@ -1,0 +1,267 @@
+"""Live estimates of one stream, with a tare that may change at any frame."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import takewhile
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.chips.compensation import Compensation
+from devices.errors import FootTileError, TareError
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileFlag
+from devices.temperature_hold import hold_temperature
+from service.estimation import LIVE_LAG_MS
+from service.estimation.calibration import Calibration
+from service.estimation.compilation import is_compiling
+from service.estimation.foot import LONG_GAP_NS
+from service.estimation.pipeline.plan import make_plan
+from service.estimation.tare.automatic import (
+    HISTORY_NS,
+    FlightTareResult,
+    compute_first_flight_tare,
+    compute_flight_tare,
+    compute_newest_unloaded_tare,
+)
+from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded_windows import TareFrames, compute_recording_tare
+from service.server.estimates.ranges import TileRanges
+from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
+
+_TADC_OVER_NS = 1_000_000_000
+_EPOCHS_MAX = 256
+
+
+@dataclass(frozen=True)
+class EstimateEpoch:
+    """Frames from `seq` on, estimated with one calibration and tare; None: not estimated."""
+
+    seq: int
+    calibration: Calibration | None
+    tare: Tare | None
+
+
+class LiveEstimator:
+    """Estimator of one stream; without calibration or tare, frames pass through.
+
+    Args:
+        info: the array.
+        calibration: calibration of its tiles; None if there is none.
+        tare: tare in force.
+        previous: former estimator of this node; if it was of the same stream, its epochs are
+            copied.
+    """
+
+    def __init__(
+        self,
+        info: ArrayInfo,
+        calibration: Calibration | None,
+        tare: Tare | None,
+        previous: LiveEstimator | None = None,
+    ) -> None:
+        self.calibration_problem: str | None = None
+        self._info = info
+        self._compensation = Compensation(info.tiles)
+        self._is_loaded_tile = np.array([not tile.reference for tile in info.tiles])
+        self._calibration: Calibration | None = None
+        self.calibration_id: str | None = None
+        """Id of the calibration in use: a hash that is slow to compute."""
+        self.ranges: TileRanges | None = None
+        """Calibrated ranges of the tiles; None without a calibration."""
+        self.airborne_since_t_ns: int | None = None
+        """Time since which all estimates are without contact; None: not yet."""
+        self._run: EstimateRun | None = None
+        self._recent: deque[FrameBatch] = deque()
+        self._flushed: list[tuple[FrameBatch, Columns]] = []
+        self._estimated_t_ns: int | None = None
+        self._has_epoch = False
+        is_same = previous is not None and previous.info.stream_id == info.stream_id
+        epochs = previous.epochs if previous is not None and is_same else ()
+        self.epochs: deque[EstimateEpoch] = deque(epochs, _EPOCHS_MAX)
+        """Epochs of the estimates, oldest first, to recompute frames as they were."""
+        if calibration is not None:
+            try:
+                EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
+                self._calibration = calibration
+                self.calibration_id = calibration.id
+                self.ranges = TileRanges.from_calibration(info, calibration)
+            except FootTileError as error:  # it does not fit these tiles: report it
+                self.calibration_problem = str(error)
+        self.set_tare(tare)
+
+    @property
+    def info(self) -> ArrayInfo:
+        """Description of the array."""
+        return self._info
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """Calibration in use."""
+        return self._calibration
+
+    @property
+    def tare(self) -> Tare | None:
+        """Tare in use; None: there is none, or it is lost."""
+        tare = self._run.plan.tare if self._run is not None else None
+        return None if tare is None or tare.is_lost else tare
+
+    def set_tare(self, tare: Tare | None) -> None:
+        """Estimate with this tare from the next frame on; all is NaN with a lost one."""
+        if self._run is not None:  # frames that wait for their look-ahead
+            self._flushed.extend(self._run.flush())
+        self.airborne_since_t_ns = None
+        self._has_epoch = False
+        if self._calibration is None or tare is None:
+            self._run = None
+            return
+        plan = make_plan(
+            self._info,
+            self._calibration,
+            tare,
+            models=self._info.models,
+            lag_ms=LIVE_LAG_MS,
+        )
+        self._run = EstimateRun(plan)
+
+    def continue_from(self, previous: LiveEstimator) -> None:
+        """Continue the same stream from an estimator with another calibration.
+
+        Its recent frames are copied, and its frames that wait for their look-ahead are flushed
+        first.
+        """
+        previous.set_tare(None)
+        self._recent, self._flushed = previous._recent, previous._flushed
+
+    def feed_frames(self, frames: FrameBatch) -> Iterator[tuple[FrameBatch, Columns]]:
+        """Add the next frames; yield the frames that are due, with or without estimates."""
+        self._recent.append(frames)
+        while int(frames.t_ns[-1]) - int(self._recent[0].t_ns[-1]) > HISTORY_NS:
+            self._recent.popleft()
+        flushed, self._flushed = self._flushed, []
+        yield from flushed
+        if not self._has_epoch and not (self._run is not None and is_compiling()):
+            self._has_epoch = True
+            tare = None if self._run is None else self._run.plan.tare
+            self.epochs.append(EstimateEpoch(int(frames.seq[0]), self._calibration, tare))
+        if self._run is None:
+            yield frames, {}
+            return
+        if is_compiling():
+            with_temperature, _ = hold_temperature(frames)
+            kpa = (
+                self._compensation.compute_usable_kpa(with_temperature)
+                - self._run.plan.tare.baseline_kpa
+            )
+            yield frames, {"gauge_kpa": kpa}
+            return
+        for due, columns in self._run.feed_frames(frames, {}):
+            self._update_contact(due, columns)
+            yield due, columns
+
+    @property
+    def newest_batch(self) -> FrameBatch | None:
+        """Last batch of frames; None before the first."""
+        return self._recent[-1] if self._recent else None
+
+    @property
+    def newest_t_ns(self) -> int | None:
+        """Time of the newest frame, node's UTC."""
+        return int(self._recent[-1].t_ns[-1]) if self._recent else None
+
+    def mean_recent_temperature_raw(self) -> Floats:
+        """Return the mean temperature counts of the last second, per tile; NaN if none was read."""
+        if not self._recent:
+            return np.full(len(self._info.tiles), np.nan)
+        since_t_ns = int(self._recent[-1].t_ns[-1]) - _TADC_OVER_NS
+        recent = [*takewhile(lambda each: each.t_ns[-1] >= since_t_ns, reversed(self._recent))]
+        temperature_raw = np.concatenate([frames.temperature_raw for frames in recent])
+        status = np.concatenate([frames.tile_flags for frames in recent])
+        is_usable = (temperature_raw != NOT_READ) & ((status & np.uint8(TileFlag.UNUSABLE)) == 0)
+        counts = is_usable.sum(axis=0)
+        total = np.where(is_usable, temperature_raw, 0).sum(axis=0)
+        return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
+    def grf_shift_n(self, baseline_shift_kpa: Floats) -> float | None:
+        """Return the GRF shift that follows from a shift of all baselines; None if unknown."""
+        if self.ranges is None:
+            return None
+        slope_n_per_kpa = self.ranges.slope_n_per_kpa
+        shift_n = (slope_n_per_kpa * baseline_shift_kpa)[np.isfinite(slope_n_per_kpa)]
+        return float(shift_n.sum()) if np.isfinite(shift_n).all() else None
+
+    def tare_from_lead(self, lead: FrameBatch) -> Tare:
+        """Compute the tare from an emulated lead.
+
+        Raises:
+            TareError: its frames give no tare, or there is no calibration.
+        """
+        return compute_recording_tare(
+            lead, self._compensation, self._require_calibration(), self._info.serials
+        )
+
+    def find_flight_tare(self, anchor: Tare | None) -> FlightTareResult:
+        """Look for an automatic tare in the last seconds.
+
+        Args:
+            anchor: tare with which an automatic one is compared; None without a tare.
+        """
+        calibration, tare = self._calibration, self.tare
+        if calibration is None or not self._recent:
+            return FlightTareResult()
+        frames = FrameBatch.concatenate(list(self._recent))
+        if tare is None:
+            return compute_first_flight_tare(self._tare_frames(frames, calibration))
+        if self.airborne_since_t_ns is None or self._estimated_t_ns is None:
+            return FlightTareResult()
+        # Contact of newer frames is not estimated yet.
+        count = int(np.searchsorted(frames.t_ns, self._estimated_t_ns, side="right"))
+        return compute_flight_tare(
+            self._tare_frames(frames.slice_rows(0, count), calibration),
+            present=tare,
+            last_manual=anchor,
+            no_contact_since_t_ns=self.airborne_since_t_ns,
+            is_load_bearing=self._is_loaded_tile,
+        )
+
+    def compute_tare(self) -> Tare:
+        """Compute the tare from the newest unloaded interval of the last seconds.
+
+        Raises:
+            TareError: there is no such interval, no calibration, or no frame.
+        """
+        calibration = self._require_calibration()
+        if not self._recent:
+            raise TareError("no frames have come yet", remedy="Connect the node")
+        frames = FrameBatch.concatenate(list(self._recent))
+        seen = self._tare_frames(frames, calibration)
+        return compute_newest_unloaded_tare(
+            seen, present=self.tare, is_load_bearing=self._is_loaded_tile
+        )
+
+    def _tare_frames(self, frames: FrameBatch, calibration: Calibration) -> TareFrames:
+        return TareFrames(frames, self._compensation, calibration, self._info.serials)
+
+    def _require_calibration(self) -> Calibration:
+        if self._calibration is None:
+            raise TareError(
+                "without a calibration there is nothing to tare",
+                remedy="Calibrate the tiles and name the calibration in the node's scene",
+            )
+        return self._calibration
+
+    def _update_contact(self, frames: FrameBatch, columns: Columns) -> None:
+        t_ns = frames.t_ns
+        before_t_ns = self._estimated_t_ns if self._estimated_t_ns is not None else int(t_ns[0])
+        may_have_contact = columns["contact"] != 0  # in contact, or unknown
+        # A gap that is too short for a step, such as a missed slot, cannot hide a contact.
+        if int(t_ns[-1]) - before_t_ns > LONG_GAP_NS:
+            may_have_contact[0] |= int(t_ns[0]) - before_t_ns > LONG_GAP_NS
+            may_have_contact[1:] |= t_ns[1:] - t_ns[:-1] > LONG_GAP_NS
+        self._estimated_t_ns = int(t_ns[-1])
+        if np.count_nonzero(may_have_contact):
+            self.airborne_since_t_ns = int(t_ns[np.flatnonzero(may_have_contact)[-1]])
+        elif self.airborne_since_t_ns is None:
+            self.airborne_since_t_ns = int(t_ns[0])

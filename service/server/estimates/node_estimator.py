@@ -1,0 +1,171 @@
+"""Estimation of one node over all its streams: calibration, tares, live estimator."""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from devices.errors import StorageError
+from devices.frames import ArrayInfo, FrameBatch
+from service.estimation.calibration import Calibration
+from service.protocol import Hello
+from service.server.estimates.assignment import CalibrationAssignment
+from service.server.estimates.live_estimator import EstimateEpoch, LiveEstimator
+from service.server.estimates.tare_controller import TareController
+from service.sessions.pipeline import Columns
+from service.sessions.tares import TareHistory
+from storage.intervals import Intervals
+from storage.journal.journal import Journal
+
+log = logging.getLogger("foottile.nodes")
+
+EstimatedBatch = tuple[FrameBatch, Columns]
+"""Frames with their estimates by column; no columns without estimates."""
+_ENDED_STREAMS_MAX = 16
+"""Number of ended streams whose epochs are kept."""
+
+
+class NodeEstimator:
+    """Estimator of a node's present stream; a bug there costs its estimates only.
+
+    Args:
+        folder: files of the node: its tares, and the calibration assigned here.
+        hello: last hello of the node.
+    """
+
+    def __init__(self, folder: Path, hello: Hello) -> None:
+        self.tare_history = TareHistory(folder / "tares.json")
+        self.assignment = CalibrationAssignment(folder / "assigned.json")
+        self.live = LiveEstimator(hello.array_info, None, None)
+        self.tare_controller: TareController
+        self._hello = hello
+        self._has_failed = False
+        self._ended_epochs: OrderedDict[str, tuple[EstimateEpoch, ...]] = OrderedDict()
+        """Epochs of streams before the present one."""
+        self._restart()
+
+    @property
+    def info(self) -> ArrayInfo:
+        """Array of the present stream."""
+        return self._hello.array_info
+
+    @property
+    def problems(self) -> list[str]:
+        """Damage found in the files, and the consequence, as text."""
+        texts = (self.tare_history.problem, self.assignment.problem)
+        return [problem for problem in texts if problem is not None]
+
+    @property
+    def chosen_calibration(self) -> Calibration | None:
+        """Calibration to use for its tiles: the assigned one, else the node's own.
+
+        It may not fit them; the calibration in use is `live.calibration`.
+        """
+        if self.assignment.problem is not None:
+            return None
+        assigned = self.assignment.current
+        return self._hello.calibration if assigned is None else assigned.calibration
+
+    @property
+    def calibration_source(self) -> Literal["node", "server"]:
+        """Origin of `chosen_calibration`."""
+        chosen = self.assignment.current is not None or self.assignment.problem is not None
+        return "server" if chosen else "node"
+
+    @property
+    def calibration_problem(self) -> str | None:
+        """Reason why no calibration is in use."""
+        node_problem = (
+            self._hello.calibration_problem if self.calibration_source == "node" else None
+        )
+        return self.assignment.problem or self.live.calibration_problem or node_problem
+
+    def epochs_of(self, stream_id: str) -> tuple[EstimateEpoch, ...]:
+        """Return the epochs of a stream since the server was started, in order."""
+        if stream_id == self.live.info.stream_id:
+            return tuple(self.live.epochs)
+        return self._ended_epochs.get(stream_id, ())
+
+    def assign_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
+        """Assign a calibration, used from the next frame on.
+
+        Sessions that are being recorded keep theirs.
+
+        Args:
+            calibration: calibration to use; None: the node's own again.
+            t_ns: the server's UTC.
+
+        Raises:
+            StorageError: that cannot be stored; nothing has changed then.
+        """
+        if calibration is None:
+            self.assignment.unassign(t_ns)
+        else:
+            self.assignment.assign(calibration, t_ns)
+        before = self.live
+        self._restart()
+        try:
+            self.live.continue_from(before)
+        except Exception as error:
+            self._disable(error)
+
+    def on_hello(self, hello: Hello) -> None:
+        """Restart the estimator if hello has another stream or calibration."""
+        previous, self._hello = self._hello, hello
+        if previous.array_info.stream_id != hello.array_info.stream_id:
+            self._ended_epochs[previous.array_info.stream_id] = tuple(self.live.epochs)
+            if len(self._ended_epochs) > _ENDED_STREAMS_MAX:
+                self._ended_epochs.popitem(last=False)
+        is_same = (previous.array_info, previous.calibration) == (
+            hello.array_info,
+            hello.calibration,
+        )
+        if not is_same or self._has_failed:
+            self._restart()
+
+    def feed_frames(self, frames: FrameBatch) -> list[EstimatedBatch]:
+        """Add the next frames of the present stream; return those whose estimates are due."""
+        try:
+            return list(self.live.feed_frames(frames))
+        except Exception as error:
+            self._disable(error)
+            return [(frames, {})]
+
+    def update_tare(self, journal: Journal | None, get_obtainable: Callable[[], Intervals]) -> None:
+        """Tare if there is reason to, as `TareController.update`.
+
+        Raises:
+            StorageError: the tare cannot be stored; it is not in force then, and retried.
+        """
+        try:
+            self.tare_controller.update(journal, get_obtainable)
+        except StorageError:
+            raise
+        except Exception as error:
+            self._disable(error)
+
+    def _restart(self) -> None:
+        self._has_failed = False
+        try:
+            tare = self.tare_history.tare_for_estimates(self.info)
+            self.live = LiveEstimator(self.info, self.chosen_calibration, tare, self.live)
+        except Exception as error:
+            self._disable(error)
+            return
+        automatic = self._hello.scene.get("auto_tare", True) is not False
+        self.tare_controller = TareController(
+            self.info, self.live, self.tare_history, automatic=automatic
+        )
+
+    def _disable(self, error: Exception) -> None:
+        node = self.info.node
+        log.exception("node %s: this is a bug; it goes on without estimates", node)
+        self._has_failed = True
+        self.live = LiveEstimator(self.info, None, None, self.live)
+        self.live.calibration_problem = f"the estimator failed, until it connects again: {error!r}"
+        self.tare_controller = TareController(
+            self.info, self.live, self.tare_history, automatic=False
+        )

@@ -1,0 +1,382 @@
+"""Store of a server's sessions: on disk, in memory, with its trash."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import shutil
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+
+from devices.errors import ChangedError, StateError, StorageError, UnknownError, UsageError
+from devices.text import escape_control_chars
+from service.server.index import SessionIndex, StartKey
+from service.server_clock import server_utc_ns
+from service.sessions.session_rebuild import rebuild_session
+from storage.durable_files import translate_storage_errors
+from storage.sessions.folder import (
+    DELETED_PREFIX,
+    FRAMES_NAME,
+    IdempotencyRecord,
+    Marker,
+    Session,
+    SessionsFolder,
+    StraySession,
+)
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.sidecars import write_markers
+from storage.sessions.verified_file_cache import VerifiedFileCache
+
+log = logging.getLogger("foottile.book")
+
+
+def load_or_rebuild(folder: SessionsFolder) -> tuple[list[Session], dict[str, str]]:
+    """Load all sessions, rebuilding damaged ones; return them, and errors by id."""
+    found, unreadable = folder.load_all()
+    errors: dict[str, str] = {}
+    for session_id, error in unreadable.items():
+        if not any(folder.get_path(session_id).glob("[!.]*")):
+            continue  # never saved
+        try:
+            session = rebuild_session(folder, session_id)
+        except StorageError as refused:
+            log.warning("session %s cannot be rebuilt: %s", session_id, refused)
+            session = None
+        if session is None:
+            log.warning("session %s is left out, and no frames are dropped: %s", session_id, error)
+            errors[session_id] = str(error)
+        else:
+            log.warning("session %s: %s", session_id, session.problem)
+            found.append(session)
+    return found, errors
+
+
+def log_strays(strays: Iterable[StraySession]) -> dict[str, str]:
+    """Log sessions whose folders were renamed or copied; return the errors by folder."""
+    for stray in strays:
+        log.warning(
+            "session folder %s is left out: %s", escape_control_chars(stray.name), stray.error
+        )
+    return {escape_control_chars(stray.name): str(stray.error) for stray in strays}
+
+
+class Trash:
+    """Deleted sessions that can be restored until the trash is emptied.
+
+    Args:
+        folder: folder of the trash.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = SessionsFolder(folder)
+        for doomed in folder.glob(DELETED_PREFIX + "*"):
+            shutil.rmtree(doomed, ignore_errors=True)
+        found, unreadable = load_or_rebuild(self.folder)
+        self.has_unreadable = bool(unreadable)
+        """True if a session cannot be read: the frames that it needs are unknown."""
+        unreadable |= log_strays(self.folder.find_strays())
+        self.problems = [f"in the trash, {text}" for text in _format_unreadable(unreadable)]
+        """Sessions that cannot be read, and the reasons, as text."""
+        self._sessions = SessionIndex(found)
+
+    def __contains__(self, session_id: str) -> bool:
+        return session_id in self._sessions
+
+    def list_sessions(self) -> list[Session]:
+        """Return all sessions in the trash, newest first."""
+        return list(self._sessions.iterate_newest_first())
+
+    def list_unsealed(self) -> list[Session]:
+        """Return the unsealed sessions in the trash."""
+        return self._sessions.list_unsealed()
+
+    def add(self, session: Session, source: SessionsFolder) -> None:
+        """Move a session into the trash.
+
+        Raises:
+            StorageError: it cannot be moved.
+        """
+        source.move_to(session.id, self.folder)
+        self._sessions.put(session)
+
+    def restore(self, session_id: str, target: SessionsFolder) -> Session:
+        """Move a session back to its former folder.
+
+        Raises:
+            UnknownError: it is not in the trash.
+            StorageError: it cannot be moved.
+        """
+        self.folder.get_path(session_id)
+        if session_id not in self._sessions:
+            raise UnknownError(f"no session {session_id!r} in the trash")
+        self.folder.move_to(session_id, target)
+        return self._sessions.remove(session_id)
+
+    def purge(self) -> list[Path]:
+        """Remove all sessions for good; return their folders, to be deleted by `delete_files`.
+
+        Raises:
+            StorageError: a folder cannot be moved; its session and those after it are still in the
+                trash.
+        """
+        doomed = []
+        for session in self.list_sessions():
+            doomed.append(self.folder.rename_for_deletion(session.id))
+            self._sessions.remove(session.id)
+        return doomed
+
+
+def delete_files(folders: list[Path]) -> int:
+    """Delete folders with all their files; return the number of bytes freed.
+
+    Raises:
+        StorageError: a file cannot be deleted; the next start tries again.
+    """
+    size_bytes = 0
+    for folder in folders:
+        with translate_storage_errors(folder):
+            files = (path for path in folder.rglob("*") if path.is_file())
+            size_bytes += sum(path.stat().st_size for path in files)
+            shutil.rmtree(folder)
+    return size_bytes
+
+
+class SessionStore:
+    """All sessions of a server.
+
+    Args:
+        folder: folder of the sessions.
+        trash: deleted sessions.
+        on_change: called with every session that changed.
+    """
+
+    def __init__(
+        self, folder: SessionsFolder, trash: Trash, on_change: Callable[[Session], None]
+    ) -> None:
+        self.folder = folder
+        self.trash = trash
+        self.on_change = on_change
+        found, self.unreadable = load_or_rebuild(folder)
+        """Errors of the sessions that cannot be read, by id; their files are unchanged."""
+        strays = folder.find_strays()
+        self.has_unreadable = bool(self.unreadable) or any(each.may_need_frames for each in strays)
+        """True if a session cannot be read: the frames that it needs are unknown."""
+        self.has_unreadable |= trash.has_unreadable
+        self.unreadable |= log_strays(strays)
+        self.problems = _format_unreadable(self.unreadable) + trash.problems
+        """Unreadable sessions and their errors as text, with those in the trash."""
+        self._sessions = SessionIndex(found)
+        self._files = VerifiedFileCache()
+
+    def open_frames(self, session_id: str, *, only_slices: bool = False) -> SealedFileReader:
+        """Open the sealed file of a session. Runs in any thread.
+
+        Args:
+            session_id: id of the session.
+            only_slices: as for `SealedFileReader`.
+
+        Raises:
+            FileFormatError: it is missing or damaged.
+        """
+        path = self.folder.get_path(session_id) / FRAMES_NAME
+        return self._files.open_reader(path, only_slices=only_slices)
+
+    def list_unsealed(self, node: str | None = None) -> list[Session]:
+        """Return unsealed sessions, of all nodes or of one, without those in the trash."""
+        return self._sessions.list_unsealed(node)
+
+    def iterate_newest_first(self, before: StartKey | None = None) -> Iterator[Session]:
+        """Yield all sessions, or those before one, newest first; change none meanwhile."""
+        return self._sessions.iterate_newest_first(before)
+
+    def get_session(self, session_id: str) -> Session:
+        """Return a session as last saved or cached.
+
+        Raises:
+            UnknownError: no session has this id.
+            StateError: it cannot be read.
+        """
+        self.folder.get_path(session_id)
+        if session_id not in self._sessions:
+            if session_id in self.unreadable:
+                raise StateError(
+                    f"session {session_id} cannot be read: {self.unreadable[session_id]}",
+                    remedy="No frames of its nodes are dropped meanwhile. See `foottile verify`",
+                )
+            remedy = "It is in the trash: restore it first" if session_id in self.trash else ""
+            raise UnknownError(f"no session {session_id!r}", remedy=remedy)
+        return self._sessions[session_id]
+
+    def find_by_idempotency_key(self, request: IdempotencyRecord | None) -> list[Session]:
+        """Return the sessions that an earlier sending of this request created, oldest first.
+
+        Raises:
+            UsageError: the key came with another request before.
+            StateError: a session that it created is in the trash.
+        """
+        if request is None:
+            return []
+        found = [
+            session
+            for session in (*self.iterate_newest_first(), *self.trash.list_sessions())
+            if session.asked is not None and session.asked.key == request.key
+        ]
+        for session in found:
+            if session.asked != request:
+                raise UsageError(
+                    "this Idempotency-Key was used by another request, which started session "
+                    f"{session.id}",
+                    remedy="Make a new key for each recording, and send it again with the same "
+                    "request only",
+                )
+            if session.id in self.trash:
+                raise StateError(
+                    f"this request has started session {session.id}, which is in the trash",
+                    remedy="Restore it, or record with another Idempotency-Key",
+                )
+        return found[::-1]
+
+    def save(self, session: Session) -> Session:
+        """Save a new or changed session to the disk, and notify `on_change`.
+
+        Raises:
+            StorageError: it cannot be saved; the session in memory is unchanged.
+        """
+        self.folder.save(session)
+        self.cache(session)
+        self.on_change(session)
+        return session
+
+    def cache(self, session: Session) -> None:
+        """Replace a session in memory only; its next `save` writes it to the disk."""
+        self._sessions.put(session)
+
+    def edit_description(
+        self, session_id: str, *, if_revision: str | None = None, **changes: object
+    ) -> Session:
+        """Edit the user-written fields of a session: name, subject, notes, tags.
+
+        Args:
+            session_id: id of the session.
+            if_revision: expected `said_of`; None: any.
+            changes: new values by name.
+
+        Raises:
+            UnknownError: no session has this id.
+            ChangedError: its revision is another one.
+            StorageError: it cannot be saved.
+        """
+        session = self.get_session(session_id)
+        check_revision(if_revision, session_revision(session), f"session {session_id}")
+        return self.save(session.model_copy(update=changes))
+
+    def add_marker(
+        self, session_id: str, label: str, t_ns: int | None, marker_id: str | None = None
+    ) -> Marker:
+        """Add a marker at `t_ns` of the server's UTC, or now; once only if it comes with an id.
+
+        Raises:
+            UnknownError: no session has this id.
+            StorageError: it cannot be saved.
+        """
+        session = self.get_session(session_id)
+        event = next((marker for marker in session.markers if marker.id == marker_id), None)
+        if event is None:
+            event = Marker(
+                id=marker_id or uuid.uuid4().hex[:12],
+                label=label,
+                t_ns=server_utc_ns() if t_ns is None else t_ns,
+            )
+            session = self.save(session.model_copy(update={"markers": (*session.markers, event)}))
+        if session.state == "sealed":
+            write_markers(session, self.folder.get_path(session_id))
+        return event
+
+    def edit_marker(
+        self, session_id: str, marker_id: str, *, if_revision: str | None = None, **changes: object
+    ) -> Marker:
+        """Rename or move a marker; arguments as for `edit_description`.
+
+        Raises:
+            UnknownError: no such session or marker.
+            ChangedError: its revision is another one.
+            StorageError: it cannot be saved.
+        """
+        event = self._find_marker(session_id, marker_id, if_revision)
+        changed = event.model_copy(update=changes)
+        events = self.get_session(session_id).markers
+        self._save_markers(session_id, tuple(changed if e.id == marker_id else e for e in events))
+        return changed
+
+    def remove_marker(
+        self, session_id: str, marker_id: str, *, if_revision: str | None = None
+    ) -> None:
+        """Remove a marker; arguments and errors as for `edit_marker`."""
+        self._find_marker(session_id, marker_id, if_revision)
+        events = self.get_session(session_id).markers
+        self._save_markers(session_id, tuple(event for event in events if event.id != marker_id))
+
+    def _find_marker(self, session_id: str, marker_id: str, if_revision: str | None) -> Marker:
+        for event in self.get_session(session_id).markers:
+            if event.id == marker_id:
+                check_revision(
+                    if_revision,
+                    marker_revision(event),
+                    f"mark {event.label!r} of session {session_id}",
+                )
+                return event
+        raise UnknownError(
+            f"session {session_id} has no mark {marker_id[:40]!r}",
+            remedy="It may have been removed",
+        )
+
+    def _save_markers(self, session_id: str, markers: tuple[Marker, ...]) -> None:
+        session = self.save(self.get_session(session_id).model_copy(update={"markers": markers}))
+        if session.state == "sealed":
+            write_markers(session, self.folder.get_path(session_id))
+
+    def move_to_trash(self, session: Session) -> None:
+        """Move a session to the trash.
+
+        Raises:
+            StorageError: it cannot be moved.
+        """
+        self.trash.add(session, self.folder)
+        self._sessions.remove(session.id)
+
+
+def session_revision(session: Session) -> str:
+    """Return the revision of a session's user-written fields, a short hash."""
+    return _hash(session.model_dump_json(include={"name", "subject", "notes", "tags"}))
+
+
+def marker_revision(marker: Marker) -> str:
+    """Return the revision of a marker, a short hash."""
+    return _hash(marker.model_dump_json())
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def check_revision(expected: str | None, actual: str, what: str) -> None:
+    """Refuse a change if the client has seen another revision.
+
+    Args:
+        expected: revision that the client has seen; None: any.
+        actual: present revision.
+        what: description of the object, for the error.
+
+    Raises:
+        ChangedError: they differ.
+    """
+    if expected is not None and expected != actual:
+        raise ChangedError(
+            f"{what} was changed by another client meanwhile",
+            remedy="Reload it and retry",
+        )
+
+
+def _format_unreadable(unreadable: Mapping[str, str]) -> list[str]:
+    return [f"session {name} is left out: {error}" for name, error in unreadable.items()]

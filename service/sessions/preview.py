@@ -1,0 +1,272 @@
+"""Preview of unsealed sessions: each frame is estimated once, on demand.
+
+Frames come from the journals, so a restart of the server loses nothing of a preview, and a session
+without viewers costs nothing. Estimates are as live, with the tares known now. They are
+provisional: further frames and tares may come, and sealing uses a longer look-ahead.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from bisect import bisect_left
+from collections import OrderedDict
+from pathlib import Path
+
+from devices.errors import FootTileError, StateError
+from devices.frames import FrameBatch
+from service.estimation.compilation import is_compiling
+from service.sessions.checkpoints import Checkpoint, Checkpoints, make_preview_stream
+from service.sessions.frames import Columns, iterate_raw_frames
+from service.sessions.inputs import SessionInputs
+from service.sessions.overview import BinnedSlice
+from storage.formats.slice import Slice
+from storage.sessions.preview import PreviewBins, select_and_downsample_bins
+from storage.sessions.pyramid import required_frame_columns, shift_bins_to_axis
+
+UPDATE_BUDGET_S = 0.5
+"""Time budget of one update; a long session is complete after several."""
+_PREVIEWS_KEPT = 4
+"""Number of sessions with a preview in memory."""
+_REST_FACTOR = 10
+"""Pause after repeated work, as a multiple of its time: late frames have those behind them
+estimated again."""
+
+
+class SessionPreview:
+    """Estimates of one unsealed session up to some frame.
+
+    Args:
+        inputs: inputs of the session.
+        folder: folder on the disk for states of estimators (`service.sessions.checkpoints`).
+    """
+
+    def __init__(self, inputs: SessionInputs, folder: Path) -> None:
+        self.checkpoints = Checkpoints(folder)
+        self._inputs = inputs
+        self._bins = PreviewBins()
+        self._stream = make_preview_stream(inputs)
+        self._position = Checkpoint()
+        self._repeated_frames = 0
+        """Number of frames that will be estimated a second time."""
+        self._fed_before_rewind = 0
+        """Number of frames that were fed before the last rewind."""
+        self.repeated_work_s = 0.0
+        """Time spent on repeated work."""
+        self.is_catching_up = False
+        """True if the journals have more frames."""
+
+    @property
+    def has_estimates(self) -> bool:
+        """True if there are estimates, not only raw counts."""
+        return self._stream is not None
+
+    def can_use(self, inputs: SessionInputs) -> bool:
+        """Return whether part of the preview is valid for these inputs."""
+        before = self._inputs
+        same = inputs.info == before.info and inputs.calibration == before.calibration
+        tares = inputs.tares[: len(before.tares)]
+        return (
+            same
+            and tares == before.tares
+            and (make_preview_stream(inputs) is None) != self.has_estimates
+        )
+
+    def valid_checkpoints(self, inputs: SessionInputs) -> list[Checkpoint]:
+        """Return the checkpoints before any change: the beginning, and perhaps more."""
+        checkpoints = self.checkpoints.checkpoints
+        if not self.can_use(inputs):
+            return [Checkpoint()]
+        count = bisect_left(checkpoints, True, key=lambda place: not self._is_valid(place, inputs))
+        return list(checkpoints[: max(1, count)])
+
+    def update(self, inputs: SessionInputs) -> None:
+        """Estimate the frames that have come; `can_use` is true of `inputs`, the present ones.
+
+        Raises:
+            FootTileError: a journal is damaged, or cannot be read.
+        """
+        if self.has_estimates and is_compiling():  # else it would compile here
+            self.is_catching_up = True
+            return
+        begun_s, is_again = time.monotonic(), self._position.fed_frames < self._fed_before_rewind
+        if self._stream is not None and inputs.tares != self._inputs.tares:
+            on = make_preview_stream(inputs)
+            if on is not None and self._position.fed_frames:
+                on.load_state(self._stream.state_dict())
+            self._stream = on
+        self._inputs = inputs
+        self.is_catching_up = True
+        for frames, columns in iterate_raw_frames(inputs, self._position.part, self._position.seq):
+            if time.monotonic() - begun_s >= UPDATE_BUDGET_S:
+                break
+            self._feed_frames(frames, columns)
+        else:
+            self.is_catching_up = False
+        if is_again:
+            self.repeated_work_s += time.monotonic() - begun_s
+
+    def is_outdated(self, inputs: SessionInputs) -> bool:
+        """Return whether frames or tares before the present position have changed."""
+        return not self._is_valid(self._position, inputs)
+
+    def rewind(self, inputs: SessionInputs) -> None:
+        """Drop everything after the last valid checkpoint."""
+        all_, true = self.checkpoints.checkpoints, self.valid_checkpoints(inputs)
+        kept_frames = self._bins.truncate(true[-1].estimated_frames)
+        # Repeat one frame at least: its number shows whether the next one follows it.
+        index = max(
+            0, bisect_left(true, max(kept_frames, 1), key=lambda place: place.estimated_frames) - 1
+        )
+        index, self._stream = self.checkpoints.resume_stream(all_, index, inputs)
+        self.checkpoints.truncate(index + 1)
+        place = all_[index]
+        self.start_repeated_work(self)
+        self._position = Checkpoint(
+            place.part,
+            place.seq,
+            place.fed_frames,
+            place.estimated_frames,
+            place.newest_ns,
+            place.last_estimated,
+        )
+        self._repeated_frames = kept_frames - place.estimated_frames
+        self._inputs = inputs
+
+    def start_repeated_work(self, previous: SessionPreview) -> None:
+        """Start measuring repeated work, up to the position of another preview."""
+        self._fed_before_rewind, self.repeated_work_s = previous._position.fed_frames, 0.0
+
+    def get_bins(self, time_slice: Slice, points: int) -> BinnedSlice:
+        """Return a slice as bins, at most four times as many as points.
+
+        Raises:
+            StateError: there is no frame yet.
+            FootTileError: a journal is damaged, or cannot be read.
+        """
+        bins = self._bins.get_bins()
+        if bins is None:
+            raise StateError(
+                f"session {self._inputs.session.id} has no frames yet", remedy="Ask again"
+            )
+        axis = self._inputs.compute_time_axis()
+        bins = shift_bins_to_axis(bins, axis)
+        begin_ns, end_ns = int(bins["t_first_ns"][0]), int(bins["t_last_ns"].max())
+        found, count = select_and_downsample_bins(
+            bins, *time_slice.compute_bounds_ns(begin_ns), 4 * points
+        )
+        return BinnedSlice(found, count * self._bins.frames_in_bin, begin_ns, end_ns, axis)
+
+    def _feed_frames(self, frames: FrameBatch, extra: Columns) -> None:
+        position = self._position
+        pieces = [(frames, extra)]
+        due = (
+            iter(pieces)
+            if self._stream is None
+            else self._stream.estimate_batches(pieces, is_final=False)
+        )
+        names = required_frame_columns(has_estimates=self.has_estimates)
+        for estimated, columns in due:
+            fields = {name: getattr(estimated, name) for name in names if name not in columns}
+            fields |= {name: columns[name] for name in (*names, "part") if name in columns}
+            self._repeated_frames -= self._bins.add_frames(
+                fields, already_added=self._repeated_frames
+            )
+            self.checkpoints.extend_times(estimated.t_ns)
+            position.estimated_frames += len(estimated)
+            position.last_estimated = int(columns["part"][-1]), int(estimated.t_ns[-1])
+        position.part, position.seq = int(extra["part"][-1]), int(frames.seq[-1]) + 1
+        position.fed_frames += len(frames)
+        position.newest_ns = max(position.newest_ns, int(frames.t_ns.max()))
+        if (
+            position.fed_frames - self.checkpoints.checkpoints[-1].fed_frames
+            >= self.checkpoints.distance_frames
+        ):
+            place = Checkpoint(
+                position.part,
+                position.seq,
+                position.fed_frames,
+                position.estimated_frames,
+                position.newest_ns,
+                position.last_estimated,
+            )
+            self.checkpoints.add_checkpoint(
+                place, None if self._stream is None else self._stream.state_dict()
+            )
+
+    def _is_valid(self, checkpoint: Checkpoint, inputs: SessionInputs) -> bool:
+        """Return whether nothing before a checkpoint has changed since."""
+        tares = inputs.tares[len(self._inputs.tares) :]
+        if any(tare.t_ns < checkpoint.newest_ns for tare in tares):
+            return False
+        stored_frames = 0
+        for i, each in enumerate(inputs.session.parts[: checkpoint.part + 1]):
+            journal = inputs.journals.get(each.stream_id)
+            ends = [checkpoint.seq - 1] if i == checkpoint.part else []
+            ends += [each.seq_last] if each.seq_last is not None else []
+            last = min(ends, default=-1)
+            if journal is not None and last >= each.seq_first:
+                stored_frames += journal.stored.restricted_to(each.seq_first, last).count
+        return stored_frames == checkpoint.fed_frames
+
+
+class SessionPreviews:
+    """Previews of unsealed sessions; only the most recently used are kept.
+
+    Args:
+        folder: folder on the disk for states of estimators.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._previews: OrderedDict[str, SessionPreview] = OrderedDict()
+        self._retry_after_s: dict[str, float] = {}
+        self._one_at_a_time = threading.Lock()
+
+    def get_updated(self, inputs: SessionInputs) -> SessionPreview:
+        """Return a session's preview, updated with the present frames.
+
+        Raises:
+            FootTileError: a journal is damaged, or cannot be read.
+        """
+        with self._one_at_a_time:
+            return self._get_updated(inputs)
+
+    def get_quickly(self, inputs: SessionInputs) -> SessionPreview:
+        """Return a session's preview without waiting for a long catch-up.
+
+        Raises:
+            FootTileError: a journal is damaged, or cannot be read.
+        """
+        so_far = self._previews.get(inputs.session.id)
+        return so_far if so_far is not None and so_far.is_catching_up else self.get_updated(inputs)
+
+    def discard(self, session_id: str) -> None:
+        """Remove the preview of a session that is sealed or gone."""
+        self._previews.pop(session_id, None)
+        self._retry_after_s.pop(session_id, None)
+
+    def _get_updated(self, inputs: SessionInputs) -> SessionPreview:
+        name = inputs.session.id
+        so_far = self._previews.get(name)
+        if so_far is None:
+            so_far = self._previews[name] = SessionPreview(inputs, self._folder)
+        elif not so_far.can_use(inputs) or so_far.is_outdated(inputs):
+            if time.monotonic() < self._retry_after_s.get(name, 0.0):
+                return so_far
+            if so_far.can_use(inputs):
+                so_far.rewind(inputs)
+            else:
+                before, so_far = so_far, SessionPreview(inputs, self._folder)
+                so_far.start_repeated_work(before)
+                self._previews[name] = so_far
+        self._previews.move_to_end(name)
+        while len(self._previews) > _PREVIEWS_KEPT:
+            self.discard(next(iter(self._previews)))
+        try:
+            so_far.update(inputs)
+        except FootTileError:
+            self.discard(name)
+            raise
+        self._retry_after_s[name] = time.monotonic() + _REST_FACTOR * so_far.repeated_work_s
+        return so_far

@@ -1,0 +1,323 @@
+"""Recovery after a crash, without a server: mends journals and completes sessions.
+
+A session is sealed if all its frames are stored or cannot come any more; the missing ones are lost,
+for a reason. On a server's folder a node may still send frames: such a session waits, unless its
+missing frames are abandoned. Every sealed file is read again and verified before it counts as
+recovered. Recovery can be killed at any time: files are written atomically, and a second run gives
+the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from devices.errors import DamagedFileError, DamagedFramesError, FootTileError, StorageError
+from service.sessions.creation import create_session
+from service.sessions.inputs import make_inputs
+from service.sessions.part_end import SessionStream, close_at_stop, close_unfinished, tail_bound
+from service.sessions.recovery_streams import OpenedStream, open_streams, read_hello
+from service.sessions.sealing import seal_session
+from service.sessions.session_rebuild import rebuild_session
+from service.sessions.tares import TareHistory
+from storage.clock.log import ClockLog
+from storage.durable_files import remove_stale_temporaries, set_aside_damaged
+from storage.intervals import NO_END, Intervals
+from storage.journal.node.journal import recover_node_journals
+from storage.journal.segment import UNREAD_SUFFIX
+from storage.sessions.folder import Ledger, Part, Session, SessionsFolder, make_session_id
+from storage.sessions.ledger import (
+    adjust_states_to_session,
+    compute_ledger,
+    group_numbers_by_stream,
+)
+from storage.sessions.sidecars import MARKERS_NAME, read_markers, write_markers
+from storage.verify.session import verify_session
+
+Outcome = Literal["sealed", "waiting", "failed"]
+Streams = Mapping[tuple[str, str], OpenedStream]
+
+
+@dataclass(frozen=True)
+class RecoveredSession:
+    """Result of recovery for one session.
+
+    Attributes:
+        session: its new state.
+        outcome: waiting: its node may still send frames.
+        problem: reason of a failure or of waiting.
+        ledger: fate of its frames, if known.
+    """
+
+    session: Session
+    outcome: Outcome
+    problem: str = ""
+    ledger: Ledger | None = None
+
+
+@dataclass
+class RecoveryReport:
+    """Result of recovery for a data folder.
+
+    Attributes:
+        sessions: formerly unsealed sessions.
+        removed_temporaries: half-written files of dead processes.
+        cut_bytes: bytes that were cut off, by journal; they are set aside, not deleted.
+        rewritten_markers: sessions whose `markers.parquet` was written again.
+        rebuilt_sessions: sessions whose `session.json` was rebuilt from the files beside it.
+        problems: further failures.
+    """
+
+    sessions: list[RecoveredSession] = field(default_factory=list)
+    removed_temporaries: list[Path] = field(default_factory=list)
+    """half-written files of dead processes."""
+    cut_bytes: dict[str, int] = field(default_factory=dict)
+    """bytes that were cut off, by journal; they are set aside, not deleted."""
+    rewritten_markers: list[str] = field(default_factory=list)
+    """sessions whose `markers.parquet` was written again."""
+    rebuilt_sessions: list[str] = field(default_factory=list)
+    """sessions whose `session.json` was rebuilt from the files beside it."""
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def is_empty(self) -> bool:
+        """True if there was nothing to do."""
+        done = any(one.outcome != "waiting" for one in self.sessions)
+        made = (
+            self.removed_temporaries,
+            self.cut_bytes,
+            self.rewritten_markers,
+            self.rebuilt_sessions,
+            self.problems,
+        )
+        return not (done or any(made))
+
+
+def _ignore(_: str) -> None:
+    pass
+
+
+def recover_folder(
+    data: Path,
+    *,
+    make_sessions: bool = False,
+    abandon_missing: bool = False,
+    report_step: Callable[[str], None] = _ignore,
+    now: Callable[[], datetime] = lambda: datetime.now(UTC),
+) -> RecoveryReport:
+    """Complete a data folder, of a server or of a node, after a crash.
+
+    Args:
+        data: data folder; the caller holds its lock.
+        make_sessions: create sessions for frames that belong to no session.
+        abandon_missing: on a server's folder, seal frames that its nodes have not sent as lost.
+        report_step: called with a description of each step.
+        now: returns the time for ids of new sessions.
+
+    Raises:
+        StorageError: the disk is full or not writable; the steps before are complete.
+    """
+    recovery = RecoveryReport()
+    sessions = SessionsFolder(data / "sessions")
+    recovery.removed_temporaries += remove_stale_temporaries(data)
+    before = _find_cut_files(data)
+    if _is_node_folder(data):
+        recover_node_journals(data)  # frames in flight of a killed node
+    opened, recovery.problems = open_streams(
+        data, report_step, is_node_folder=_is_node_folder(data)
+    )
+    for path in sorted(_find_cut_files(data) - before):
+        name = f"{path.parent.parent.name}/{path.parent.name}"
+        recovery.cut_bytes[name] = recovery.cut_bytes.get(name, 0) + path.stat().st_size
+    loaded, unreadable = sessions.load_all()
+    loaded.sort(key=lambda session: session.id)
+    for session_id, error in sorted(unreadable.items()):
+        if not any(sessions.get_path(session_id).iterdir()):
+            continue
+        if rebuild_session(sessions, session_id) is None:
+            recovery.problems.append(str(error))
+        else:
+            recovery.rebuilt_sessions.append(session_id)
+    strays = [*sessions.find_strays(), *SessionsFolder(data / "trash").find_strays()]
+    recovery.problems += [str(stray.error) for stray in strays]
+    for session in loaded:
+        if session.state == "sealed":
+            if _rewrite_markers(session, sessions.get_path(session.id)):
+                recovery.rewritten_markers.append(session.id)
+            continue
+        report_step(f"session {session.id} ({session.name})")
+        recovery.sessions.append(
+            _seal_if_possible(data, sessions, session, opened, abandon_missing=abandon_missing)
+        )
+    if make_sessions:
+        for session in _make_sessions(data, loaded, opened, now):
+            report_step(f"session {session.id} ({session.name})")
+            recovery.sessions.append(
+                _seal_if_possible(data, sessions, session, opened, abandon_missing=True)
+            )
+    return recovery
+
+
+def _seal_if_possible(
+    data: Path,
+    sessions: SessionsFolder,
+    session: Session,
+    opened: Streams,
+    *,
+    abandon_missing: bool,
+) -> RecoveredSession:
+    """Seal one session, or return the reason why not."""
+    own_streams = {
+        part.stream_id: opened.get((session.node, part.stream_id)) for part in session.parts
+    }
+    for stream in own_streams.values():
+        if stream is not None:
+            with suppress(StorageError):  # frames matter more than clock measurements
+                session = session.with_clock_rows(ClockLog(stream.journal.folder).read_rows())
+    is_local, abandon_missing = _is_node_folder(data), abandon_missing or session.given_up
+    session = _close_parts(session, own_streams, is_local=is_local, abandon_missing=abandon_missing)
+    if any(part.seq_last is None for part in session.parts):
+        return RecoveredSession(session, "waiting", "its node may still be recording it")
+    for part in session.parts:
+        stream = own_streams[part.stream_id]
+        if stream is not None and part.seq_last is not None:
+            stream.invalidate_damaged(part.seq_first, part.seq_last)
+            stream.save_losses()
+    streams = _find_streams(session, own_streams, is_local=is_local)
+    ledger = compute_ledger(
+        session.parts, adjust_states_to_session(session, streams), is_finished=True
+    )
+    if pending := ledger.pending:
+        text = f"{pending} frames may still come from node {session.node}"
+        return RecoveredSession(session, "waiting", text, ledger)
+    folder = sessions.get_path(session.id)
+    try:
+        session = session.model_copy(update={"state": "sealing"})
+        sessions.save(session)
+        sources = make_inputs(
+            session,
+            streams,
+            load_tares=lambda: TareHistory(data / "nodes" / session.node / "tares.json"),
+            emulated=read_hello(data, session.node).get("emulated"),
+        )
+        sealed = seal_session(sources, folder, ledger)
+        problems = verify_session(folder, expected_session=sealed).problems
+        if problems:
+            return RecoveredSession(session, "failed", "; ".join(problems), ledger)
+        sessions.save(sealed)
+    except FootTileError as error:
+        return RecoveredSession(session, "failed", str(error), ledger)
+    return RecoveredSession(sealed, "sealed", sealed.problem or "", ledger)
+
+
+def _close_parts(
+    session: Session,
+    own: Mapping[str, OpenedStream | None],
+    *,
+    is_local: bool,
+    abandon_missing: bool,
+) -> Session:
+    """Return the session with its parts closed, as well as they are known."""
+    while True:
+        streams = _find_streams(session, own, is_local=is_local)
+        try:
+            if is_local or abandon_missing:
+                closed = close_unfinished(session, streams)
+                return closed.model_copy(update={"given_up": not is_local})
+            return close_at_stop(session, streams, wait_for_missing=True)
+        except DamagedFramesError as error:  # at the stop: retry without these frames
+            _invalidate(own.values(), error)
+
+
+def _invalidate(streams: Iterable[OpenedStream | None], error: DamagedFramesError) -> None:
+    """Remove damaged frames from the stored ones.
+
+    Raises:
+        DamagedFramesError: the same error, if no stream had these frames.
+    """
+    for stream in streams:
+        if stream is not None and stream.journal.folder == Path(error.where).parent:
+            before = stream.journal.stored.count
+            stream.invalidate_damaged(error.seq_first, error.seq_last)
+            if stream.journal.stored.count < before:
+                return
+    raise error
+
+
+def _is_node_folder(data: Path) -> bool:
+    """Return whether this is a node's own folder: then no more frames will come."""
+    return not (data / "nodes").is_dir()
+
+
+def _find_streams(
+    session: Session, streams: Mapping[str, OpenedStream | None], *, is_local: bool
+) -> dict[str, SessionStream]:
+    unknown = SessionStream(obtainable=Intervals(() if is_local else [(0, NO_END)]))
+    return {
+        stream_id: stream.make_session_stream(session) if stream is not None else unknown
+        for stream_id, stream in streams.items()
+    }
+
+
+def _make_sessions(
+    data: Path, known: list[Session], streams: Streams, now: Callable[[], datetime]
+) -> list[Session]:
+    """Return new sessions for frames that belong to no session, one for each run of a stream."""
+    # Frames of a deleted session must not come back as a new one. A session in the trash that
+    # cannot be read has unknown frames.
+    known = [*known, *SessionsFolder(data / "trash").load_all()[0]]
+    found = []
+    for (node, stream_id), stream in streams.items():
+        parts = (part for session in known if session.node == node for part in session.parts)
+        used = group_numbers_by_stream(parts).get(stream_id, Intervals())
+        journal, hello = stream.journal, read_hello(data, node)
+        # Lost frames do not split a run; frames that belong to a session do.
+        unused = (journal.stored | stream.lost.numbers | stream.damaged) - used
+        for run in unused:
+            stored = list(journal.stored.restricted_to(*run))
+            if not stored:
+                continue
+            first, last = stored[0][0], stored[-1][1]
+            session = create_session(
+                journal.info,
+                f"recovered {node} {stream_id}",
+                Part(stream_id=stream_id, seq_first=first, seq_last=last),
+                scene_content=hello.get("scene") or {},
+                calibration=None,
+                id=make_session_id(now()),
+                node=node,
+                state="sealing",
+                started_t_ns=journal.find_t_ns_near(first, is_upper=False) or 0,
+                stopped_t_ns=journal.find_t_ns_near(last, is_upper=True),
+            )
+            session = session.model_copy(update={"calibration": hello.get("calibration")})
+            if last == journal.stored.last and (
+                tail := tail_bound(stream.make_session_stream(session))
+            ):
+                session = session.model_copy(update={"max_lost_tail_frames": {stream_id: tail}})
+            found.append(session)
+    return found
+
+
+def _find_cut_files(data: Path) -> set[Path]:
+    """Return the files with bytes behind the last whole batch of a segment."""
+    return set(data.glob("journal/*/*/*" + UNREAD_SUFFIX))
+
+
+def _rewrite_markers(session: Session, folder: Path) -> bool:
+    """Write `markers.parquet` again if it differs from `session.json`, which is written first."""
+    try:
+        stored = read_markers(folder / MARKERS_NAME)
+        if stored.markers == session.markers and stored.has_hash:
+            return False
+    except FileNotFoundError:
+        if not session.frames:
+            return False
+    except DamagedFileError:
+        set_aside_damaged(folder / MARKERS_NAME)
+    write_markers(session, folder)
+    return True

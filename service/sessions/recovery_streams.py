@@ -1,0 +1,157 @@
+"""Streams of a data folder without a running process: every journal opened and mended."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from devices.errors import DamagedFramesError, FileFormatError
+from devices.text import escape_control_chars
+from service.sessions.part_end import SessionStream, find_seqs_around
+from storage.checksummed_json import read_checksummed_json
+from storage.durable_files import ASIDE_SUFFIX, remove_stale_temporaries
+from storage.intervals import CORRUPT, NO_END, Intervals, Losses
+from storage.journal.journal import Journal
+from storage.journal.segment import SUFFIX
+from storage.journal.stream_notes import NOTES_FILE, StreamNotes
+from storage.sessions.folder import Session
+
+
+@dataclass
+class OpenedStream:
+    """Journal of one stream, opened after a crash.
+
+    Attributes:
+        journal: its frames.
+        notes: its `stream.json`; None if there is none.
+        damaged: frames that were stored and cannot be read any more.
+        is_node_folder: True: the stream is in its own node's folder.
+    """
+
+    journal: Journal
+    notes: StreamNotes | None
+    damaged: Intervals
+    is_node_folder: bool
+    """True: the stream is in its own node's folder."""
+
+    @property
+    def lost(self) -> Losses:
+        """Frames that cannot come any more, by reason."""
+        lost = Losses(self.notes.lost if self.notes is not None else None)
+        if self.is_node_folder:
+            lost.add(self.damaged, CORRUPT)
+        lost.remove(self.journal.stored)
+        return lost
+
+    def make_session_stream(self, session: Session) -> SessionStream:
+        """Return the stream's facts for a session."""
+        notes, lost = self.notes or StreamNotes(array_info=self.journal.info), self.lost
+        rows = [row for row in session.clock if row.stream_id == self.journal.info.stream_id]
+        measured_ns = rows[-1].server_minus_node_ns if rows else None
+        return SessionStream(
+            stored=self.journal.stored,
+            lost=lost,
+            damaged=self.damaged,
+            obtainable=Intervals(() if self.is_node_folder else [(0, NO_END)]) - lost.numbers,
+            next_seq=notes.next_seq,
+            max_lost_tail_frames=notes.max_lost_tail_frames,
+            missed_slots=notes.missed_slots,
+            info=self.journal.info,
+            journal=self.journal,
+            find_seqs_around=partial(find_seqs_around, self.journal),
+            offset_ns=0 if self.is_node_folder else measured_ns,  # a node stops by its own clock
+        )
+
+    def save_losses(self) -> None:
+        """Save the damage found: once cut off, no other record exists.
+
+        On a server's folder these frames are not lost yet: the node may have them. Unreadable notes
+        are replaced.
+
+        Raises:
+            StorageError: the disk is full or not writable.
+        """
+        notes = self.notes or StreamNotes(array_info=self.journal.info)
+        if self.is_node_folder:
+            found: dict[str, object] = {"lost": self.lost.to_pairs()}
+        else:
+            found = {"damaged": tuple(self.damaged)}
+        now = notes.model_copy(update=found)
+        was_broken = self.notes is None and any(
+            self.journal.folder.glob(NOTES_FILE + ASIDE_SUFFIX + "*")
+        )
+        if now != notes or was_broken:
+            self.notes = now
+            self.notes.save(self.journal.folder)
+
+    def invalidate_damaged(self, first: int, last: int) -> None:
+        """Read the stored frames from `first` to `last`; frames with a wrong checksum are lost.
+
+        Raises:
+            StorageError: it cannot be read.
+        """
+        seq = first
+        while seq <= last:
+            try:
+                for _ in self.journal.read_messages(seq, last):
+                    pass
+            except DamagedFramesError as error:
+                damaged = Intervals([(error.seq_first, error.seq_last)])
+                self.journal.invalidate(damaged)
+                self.damaged = self.damaged | (damaged - self.journal.stored)
+                seq = error.seq_last + 1
+            else:
+                return
+
+
+def open_streams(
+    data: Path, report_step: Callable[[str], None], *, is_node_folder: bool
+) -> tuple[dict[tuple[str, str], OpenedStream], list[str]]:
+    """Open every journal of a data folder; this cuts off partial batches and syncs the rest.
+
+    Args:
+        data: the data folder.
+        report_step: called with a description of each step.
+        is_node_folder: True: a node's own folder.
+
+    Returns:
+        Streams by node and stream id, and failures as text.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    streams: dict[tuple[str, str], OpenedStream] = {}
+    problems: list[str] = []
+    for folder in sorted((data / "journal").glob("*/*")):
+        if not folder.is_dir() or not (
+            (folder / NOTES_FILE).exists() or any(folder.glob("*" + SUFFIX))
+        ):
+            continue
+        report_step(f"journal {folder.parent.name}/{folder.name}")
+        remove_stale_temporaries(folder)
+        try:
+            journal = Journal.open(folder)
+            problems += journal.problems
+            notes = StreamNotes.load_or_set_aside(folder, problems)
+        except FileFormatError as error:
+            problems.append(
+                escape_control_chars(f"journal {folder.parent.name}/{folder.name}: {error}")
+            )
+            continue
+        stream = OpenedStream(journal, notes, journal.lost.numbers, is_node_folder)
+        stream.save_losses()
+        streams[(folder.parent.name, folder.name)] = stream
+    return streams, problems
+
+
+def read_hello(data: Path, node: str) -> dict[str, Any]:
+    """Read the node's last hello on the server's disk; empty if there is none."""
+    try:
+        content = json.loads(read_checksummed_json(data / "nodes" / node / "hello.json").text)
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,199 @@
+"""Placement of markers: each at the nearest frame of its session in the server's time.
+
+Markers may be set after a session was sealed, so no file of frames has them: they are placed when
+the session is read. A marker without a frame within a second has no frame, and so has a marker
+whose frames have no server's time, because their clock was never compared. The reason is stated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from storage.clock.table import ClockTable
+from storage.formats.slice import Slice
+from storage.schema import UNKNOWN_T_NS, Array
+from storage.sessions.folder import Marker
+from storage.sessions.time_axis import NODE_AXIS, TimeAxis
+
+DISTANCE_MAX_NS = 1_000_000_000
+"""Largest distance in time between a marker and its frame."""
+LABEL_SEPARATOR = "; "
+"""Separator of the labels of several markers at one frame, in the order of their instants."""
+
+PLACEMENT_COLUMNS = ("seq", "t_mono_ns", "t_ns")
+"""Columns by which markers are placed, besides `part`."""
+
+_NO_DISTANCE = np.iinfo(np.uint64).max
+
+
+@dataclass(frozen=True)
+class PlacedMarker:
+    """Marker with its frame, or with the reason why it has none.
+
+    Attributes:
+        marker: label and instant.
+        frame: part and number of its frame; None: no frame.
+        distance_ns: distance in time between marker and frame.
+        uncertainty_ns: bound of the error of the frame's server time.
+        exclusion_reason: reason why the marker is not in the data; empty if it is.
+    """
+
+    marker: Marker
+    frame: tuple[int, int] | None = None
+    distance_ns: int | None = None
+    uncertainty_ns: int | None = None
+    exclusion_reason: str = ""
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the marker as JSON, for the notes of a file."""
+        part, seq = self.frame or (None, None)
+        return {
+            **self.marker.model_dump(mode="json"),
+            "part": part,
+            "seq": seq,
+            "apart_ns": self.distance_ns,
+            "uncertainty_ns": self.uncertainty_ns,
+            "left_out": self.exclusion_reason or None,
+        }
+
+
+class PlacedMarkers:
+    """Markers of a session, placed at frames.
+
+    Args:
+        markers: markers in the order of their instants.
+    """
+
+    def __init__(self, markers: Sequence[PlacedMarker]) -> None:
+        self.markers = tuple(markers)
+        self._labels: dict[tuple[int, int], str] = {}
+        for mark in self.markers:
+            if mark.frame is not None:
+                earlier = self._labels.get(mark.frame)
+                label = mark.marker.label
+                self._labels[mark.frame] = (
+                    label if earlier is None else earlier + LABEL_SEPARATOR + label
+                )
+        self._seqs = np.array([seq for _, seq in self._labels], dtype=np.uint64)
+
+    @property
+    def excluded(self) -> tuple[PlacedMarker, ...]:
+        """Markers that are not in the data."""
+        return tuple(mark for mark in self.markers if mark.exclusion_reason)
+
+    def get_frame_labels(self, seq: Array, part: Array | None) -> Array:
+        """Return the labels of frames, object[n]: text, or None without a marker.
+
+        Args:
+            seq: uint64[n], numbers of the frames.
+            part: uint16[n], their parts; None: the first part.
+        """
+        labels = np.full(len(seq), None, dtype=object)
+        for row in np.flatnonzero(np.isin(seq, self._seqs)):
+            labels[row] = self._labels.get((0 if part is None else int(part[row]), int(seq[row])))
+        return labels
+
+
+def place_markers(
+    markers: Iterable[Marker],
+    frame_chunks: Iterable[Mapping[str, Array]],
+    clock: ClockTable,
+    selection: Slice,
+    begin_t_ns: int | None = None,
+    axis: TimeAxis = NODE_AXIS,
+) -> PlacedMarkers:
+    """Place every marker at its nearest frame; of two equally near frames at the earlier one.
+
+    Args:
+        markers: markers in any order.
+        frame_chunks: `PLACEMENT_COLUMNS` of all frames of the session, and `part`
+            if it has parts. Frames further than `DISTANCE_MAX_NS` from every marker may be omitted.
+        clock: clock table of the session.
+        selection: the requested slice; a marker with a frame outside is left out.
+        begin_t_ns: instant of the session's first frame; None: of the first frame in
+            `frame_chunks`.
+        axis: time axis of the session.
+    """
+    ordered = sorted(markers, key=lambda event: event.t_ns)
+    nearest = _NearestFrames(np.array([event.t_ns for event in ordered], dtype=np.int64))
+    for piece in frame_chunks:
+        if not len(piece["t_ns"]):
+            continue
+        begin_t_ns = int(piece["t_ns"][0]) if begin_t_ns is None else begin_t_ns
+        times = clock.compute_server_time(piece["t_mono_ns"], piece["t_ns"], piece.get("part"))
+        at_ns = axis.shift_to_axis(piece["t_ns"], piece.get("part"))
+        nearest.add_frames(piece, times, selection.compute_row_mask(at_ns, begin_t_ns))
+    return PlacedMarkers([nearest.make_placed_marker(i, event) for i, event in enumerate(ordered)])
+
+
+@dataclass
+class _NearestFrames:
+    """Running search for the nearest frame of each of n instants."""
+
+    t_ns: Array
+    distance_ns: Array = field(init=False)
+    frame_facts: dict[str, Array] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.distance_ns = np.full(len(self.t_ns), _NO_DISTANCE, dtype=np.uint64)
+        types = {"seq": np.uint64, "part": np.uint16, "uncertainty_ns": np.int64, "inside": bool}
+        self.frame_facts = {name: np.zeros(len(self.t_ns), type_) for name, type_ in types.items()}
+
+    def add_frames(
+        self, piece: Mapping[str, Array], times: Mapping[str, Array], is_in_slice: Array
+    ) -> None:
+        """Update the nearest frames by further frames."""
+        t_server_ns = times["t_server_ns"]
+        known = np.flatnonzero(t_server_ns != UNKNOWN_T_NS)
+        if not len(known) or not len(self.t_ns):
+            return
+        rows = known[np.argsort(t_server_ns[known], kind="stable")]
+        rising_ns = t_server_ns[rows]
+        after = np.searchsorted(rising_ns, self.t_ns)
+        # The first of several frames with one instant.
+        before = np.searchsorted(rising_ns, rising_ns[np.maximum(after - 1, 0)])
+        values = {
+            "seq": piece["seq"],
+            "part": piece.get("part", np.zeros(len(t_server_ns), dtype=np.uint16)),
+            "uncertainty_ns": times["t_server_uncertainty_ns"],
+            "inside": is_in_slice,
+        }
+        for at in (before, np.minimum(after, len(rows) - 1)):
+            apart_ns = _distance_ns(self.t_ns, rising_ns[at])
+            nearer = apart_ns < self.distance_ns
+            self.distance_ns[nearer] = apart_ns[nearer]
+            for name, column in self.frame_facts.items():
+                column[nearer] = values[name][rows[at[nearer]]]
+
+    def make_placed_marker(self, i: int, marker: Marker) -> PlacedMarker:
+        """Return the marker of instant number i with its frame."""
+        if self.distance_ns[i] > DISTANCE_MAX_NS:
+            return PlacedMarker(
+                marker,
+                exclusion_reason=_NO_FRAME if self.distance_ns[i] != _NO_DISTANCE else _NO_CLOCK,
+            )
+        facts: dict[str, Any] = {
+            name: column[i].item() for name, column in self.frame_facts.items()
+        }
+        return PlacedMarker(
+            marker,
+            (facts["part"], facts["seq"]),
+            int(self.distance_ns[i]),
+            facts["uncertainty_ns"],
+            "" if facts["inside"] else _NOT_IN_SLICE,
+        )
+
+
+_NO_FRAME = "no frame within a second of it"
+_NO_CLOCK = "no frame's time is known by the server's clock"
+_NOT_IN_SLICE = "its frame is not in this slice"
+
+
+def _distance_ns(a_ns: Array, b_ns: Array) -> Array:
+    """Return distances of int64 instants as uint64: an int64 might overflow."""
+    a, b = a_ns.astype(np.uint64), b_ns.astype(np.uint64)
+    return np.where(a_ns > b_ns, a - b, b - a)

@@ -1,0 +1,128 @@
+"""Registry of all table formats; a new format is a module and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from devices.errors import FileFormatError, UsageError
+from storage.formats.readers.bioware import is_bioware, read_bioware
+from storage.formats.readers.force_platform import read_force_platforms
+from storage.formats.readers.loadsol import is_loadsol, read_loadsol
+from storage.formats.readers.moticon import is_moticon, read_moticon
+from storage.formats.readers.netforce import is_netforce, read_netforce
+from storage.formats.readers.nexus import is_nexus, read_nexus
+from storage.formats.readers.opensim import read_opensim_table
+from storage.formats.readers.parquet import read_parquet_table
+from storage.formats.readers.pedar import is_pedar, refuse_pedar
+from storage.formats.readers.pressure_plate import read_pressure_plate
+from storage.formats.readers.rosbag import is_bag_folder, read_bag_table
+from storage.formats.readers.table import VALUES_MAX, ColumnFilter, ForceTable
+from storage.formats.readers.tekscan import is_tekscan, read_tekscan
+from storage.formats.readers.text import HEAD_CHARACTERS, parse_text_table, read_decoded_text
+from storage.formats.readers.text_options import TextOptions
+
+
+@dataclass(frozen=True)
+class TextFormat:
+    """Text format of a measuring program, recognised by its head and not by the file's ending.
+
+    Attributes:
+        matches_head: predicate of the first `HEAD_CHARACTERS` of a text.
+        read: function (text, path, column filter, limit of numbers) that returns the table.
+    """
+
+    matches_head: Callable[[str], bool]
+    read: Callable[[str, str, ColumnFilter, int], ForceTable]
+
+
+TEXT_FORMATS: tuple[TextFormat, ...] = (
+    TextFormat(is_bioware, read_bioware),
+    TextFormat(is_nexus, read_nexus),
+    TextFormat(is_loadsol, read_loadsol),
+    TextFormat(is_moticon, read_moticon),
+    TextFormat(is_tekscan, read_tekscan),
+    TextFormat(is_pedar, refuse_pedar),
+    TextFormat(is_netforce, read_netforce),  # last: the format has no head
+)
+
+
+@dataclass(frozen=True)
+class TableFormat:
+    """Table format.
+
+    Attributes:
+        endings: endings of its files, in lower case.
+        read: function (path, column filter, limit of numbers) that returns the table.
+    """
+
+    endings: tuple[str, ...]
+    read: Callable[[Path, ColumnFilter, int], ForceTable]
+
+
+def _read_text(
+    path: Path, is_needed: ColumnFilter, values_max: int, options: TextOptions | None = None
+) -> ForceTable:
+    options = options or TextOptions()
+    text = read_decoded_text(path, options.encoding)
+    head = text[:HEAD_CHARACTERS]
+    for one in () if options.is_plain_table else TEXT_FORMATS:
+        if one.matches_head(head):
+            return one.read(text, str(path), is_needed, values_max)
+    return parse_text_table(text, str(path), is_needed, values_max, options)
+
+
+TEXT = TableFormat((".csv", ".txt", ".tsv"), _read_text)
+BAG = TableFormat((".bag", ".mcap", ".db3"), read_bag_table)
+TABLE_FORMATS = (
+    TEXT,
+    BAG,
+    TableFormat((".parquet",), read_parquet_table),
+    TableFormat((".c3d",), read_force_platforms),
+    TableFormat((".mot", ".sto"), read_opensim_table),
+    TableFormat((".npz",), read_pressure_plate),
+)
+
+
+def read_table(
+    path: Path,
+    is_needed: ColumnFilter,
+    values_max: int = VALUES_MAX,
+    text_options: TextOptions | None = None,
+) -> ForceTable:
+    """Read the needed columns of a file; the format follows from the ending, default text.
+
+    Raises:
+        FileFormatError: the file cannot be read.
+        UsageError: a text layout is stated, and the file is no text.
+    """
+    ending = path.suffix.lower()
+    chosen = next((one for one in TABLE_FORMATS if ending in one.endings), TEXT)
+    if is_bag_folder(path):
+        chosen = BAG
+    try:
+        if chosen is TEXT:
+            return _read_text(path, is_needed, values_max, text_options)
+        refuse_text_options(path, text_options)
+        return chosen.read(path, is_needed, values_max)
+    except MemoryError as error:
+        raise FileFormatError(
+            "there is not enough memory to read it",
+            where=str(path),
+            remedy="Lift the limit (ulimit -v), or cut out the part that is needed",
+        ) from error
+
+
+def refuse_text_options(path: Path, text_options: TextOptions | None) -> None:
+    """Refuse text options for a file that is no text.
+
+    Raises:
+        UsageError: an option is set.
+    """
+    if text_options is not None and text_options != TextOptions():
+        raise UsageError(
+            "--skip-rows, --units-row, --decimal and --encoding apply only to text tables",
+            where=str(path),
+            remedy="Leave them out",
+        )

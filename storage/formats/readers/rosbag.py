@@ -1,0 +1,230 @@
+"""Reader of ROS bags and MCAP: `geometry_msgs/WrenchStamped` of force sensors, ROS 1 and ROS 2.
+
+ROS uses N, N m and m (REP 103). Each topic is a sensor: `/left/wrench` becomes `left_wrench_fx`,
+`_fy`, `_fz`, along the axes of its frame, and `_cop_x`, `_cop_y`, in the plane z = 0 of its frame:
+x = -torque.y / force.z, y = torque.x / force.z. A bag does not state the distance of the ground
+from this plane, so a centre of pressure is read only if the user maps it. Times are the headers'
+stamps, sorted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.errors import FileFormatError, FootTileError, require_extra
+from devices.input_files import check_regular_file
+from storage.formats.readers.plate_signals import PlateSignals, make_plate_table
+from storage.formats.readers.table import (
+    ColumnFilter,
+    ForceTable,
+    check_table_size,
+    make_repeated_name_error,
+)
+
+FORM = "a ROS bag or an MCAP file with topics of geometry_msgs/WrenchStamped"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+WRENCHES = (WRENCH, "geometry_msgs/WrenchStamped")
+YEAR_2000_NS = 946_684_800_000_000_000
+"""Year 2000; earlier stamps are from a simulation or from a clock that was never set."""
+_COLUMNS = ("fz", "fx", "fy", "cop_x", "cop_y")
+_Message = tuple[str, int, Any]
+"""Topic, time of recording in ns, and the decoded message."""
+
+
+@dataclass(frozen=True)
+class _Bag:
+    """Topics of wrenches in a bag, and a function that reads the messages of given topics."""
+
+    topics: list[str]
+    read_messages: Callable[[list[str]], Iterator[_Message]]
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Return whether a path is the folder of a ROS 2 bag."""
+    try:
+        return (path / "metadata.yaml").is_file()
+    except OSError:  # name too long
+        return False
+
+
+@require_extra("mcap", "To read ROS bags and MCAP")
+def read_bag_table(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+    """Read the wrenches of the needed topics; the only topic of a bag needs no mapping.
+
+    Raises:
+        FileFormatError: unreadable, no wrenches, or two needed topics differ in their times.
+    """
+    where = str(path)
+    try:
+        for file in path.iterdir() if path.is_dir() else (path,):
+            if not file.is_dir():
+                check_regular_file(file)  # the libraries would block on a pipe or a device
+        bag = _open_mcap(path) if path.suffix.lower() == ".mcap" else _open_rosbag(path)
+        return _make_table(bag, where, is_needed, values_max)
+    except (FootTileError, ModuleNotFoundError):
+        raise
+    except Exception as error:  # libraries raise whatever damaged bytes lead to
+        kind = type(error).__name__
+        raise FileFormatError(
+            f"cannot be read: {str(error)[:200] or kind}", where=where, expected=FORM
+        ) from error
+
+
+def _make_table(bag: _Bag, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
+    names = {topic: topic.strip("/").replace("/", "_") for topic in bag.topics}
+    if not names:
+        raise FileFormatError("there is no wrench in it", where=where, expected=FORM)
+    if twice := sorted({name for name in names.values() if list(names.values()).count(name) > 1}):
+        raise make_repeated_name_error(twice, where)
+    needed = [
+        topic
+        for topic, name in names.items()
+        if len(names) == 1 or any(is_needed(f"{name}_{column}") for column in _COLUMNS)
+    ]
+    found = _read_wrenches(bag, needed, where, values_max)
+    plates: list[PlateSignals] = []
+    time_s, begin_ns = np.empty(0), 0
+    forces: dict[str, Floats] = {}
+    notes = []
+    for topic, sensor in found.items():
+        name = names[topic]
+        if plates and not np.array_equal(sensor.t_ns, found[needed[0]].t_ns):
+            raise FileFormatError(
+                f"topics {needed[0]} and {topic} have stamps of their own",
+                where=where,
+                expected="the same stamps, to add sensors up",
+                remedy="Compare each sensor alone",
+            )
+        begin_ns = int(sensor.t_ns[0])
+        time_s = (sensor.t_ns - begin_ns) * 1e-9
+        force, torque = sensor.wrench[:3], sensor.wrench[3:]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            cop = np.stack([-torque[1], torque[0]]) / force[2]
+        cop[:, ~np.isfinite(cop).all(axis=0)] = np.nan
+        plates.append(PlateSignals(name, force[2], cop, "N", "m", notes=sensor.notes))
+        forces |= {f"{name}_fx": force[0], f"{name}_fy": force[1]}
+    if len(names) > 1:
+        notes.append(f"topics of wrenches are {', '.join(names)}: --map says which one")
+    table = make_plate_table(where, time_s, plates, notes)
+    columns = {
+        name: column
+        for name, column in {**table.columns, **forces}.items()
+        if name not in ("cop_x_m", "cop_y_m") and (plates or name != "time_s")
+    }
+    return replace(
+        table,
+        names=tuple(f"{name}_{column}" for name in names.values() for column in _COLUMNS),
+        columns=columns,
+        units={**table.units, **dict.fromkeys(forces, "N")},
+        plate_forces=table.plate_forces | set(forces),
+        epoch_ns=begin_ns if begin_ns > YEAR_2000_NS else None,
+    )
+
+
+@dataclass(frozen=True)
+class _WrenchSeries:
+    """Stamps (n,) in ns and wrenches (6, n) of a topic, in the order of their stamps."""
+
+    t_ns: Any
+    wrench: Floats
+    notes: tuple[str, ...]
+
+
+def _read_wrenches(
+    bag: _Bag, topics: list[str], where: str, values_max: int
+) -> dict[str, _WrenchSeries]:
+    """Return stamps and wrenches by topic.
+
+    Raises:
+        FileFormatError: a topic has no messages, too many messages, or messages in two frames.
+    """
+    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics}
+    stamps: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
+    frames: dict[str, set[str]] = {topic: set() for topic in topics}
+    for topic, logged_ns, message in bag.read_messages(topics) if topics else ():
+        check_table_size(len(rows[topic]), len(_COLUMNS) + 3, values_max, where)
+        force, torque = message.wrench.force, message.wrench.torque
+        rows[topic].append((force.x, force.y, force.z, torque.x, torque.y, torque.z))
+        stamp = message.header.stamp
+        stamps[topic].append((1_000_000_000 * int(stamp.sec) + int(stamp.nanosec), logged_ns))
+        frames[topic].add(message.header.frame_id)
+    found = {}
+    for topic in topics:
+        if not rows[topic]:
+            raise FileFormatError(f"topic {topic} has no messages", where=where, expected=FORM)
+        if len(frames[topic]) > 1:
+            raise FileFormatError(
+                f"topic {topic} is in the frames {', '.join(sorted(frames[topic]))[:200]}",
+                where=where,
+                expected="wrenches in one frame",
+            )
+        (frame,) = frames[topic]
+        notes = [f"forces are along the axes of its frame {frame!r}, COP in the plane z = 0 of it"]
+        stamp_ns, logged_ns = np.array(stamps[topic], dtype=np.int64).T
+        if not stamp_ns.any():
+            notes.append("its headers have no stamps: recording times are used")
+            stamp_ns = logged_ns
+        order = np.argsort(stamp_ns, kind="stable")
+        wrench = np.array(rows[topic], dtype=np.float64).T[:, order]
+        found[topic] = _WrenchSeries(stamp_ns[order], wrench, tuple(notes))
+    return found
+
+
+def _open_rosbag(path: Path) -> _Bag:
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+    from rosbags.typesys import Stores, get_typestore
+
+    is_first = path.suffix.lower() == ".bag"
+    types = get_typestore(Stores.ROS1_NOETIC if is_first else Stores.ROS2_HUMBLE)
+    decode = types.deserialize_ros1 if is_first else types.deserialize_cdr
+
+    def messages(topics: list[str]) -> Iterator[_Message]:
+        with Reader1(path) if is_first else Reader2(path) as reader:
+            own = [c for c in reader.connections if c.msgtype == WRENCH and c.topic in topics]
+            for connection, logged_ns, raw in reader.messages(own):
+                yield connection.topic, logged_ns, decode(raw, WRENCH)
+
+    with Reader1(path) if is_first else Reader2(path) as reader:
+        found = [c.topic for c in reader.connections if c.msgtype == WRENCH]
+    return _Bag(list(dict.fromkeys(found)), messages)
+
+
+def _open_mcap(path: Path) -> _Bag:
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_typestore
+
+    decoders = {
+        "ros1": get_typestore(Stores.ROS1_NOETIC).deserialize_ros1,
+        "cdr": get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr,
+    }
+
+    def messages(topics: list[str]) -> Iterator[_Message]:
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            for schema, channel, message in reader.iter_messages(topics):
+                if schema is not None and schema.name in WRENCHES:
+                    decode = decoders[channel.message_encoding]
+                    yield channel.topic, message.log_time, decode(message.data, WRENCH)
+
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    if summary is None:
+        raise FileFormatError(
+            "it is cut off: it has no summary",
+            where=str(path),
+            expected=FORM,
+            remedy="Repair it with `mcap recover`",
+        )
+    found = [
+        channel.topic
+        for channel in summary.channels.values()
+        if (schema := summary.schemas.get(channel.schema_id)) and schema.name in WRENCHES
+    ]
+    return _Bag(list(dict.fromkeys(found)), messages)

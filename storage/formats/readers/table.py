@@ -1,0 +1,144 @@
+"""Table of number columns of a file of any format, with the units that the file states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from devices.errors import FileFormatError
+
+Column = npt.NDArray[np.float64] | npt.NDArray[np.int64]
+"""(n,), float64 with NaN in empty cells; int64 for instants in nanoseconds."""
+ColumnFilter = Callable[[str], bool]
+"""Predicate of column names; only columns for which it is true are read."""
+
+TEXT_BYTES_MAX = 256 << 20
+VALUES_MAX = 50_000_000
+"""Limit of rows times columns: 400 MB in memory."""
+STANDARD_UNITS: Mapping[str, str] = {
+    "time_s": "s",
+    "grf_n": "N",
+    "fz_n": "N",
+    "cop_x_m": "m",
+    "cop_y_m": "m",
+}
+"""Units of the standard column names, which state unit and sign, in upper or lower case."""
+SOLE_FRACTION = "sole"
+"""Unit of a centre of pressure given as fractions of the sole's length and width."""
+SOLE_UNITS = ("sole lengths", "sole widths")
+"""Units of the coordinates x and y of such a centre of pressure."""
+INSTANT_COLUMN = "t_ns"
+"""Name of a session's column of instants, which need all 64 bits."""
+
+
+@dataclass(frozen=True)
+class ForceTable:
+    """Table of a file's columns, in the units of the file.
+
+    Attributes:
+        where: path of the file.
+        names: names of all columns of the file.
+        columns: the needed columns by name.
+        units: unit of each column whose unit the file states.
+        positive_forces: names of forces that the file states to be positive under load.
+        plate_forces: names of plates' forces, whose sign is inferred from the load.
+        epoch_ns: UTC of time zero; None if the file does not state it.
+        notes: remarks for the user.
+        expected_form: expected form of the file, for errors; empty for binary formats.
+        schema: Arrow schema of a Parquet file.
+    """
+
+    where: str
+    names: tuple[str, ...]
+    columns: Mapping[str, Column]
+    units: Mapping[str, str] = field(default_factory=dict)
+    positive_forces: frozenset[str] = frozenset()
+    plate_forces: frozenset[str] = frozenset()
+    epoch_ns: int | None = None
+    notes: tuple[str, ...] = ()
+    expected_form: str = ""
+    schema: pa.Schema | None = None
+
+
+def make_force_table(
+    where: str,
+    names: Iterable[str],
+    columns: Mapping[str, Column],
+    *,
+    units: Mapping[str, str] | None = None,
+    notes: tuple[str, ...] = (),
+    expected_form: str = "",
+    schema: pa.Schema | None = None,
+) -> ForceTable:
+    """Return a table; columns with a standard name in any case get that name and its unit.
+
+    `fz_n` is `grf_n` as well, if the file has no `grf_n`.
+
+    Raises:
+        FileFormatError: two names differ only in case.
+    """
+    found = dict(columns)
+    for name in columns:
+        if name.lower() in STANDARD_UNITS and name.lower() != name:
+            if name.lower() in found:
+                raise make_repeated_name_error([name.lower()], where)
+            found[name.lower()] = columns[name]
+    if "fz_n" in found and "grf_n" not in found:
+        found["grf_n"] = found["fz_n"]
+    ours = {name: unit for name, unit in STANDARD_UNITS.items() if name in found}
+    cased = {
+        name: STANDARD_UNITS[name.lower()] for name in columns if name.lower() in STANDARD_UNITS
+    }
+    forces = {name for name, unit in (cased | ours).items() if unit == "N"}
+    return ForceTable(
+        where,
+        tuple(names),
+        found,
+        {**(units or {}), **cased, **ours},
+        frozenset(forces),
+        notes=notes,
+        expected_form=expected_form,
+        schema=schema,
+    )
+
+
+def select_needed_names(
+    column_names: Collection[str], is_needed: ColumnFilter, where: str
+) -> list[str]:
+    """Return the names of the columns to read.
+
+    Raises:
+        FileFormatError: two columns have one of these names.
+    """
+    needed = [name for name in column_names if name and is_needed(name)]
+    if twice := sorted({name for name in needed if needed.count(name) > 1}):
+        raise make_repeated_name_error(twice, where)
+    return needed
+
+
+def make_repeated_name_error(repeated_names: Collection[str], where: str) -> FileFormatError:
+    """Return the error for names that two columns have."""
+    return FileFormatError(
+        f"column {', '.join(repeated_names)} is there twice",
+        where=where,
+        expected="a name of its own for each column, whatever its case",
+    )
+
+
+def check_table_size(row_count: int, column_count: int, values_max: int, where: str) -> None:
+    """Refuse a table that is too large for memory.
+
+    Raises:
+        FileFormatError: rows times columns exceed `values_max`.
+    """
+    if row_count * column_count > values_max:
+        raise FileFormatError(
+            f"{row_count} rows of {column_count} columns are too many for memory",
+            where=where,
+            expected=f"up to {values_max} numbers",
+            remedy="Cut out the part that is needed",
+        )

@@ -1,0 +1,126 @@
+"""Description of an export format: names, capabilities, encoder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from devices.errors import Extra, UsageError, require_extra
+from storage.formats.export import Export
+
+TABLE_OPTIONS = ("names", "times")
+"""Options of every format that writes `Export.read_tables`."""
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """Export format of sessions.
+
+    Attributes:
+        name: name in requests and commands.
+        title: name in menus.
+        opened_by: some programs that open it.
+        media_type: media type of HTTP.
+        encoder: generator of the file's chunks; see the package.
+        group_encoder: generator for several sessions on one time axis; None: one session only.
+        suffix: ending of its files, without the dot; empty: the name.
+        options: names of the supported fields of `FormatOptions`.
+        takes_columns: True if columns can be selected; else they are fixed.
+        needs_forces: True if a session without estimates cannot be written.
+        needs_sealed: True if only sealed sessions can be written.
+        has_markers_by_default: True if markers are included by default.
+        frames_max: limit of frames; None: no limit.
+        extra: extra that has to be installed; None: none.
+        packages: modules of the extra that tell whether it is installed.
+    """
+
+    name: str
+    title: str
+    opened_by: str
+    media_type: str
+    encoder: Callable[[Export], Iterator[bytes]]
+    group_encoder: Callable[[Sequence[Export]], Iterator[bytes]] | None = None
+    suffix: str = ""
+    options: tuple[str, ...] = ()
+    takes_columns: bool = True
+    needs_forces: bool = False
+    needs_sealed: bool = False
+    has_markers_by_default: bool = True
+    frames_max: int | None = None
+    extra: Extra | None = None
+    packages: tuple[str, ...] = ()
+
+    @property
+    def ending(self) -> str:
+        """Ending of its files, without the dot."""
+        return self.suffix or self.name
+
+    @property
+    def missing(self) -> str | None:
+        """Extra that has to be installed; None if the format can be written here."""
+        is_here = all(find_spec(package) is not None for package in self.packages)
+        return None if is_here else self.extra
+
+    def encode(self, export: Export) -> Iterator[bytes]:
+        """Yield the file of one session in chunks.
+
+        Raises:
+            UsageError: a column or option is not supported, there are too many frames, or the
+                slice begins after the session's end; raised before the first chunk.
+        """
+        self._check_export(export)
+        with self._extra_context():
+            yield from self.encoder(export)
+
+    def encode_together(self, exports: Sequence[Export]) -> Iterator[bytes]:
+        """Yield one file of several sessions on one time axis, in chunks.
+
+        Raises:
+            UsageError: as for `encode_frames`, for any session; the format holds one session only,
+                or a session does not have the server's time.
+        """
+        if self.group_encoder is None:
+            raise UsageError(f"{self.name} holds one session only")
+        for export in exports:
+            self._check_export(export)
+            if export.clock is None:
+                raise UsageError(
+                    "the nodes' own clocks are no common axis", remedy="Ask for the server's clock"
+                )
+        with self._extra_context():
+            yield from self.group_encoder(exports)
+
+    @property
+    def holds_several(self) -> bool:
+        """True if one file can hold several sessions."""
+        return self.group_encoder is not None
+
+    def _extra_context(self) -> AbstractContextManager[None]:
+        if self.extra is None:
+            return nullcontext()
+        return require_extra(self.extra, f"the format {self.name}")
+
+    def _check_export(self, export: Export) -> None:
+        for name in export.options.specified_names:
+            if name not in self.options:
+                known = ", ".join(self.options)
+                raise UsageError(
+                    f"{self.name} has no option {name!r}",
+                    expected=f"of its options: {known}" if known else "none for this format",
+                )
+        if export.selection.columns and not self.takes_columns:
+            raise UsageError(
+                f"{self.name} has fixed columns, and none can be selected",
+                remedy="Leave columns out, or ask for Parquet, Arrow or CSV",
+            )
+        if self.needs_forces and not export.has_forces:
+            why = export.notes.get("estimates")
+            raise UsageError(
+                f"{self.name} holds forces, and this session has none"
+                + (f": {why}" if isinstance(why, str) else ""),
+                where=export.display_name,
+                remedy="Add them with `foottile estimate`, or ask for its counts as Parquet, "
+                "Arrow or CSV",
+            )

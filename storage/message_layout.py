@@ -1,0 +1,139 @@
+"""Byte layout of messages of frames: where each column lies, by the message's header.
+
+Messages with equal headers have equal layouts. So a header is checked once, by Arrow and here, and
+thousands of messages are then read as numpy columns without parsing each by Arrow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pyarrow as pa
+
+from devices.errors import FileFormatError
+from storage.arrow_header import HeaderError, read_batch_header
+from storage.schema import frames_from_record_batch
+
+MAX_MESSAGE_FRAMES = 4096
+"""Upper limit of frames in one message; a node sends some ten."""
+PREFIX_BYTES = 8
+"""Length of the marker and the header's length, before the header of a message."""
+_CONTINUATION_MARKER = b"\xff\xff\xff\xff"
+"""First bytes of a message.
+
+Arrow also reads older messages without it, whose header and body begin four bytes earlier: there
+the computed offsets would be wrong.
+"""
+_MAX_CACHED_HEADERS = 256
+"""Upper limit of cached headers; a node's batches have two or three different ones."""
+_MAX_CACHED_HEADER_BYTES = 4096
+"""Longest cached header: ours take some 700 bytes, a stranger's up to a megabyte."""
+
+
+@dataclass(frozen=True)
+class MessageLayout:
+    """Byte layout of a message, from its header.
+
+    Attributes:
+        rows: number of frames.
+        message_bytes: length of the message, prefix and header included.
+        columns: offset and length in bytes of each column's values in the message, in the order of
+            the schema.
+    """
+
+    rows: int
+    message_bytes: int
+    columns: tuple[tuple[int, int], ...]
+
+
+def compute_layout(message: pa.ipc.Message, schema: pa.Schema) -> MessageLayout:
+    """Compute a message's layout; check that its size fits its number of frames first.
+
+    Args:
+        message: a message whose form Arrow has checked.
+        schema: schema of its stream (`storage.schema.wire_schema`).
+
+    Raises:
+        FileFormatError: it has no frames, or too many.
+        HeaderError: columns or buffers do not fit that many frames.
+    """
+    header = read_batch_header(message)
+    rows = header.rows
+    if not 0 < rows <= MAX_MESSAGE_FRAMES:
+        raise FileFormatError(
+            f"a message of {rows} frames", expected=f"1 to {MAX_MESSAGE_FRAMES} frames"
+        )
+    nodes: list[tuple[int, int]] = []
+    needed_bytes: list[int] = []
+    values_at: list[int] = []
+    for type_ in schema.types:
+        nodes.append((rows, 0))
+        needed_bytes.append(0)  # validity bitmap: empty, no row is null
+        values, value_type = rows, type_
+        if isinstance(type_, pa.FixedSizeListType):
+            values, value_type = rows * type_.list_size, type_.value_type
+            nodes.append((values, 0))
+            needed_bytes.append(0)
+        values_at.append(len(needed_bytes))
+        needed_bytes.append(values * value_type.bit_width // 8)
+    if list(header.nodes) != nodes:
+        raise HeaderError(f"its columns are not those of {rows} frames without empty values")
+    if len(header.buffers) != len(needed_bytes):
+        raise HeaderError(f"{len(header.buffers)} buffers instead of {len(needed_bytes)}")
+    end = 0
+    for (offset, length), needed in zip(header.buffers, needed_bytes, strict=True):
+        if length < needed:
+            raise HeaderError(f"a column of {length} bytes where {needed} are needed")
+        if length and (offset < end or offset + length > header.body_bytes):
+            raise HeaderError("its buffers overlap, or reach outside of it")
+        end = max(end, offset + length if length else 0)
+    body = PREFIX_BYTES + message.metadata.size
+    columns = tuple((body + header.buffers[at][0], needed_bytes[at]) for at in values_at)
+    return MessageLayout(rows, body + header.body_bytes, columns)
+
+
+class MessageLayoutCache:
+    """Cache of message layouts by header, for one stream. Thread-safe.
+
+    Args:
+        schema: schema of the stream (`storage.schema.wire_schema`).
+    """
+
+    def __init__(self, schema: pa.Schema) -> None:
+        self.schema = schema
+        self._cache: dict[bytes, MessageLayout] = {}
+
+    def get_layout(self, message: bytes | memoryview) -> MessageLayout:
+        """Return the layout of a message; validate a header that is not cached yet.
+
+        Raises:
+            FileFormatError: it is no message of this stream, or is cut off.
+        """
+        head = bytes(message[: PREFIX_BYTES + int.from_bytes(message[4:PREFIX_BYTES], "little")])
+        layout = self._cache.get(head)
+        try:
+            if layout is None:
+                layout = self._validate_and_cache(message, head)
+            if layout.message_bytes != len(message):
+                raise HeaderError(f"it has {len(message)} bytes, not those its header states")
+        except (pa.ArrowException, EOFError, OSError, ValueError, IndexError) as error:
+            raise FileFormatError(
+                f"no Arrow message of frames: {error}",
+                expected="a record batch of the schema announced in hello",
+            ) from error
+        return layout
+
+    def _validate_and_cache(self, message: bytes | memoryview, head: bytes) -> MessageLayout:
+        if not head.startswith(_CONTINUATION_MARKER):
+            raise HeaderError("it does not begin as messages do since Arrow 0.15")
+        found = pa.ipc.read_message(pa.py_buffer(message))
+        layout = compute_layout(found, self.schema)
+        if layout.message_bytes == len(message):
+            record = pa.ipc.read_record_batch(found, self.schema)
+            record.validate(full=True)  # checks the values, which the header does not describe
+            frames_from_record_batch(record)
+            if len(head) <= _MAX_CACHED_HEADER_BYTES:
+                if len(self._cache) >= _MAX_CACHED_HEADERS:
+                    self._cache.clear()
+                self._cache[head] = layout
+        return layout

@@ -1,0 +1,238 @@
+"""SHA-256 that a Parquet file carries in its own footer, over all of its bytes.
+
+The hash's own digits count as zeros. So it covers every byte, in the footer's statistics as well as
+in a page. A sealed session's footer also has a hash of the footer alone: a reader of a slice checks
+columns, offsets and statistics by it in a millisecond, and the pages that it reads by their
+checksums.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from devices.errors import DamagedFileError, FileFormatError
+
+FILE_HASH_KEY = b"foottile.file_sha256"
+FOOTER_HASH_KEY = b"foottile.footer_sha256"
+FORMAT_KEY = b"foottile.format"
+"""Key of the format version in the schema's metadata of frames, markers and clocks."""
+FORMAT = b"2"
+FORMAT_WITHOUT_HASH = b"1"
+"""Version of older files: the same format without a hash. They are read, not written."""
+HASH_PLACEHOLDER = b"0" * 64
+"""Placeholder for the digits of a hash."""
+_THRIFT_TEXT_64 = b"\x18\x40"
+"""Thrift's prefix of a 64-byte text: behind its key it occurs once in a footer."""
+_REMEDY = "`foottile verify` says more; pull it again, or use a copy"
+_MAGIC = b"PAR1"
+_TAIL = 8
+_BLOCK = 1 << 20
+
+
+def embed_file_hashes(path: Path) -> None:
+    """Fill in the hashes of a Parquet file's footer and bytes, where placeholders stand.
+
+    The footer's is optional. The file is on the disk when this returns.
+
+    Raises:
+        OSError: it cannot be written.
+        FileFormatError: the file has no placeholder for its hash.
+    """
+    with path.open("r+b") as file:
+        embed_hashes(file, where=str(path))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def embed_hashes(file: BinaryIO, *, where: str) -> None:
+    """Fill in the hashes of an open or in-memory Parquet file.
+
+    Raises:
+        OSError: it cannot be written.
+        FileFormatError: the file has no placeholder for its hash.
+    """
+    begin, footer = _footer(file)
+    at = _find_digits(footer, FILE_HASH_KEY)
+    if at is None:
+        raise FileFormatError("the footer has no placeholder for the file's hash", where=where)
+    own = _find_digits(footer, FOOTER_HASH_KEY)
+    if own is not None:
+        file.seek(begin + own)
+        file.write(_footer_hash(footer, own, at).encode())
+    at += begin
+    digits = _hash_without(file, at)
+    file.seek(at)
+    file.write(digits.encode())
+
+
+def read_stated_and_actual_hash(path: Path) -> tuple[str, str] | None:
+    """Return a Parquet file's stated and actual hash; None if it states none.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return _hashes(file)
+
+
+def compute_stated_and_actual_hash(content: bytes) -> tuple[str, str] | None:
+    """Return the stated and actual hash of a Parquet file in memory; None if it states none."""
+    return _hashes(io.BytesIO(content))
+
+
+def check_file_hash(
+    hashes: tuple[str, str] | None, metadata: Mapping[bytes, bytes], *, where: str
+) -> None:
+    """Refuse a Parquet file whose bytes have changed since it was written.
+
+    Checksums of pages alone are not enough: a flip in the footer may give a column the name or the
+    place of another one. A file of another program, or of an older version, states no hash and no
+    format with a hash, and passes.
+
+    Args:
+        hashes: stated and actual, as of `read_stated_and_actual_hash`.
+        metadata: the metadata of its schema.
+        where: for errors.
+
+    Raises:
+        DamagedFileError: its hash is wrong, or missing.
+    """
+    if hashes is None and metadata.get(FORMAT_KEY, FORMAT_WITHOUT_HASH) != FORMAT_WITHOUT_HASH:
+        raise DamagedFileError(
+            "its hash is gone: it was changed, or another program has rewritten it",
+            where=where,
+            expected="the bytes as they were written",
+            remedy=f"{_REMEDY}; export it to work on it with other programs",
+        )
+    if hashes is not None and hashes[0] != hashes[1]:
+        raise DamagedFileError(
+            "its bytes have changed since it was sealed, by the hash in its footer",
+            where=where,
+            expected="the bytes as they were written",
+            remedy=_REMEDY,
+        )
+
+
+def read_footer(path: Path) -> bytes:
+    """Return the footer of a Parquet file, without the eight bytes behind it; empty if it has none.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return read_footer_from(file)
+
+
+def read_footer_from(file: BinaryIO) -> bytes:
+    """Read the footer of an open Parquet file, and nothing else of it.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    return _footer(file)[1]
+
+
+def footer_stated_and_actual_hash(footer: bytes) -> tuple[str, str] | None:
+    """Return a footer's stated and actual hash of itself; None if it states none.
+
+    The digits of both hashes, the footer's and the file's, count as zeros.
+    """
+    own, at = _find_digits(footer, FOOTER_HASH_KEY), _find_digits(footer, FILE_HASH_KEY)
+    if own is None or at is None:
+        return None
+    stated = footer[own : own + len(HASH_PLACEHOLDER)].decode("ascii", "replace")
+    return stated, _footer_hash(footer, own, at)
+
+
+def check_footer_hash(hashes: tuple[str, str], *, where: str) -> None:
+    """Refuse a footer whose bytes have changed since it was written.
+
+    Args:
+        hashes: as of `footer_stated_and_actual_hash`.
+        where: for errors.
+
+    Raises:
+        DamagedFileError: its hash is wrong.
+    """
+    if hashes[0] != hashes[1]:
+        raise DamagedFileError(
+            "the bytes of its footer have changed since it was sealed, by the footer's hash",
+            where=where,
+            expected="the bytes as they were written",
+            remedy=_REMEDY,
+        )
+
+
+def _hashes(file: BinaryIO) -> tuple[str, str] | None:
+    begin, footer = _footer(file)
+    at = _find_digits(footer, FILE_HASH_KEY)
+    if at is None:
+        return None
+    stated = footer[at : at + len(HASH_PLACEHOLDER)].decode("ascii", "replace")
+    return stated, _hash_without(file, begin + at)
+
+
+def compute_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes in hexadecimal digits.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _footer(file: BinaryIO) -> tuple[int, bytes]:
+    """Return the offset and bytes of a file's footer; empty if it is no Parquet file."""
+    size = file.seek(0, os.SEEK_END)
+    if size < _TAIL + len(_MAGIC):
+        return size, b""
+    file.seek(size - _TAIL)
+    tail = file.read(_TAIL)
+    length = int.from_bytes(tail[:4], "little")
+    if tail[4:] != _MAGIC or length > size - _TAIL - len(_MAGIC):
+        return size, b""
+    begin = size - _TAIL - length
+    file.seek(begin)
+    return begin, file.read(length)
+
+
+def _find_digits(footer: bytes, key: bytes) -> int | None:
+    """Return the offset of a hash's digits in a footer; None if there is no unique one."""
+    before = key + _THRIFT_TEXT_64
+    at = footer.find(before)
+    begin = at + len(before)
+    if at < 0 or footer.find(before, begin) >= 0 or begin + len(HASH_PLACEHOLDER) > len(footer):
+        return None
+    return begin
+
+
+def _footer_hash(footer: bytes, *places: int) -> str:
+    """Return the hash of a footer with zeros for the digits at these places."""
+    hash_, begin = hashlib.sha256(), 0
+    for at in sorted(places):
+        hash_.update(memoryview(footer)[begin:at])
+        hash_.update(HASH_PLACEHOLDER)
+        begin = at + len(HASH_PLACEHOLDER)
+    hash_.update(memoryview(footer)[begin:])
+    return hash_.hexdigest()
+
+
+def _hash_without(file: BinaryIO, at: int) -> str:
+    """Return the hash of the file with zeros for the digits at `at`."""
+    hash_ = hashlib.sha256()
+    file.seek(0)
+    left = at
+    while left and (block := file.read(min(left, _BLOCK))):
+        hash_.update(block)
+        left -= len(block)
+    hash_.update(HASH_PLACEHOLDER)
+    file.seek(at + len(HASH_PLACEHOLDER))
+    while block := file.read(_BLOCK):
+        hash_.update(block)
+    return hash_.hexdigest()

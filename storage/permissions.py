@@ -1,0 +1,71 @@
+"""Permissions of the files that a process writes: for its user, and for a group if allowed."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+from devices.errors import StorageError
+from devices.text import is_utf8_encodable
+from storage.durable_files import (
+    LOCK_NAME,
+    get_original_name,
+    make_synced_folder,
+    translate_storage_errors,
+)
+
+_OUR_NAMES = {
+    *(LOCK_NAME, ".writable", "journal", "nodes", "server_id", "sessions", "token", "trash"),
+    "demo",  # a data folder of its own, within the user's
+    "servers",  # foottile.local_server keeps it beside a node's journal
+}
+"""All names that servers and nodes write in their folder."""
+_CHMOD_UNSUPPORTED = {
+    *(errno.EPERM, errno.EACCES, errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+}
+"""Errors of `chmod` on another user's folder, or without permissions, such as vfat and CIFS."""
+
+
+def restrict_to_owner(folder: Path) -> None:
+    """Set umask and folder permissions so that only this user can read the files.
+
+    A folder is closed to others if it is created here, is empty, or holds only files of ours. One
+    that its owner has opened to its group only stays so, and the group can read new files.
+
+    Args:
+        folder: where the process will write; created if absent.
+
+    Raises:
+        StorageError: it cannot be created or closed to others, or its path is not UTF-8.
+    """
+    if not is_utf8_encodable(str(folder.absolute())):
+        raise StorageError(
+            "the path is not UTF-8",
+            where=str(folder.absolute()),
+            expected="a path that JSON can state: it is in messages and in files",
+            remedy="Rename the folder, or choose another one",
+        )
+    os.umask(0o077)
+    with translate_storage_errors(folder):
+        make_synced_folder(folder)
+    mode = stat.S_IMODE(folder.stat().st_mode)
+    if mode & 0o050 and not mode & 0o007:
+        os.umask(0o027)
+    elif mode & 0o077 and _has_only_our_files(folder):
+        try:
+            folder.chmod(mode & ~0o077)
+        except OSError as error:
+            if error.errno not in _CHMOD_UNSUPPORTED:
+                raise StorageError(
+                    f"cannot be closed to other users: {error.strerror}",
+                    where=str(folder),
+                    remedy="Choose another folder with --data",
+                    errno=error.errno,
+                ) from error
+
+
+def _has_only_our_files(folder: Path) -> bool:
+    """Return whether the folder holds only files of ours; a home folder must stay as it is."""
+    return {get_original_name(path.name) for path in folder.iterdir()} <= _OUR_NAMES

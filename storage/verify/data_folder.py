@@ -1,0 +1,237 @@
+"""Verification of any path, up to a whole data folder, with one verdict.
+
+Nothing is written, no lock is taken; a server or node may run meanwhile.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from devices.errors import FileFormatError, FootTileError
+from storage.durable_files import ASIDE_SUFFIX
+from storage.journal.segment import SUFFIX
+from storage.journal.segment_format import INDEX_SUFFIX
+from storage.journal.stream_notes import NOTES_FILE
+from storage.sessions.folder import FRAMES_NAME, SESSION_ID, Ledger, SessionsFolder
+from storage.sessions.metadata import SESSION_NAME
+from storage.verify.export import ExportReport, read_export
+from storage.verify.journal import StreamReport, verify_journal
+from storage.verify.other_files import OtherFilesReport, verify_json_file, verify_other_files
+from storage.verify.segment import SegmentReport, verify_segment
+from storage.verify.session import SessionReport, verify_file_without_session, verify_session
+
+Verdict = Literal["complete", "unproven", "lossy", "pending", "damaged", "export"]
+
+_STREAM_NAME = re.compile(r"[0-9a-f]{32}")
+
+
+@dataclass
+class DataFolderReport:
+    """Result of the verification of a server's or node's data folder.
+
+    Attributes:
+        path: the folder.
+        sessions: reports of its sessions, including those in the trash.
+        streams: reports of its journals.
+        problems: messages of other damage.
+        unproven: other files without a hash.
+        set_aside: files that were found damaged before, and wait for a person.
+    """
+
+    path: Path
+    sessions: list[SessionReport] = field(default_factory=list)
+    streams: list[StreamReport] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    unproven: list[str] = field(default_factory=list)
+    set_aside: list[str] = field(default_factory=list)
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the report for JSON (docs/formats.md)."""
+        sessions, streams = self.sessions, self.streams
+        everything = [
+            *self.problems,
+            *(
+                f"session {s.id or s.path.name}: {message}"
+                for s in sessions
+                for message in s.problems
+            ),
+            *(
+                f"journal {j.node}/{j.stream_id}: {message}"
+                for j in streams
+                for message in j.problems
+            ),
+        ]
+        unproven = [
+            *self.unproven,
+            *(
+                f"session {s.id or s.path.name}: {message}"
+                for s in sessions
+                for message in s.unproven
+            ),
+            *(
+                f"journal {j.node}/{j.stream_id}: {message}"
+                for j in streams
+                for message in j.unproven
+            ),
+        ]
+        return {
+            "sessions": [session.to_json_dict() for session in sessions],
+            "journals": [stream.to_json_dict() for stream in streams],
+            "problems": everything,
+            "unproven": unproven,
+            "set_aside": self.set_aside,
+        }
+
+
+Report = DataFolderReport | SessionReport | StreamReport | SegmentReport | ExportReport
+
+
+def verify_path(path: Path, *, data_folder: Path | None = None) -> Report:
+    """Verify a session, sealed file, journal, segment, data folder, or JSON file of ours.
+
+    Args:
+        path: a folder or a file.
+        data_folder: data folder with the journals of an unsealed session; default: the one around
+            it.
+
+    Raises:
+        FileFormatError: the path does not exist, or has no file of FootTile.
+    """
+    if path.is_file():
+        if path.suffix in (SUFFIX, INDEX_SUFFIX):
+            return verify_segment(path.with_suffix(SUFFIX))
+        if path.name == SESSION_NAME:
+            return verify_session(path.parent, data_folder=data_folder)
+        if path.name == NOTES_FILE:
+            return verify_journal(path.absolute().parent)
+        if path.suffix == ".json":
+            others = OtherFilesReport()
+            verify_json_file(path, path.name, others)
+            return DataFolderReport(path, problems=others.problems, unproven=others.unproven)
+        return read_export(path) or verify_file_without_session(path)
+    if not path.exists():
+        raise FileFormatError("no such file or folder", where=str(path))
+    if (path / "sessions").is_dir() or (path / "journal").is_dir():
+        return verify_data_folder(path)
+    if (path / SESSION_NAME).exists() or (path / FRAMES_NAME).exists():
+        return verify_session(path, data_folder=data_folder)
+    if (path / NOTES_FILE).exists() or any(path.glob("*" + SUFFIX)):
+        return verify_journal(path.absolute())
+    if any(path.glob("*.json")):
+        return verify_data_folder(path)
+    raise FileFormatError(
+        "foottile wrote none of its files",
+        where=str(path),
+        expected="a data folder, a session's or a stream's folder, or one of their files",
+    )
+
+
+def verify_data_folder(path: Path) -> DataFolderReport:
+    """Verify a data folder: every session and every journal in it.
+
+    Raises:
+        FileFormatError: it cannot be read.
+    """
+    data = path.absolute()
+    report = DataFolderReport(path)
+    verify_once = cache(verify_journal)
+    proven: set[Path] = set()
+    for folder in _find_folders(data, "journal/*", _STREAM_NAME, report):
+        proven.add(folder)
+        with _report_errors(report, folder, data):
+            report.streams.append(verify_once(folder))
+    for place in ("sessions", "trash"):
+        for folder in _find_folders(data, place, SESSION_ID, report):
+            proven.add(folder)
+            with _report_errors(report, folder, data):
+                # The folder of a session that was never saved is empty.
+                if any(not inside.name.startswith(".") for inside in folder.iterdir()):
+                    session = verify_session(
+                        folder, data_folder=data, verify_stream_journal=verify_once
+                    )
+                    if session.id not in (None, folder.name):
+                        session.problems.append(f"it lies in the folder of {folder.name}")
+                    report.sessions.append(session)
+        for stray in SessionsFolder(data / place).find_strays():
+            folder = data / place / stray.name
+            proven.add(folder)
+            with _report_errors(report, folder, data):
+                session = verify_session(
+                    folder, data_folder=data, verify_stream_journal=verify_once
+                )
+                session.problems.append(f"{place}/{stray.name}: {stray.error.what}")
+                report.sessions.append(session)
+    others = verify_other_files(data, proven)
+    report.problems += others.problems
+    report.unproven, report.set_aside = others.unproven, others.set_aside
+    return report
+
+
+def _find_folders(
+    data: Path, pattern: str, name_pattern: re.Pattern[str], report: DataFolderReport
+) -> Iterator[Path]:
+    """Yield folders with a name of this form; report other files with such a name as problems.
+
+    A link in place of the folder of all sessions, or all journals, is followed.
+    """
+    for path in sorted(data.glob(f"{pattern}/*")):
+        if ASIDE_SUFFIX in path.name or not name_pattern.fullmatch(path.name):
+            continue
+        with _report_errors(report, path, data):
+            if path.is_symlink() or (path.parent.is_symlink() and path.parent.parent != data):
+                what = "it is a link, or in one: links are not followed"
+                report.problems.append(f"{path.relative_to(data)}: {what}")
+            elif path.is_dir():
+                yield path
+            else:
+                report.problems.append(f"{path.relative_to(data)}: it is not a folder")
+
+
+@contextmanager
+def _report_errors(report: DataFolderReport, path: Path, data: Path) -> Iterator[None]:
+    """Context manager: report any error as a problem and go on; a deleted path is none.
+
+    Damaged bytes may cause any error, and none may hide other damage.
+    """
+    try:
+        yield
+    except Exception as error:
+        if os.path.lexists(path):
+            what = error.what if isinstance(error, FootTileError) else f"cannot be read: {error}"
+            report.problems.append(f"{path.relative_to(data)}: {what}")
+
+
+def find_verdict(report: Report) -> Verdict:
+    """Return the worst finding.
+
+    Frames of a journal that no session needs may be deleted: that is no loss.
+    """
+    if report.problems:
+        return "damaged"
+    if isinstance(report, ExportReport):
+        return "export"
+    verdicts: set[Verdict] = set()
+    if isinstance(report, DataFolderReport):
+        parts: list[Report] = [*report.sessions, *report.streams]
+        verdicts = {find_verdict(part) for part in parts}
+    elif isinstance(report, SessionReport) and not report.is_in_trash:
+        verdicts = {_ledger_verdict(report.ledger)}
+    if not isinstance(report, SegmentReport) and report.unproven:
+        verdicts.add("unproven")
+    order: tuple[Verdict, ...] = ("damaged", "pending", "lossy", "unproven")
+    return next((verdict for verdict in order if verdict in verdicts), "complete")
+
+
+def _ledger_verdict(ledger: Ledger | None) -> Verdict:
+    if ledger is None or any(part.pending for part in ledger.parts):
+        return "pending"
+    if ledger.lossy:
+        return "lossy"
+    return "complete" if ledger.complete else "pending"

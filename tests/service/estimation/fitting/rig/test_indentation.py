@@ -1,0 +1,145 @@
+"""A bench recording reduced to blocks: which readings count, and what they are averaged to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from devices.errors import CalibrationError
+from service.estimation.fitting.rig.indentation import (
+    Indentation,
+    average_strokes,
+    format_origin,
+    measure_unloaded,
+)
+
+Segment = tuple[str, list[float], list[float]]
+"""Phase, absolute pressures and reference forces; a phase with * is of another tile."""
+
+
+def recording(*segments: Segment, period_ms: float = 10.0, **changes: Any) -> Indentation:
+    phase = [name.rstrip("*") for name, kpa, _ in segments for _ in kpa]
+    under = [not name.endswith("*") for name, kpa, _ in segments for _ in kpa]
+    columns: dict[str, Any] = {
+        "serial": "T01",
+        "where": "bench.parquet",
+        "t_ns": (np.arange(len(phase)) * period_ms * 1e6).astype(np.int64),
+        "kpa": np.array([p for _, kpa, _ in segments for p in kpa]),
+        "reference_n": np.array([f for _, _, force in segments for f in force]),
+        "phase": np.array(phase),
+        "is_under_indenter": np.array(under),
+        "temperature_raw": np.full(len(phase), 500.0),
+    }
+    return Indentation(**columns | changes)
+
+
+def rest(n: int = 20, kpa: float = 100.0, force_n: float = 0.0) -> Segment:
+    return "rest", [kpa] * n, [force_n] * n
+
+
+def ramp(phase: str, begin: float, end: float, n: int = 60) -> Segment:
+    """Pressure 100 kPa + x and force 2 x along a ramp."""
+    x = np.linspace(begin, end, n)
+    return phase, (100.0 + x).tolist(), (2.0 * x).tolist()
+
+
+def test_baseline_noise_and_zero_come_from_the_second_before_the_first_press() -> None:
+    early = rest(50, kpa=90.0, force_n=9.0)  # more than a second before
+    late = ("rest", [99.0, 101.0] * 50, [0.1, 0.3] * 50)
+    zero = measure_unloaded(recording(early, late, ramp("load", 0, 10)))
+    assert zero.baseline_kpa == pytest.approx(100.0)
+    assert zero.noise_kpa == pytest.approx(np.sqrt(100 / 99))
+    assert zero.reference_zero_n == pytest.approx(0.2)
+
+
+def test_the_reference_has_no_zero_where_it_was_not_over_the_tile() -> None:
+    away = ("rest*", [100.0] * 20, [7.0] * 20)
+    assert measure_unloaded(recording(away, ramp("load", 0, 10))).reference_zero_n == 0.0
+    blind = ("rest", [100.0] * 20, [np.nan] * 20)
+    assert measure_unloaded(recording(blind, ramp("load", 0, 10))).reference_zero_n == 0.0
+
+
+def test_unreadable_samples_are_not_in_the_baseline() -> None:
+    gappy = ("rest", [100.0, np.nan] * 10, [0.0] * 20)
+    assert measure_unloaded(recording(gappy, ramp("load", 0, 10))).baseline_kpa == 100.0
+
+
+def test_too_little_rest_before_the_press_is_refused_with_file_and_tile() -> None:
+    with pytest.raises(CalibrationError, match=r"bench\.parquet, tile T01: only 9 readings"):
+        measure_unloaded(recording(rest(9), ramp("load", 0, 10)))
+    assert measure_unloaded(recording(rest(10), ramp("load", 0, 10))).baseline_kpa == 100.0
+
+
+def test_a_tile_that_is_never_pressed_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="never presses this tile"):
+        measure_unloaded(recording(rest(), ("load*", [110.0] * 50, [20.0] * 50)))
+
+
+def test_a_stroke_is_averaged_in_sixty_blocks_each_way() -> None:
+    # 180 readings a ramp, three to a block: the mean of three neighbours is the middle one
+    made = average_strokes(
+        recording(
+            rest(force_n=0.5),
+            ("load", (100 + np.arange(180) / 10).tolist(), (0.5 + np.arange(180) / 5).tolist()),
+            ("unload", (118 - np.arange(180) / 10).tolist(), (36 - np.arange(180) / 5).tolist()),
+        )
+    )
+    middles = np.arange(1, 180, 3) / 10
+    assert made.gauge_kpa == pytest.approx([*middles, *(18 - middles)])
+    assert made.force_n == pytest.approx([*(2 * middles), *(35.5 - 2 * middles)])
+    assert made.loading.tolist() == [True] * 60 + [False] * 60
+    assert made.repeat.tolist() == [0] * 120
+
+
+def test_repeats_are_numbered_in_order() -> None:
+    one = (ramp("load", 0, 10), ramp("unload", 10, 0), rest())
+    made = average_strokes(recording(rest(), *one, *one, *one))
+    assert made.repeat.tolist() == [0] * 120 + [1] * 120 + [2] * 120
+
+
+def test_strokes_need_no_rest_between_them() -> None:
+    one = (ramp("load", 0, 10), ramp("unload", 10, 0))
+    assert np.unique(average_strokes(recording(rest(), *one, *one)).repeat).tolist() == [0, 1]
+
+
+def test_holds_releases_taps_and_soak_are_not_used() -> None:
+    fast = (
+        ramp("load", 0, 10),
+        ramp("hold", 10, 9),
+        ramp("release", 9, 0, 5),
+        rest(),
+        ramp("tap", 0, 5, 4),
+        rest(),
+        ramp("soak", 0, 1),
+    )
+    slow = (ramp("load", 0, 10), ramp("unload", 10, 0))
+    with_them = average_strokes(recording(rest(), *slow, rest(), *fast))
+    without = average_strokes(recording(rest(), *slow))
+    assert with_them.gauge_kpa.tolist() == without.gauge_kpa.tolist()
+    assert with_them.force_n.tolist() == without.force_n.tolist()
+    with pytest.raises(CalibrationError, match="no slow stroke"):
+        average_strokes(recording(rest(), *fast))
+
+
+def test_strokes_on_other_tiles_are_not_used() -> None:
+    other = (("load*", [100.0] * 60, [5.0] * 60), ("unload*", [100.0] * 60, [5.0] * 60))
+    own = (ramp("load", 0, 10), ramp("unload", 10, 0))
+    made = average_strokes(recording(rest(), *other, rest(), *own))
+    assert made.force_n.max() == pytest.approx(20.0)
+    assert np.unique(made.repeat).tolist() == [0]
+
+
+def test_readings_that_are_missing_shorten_a_block_and_shift_nothing() -> None:
+    kpa = (100 + np.arange(180) / 10).tolist()
+    force_n = (np.arange(180) / 5).tolist()
+    kpa[::3] = [np.nan] * 60  # of each block of three one is left out
+    back = ramp("unload", 17.9, 0)
+    made = average_strokes(recording(rest(), ("load", kpa, force_n), back))
+    assert made.loading.sum() == 60
+    np.testing.assert_allclose(made.force_n[:60], 2.0 * made.gauge_kpa[:60], rtol=1e-12)
+
+
+def test_a_place_names_file_and_tile() -> None:
+    assert format_origin(recording(rest())) == "bench.parquet, tile T01"

@@ -1,0 +1,128 @@
+"""A curve from dead weights: what it needs, and that its interval is as wide as weights are few."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from devices.errors import CalibrationError
+from service.estimation.calibration import TileCalibration
+from service.estimation.dead_weights import STANDARD_GRAVITY_M_S2, parse_weight
+from service.estimation.fitting.rig.indentation import Indentation
+from service.estimation.fitting.weights_fit import fit_dead_weights
+
+RATE_HZ = 50
+BASELINE_KPA = 100.0
+FIVE = {"200 g": 1.0, "500 g": 1.0, "1 kg": 1.0, "1500 g": 1.0, "2 kg": 1.0}
+"""Each with the gain of its loading."""
+
+
+def kpa_of(force_n: float) -> float:
+    """Pressure of a dome that stiffens, above its baseline."""
+    return 20.0 * float(np.log1p(force_n / 25.0))
+
+
+def recorded(*steps: tuple[str, float], seconds: float = 4.0) -> Indentation:
+    """A recording in which each step's text and absolute pressure last so long."""
+    rng = np.random.default_rng(5)
+    each = round(seconds * RATE_HZ)
+    kpa = np.concatenate([np.full(each, level_kpa) for _, level_kpa in steps])
+    return Indentation(
+        serial="T01",
+        where="by hand",
+        t_ns=np.arange(len(kpa), dtype=np.int64) * (1_000_000_000 // RATE_HZ),
+        kpa=kpa + 0.05 * rng.standard_normal(len(kpa)),
+        reference_n=np.full(len(kpa), np.nan),
+        phase=np.repeat([text for text, _ in steps], each),
+        is_under_indenter=np.ones(len(kpa), dtype=np.bool_),
+        temperature_raw=np.full(len(kpa), np.nan),
+    )
+
+
+def put_on(weights: dict[str, float], repeats: int = 1) -> Indentation:
+    """Every weight after a rest, with the gain of its loading."""
+    steps = []
+    for text, gain in list(weights.items()) * repeats:
+        weight = parse_weight(text)
+        assert weight is not None
+        steps += [("rest", BASELINE_KPA), (text, BASELINE_KPA + kpa_of(gain * weight.force_n))]
+    return recorded(*steps)
+
+
+def half_width_n(tile: TileCalibration) -> float:
+    assert tile.weights is not None
+    return tile.weights.band_95[-1].new_loading_n
+
+
+@pytest.mark.parametrize(
+    ("text", "force_n", "percent"),
+    [
+        ("500 g +-0 %", 0.5 * STANDARD_GRAVITY_M_S2, 0.15),
+        ("0.5kg ±0%", 0.5 * STANDARD_GRAVITY_M_S2, 0.15),
+        ("4.9 N +-0 %", 4.9, 0.0),
+        ("4.9 N", 4.9, 1.0 / np.sqrt(3.0)),
+    ],
+)
+def test_a_weight_is_a_force_with_its_uncertainty(
+    text: str, force_n: float, percent: float
+) -> None:
+    weight = parse_weight(text)
+    assert weight is not None
+    assert weight.force_n == pytest.approx(force_n)
+    assert 100.0 * weight.relative_sigma == pytest.approx(percent)
+
+
+@pytest.mark.parametrize("text", ["500", "g", "0 g", "500 lb", "rest", "-5 N", "1e3 g", "9999 kg"])
+def test_what_names_no_weight_is_none(text: str) -> None:
+    assert parse_weight(text) is None
+
+
+def test_five_weights_give_the_curve_of_a_tile() -> None:
+    tile = fit_dead_weights([put_on(FIVE)])
+    assert tile.absolute_scale == "measured"
+    assert tile.weights is not None
+    assert [step.weight for step in tile.weights.steps] == list(FIVE)
+    for point in tile.weights.band_95:
+        true_n = 25.0 * (np.exp(point.gauge_kpa / 20.0) - 1.0)
+        assert abs(point.force_n - true_n) < max(0.02 * true_n, 0.05)
+
+
+def test_loadings_that_differ_and_weights_that_are_fewer_widen_the_interval() -> None:
+    apart = dict(zip(FIVE, (1.04, 0.97, 1.02, 0.95, 1.03), strict=True))
+    alike_n, apart_n = (half_width_n(fit_dead_weights([put_on(each)])) for each in (FIVE, apart))
+    assert apart_n > 2.0 * alike_n
+    assert half_width_n(fit_dead_weights([put_on(apart, repeats=3)])) < 0.8 * apart_n
+
+
+def test_the_tolerance_of_the_scale_does_not_average_out() -> None:
+    loose = {f"{text} +-5 %": gain for text, gain in FIVE.items()}
+    tile = fit_dead_weights([put_on(loose, repeats=4)])
+    assert half_width_n(tile) > 1.96 * 0.05 / np.sqrt(3.0) * 2.0 * STANDARD_GRAVITY_M_S2
+
+
+@pytest.mark.parametrize(
+    ("recording", "says"),
+    [
+        (put_on(dict(list(FIVE.items())[:4])), "4 weights on the tile"),
+        (put_on({"200 g": 1.0, "1 kg": 1.0, "2 kg": 1.0}, repeats=3), "3 of them different"),
+        (put_on(FIVE | {"200 g": 2.2}), "reads like"),
+        (put_on(FIVE | {"2 kg": 0.3}), "a pressure that rises with the weight"),
+        (put_on(dict.fromkeys(FIVE, 0.001)), "kPa at most under"),
+        (recorded(("1 kg", 105.0), ("rest", 100.0)), "no rest before the weight of 1 kg"),
+        (recorded(("rest", 100.0), ("1 kg", 105.0), seconds=1.0), "the rest lasted 1.0 s"),
+        (recorded(("rest", 100.0), ("1 kg", np.inf)), "chip was at its end"),
+        (
+            recorded(
+                *(
+                    step
+                    for i, text in enumerate(FIVE)
+                    for step in (("rest", 100.0 + i), (text, 101.0 + 3 * i))
+                )
+            ),
+            "drifts by 4.0",
+        ),
+    ],
+)
+def test_weights_that_show_no_curve_are_refused(recording: Indentation, says: str) -> None:
+    with pytest.raises(CalibrationError, match=says):
+        fit_dead_weights([recording])

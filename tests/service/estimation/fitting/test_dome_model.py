@@ -1,0 +1,131 @@
+"""The bench's forward model against the ladder's inverse: force in, pressure out, force again."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.estimation.fitting.dome_model import compute_pressures
+from service.estimation.models import flow, gas, hysteresis, rubber
+from service.estimation.models.hysteresis import WIDTHS_N
+from tests.builders.readings import through
+
+CURVE = np.array([22.0, 5.0, 5.0])
+SCALE_KPA, BASE_KPA, WALL = 16.0, 100.3, 0.00124
+PART, CREEP_S, LOOP = (0.05, 0.04), (0.08, 1.2), (0.03, 0.04, 0.05)
+
+
+def modelled(
+    t_ns: np.ndarray,
+    force_n: np.ndarray,
+    *,
+    gamma: float = 1.0,
+    part: tuple[float, ...] = (),
+    loop: tuple[float, ...] = (),
+    flow: tuple[float, float, float] = (0.0, 1.0, 4.0),
+) -> np.ndarray:
+    return np.asarray(
+        compute_pressures(
+            t_ns * 1e-9,
+            force_n,
+            CURVE,
+            SCALE_KPA,
+            BASE_KPA,
+            gamma,
+            0.011,
+            WALL,
+            np.array(part),
+            np.array(CREEP_S[: len(part)]),
+            np.array(loop),
+            WIDTHS_N[: len(loop)].copy(),
+            *flow,
+        )
+    )
+
+
+def apparent_n(kpa: np.ndarray) -> np.ndarray:
+    """What the curve says of a pressure."""
+    x = (kpa - BASE_KPA) / SCALE_KPA
+    c1, c2, c3 = CURVE
+    return np.asarray(x * (c1 + x * (c2 + x * c3)))
+
+
+def strides(seed: int, n: int = 120) -> tuple[np.ndarray, np.ndarray]:
+    """Instants at steps of any length, and a load that comes and goes; at first nothing."""
+    rng = np.random.default_rng(seed)
+    t_ns = np.cumsum(rng.choice([1_838_235, 1_000, 20_000_000, 10**10], n)).astype(np.int64)
+    force_n = np.maximum(0.0, 14.0 + 14.0 * np.sin(np.cumsum(rng.normal(0, 0.7, n))))
+    force_n[0] = 0.0
+    return t_ns, force_n
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000))
+def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
+    t_ns, force_n = strides(seed)
+    law = (0.08, 0.3, 4.7)
+    out = modelled(t_ns, force_n, part=PART, loop=LOOP, flow=law)
+    sprung, loop = (
+        flow.FlowModel(*(np.array([x]) for x in law)),
+        hysteresis.HysteresisModel(np.array([LOOP])),
+    )
+    creep, nan = rubber.CreepModel(np.array([PART]), np.array([CREEP_S])), math.nan
+    felt_n = apparent_n(out[:, 0])
+    felt_n = through(
+        flow.compensate, sprung.to_records(), flow.initial_state(1), felt_n, t_ns, nan, nan
+    )
+    felt_n = through(
+        hysteresis.compensate, loop.to_records(), hysteresis.initial_state(1), felt_n, nan
+    )
+    felt_n = through(
+        rubber.compensate, creep.to_records(), rubber.initial_state(1), felt_n, t_ns, nan, nan
+    )
+    assert felt_n == pytest.approx(force_n, abs=1e-9)
+    assert out[:, 2] == pytest.approx(force_n - apparent_n(out[:, 0]), abs=1e-9)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000), gamma=st.floats(1.01, 1.4))
+def test_the_gas_comes_back_as_exactly_as_the_forward_model_is_solved(
+    seed: int, gamma: float
+) -> None:
+    # Six rounds, each of which leaves less than k = (gamma - 1)/gamma of what was off.
+    t_ns, force_n = strides(seed)
+    out = modelled(t_ns, force_n, gamma=gamma)
+    model = gas.GasModel(*(np.array([x]) for x in (gamma, 0.011, WALL, BASE_KPA)))
+    settled = through(
+        gas.compute_isothermal_pressure,
+        model.to_records(),
+        gas.initial_state(1),
+        out[:, 0],
+        t_ns,
+        math.nan,
+    )
+    # After a long pause the inverse begins in equilibrium, where the rest of the heat is lost.
+    long = np.diff(t_ns, prepend=t_ns[0]) > gas.RESTART_TIME_CONSTANTS * gamma * 0.011e9
+    off_kpa = np.abs(settled - out[:, 1])[1:]
+    jump_kpa = 0.5 * np.abs(np.diff(out[:, 1]))
+    assert (off_kpa[~long[1:]] <= ((gamma - 1) / gamma) ** 6 * 2.0 * jump_kpa.max() + 0.05).all()
+    assert np.median(off_kpa) < 0.01
+
+
+def test_without_effects_it_is_the_curve_turned_round() -> None:
+    force_n = np.linspace(-2.0, 40.0, 100)
+    out = modelled(np.arange(100) * 10**6, force_n)
+    inside = (force_n >= 0.0) & (force_n <= CURVE.sum())
+    assert apparent_n(out[inside, 0]) == pytest.approx(force_n[inside], abs=1e-9)
+    assert out[:, 0].tolist() == out[:, 1].tolist()
+    assert (np.diff(out[:, 0]) > 0.0).all()
+
+
+def test_a_trial_curve_that_turns_over_still_has_pressures() -> None:
+    out = compute_pressures(
+        np.linspace(0, 0.098, 50), np.linspace(0, 60, 50), np.array([20.0, -40.0, 5.0]), SCALE_KPA,
+        BASE_KPA, 1.3, 0.011, WALL, np.array(PART), np.array(CREEP_S), np.array(LOOP), WIDTHS_N,
+        0.08, 0.3, 4.0,
+    )  # fmt: skip
+    assert np.isfinite(out).all()

@@ -1,0 +1,284 @@
+"""The full ladder: any split the same bits, no warning and no infinity, and what must not matter.
+
+Tiles read one newton a count (see tests/builders); the last tile of an array is bare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.frames import NOT_READ, FrameBatch, TileFlag
+from service.estimation.estimates import EstimateFlag, Estimates
+from service.estimation.pipeline.model_set import MODEL_NAMES
+from service.estimation.pipeline.plan import EstimationPlan
+from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
+from tests.builders.calibrations import make_effects, newton_tile
+from tests.builders.estimates import estimate, newton_plan
+from tests.builders.frames import LAYOUTS, assert_same_bits, cut_up, loaded_frames, with_columns
+from tests.service.estimation.feet import SQUARE, wild_frames
+
+CHIPS = [DATA_SHEET_CHIP, FORUM_CHIP] * 3
+BARE = (0.05, 0.05, -0.1)
+EXTREME_CHIPS = [
+    (0x7FFF, 0x8000, 0x8000, 0x7FFC),
+    (0x0001, 0xFFFF, 0xFFFF, 0x0004),
+    (0x8000, 0x7FFF, 0x7FFF, 0x8000),
+    (0x7FFF, 0x8000, 0x7FFF, 0x8000),
+    (0, 0, 0, 0),
+]
+
+
+def full_plan_of(
+    positions_m: Sequence[tuple[float, float, float]] = SQUARE,
+    *,
+    models: Sequence[str] = MODEL_NAMES,
+    lag_ms: float = 10.0,
+    sigma_n: float = 1.0,
+    **array: Any,
+) -> EstimationPlan:
+    """All models over these tiles and a bare one; calibrations know all effects, each its own."""
+    places = [*positions_m, BARE]
+    info = array_at(places, references=[len(positions_m)], **array)
+    known = make_effects()
+    assert known.gas is not None
+    tiles = []
+    for i, serial in enumerate(info.serials[:-1]):
+        tau_s = known.gas.tau_s.model_copy(update={"value": 0.005 + 0.006 * i})
+        gas = known.gas.model_copy(update={"tau_s": tau_s})
+        curve = (0.0, 1.0 + 0.1 * i, 1e-3, 1e-5)
+        tiles.append(
+            newton_tile(
+                serial,
+                coefficients=curve,
+                relative_misfit=0.01,
+                effects=known.model_copy(
+                    update={
+                        "gas": gas,
+                        "rubber": known.rubber
+                        and known.rubber.model_copy(update={"coefficients": curve}),
+                    }
+                ),
+            )
+        )
+    return newton_plan(info, models=models, lag_ms=lag_ms, tiles=tiles, sigma_n=sigma_n)
+
+
+def steps_taken(rows: int, tiles: int, seed: int) -> np.ndarray:
+    """Forces (rows, tiles + 1) of a foot that comes and goes, noise and spikes in it."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) + rng.uniform(0, 60)
+    load = np.maximum(0.0, np.sin(t / rng.uniform(8, 40)))[:, None] * rng.uniform(5, 60, tiles)
+    forces_n = np.concatenate([load, np.zeros((rows, 1))], axis=1)
+    forces_n = forces_n + rng.normal(0, 1.0, forces_n.shape)
+    spiked = rng.random(forces_n.shape) < 0.02
+    return forces_n + np.where(spiked, -12.0, 0.0)
+
+
+def troubled(frames: FrameBatch, seed: int) -> FrameBatch:
+    """The same with gaps of all lengths, tiles silent, stale and saturated, and warm surroundings.
+
+    Tiles are sampled one after another, now and then two at one instant.
+    """
+    rng = np.random.default_rng(seed + 1)
+    shape = frames.pressure_raw.shape
+    steps_ns = rng.choice(
+        [2_000_000] * 60 + [1, 2_000_007, 900_000, 8_000_000, 60 * 10**9], shape[0]
+    )
+    silent = rng.random(shape) < 0.02
+    saturated = rng.random(shape) < 0.02
+    status = np.where(rng.random(shape) < 0.02, 2 ** rng.integers(0, 6, shape), 0)
+    warm = 480 - np.minimum(np.arange(shape[0]) // 20, 30)[:, None] + rng.integers(0, 2, shape)
+    unread = silent | (rng.random(shape) < 0.2)
+    return with_columns(
+        frames,
+        seq=np.cumsum(rng.choice([1] * 60 + [2, 900], shape[0])),
+        t_mono_ns=np.cumsum(steps_ns),
+        pressure_raw=np.where(silent, NOT_READ, np.where(saturated, 1010, frames.pressure_raw)),
+        temperature_raw=np.where(unread, NOT_READ, warm),
+        tile_flags=np.where(silent, TileFlag.NO_ANSWER, status),
+        sample_offset_us=rng.choice([0, 0, 400, 700, 1100], shape),
+        servo_counts=np.cumsum(rng.integers(-3, 9, shape[0])),
+        servo_age_us=rng.integers(0, 2000, shape[0]),
+    )
+
+
+# --- any split ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lag_ms", [0, 1, 3, 5, 10, 100])
+@settings(max_examples=80, deadline=None)
+@given(
+    rows=st.integers(1, 90),
+    tiles=st.integers(1, 4),
+    seed=st.integers(0, 2**32 - 1),
+    left_out=st.one_of(
+        st.just(set(MODEL_NAMES) - {"static"}),
+        st.just(set(MODEL_NAMES) - {"unwrap", "static"}),
+        st.sets(st.sampled_from([name for name in MODEL_NAMES if name != "static"])),
+    ),
+    wild=st.booleans(),
+    cuts=st.one_of(st.just(range(90)), st.sets(st.integers(1, 89))),
+    how=st.sampled_from(list(LAYOUTS)),
+)
+def test_any_split_in_any_memory_order_gives_the_same_bits(
+    lag_ms: float,
+    rows: int,
+    tiles: int,
+    seed: int,
+    left_out: set[str],
+    wild: bool,
+    cuts: Collection[int],
+    how: str,
+) -> None:
+    models = [name for name in MODEL_NAMES if seed % 2 or name not in left_out]
+    chips = CHIPS[: tiles + 1] if seed % 3 else None
+    plan = full_plan_of(
+        SQUARE[:tiles], lag_ms=lag_ms, models=models, servo=make_servo(), chips=chips
+    )
+    if wild:
+        frames = wild_frames(rows, tiles + 1, seed)
+    else:
+        frames = troubled(loaded_frames(steps_taken(rows, tiles, seed)), seed)
+    whole, split = estimate(plan, frames), estimate(plan, *cut_up(frames, cuts, how))
+    assert_same_bits(whole, split)
+    assert split.seq.tolist() == frames.seq.tolist()
+    assert split.t_ns.tolist() == frames.t_ns.tolist()
+
+
+@pytest.mark.parametrize("lag_ms", [0, 1, 10, 100])
+@pytest.mark.parametrize("size", [1, 7, 300])
+def test_windows_reach_back_as_far_in_short_batches_as_in_long_ones(
+    lag_ms: float, size: int
+) -> None:
+    # Long quiet stretches, so that windows grow to all of the 250 ms and 128 samples.
+    plan = full_plan_of(lag_ms=lag_ms)
+    rng = np.random.default_rng(1)
+    forces_n = np.repeat([0.0, 20.0, 35.0], 200)[:, None] + rng.normal(0, 1, (600, 5))
+    t_mono_ns = np.cumsum(np.repeat([2_000_000, 1_000_000, 2_900_000], 200))
+    frames = loaded_frames(forces_n, t_mono_ns=t_mono_ns)
+    whole = estimate(plan, frames)
+    assert np.std(whole.force_n[150:190, 0]) < 0.8, "it averages"
+    assert_same_bits(whole, estimate(plan, *cut_up(frames, range(0, 600, size))))
+
+
+# --- nothing wild gets out ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lag_ms", [0, 10])
+@settings(max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_whatever_the_frames_say_nothing_warns_and_nothing_is_infinite(
+    lag_ms: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    shape = (40, 5)
+    chips = [
+        CHIPS[:5],
+        [EXTREME_CHIPS[k] for k in rng.integers(0, 5, 5)],
+        None,
+    ][seed % 3]
+    plan = full_plan_of(lag_ms=lag_ms, servo=make_servo(), chips=chips)
+    pressure_raw = rng.choice(
+        [rng.integers(0, 1024, shape), 0 * np.ones(shape), 1023 * np.ones(shape)]
+    )
+    pressure_raw = np.where(
+        rng.random(shape) < 0.5, pressure_raw, rng.choice([0, 1, 480, 500, 1010, 1023], shape)
+    )
+    steps_ns = rng.choice([2_000_000] * 9 + [0, 1, 5_000_000, 60 * 10**9, 3600 * 10**9], 40)
+    frames = loaded_frames(
+        np.zeros(shape),
+        pressure_raw=np.where(rng.random(shape) < 0.05, NOT_READ, pressure_raw),
+        temperature_raw=rng.choice([0, 480, 511, 512, 640, 1023, NOT_READ], shape),
+        tile_flags=np.where(rng.random(shape) < 0.1, rng.integers(0, 64, shape), 0),
+        t_mono_ns=np.cumsum(steps_ns),
+        sample_offset_us=np.where(
+            rng.random(shape) < 0.2, rng.integers(-(2**31), 2**31, shape), 500
+        ),
+        servo_counts=rng.integers(-(2**31), 2**31, 40),
+        servo_age_us=rng.integers(-1, 2**31, 40),
+        reference_force_n=rng.choice([np.nan, np.inf, -np.inf], 40),
+    )
+    e = estimate(plan, frames)
+    assert len(e) == 40
+    for f in fields(Estimates):
+        assert not np.isinf(getattr(e, f.name).astype(np.float64)).any(), f.name
+    lost = np.isnan(e.grf_n)
+    why = EstimateFlag.TILE_MISSING | EstimateFlag.SATURATED
+    assert np.array_equal(lost, (e.estimate_flags & why) != 0)
+    assert set(e.contact[lost].tolist()) <= {1, 255}
+    assert (e.grf_lower_bound_n[lost & (e.contact == 1)] > 0.0).all()
+
+
+def test_without_a_word_of_the_bare_tile_there_is_no_force_and_a_flag() -> None:
+    forces_n = np.full((30, 5), 20.0)
+    forces_n[:, 4] = np.nan
+    forces_n[20, 4] = 0.0
+    e = estimate(full_plan_of(), loaded_frames(forces_n))
+    assert np.isnan(e.grf_n).tolist() == [True] * 20 + [False] * 10
+    missing = (e.estimate_flags & EstimateFlag.TILE_MISSING) != 0
+    assert missing.tolist() == [True] * 20 + [False] * 10
+
+
+def test_a_centre_outside_the_tiles_is_nan_and_flagged() -> None:
+    # Two tiles are pulled at by a tenth of what presses on the others.
+    forces_n = np.tile([-8.0, 40.0, -8.0, 40.0, 0.0], (60, 1))
+    e = estimate(full_plan_of(sigma_n=0.3), loaded_frames(forces_n))
+    assert (e.contact[20:] == 1).all()
+    assert np.isnan(e.cop_x_m).all()
+    assert (e.estimate_flags & EstimateFlag.COP_MASKED).all()
+
+
+# --- what must not matter -------------------------------------------------------------------------
+
+
+@settings(max_examples=10)
+@given(order=st.permutations(range(4)), seed=st.integers(0, 1000))
+def test_the_order_of_the_tiles_does_not_matter(order: list[int], seed: int) -> None:
+    plan = full_plan_of()
+    columns = [*order, 4]
+    frames = troubled(loaded_frames(steps_taken(80, 4, seed)), seed)
+    other = replace(
+        frames,
+        **{
+            name: getattr(frames, name)[:, columns]
+            for name in ("pressure_raw", "temperature_raw", "tile_flags", "sample_offset_us")
+        },
+    )
+    tiles = tuple(plan.info.tiles[i] for i in columns)
+    other_info = plan.info.model_copy(update={"tiles": tiles})
+    other_plan = newton_plan(
+        other_info, models=MODEL_NAMES, lag_ms=10, tiles=plan.calibration.tiles, sigma_n=1.0
+    )
+    one, two = estimate(plan, frames), estimate(other_plan, other)
+    for name in ("gauge_kpa", "force_n", "force_sigma_n"):
+        assert getattr(one, name)[:, columns].tobytes() == getattr(two, name).tobytes()
+    assert two.grf_n == pytest.approx(one.grf_n, abs=1e-9, nan_ok=True)
+    assert two.cop_x_m == pytest.approx(one.cop_x_m, abs=1e-9, nan_ok=True)
+    assert two.cop_y_m == pytest.approx(one.cop_y_m, abs=1e-9, nan_ok=True)
+
+
+@settings(max_examples=10)
+@given(
+    scale=st.floats(0.3, 1.0),
+    x_m=st.floats(-0.5, 0.5),
+    y_m=st.floats(-0.5, 0.5),
+    seed=st.integers(0, 1000),
+)
+def test_the_centre_moves_and_grows_with_the_tiles(
+    scale: float, x_m: float, y_m: float, seed: int
+) -> None:
+    moved = [(scale * x + x_m, scale * y + y_m, z) for x, y, z in SQUARE]
+    frames = loaded_frames(steps_taken(80, 4, seed))
+    one = estimate(replace(full_plan_of(), cop_sigma_max_m=1.0), frames)
+    two = estimate(replace(full_plan_of(moved), cop_sigma_max_m=1.0), frames)
+    assert two.grf_n.tobytes() == one.grf_n.tobytes()
+    assert two.cop_x_m == pytest.approx(scale * one.cop_x_m + x_m, abs=1e-9, nan_ok=True)
+    assert two.cop_y_m == pytest.approx(scale * one.cop_y_m + y_m, abs=1e-9, nan_ok=True)
+    assert two.cop_sigma_x_m == pytest.approx(scale * one.cop_sigma_x_m, abs=1e-9, nan_ok=True)

@@ -1,0 +1,98 @@
+"""Sealed sessions into one file, from their folders on the disk."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from devices.errors import UsageError
+from service.offline.export import ExportOptions, export_merged, export_session
+from storage.clock.file import CLOCK_NAME, write_clock_file
+from storage.clock.log import ClockOffset
+from storage.clock.table import StreamClockFacts
+from storage.formats.slice import Slice
+from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.writer import SealedFileWriter
+from tests.builders.arrays import UTC_NS
+from tests.builders.frames import make_frames
+from tests.storage.formats.walks import ARRAY, ROWS, walk
+
+ezc3d = pytest.importorskip("ezc3d")
+
+TOGETHER = ExportOptions("c3d", clock="server")
+
+
+def sealed(folder: Path, node: str, later_ns: int) -> Path:
+    """A session of a node whose clock is behind the server's by so much."""
+    folder.mkdir()
+    info = ARRAY.model_copy(update={"node": node, "stream_id": node.ljust(32, "0")})
+    with SealedFileWriter(folder / FRAMES_NAME, info, {}) as writer:
+        writer.append_frames(make_frames(ROWS, len(info.tiles)), walk())
+    row = ClockOffset(
+        stream_id=info.stream_id, t_mono_ns=0, server_minus_node_ns=later_ns, uncertainty_ns=400_000
+    )
+    write_clock_file(folder / CLOCK_NAME, [row], [StreamClockFacts(info.stream_id, UTC_NS, True)])
+    return folder / FRAMES_NAME
+
+
+@pytest.fixture(scope="module")
+def feet(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("feet")
+    return [sealed(folder / "l", "left", 0), sealed(folder / "r", "right", 300_000_000)]
+
+
+def test_two_sealed_sessions_are_two_platforms_of_one_file(
+    feet: list[Path], tmp_path: Path
+) -> None:
+    done = export_merged(feet, tmp_path / "take.c3d", TOGETHER)
+    assert done.size_bytes == (tmp_path / "take.c3d").stat().st_size
+    read = ezc3d.c3d(str(tmp_path / "take.c3d"), extract_forceplat_data=True)
+    left_n, right_n = (-plate["force"][2] for plate in read["data"]["platform"])
+    assert len(left_n) == ROWS + 150
+    np.testing.assert_allclose(left_n[:ROWS], right_n[150:], atol=1e-3)
+    contexts = read["parameters"]["EVENT"]["CONTEXTS"]["value"]
+    assert sorted(set(contexts)) == ["Left", "Right"]
+
+
+def test_a_slice_counts_from_each_sessions_own_beginning(feet: list[Path], tmp_path: Path) -> None:
+    half = replace(TOGETHER, part=Slice(0.0, 1.0))
+    export_merged(feet, tmp_path / "half.c3d", half)
+    read = ezc3d.c3d(str(tmp_path / "half.c3d"))
+    assert read["data"]["analogs"].shape[2] == 500 + 150
+
+
+@pytest.mark.parametrize(
+    ("options", "count", "said"),
+    [
+        (
+            ExportOptions("csv", clock="server"),
+            2,
+            "csv holds one session only.*c3d, opensim, mcap, mat, xdf",
+        ),
+        (ExportOptions("c3d"), 2, "the nodes' own clocks are no common axis"),
+        (replace(TOGETHER, markers=True), 2, "its markers are unknown"),
+        (replace(TOGETHER, part=Slice(50.0)), 2, "starts at 50 s"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_cannot_be_put_together_leaves_no_file(
+    feet: list[Path], tmp_path: Path, options: ExportOptions, count: int, said: str
+) -> None:
+    with pytest.raises(UsageError, match=said):
+        export_merged(feet[:count], tmp_path / "take.c3d", options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_on_the_servers_axis_a_session_alone_says_how_far_it_may_be_off(
+    feet: list[Path], tmp_path: Path
+) -> None:
+    export_session(feet[1], tmp_path / "right.c3d", TOGETHER)
+    read = ezc3d.c3d(str(tmp_path / "right.c3d"))
+    labels = read["parameters"]["ANALOG"]["LABELS"]["value"]
+    bound_s = read["data"]["analogs"][0, labels.index("t_server_uncertainty_s")]
+    assert (bound_s >= 400e-6).all()
+    (begin,) = read["parameters"]["FOOTTILE"]["BEGIN_T_NS"]["value"]
+    assert int(begin) == UTC_NS + 300_000_000

@@ -1,0 +1,320 @@
+"""What a reader of every frame is given when something happens that seldom does."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from devices.errors import DamagedFramesError, FileFormatError, StorageError
+from service.protocol import CloseConnection, LinkCloseCode
+from service.server.live_feed.events import FeedEvent, FrameRows, Gap, Position, StreamStart
+from service.server.live_feed.reader import FeedReader, Policy
+from service.server.live_feed.recomputation import RecomputedFrames
+from storage.journal.journal import Journal
+from tests.builders.arrays import PERIOD_NS, UTC_NS
+from tests.service.server.live_feed.world import WAITING, World, bits
+
+FIRST, SECOND, THIRD = (f"{number:032x}" for number in range(3))
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    one = World(tmp_path)
+    yield one
+    one.close()
+
+
+def all_of(world: World, reader: FeedReader) -> list[FeedEvent]:
+    """What it is given until nothing is there."""
+    items = []
+    while (item := world.read(reader)) is not None:
+        items.append(item)
+    return items
+
+
+def told(items: list[FeedEvent]) -> list[tuple[str, str, int, int]]:
+    """Frames that came and frames that are left out, by stream, those of a kind together."""
+    spans: list[tuple[str, str, int, int]] = []
+    for item in items:
+        if isinstance(item, StreamStart):
+            continue
+        kind = item.reason if isinstance(item, Gap) else "came"
+        span = kind, item.stream_id, item.first_seq, item.last_seq
+        if spans and spans[-1][:2] == span[:2] and spans[-1][3] + 1 == span[2]:
+            span = *span[:2], spans.pop()[2], span[3]
+        spans.append(span)
+    return spans
+
+
+def refused(world: World, reader: FeedReader) -> CloseConnection:
+    with pytest.raises(CloseConnection) as end:
+        all_of(world, reader)
+    return end.value
+
+
+# --- lossless -------------------------------------------------------------------------------------
+
+
+def test_what_waits_for_its_look_ahead_comes_when_its_stream_has_ended(world: World) -> None:
+    world.send_newest(40)
+    world.restart()  # memory is empty
+    world.connect()
+    reader = world.reader("lossless", Position(FIRST, 0))
+    ((_, _, _, last),) = told(all_of(world, reader))
+    assert 40 - WAITING <= last + 1 < 40
+    world.reboot()
+    world.send_newest(20)
+    (rest, (_, _, begin, _)) = told(all_of(world, reader))
+    assert rest == ("came", FIRST, last + 1, 39)
+    assert begin == 0
+
+
+def test_frames_that_came_while_others_were_estimated_again_follow_them(world: World) -> None:
+    world.send_newest(40)
+    world.restart()
+    world.connect()
+    reader = world.reader("lossless", Position(FIRST, 0))
+    assert isinstance(world.read(reader), FrameRows)
+    world.node.receive_frames(  # they reach the journal, and no live picture
+        world.node.present_stream, world.payload(40, 79), UTC_NS
+    )
+    ((_, _, _, last),) = told(all_of(world, reader))
+    assert last + 1 >= 80 - WAITING
+
+
+def test_a_stream_of_which_nothing_has_come_is_waited_for_after_a_restart(world: World) -> None:
+    world.send_newest(20)
+    world.leave()
+    world.reboot()
+    world.take(20)
+    world.reboot()
+    world.connect()  # it has told of the second stream
+    world.restart()
+    reader = world.reader("lossless", Position(SECOND, 0))
+    assert all_of(world, reader) == []
+    world.connect()
+    world.send_lacking()
+    assert told(all_of(world, reader))[0] == ("came", SECOND, 0, 19)
+
+
+def test_after_a_stream_that_the_node_has_forgotten_comes_the_one_taken_then(world: World) -> None:
+    world.send_newest(20)
+    world.leave()
+    world.reboot()
+    world.take(20)
+    world.reboot()
+    del world.streams[FIRST]  # all of it was acknowledged
+    world.restart()
+    world.connect()
+    world.send_lacking()
+    items = all_of(world, world.reader("lossless", Position(FIRST, 0)))
+    assert told(items)[:2] == [("came", FIRST, 0, 19), ("came", SECOND, 0, 19)]
+    assert isinstance(items[-1], StreamStart)
+
+
+def test_a_stream_that_is_deleted_while_it_is_read_ends_the_reader(tmp_path: Path) -> None:
+    world = World(tmp_path, is_recording=False)
+    world.send_newest(20)
+    reader = world.reader("lossless", Position(FIRST, 0))
+    world.forget()
+    world.reboot()
+    del world.streams[FIRST]
+    world.connect()
+    world.prune()
+    world.send_newest(20)
+    world.forget()
+    assert refused(world, reader).code == LinkCloseCode.NO_STREAM
+    world.close()
+
+
+def test_estimates_of_a_stream_that_has_ended_are_the_bits_of_live(world: World) -> None:
+    for _ in range(20):
+        world.send_newest(10)
+    # Its interval is over by then; it is in force from the next frame on.
+    world.tare((world.node.last_t_ns or 0) - 50 * PERIOD_NS, counts=-5)
+    for _ in range(20):
+        world.send_newest(10)
+    world.reboot()
+    world.send_newest(20)
+    world.forget()
+    compared = 0
+    for item in all_of(world, world.reader("lossless", Position(FIRST, 0))):
+        if isinstance(item, FrameRows) and item.stream_id == FIRST:
+            assert item.is_recomputed
+            for row, seq in enumerate(item.batch[0].seq.tolist()):
+                if (live := world.published.get((FIRST, seq))) is not None:
+                    assert bits(item.batch[1], row) == live
+                    compared += 1
+    assert compared > 390
+
+
+def test_of_another_scene_that_the_calibration_does_not_fit_frames_come_alone(world: World) -> None:
+    world.send_newest(40)
+    world.reboot()
+    world.present.info = world.present.info.model_copy(update={"models": ("static",)})
+    first = world.streams[FIRST]
+    first.info = first.info.model_copy(update={"models": ("static", "rubber")})
+    world.restart()
+    world.connect()
+    world.node.streams[FIRST].info = first.info
+    (*_, last) = all_of(world, world.reader("lossless", Position(FIRST, 0)))[:1]
+    assert isinstance(last, FrameRows)
+    assert last.batch[1] == {}
+
+
+# --- what is wrong on the disk --------------------------------------------------------------------
+
+
+def test_of_damaged_frames_only_these_are_lost_and_those_before_and_behind_come(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for _ in range(6):
+        world.send_newest(10)
+    world.forget_sent(60)
+    world.restart()
+    world.connect()
+    damage(world, 25)
+    items = all_of(world, world.reader("lossless", Position(FIRST, 0)))
+    assert told(items)[:2] == [("came", FIRST, 0, 19), ("corrupt", FIRST, 20, 29)]
+    assert told(items)[2][:3] == ("came", FIRST, 30)
+
+
+def test_damaged_frames_that_the_node_still_has_come_once_more(world: World) -> None:
+    for _ in range(6):
+        world.send_newest(10)
+    world.restart()
+    world.connect()
+    damage(world, 25)
+    reader = world.reader("lossless", Position(FIRST, 0))
+    items = all_of(world, reader)
+    assert told(items) == [("came", FIRST, 0, 19)]
+    world.send_lacking()
+    world.send_newest(20)
+    items += all_of(world, reader)
+    ((_, _, first, last),) = told(items)
+    assert (first, last + 1) >= (0, 80 - WAITING)
+
+
+def damage(world: World, seq: int) -> None:
+    """Flip a bit in the message on disk that holds a frame."""
+    for stream in world.node.streams.values():
+        stream.close()
+    (path,) = (world.folder / "journal" / FIRST).glob("*.arrows")
+    content = bytearray(path.read_bytes())
+    counts = world.present.frames(seq, seq + 3).pressure_raw.tobytes()
+    content[content.index(counts)] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (StorageError("a bad sector", errno=errno.EIO), LinkCloseCode.TRY_LATER),
+        (FileFormatError("no frames of this stream"), LinkCloseCode.UNREADABLE),
+        (
+            DamagedFramesError("in another folder", seq_first=3, seq_last=4),
+            LinkCloseCode.UNREADABLE,
+        ),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_cannot_be_read_ends_the_reader_with_the_position_to_resume_from(
+    world: World, monkeypatch: pytest.MonkeyPatch, error: Exception, code: LinkCloseCode
+) -> None:
+    world.send_newest(40)
+    world.restart()
+    world.connect()
+
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(RecomputedFrames, "next_rows", fails)
+    end = refused(world, world.reader("lossless", Position(FIRST, 3)))
+    assert end.code == code
+    assert end.reason.endswith(f"resume with stream_id={FIRST}&from_seq=3")
+    assert len(end.reason) <= 123
+
+
+def test_a_journal_that_cannot_be_read_now_is_not_taken_for_one_that_is_not_there(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.send_newest(40)
+    world.reboot()
+    world.send_newest(20)
+
+    whole = Journal.open
+
+    def opens(folder: Path, **how: object) -> Journal:
+        if folder.name == FIRST:
+            raise StorageError("no descriptor is left", errno=errno.EMFILE)
+        return whole(folder, **how)  # type: ignore[arg-type]  # of several types
+
+    monkeypatch.setattr(Journal, "open", opens)
+    world.restart()
+    world.connect()
+    assert (
+        refused(world, world.reader("lossless", Position(FIRST, 0))).code == LinkCloseCode.TRY_LATER
+    )
+
+
+# --- drop_oldest, latest --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", ["drop_oldest", "latest"])
+def test_what_is_left_out_of_streams_that_have_ended_is_said(world: World, policy: Policy) -> None:
+    world.send_newest(40)
+    reader = world.reader(policy, Position(FIRST, 0))
+    first = told(all_of(world, reader))
+    world.leave()
+    world.reboot()
+    world.take(20)
+    world.reboot()
+    world.take(15)
+    world.connect()
+    world.send_newest(30)
+    (end,) = {last + 1 for kind, _, _, last in first if kind == "came"}
+    at = told(all_of(world, reader))
+    assert at[0] == ("late", FIRST, end, 39)
+    assert at[1] == ("late", SECOND, 0, 19)
+    assert at[2] == ("late", THIRD, 0, 14)
+    assert at[3][:3] == ("came", THIRD, 15)
+
+
+@pytest.mark.parametrize("policy", ["drop_oldest", "latest"])
+def test_frames_that_come_once_more_after_a_restart_are_not_given_again(
+    world: World, policy: Policy
+) -> None:
+    world.send_newest(40)
+    world.restart()
+    world.connect()
+    reader = world.reader(policy, Position(FIRST, 60))
+    world.send_newest(15)
+    assert all_of(world, reader) == []
+    world.send_newest(40)
+    assert told(all_of(world, reader))[0][2] == 60
+
+
+def test_latest_gives_the_newest_piece_and_says_what_lies_between(world: World) -> None:
+    reader = world.reader("latest", Position(FIRST, 0))
+    for _ in range(4):
+        world.send_newest(10)
+    missed, came = told(all_of(world, reader))
+    assert missed == ("slow", FIRST, 0, came[2] - 1)
+
+
+@pytest.mark.parametrize("policy", ["lossless", "drop_oldest", "latest"])
+def test_one_who_comes_back_in_the_middle_of_a_piece_has_each_frame_once(
+    world: World, policy: Policy
+) -> None:
+    world.send_newest(40)
+    item = world.read(world.reader(policy, Position(FIRST, 0)))
+    middle = (item.first_seq + item.to_seq) // 2
+    following = world.read(world.reader(policy, Position(FIRST, middle)))
+    assert (following.first_seq, following.to_seq) == (middle, item.to_seq)
+    assert (
+        following.estimated[0].pressure_raw.tolist()
+        == item.estimated[0].pressure_raw[middle:].tolist()
+    )

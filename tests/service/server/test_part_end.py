@@ -1,0 +1,364 @@
+"""Sessions over several streams of a node: which frames belong to them, whatever came between."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from devices.frames import FrameBatch
+from tests.builders.frames import assert_same_bits
+from tests.service.fake_node import FakeNode
+from tests.service.recording import Recording, parts_of, whole_parts_of
+from tests.service.running import Running
+from tests.waiting import until
+
+
+@pytest.fixture
+def session(tared: FakeNode) -> Recording:
+    """A session of fifty frames, 70 to 119, whose node has left then."""
+    session = tared.record()
+    tared.deliver(50)
+    tared.leave()
+    return session
+
+
+def reboot_now(node: FakeNode) -> None:
+    """Begin a new stream whose first frame is taken now."""
+    node.reboot()
+    node.next_t_mono_ns = time.monotonic_ns()
+
+
+def test_streams_that_were_taken_while_the_link_was_down_are_parts_and_nothing_is_lost(
+    running: Running, tared: FakeNode, session: Recording
+) -> None:
+    tared.frames(30)
+    tared.reboot()
+    tared.frames(40)
+    tared.reboot()
+    first, second = tared.before
+    tared.connect(earlier=(first.said(), second.said()))
+    assert tared.lacks[first.stream_id] == [(120, 149)]
+    assert tared.lacks[second.stream_id] == [(0, 39)]
+    third = tared.deliver(20)
+    assert session.ledger()["parts"][0]["pending"] == 30
+    tared.send_lacking()
+    sealed = tared.finish(session)
+    assert whole_parts_of(sealed) == [
+        (first.stream_id, 70, 149),
+        (second.stream_id, 0, 39),
+        (tared.stream_id, 0, 19),
+    ]
+    old = FrameBatch.concatenate(first.sent)
+    assert_same_bits(
+        session.frames(), FrameBatch.concatenate([old.slice_rows(70, 150), *second.sent, third])
+    )
+    path = session.folder / "frames.parquet"
+    column = pq.read_table(path, columns=["part"])["part"].to_numpy()
+    np.testing.assert_array_equal(column, [0] * 80 + [1] * 40 + [2] * 20)
+    assert running.node()["lost_frames"] == 0
+
+
+def test_it_goes_on_so_although_the_server_is_restarted_between_any_two_steps(
+    running: Running, tared: FakeNode
+) -> None:
+    session = tared.record()
+    tared.deliver(50)
+    running.restart()
+    tared.frames(30)
+    tared.reboot()
+    [first] = tared.before
+    tared.connect(earlier=(first.said(stored=((120, 149),)),))
+    tared.deliver(10)
+    running.restart()
+    tared.connect(earlier=(first.said(stored=((120, 149),)),))
+    tared.send_lacking()
+    while first.stream_id not in tared.acked_of or tared.acked_of[first.stream_id].last != 149:
+        tared.receive("ack")
+    running.restart()
+    tared.connect(earlier=(first.said(stored=()),))
+    tared.taken_in() if tared.seq > 10 else None
+    sealed = tared.finish(session)
+    assert whole_parts_of(sealed) == [(first.stream_id, 70, 149), (tared.stream_id, 0, 9)]
+
+
+@pytest.mark.parametrize(("said", "open_tail"), [(250, 200), (30, 0), (50, 0)])
+def test_a_tail_that_a_power_cut_left_open_is_shorter_by_what_the_server_has_of_it(
+    tared: FakeNode, session: Recording, said: int, open_tail: int
+) -> None:
+    tared.reboot()
+    [first] = tared.before
+    # The last fifty frames are here, and were lost there when the power failed.
+    tared.connect(earlier=(first.said(stored=((0, 69),), next_seq=70, max_lost_tail_frames=said),))
+    sealed = tared.finish(session)
+    assert parts_of(sealed)[0] == (first.stream_id, 70, 119)
+    part = session.ledger()["parts"][0]
+    assert (part["recorded"], part["lost"], part["max_lost_tail_frames"]) == (50, {}, open_tail)
+    assert sealed["complete"] == ("lossy" if open_tail else True)
+    assert sealed["max_lost_tail_frames"] == open_tail
+
+
+def test_what_an_earlier_stream_lost_is_named(tared: FakeNode, session: Recording) -> None:
+    tared.frames(30)
+    tared.reboot()
+    [first] = tared.before
+    lost = {"disk_full": ((120, 129),), "corrupt": ((130, 134),)}
+    tared.connect(earlier=(first.said(stored=((135, 149),), lost=lost, missed_slots=7),))
+    tared.send_lacking()
+    sealed = tared.finish(session)
+    assert sealed["complete"] == "lossy"
+    assert sealed["lost"] == {"corrupt": 5, "disk_full": 10}
+    ledger = session.ledger()
+    assert ledger["parts"][0]["recorded"] == 65
+    assert ledger["missed_slots"] == sealed["missed_slots"] == 7
+
+
+def test_a_stop_while_the_node_was_away_falls_into_the_stream_that_was_taken_then(
+    tared: FakeNode, session: Recording
+) -> None:
+    tared.frames(30)
+    tared.reboot()
+    tared.frames(40)  # long ago, as all before
+    session.stop()
+    tared.frames(25, now=True)
+    reboot_now(tared)
+    tared.frames(10)
+    first, second = tared.come_back()
+    sealed = session.sealed()
+    assert whole_parts_of(sealed) == [(first.stream_id, 70, 149), (second.stream_id, 0, 39)]
+
+
+def test_a_stop_between_two_streams_ends_with_the_first_one(
+    tared: FakeNode, session: Recording
+) -> None:
+    tared.frames(30)
+    session.stop()
+    reboot_now(tared)
+    tared.frames(10)
+    reboot_now(tared)
+    first, _ = tared.come_back()
+    sealed = session.sealed()
+    assert whole_parts_of(sealed) == [(first.stream_id, 70, 149)]
+
+
+def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(
+    tared: FakeNode, session: Recording
+) -> None:
+    tared.reboot()
+    tared.frames(40)
+    session.stop()
+    tared.frames(10, now=True)
+    [first] = tared.before
+    tared.connect(earlier=(first.said(),))
+    tared.send_again(tared.sent[-1])  # the newest first
+    assert session.now()["state"] == "pending"
+    tared.send_again(tared.sent[0])
+    sealed = session.sealed()
+    assert whole_parts_of(sealed) == [(first.stream_id, 70, 119), (tared.stream_id, 0, 39)]
+
+
+def test_frames_of_a_node_that_is_much_slower_than_its_rate_belong_to_it_too(
+    tared: FakeNode, session: Recording
+) -> None:
+    tared.reboot()
+    tared.nominal_rate_hz = 1e5  # its frames would be of the last millisecond
+    tared.frames(40)
+    session.stop()
+    time.sleep(1.1)  # a node may have taken frames in the last second that it does not know of
+    tared.frames(10, now=True)
+    [first] = tared.before
+    tared.connect(earlier=(first.said(),))
+    for frames in tared.sent:
+        tared.send_again(frames)
+    sealed = session.sealed()
+    assert whole_parts_of(sealed) == [(first.stream_id, 70, 119), (tared.stream_id, 0, 39)]
+
+
+def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(
+    tared: FakeNode, session: Recording
+) -> None:
+    tared.frames(30)
+    session.stop()
+    tared.frames(30, now=True)
+    tared.frames(10)
+    tared.connect()
+    tared.send_again(tared.sent[-1])  # newest first
+    tared.taken_in()
+    time.sleep(0.1)
+    assert parts_of(session.now()) == [(tared.stream_id, 70, None)]
+    tared.send_again(tared.sent[-3])
+    tared.send_again(tared.sent[-2])
+    sealed = session.sealed()
+    assert whole_parts_of(sealed) == [(tared.stream_id, 70, 149)]
+
+
+def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(50)
+    session.stop()
+    # From then on five hundred frames a second, the first ten thousand of which were lost.
+    tared.next_t_mono_ns = time.monotonic_ns()
+    lost = tared.frames(10_000)
+    tared.next_t_mono_ns -= 10_000 * 2_000_000
+    tared.next_t_mono_ns += 19_000_000_000
+    tared.send(10)
+    first, last = int(lost.seq[0]), int(lost.seq[-1])
+    tared.say_lost(disk_full=[[first, last]])
+    sealed = session.sealed()
+    end = sealed["parts"][0]["seq_last"]
+    assert sealed["lost"] == {"disk_full": end - 119}
+    # 19 of 20 seconds came after the stop.
+    assert 0.03 * 10_000 < end - 119 < 0.07 * 10_000
+
+
+def test_other_tiles_begin_a_session_of_their_own_also_in_an_earlier_stream(
+    running: Running, tared: FakeNode
+) -> None:
+    session = tared.record(name="mud")
+    tared.deliver(50)
+    tared.restart()
+    tared.tiles = 3
+    tared.frames(40)
+    tared.reboot()
+    first, second = tared.come_back()
+    tared.deliver(20)
+    sealed = session.sealed()
+    assert parts_of(sealed) == [(first.stream_id, 70, 119)]
+    assert "other tiles" in sealed["problem"]
+    other = running.only_session(but=session)
+    assert (other["name"], other["state"]) == ("mud (2)", "recording")
+    sealed = tared.finish(other)
+    assert parts_of(sealed) == [(second.stream_id, 0, 39), (tared.stream_id, 0, 19)]
+    assert sealed["complete"] is True
+
+
+def test_a_node_that_does_not_remember_its_stream_leaves_a_tail_that_is_bounded_by_its_silence(
+    tared: FakeNode,
+) -> None:
+    session = tared.record()
+    tared.deliver(50, now=True)
+    tared.leave()
+    reboot_now(tared)
+    tared.connect()
+    tail = session.ledger()["parts"][0]["max_lost_tail_frames"]
+    # Since its newest frame, at five hundred a second; a test that is slow takes some seconds.
+    assert 1 <= tail <= 500 * 20
+    assert session.now()["complete"] == "lossy"
+
+
+def test_two_sessions_of_one_node_overlap_and_each_has_its_own_frames(
+    running: Running, tared: FakeNode
+) -> None:
+    first = tared.record(name="first")
+    tared.deliver(50)
+    second = tared.record(name="second")
+    tared.deliver(50)
+    assert set(running.node()["recording"]) == {first.id, second.id}
+    # The stop has to lie after them on the node's clock, too.
+    first.stop()
+    tared.send(10, now=True)
+    until(lambda: first.now()["state"] == "sealed")
+    assert running.node()["recording"] == [second.id]
+    tared.taken_in()
+    until(lambda: time.monotonic_ns() > tared.next_t_mono_ns)
+    second.stop()
+    tared.send(10, now=True)
+    assert parts_of(first.sealed()) == [(tared.stream_id, 70, 169)]
+    assert parts_of(second.sealed()) == [(tared.stream_id, 120, 179)]
+    assert first.sealed()["complete"] is True
+    assert second.sealed()["complete"] is True
+    assert_same_bits(second.frames(), tared.all_sent().slice_rows(120, 180))
+
+
+def test_the_node_is_told_what_sessions_need_whenever_that_changes(tared: FakeNode) -> None:
+    def told() -> tuple[list[tuple[str, list[Any]]], bool]:
+        wanted = tared.wanted
+        return [(each.stream_id, [*each.numbers]) for each in wanted.streams], wanted.recording
+
+    assert told() == ([], False)
+    first = tared.record()
+    tared.receive("wanted")
+    assert told() == ([(tared.stream_id, [(70, None)])], True)
+    tared.deliver(50)
+    second = tared.record(pre_roll_s=0.02)
+    tared.finish(first)
+    tared.finish(second)
+    until(lambda: told() == ([], False) or (tared.receive("wanted") and False))
+    third = tared.record()
+    until(lambda: told()[1] or (tared.receive("wanted") and False))
+    tared.restart()
+    [before] = tared.before
+    tared.connect(earlier=(before.said(),))
+    first_seq = third["parts"][0]["seq_first"]
+    assert told() == (
+        sorted([(before.stream_id, [(first_seq, 139)]), (tared.stream_id, [(0, None)])])
+        if first_seq <= 139
+        else [(tared.stream_id, [(0, None)])],
+        True,
+    )
+
+
+def test_while_it_is_not_known_which_stream_a_stop_fell_into_none_of_them_may_be_forgotten(
+    tared: FakeNode, session: Recording
+) -> None:
+    tared.frames(30)
+    tared.reboot()
+    tared.frames(40)
+    session.stop()
+    tared.frames(10, now=True)
+    [first] = tared.before
+    tared.connect(earlier=(first.said(),))
+    wanted = {each.stream_id: [*each.numbers] for each in tared.wanted.streams}
+    assert wanted == {first.stream_id: [(70, None)], tared.stream_id: [(0, None)]}
+    assert tared.wanted.recording is False
+
+
+def test_a_pre_roll_reaches_into_what_the_node_has_yet_to_send(tared: FakeNode) -> None:
+    tared.leave()
+    backlog = tared.frames(400)
+    tared.connect()
+    tared.deliver(20)
+    session = tared.record(pre_roll_s=0.44)  # 220 frames, of which 20 are here
+    first = session["parts"][0]["seq_first"]
+    assert 490 - 220 - 15 <= first <= 490 - 220 + 15
+    tared.send_again(backlog)
+    tared.deliver(30)
+    sealed = tared.finish(session)
+    assert whole_parts_of(sealed) == [(tared.stream_id, first, 519)]
+
+
+def test_events_are_kept_by_their_instant_also_while_the_node_is_away_and_after_the_stop(
+    running: Running, tared: FakeNode
+) -> None:
+    session = tared.record()
+    url = f"{session.url}/markers"
+    tared.leave()
+    assert running.http.post(url, json={"label": "away", "t_ns": 5}).status_code == 201
+    session.stop()
+    assert running.http.post(url, json={"label": "pending", "t_ns": 7}).status_code == 201
+    tared.connect()
+    tared.send(10, now=True)
+    session.sealed()
+    before = session.now()
+    assert running.http.post(url, json={"label": "sealed", "t_ns": 6}).status_code == 201
+    events = running.http.get(url).json()["items"]
+    assert [(e["label"], e["t_ns"]) for e in events] == [
+        ("away", 5),
+        ("sealed", 6),
+        ("pending", 7),
+    ]
+    assert session.now()["sha256"] == before["sha256"]
+
+
+def test_a_mark_that_is_sent_twice_with_its_id_is_marked_once(
+    running: Running, tared: FakeNode
+) -> None:
+    url = f"/sessions/{tared.record()['id']}/markers"
+    for label in ("stone", "again"):
+        answer = running.http.post(url, json={"label": label, "t_ns": 5, "id": "0123456789ab"})
+        assert (answer.status_code, answer.json()["label"]) == (201, "stone")
+    assert len(running.http.get(url).json()["items"]) == 1
+    assert running.http.post(url, json={"label": "x", "id": "no"}).status_code == 422

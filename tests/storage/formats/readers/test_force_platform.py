@@ -1,0 +1,449 @@
+"""Force platforms of C3D files that are written byte by byte: what is read, and what is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError, UsageError
+from storage.formats.readers.c3d import C3dFile
+from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
+from tests.builders.c3d import c3d_bytes, force_plate
+
+LOAD_N = np.linspace(0.0, 98.0, 50)
+X_MM, Y_MM = 10.0, 20.0
+"""Of the load, in the plate's own axes, of which y and z are turned in the laboratory's."""
+
+
+def channels(kind: int) -> npt.NDArray[np.float64]:
+    """What a plate of this type measures of `LOAD_N` at (`X_MM`, `Y_MM`) on its surface."""
+    nothing = np.zeros(50)
+    if kind == 1:  # forces, the centre of pressure itself, free moment
+        return np.stack([nothing, nothing, LOAD_N, nothing + X_MM, nothing + Y_MM, nothing], axis=1)
+    if kind == 3:  # four corners of 200 by 100 mm, x12, x34, y14, y23, then z1 to z4
+        right, front = 0.5 + X_MM / 200.0, 0.5 + Y_MM / 100.0
+        parts = [right * front, (1 - right) * front, (1 - right) * (1 - front), right * (1 - front)]
+        return np.stack([*[nothing] * 4, *(part * LOAD_N for part in parts)], axis=1)
+    return np.stack([nothing, nothing, LOAD_N, Y_MM * LOAD_N, -X_MM * LOAD_N, nothing], axis=1)
+
+
+MORE: dict[int, dict[str, Any]] = {
+    1: {},
+    2: {},
+    3: {"ORIGIN": np.array([[100.0, 50.0, -40.0]])},
+    4: {"CAL_MATRIX": np.eye(6).reshape(1, 6, 6)},
+}
+
+
+UNITS = {
+    1: ["N", "N", "N", "mm", "mm", "Nmm"],
+    2: ["N"] * 3 + ["Nmm"] * 3,
+    3: ["N"] * 8,
+    4: ["V"] * 6,
+}
+
+
+def written(path: Path, kind: int = 2, **more: Any) -> Path:
+    analog = channels(kind if kind in MORE else 2)
+    content = force_plate(kind, analog.shape[1], **{**MORE.get(kind, {}), **more})
+    content["ANALOG"]["UNITS"] = UNITS.get(kind, UNITS[2])
+    path.write_bytes(c3d_bytes(content, analog))
+    return path
+
+
+def read(path: Path, stated: ReferenceOptions | None = None) -> ReferenceData:
+    return read_reference(path, stated or ReferenceOptions())
+
+
+@pytest.mark.parametrize("kind", MORE)
+def test_plates_of_four_types_say_what_bears_on_them(tmp_path: Path, kind: int) -> None:
+    columns = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
+    volts = ReferenceOptions(columns, {"grf": "N", "cop": "mm"}, "+")
+    found = read(written(tmp_path / "gait.c3d", kind), volts if kind == 4 else ReferenceOptions())
+    np.testing.assert_allclose(found.time_s, np.arange(50) / 1000.0)
+    np.testing.assert_allclose(found.grf_n, LOAD_N, atol=1e-4)
+    assert found.cop_m is not None
+    np.testing.assert_allclose(found.cop_m[1:], [[0.01, -0.02]] * 49, atol=1e-6)
+
+
+def test_a_plate_is_chosen_and_its_axes_turned_by_the_mapping(tmp_path: Path) -> None:
+    stated = ReferenceOptions(
+        {"grf_n": "plate1_fz", "cop_x_m": "-plate1_cop_y", "cop_y_m": "plate1_cop_x"}
+    )
+    found = read(written(tmp_path / "gait.c3d"), stated)
+    assert found.cop_m is not None
+    np.testing.assert_allclose(found.cop_m[1:], [[0.02, 0.01]] * 49, atol=1e-6)
+
+
+def test_a_plate_that_was_not_zeroed_is_said_and_nothing_taken_off(tmp_path: Path) -> None:
+    path = tmp_path / "gait.c3d"
+    analog = channels(2)
+    analog[:, 2] += 5.0
+    path.write_bytes(c3d_bytes(force_plate(2, 6, ZERO=[1, 2]), analog))
+    found = read(path)
+    np.testing.assert_allclose(found.grf_n, LOAD_N + 5.0, atol=1e-4)
+    assert "ZERO states frames 1 to 2, in which plates read 24.000" in found.notes[0]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("kind", [1, 2, 3])
+def test_load_and_reaction_read_alike_and_the_file_is_said_to_hold_which(
+    tmp_path: Path, kind: int, sign: float
+) -> None:
+    path, analog = tmp_path / "gait.c3d", channels(kind)
+    forces = slice(0, 8) if kind == 3 else [0, 1, 2] if kind == 1 else slice(0, 6)
+    analog[:, forces] *= sign
+    content = force_plate(kind, analog.shape[1], **MORE[kind])
+    content["ANALOG"]["UNITS"] = UNITS[kind]
+    path.write_bytes(c3d_bytes(content, analog))
+    found = read(path)
+    np.testing.assert_allclose(found.grf_n, LOAD_N, atol=1e-4)
+    assert found.cop_m is not None
+    np.testing.assert_allclose(found.cop_m[1:], [[0.01, -0.02]] * 49, atol=1e-6)
+    assert ("the load on the plate" if sign > 0.0 else "the reaction on the foot") in found.notes[0]
+    is_negative = "-" if sign > 0.0 else "+"
+    with pytest.raises(FileFormatError, match="negative under load"):
+        read(path, ReferenceOptions(sign=is_negative))
+
+
+@pytest.mark.parametrize(
+    "force_n",
+    [
+        np.zeros(5000) + 5.0,  # an offset
+        np.random.default_rng(1).normal(size=5000),  # noise
+        np.concatenate([np.zeros(1000), np.full(500, 300.0), np.full(500, -120.0)]),
+    ],
+)
+def test_a_sign_that_the_load_does_not_tell_has_to_be_stated(
+    tmp_path: Path, force_n: npt.NDArray[np.float64]
+) -> None:
+    noise_n = 0.01 * np.random.default_rng(2).normal(size=len(force_n))
+    analog = np.zeros((len(force_n), 6))
+    analog[:, 2] = force_n + noise_n
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(force_plate(2, 6), analog))
+    with pytest.raises(UsageError, match=r"does not tell the sign.*--sign"):
+        read(path)
+    np.testing.assert_allclose(
+        read(path, ReferenceOptions(sign="+")).grf_n, analog[:, 2], atol=1e-4
+    )
+
+
+def test_a_spike_of_the_other_sign_is_no_load(tmp_path: Path) -> None:
+    analog = np.zeros((5000, 6))
+    analog[1000:1600, 2] = -700.0
+    analog[3000:3003, 2] = 5000.0
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(force_plate(2, 6), analog))
+    assert read(path).grf_n[1200] == 700.0
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"USED": 0}, "no force platform"),
+        ({"TYPE": [6]}, "of type 6; expected force platforms of types 1 to 4"),
+        ({"CHANNEL": np.array([[1, 2, 3, 4, 5, 60]])}, "expected 6 of the 6 channels"),
+    ],
+)
+def test_what_is_no_plate_is_refused_in_a_sentence(
+    tmp_path: Path, more: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(FileFormatError, match=said):
+        read(written(tmp_path / "gait.c3d", **more))
+
+
+@pytest.mark.parametrize(
+    ("units", "said"),
+    [
+        (["lbf"] * 3 + ["Nmm"] * 3, "unit of column 'plate1_fz'"),
+        ([""] * 6, "unit of column 'plate1_fz'"),
+        (["N"] * 3 + ["lbin"] * 3, "unit of column 'plate1_cop_x'"),
+    ],
+)
+def test_a_unit_that_the_file_does_not_say_has_to_be_stated(
+    tmp_path: Path, units: list[str], said: str
+) -> None:
+    content = force_plate(2, 6)
+    content["ANALOG"]["UNITS"] = [unit or " " for unit in units]
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, channels(2)))
+    columns = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
+    with pytest.raises(UsageError, match=said):
+        read(path, ReferenceOptions(columns))
+    factor, unit = (1.0, "N") if units[0] == "N" else (1e3, "kN")
+    found = read(path, ReferenceOptions(columns, {"grf": unit, "cop": "mm"}, "+"))
+    np.testing.assert_allclose(found.grf_n, factor * LOAD_N, atol=0.1)
+    assert found.cop_m is not None
+    np.testing.assert_allclose(found.cop_m[1:], [[0.01, -0.02]] * 49, atol=1e-6)
+
+
+def test_forces_that_a_matrix_makes_of_volts_have_no_unit_of_their_own(tmp_path: Path) -> None:
+    content = force_plate(4, 6, **MORE[4])
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, channels(4)))
+    with pytest.raises(FileFormatError, match="no column 'grf_n'"):
+        read(path)
+
+
+def test_of_two_plates_none_is_chosen_for_the_user(tmp_path: Path) -> None:
+    more = {
+        "USED": 2,
+        "TYPE": [2, 2],
+        "CORNERS": np.repeat(force_plate(2, 6)["FORCE_PLATFORM"]["CORNERS"], 2, axis=0),
+        "ORIGIN": np.array([[0.0, 0.0, -40.0]] * 2),
+        "CHANNEL": np.arange(1, 13).reshape(2, 6),
+    }
+    content = force_plate(2, 12, **more)
+    content["ANALOG"]["UNITS"] = 2 * (["N"] * 3 + ["Nmm"] * 3)
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, np.concatenate([channels(2), 0.5 * channels(2)], axis=1)))
+    with pytest.raises(FileFormatError, match="no column 'grf_n'"):
+        read(path)
+    found = read(path, ReferenceOptions({"grf_n": "plate2_fz"}))
+    np.testing.assert_allclose(found.grf_n, 0.5 * LOAD_N, atol=1e-4)
+    assert "there are 2 plates or soles (plate1, plate2): --map says which one" in found.notes
+
+
+@pytest.mark.parametrize("content", [b"", b"junk", b"\x02\x50" + b"\xff" * 600])
+def test_what_is_no_c3d_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError):
+        read(path)
+
+
+@settings(max_examples=300, deadline=None)
+@given(at=st.integers(0, 4095), byte=st.integers(0, 255), cut=st.integers(0, 3))
+def test_a_damaged_file_is_read_or_refused_in_a_sentence(
+    tmp_path_factory: pytest.TempPathFactory, at: int, byte: int, cut: int
+) -> None:
+    path = tmp_path_factory.mktemp("damaged") / "gait.c3d"
+    written(path)
+    content = bytearray(path.read_bytes())
+    content[at % len(content)] = byte
+    path.write_bytes(content[: len(content) - 700 * cut])
+    with suppress(FileFormatError, UsageError):
+        read(path)
+
+
+def test_a_file_that_was_cut_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "gait.c3d")
+    path.write_bytes(path.read_bytes()[:-600])
+    with pytest.raises(FileFormatError, match="it ends after 3 frames of 5"):
+        read(path)
+
+
+# --- Independent readings -------------------------------------------------------------------------
+
+
+def corners_of(rng: np.random.Generator, *, up: int) -> npt.NDArray[np.float64]:
+    """Return corners (4, 3) in mm of a plate that lies anywhere, this axis of the laboratory up."""
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    across = np.roll(np.eye(3), up - 2, axis=1)  # rows: two level axes, then up
+    x = np.cos(angle) * across[0] + np.sin(angle) * across[1]
+    z = -across[2]
+    y = np.cross(z, x)
+    signs = [(1, 1), (-1, 1), (-1, -1), (1, -1)]
+    place = rng.uniform(-500.0, 500.0, 3)
+    return np.array([place + 250.0 * a * x + 150.0 * b * y for a, b in signs])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    kind=st.sampled_from([1, 2, 3, 4]),
+    sign=st.sampled_from([1.0, -1.0]),
+    up=st.sampled_from([0, 1, 2]),
+    raised=st.sampled_from([1.0, -1.0]),
+    seed=st.integers(0, 1000),
+)
+def test_any_plate_gives_the_force_and_the_place_that_were_laid_on_it(
+    tmp_path_factory: pytest.TempPathFactory,
+    kind: int,
+    sign: float,
+    up: int,
+    raised: float,
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    corners = corners_of(rng, up=up).astype(np.float32).astype(np.float64)
+    x, y = corners[0] - corners[1], corners[0] - corners[3]
+    x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
+    origin = np.array([3.0, -5.0, -40.0]) if kind != 3 else np.array([120.0, 80.0, -40.0])
+    force = np.stack([5.0 * rng.normal(size=50), 5.0 * rng.normal(size=50), LOAD_N + 10.0])
+    local = np.stack([rng.uniform(-90, 90, 50), rng.uniform(-60, 60, 50), np.zeros(50)])
+    # Moments about the origin of the plate, from which the middle of its surface is at `origin`.
+    middle = origin if kind in (2, 4) else np.array([0.0, 0.0, origin[2]])
+    at = local + middle[:, None]
+    moment = np.cross(at, force, axis=0)
+    nothing = np.zeros(50)
+    if kind == 1:
+        rows = [*(sign * force), *local[:2], nothing]
+    elif kind == 3:
+        a, b = origin[:2]
+        # Vertical forces of the sensors that have this sum and these moments.
+        sums = np.array([[1, 1, 1, 1], [b, b, -b, -b], [-a, a, a, -a], [1, -1, 1, -1]])
+        wanted = np.stack([force[2], moment[0], moment[1], nothing])
+        z = np.linalg.solve(sums, wanted)
+        rows = [*(sign * np.stack([0.5 * force[0]] * 2 + [0.5 * force[1]] * 2)), *(sign * z)]
+    else:
+        rows = [*(sign * force), *(sign * moment)]
+    matrix = np.eye(6) + 0.05 * rng.normal(size=(6, 6)).round(3)
+    if kind == 4:
+        rows = list(np.linalg.solve(matrix, np.stack(rows)))
+    stored = np.stack(rows, axis=1)
+    more = {"CORNERS": corners.reshape(1, 4, 3), "ORIGIN": raised * origin[None]}
+    if kind == 1:
+        more["ORIGIN"] = np.zeros((1, 3))
+    if kind == 3:
+        more["ORIGIN"] = np.array([[*origin[:2], raised * origin[2]]])
+    if kind == 4:
+        more["CAL_MATRIX"] = matrix.T.reshape(1, 6, 6)
+    content = force_plate(kind, stored.shape[1], **more)
+    content["ANALOG"]["UNITS"] = UNITS[kind]
+    path = tmp_path_factory.mktemp("plates") / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, stored))
+    columns = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
+    found = read(path, ReferenceOptions(columns, {"grf": "N", "cop": "mm"} if kind == 4 else {}))
+    placed = corners.mean(axis=0)[:, None] + np.outer(x, local[0]) + np.outer(y, local[1])
+    level = {2: (0, 1, 1.0), 1: (0, 2, -1.0), 0: (2, 1, -1.0)}[up]
+    expected = np.stack([placed[level[0]], placed[level[1]]]) * 1e-3
+    expected[0 if up == 0 else 1] *= level[2]
+    np.testing.assert_allclose(found.grf_n, force[2], rtol=1e-5)
+    assert found.cop_m is not None
+    np.testing.assert_allclose(found.cop_m, expected.T, atol=2e-5)
+
+
+@pytest.mark.parametrize("kind", [1, 2, 4])
+def test_another_program_reads_the_same(tmp_path: Path, kind: int) -> None:
+    ezc3d = pytest.importorskip("ezc3d")
+    path = written(tmp_path / "gait.c3d", kind)
+    columns = {"grf_n": "plate1_fz", "cop_x_m": "plate1_cop_x", "cop_y_m": "plate1_cop_y"}
+    found = read(path, ReferenceOptions(columns, {"grf": "N", "cop": "mm"} if kind == 4 else {}))
+    plate = ezc3d.c3d(str(path), extract_forceplat_data=True)["data"]["platform"][0]
+    np.testing.assert_allclose(found.grf_n, -plate["force"][2], rtol=1e-12)
+    assert found.cop_m is not None
+    np.testing.assert_allclose(
+        1e3 * found.cop_m[1:], plate["center_of_pressure"][:2, 1:].T, rtol=1e-9
+    )
+
+
+# --- Forms of the file ----------------------------------------------------------------------------
+
+
+def test_more_than_32767_frames_and_integers_without_a_sign_are_read(tmp_path: Path) -> None:
+    frames = 40_000
+    counts = np.zeros((frames, 6))
+    counts[:, 2] = 32_768 + np.where(np.arange(frames) % 1000 < 300, 20_000, 0)
+    content = force_plate(2, 6)
+    content["ANALOG"] |= {
+        "FORMAT": ["UNSIGNED"],
+        "OFFSET": np.array([0, 0, 32_768, 0, 0, 0]),
+        "SCALE": np.full(6, 0.05),
+        "RATE": 100.0,
+    }
+    content["POINT"] |= {"FRAMES": frames, "SCALE": 1.0}
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, counts, samples_a_frame=1, is_integer=True))
+    found = read(path)
+    assert len(found.grf_n) == frames
+    assert (found.grf_n[0], found.grf_n[500]) == (pytest.approx(1000.0), 0.0)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"POINT": {"FRAMES": np.array([70_000.0])}},
+        {"POINT": {"LONG_FRAMES": np.array([70_000.0])}},
+        {"TRIAL": {"ACTUAL_START_FIELD": [1, 0], "ACTUAL_END_FIELD": [70_000 - 65_536, 1]}},
+    ],
+)
+def test_frames_beyond_65535_are_counted_as_the_file_states_them(
+    tmp_path: Path, more: dict[str, dict[str, Any]]
+) -> None:
+    frames = 70_000
+    analog = np.zeros((frames, 6))
+    analog[::1000, 2] = 100.0
+    analog[1::1000, 2] = 100.0
+    content = force_plate(2, 6)
+    content["ANALOG"]["RATE"] = 100.0
+    for group, values in more.items():
+        content[group] = {**content.get(group, {}), **values}
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, analog, samples_a_frame=1, frames_in_header=65_535))
+    assert len(read(path).grf_n) == frames
+
+
+def test_a_file_without_a_rate_of_points_is_read_by_its_analog_rate(tmp_path: Path) -> None:
+    content = force_plate(2, 6)
+    content["POINT"]["RATE"] = 0.0
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(content, channels(2), point_hz=0.0))
+    np.testing.assert_allclose(read(path).time_s, np.arange(50) / 1000.0)
+
+
+def test_a_plate_without_channels_leaves_the_others_alone(tmp_path: Path) -> None:
+    more = {
+        "USED": 2,
+        "TYPE": [2, 2],
+        "CORNERS": np.repeat(force_plate(2, 6)["FORCE_PLATFORM"]["CORNERS"], 2, axis=0),
+        "ORIGIN": np.array([[0.0, 0.0, -40.0]] * 2),
+        "CHANNEL": np.array([[1, 2, 3, 4, 5, 6], [0] * 6]),
+    }
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(force_plate(2, 6, **more), channels(2)))
+    found = read(path)
+    np.testing.assert_allclose(found.grf_n, LOAD_N, atol=1e-4)
+    assert "plate 2 is not read" in found.notes[0]
+
+
+def test_a_plate_whose_sensors_are_nowhere_has_a_force_and_no_centre(tmp_path: Path) -> None:
+    found = read(written(tmp_path / "gait.c3d", 3, ORIGIN=np.zeros((1, 3))))
+    np.testing.assert_allclose(found.grf_n, LOAD_N, atol=1e-4)
+    assert found.cop_m is None
+    assert "no centre of pressure" in found.notes[0]
+
+
+def test_one_sample_without_load_and_a_centre_nowhere_is_left_out(tmp_path: Path) -> None:
+    analog = channels(2)
+    analog[0, 2:5] = (1e-13, 1.0, 1.0)
+    path = tmp_path / "gait.c3d"
+    path.write_bytes(c3d_bytes(force_plate(2, 6), analog))
+    found = read(path)
+    assert found.cop_m is not None
+    assert np.isnan(found.cop_m[0]).all()
+    np.testing.assert_allclose(found.cop_m[1:], [[0.01, -0.02]] * 49, atol=1e-6)
+
+
+def test_a_file_is_read_where_memory_is_limited(tmp_path: Path) -> None:
+    path = written(tmp_path / "gait.c3d")
+    code = (
+        "import resource, pathlib\n"
+        "from storage.formats.reference import ReferenceOptions, read_reference\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))\n"
+        f"print(len(read_reference(pathlib.Path({str(path)!r}), ReferenceOptions()).grf_n))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "50"
+
+
+def test_memory_that_is_not_enough_is_named_as_the_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path / "gait.c3d")
+
+    def refuse(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(C3dFile, "get_scaled_samples", refuse)
+    with pytest.raises(FileFormatError, match=r"not enough memory.*ulimit -v"):
+        read(path)

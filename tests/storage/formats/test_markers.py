@@ -1,0 +1,231 @@
+"""Marks at frames: each at the nearest one, or said to be at none; nothing else changes."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import UsageError
+from devices.frames import FrameBatch
+from storage.clock.bounds import OffsetRows
+from storage.clock.table import ClockTable, StreamClockFacts
+from storage.formats.export import make_frame_source
+from storage.formats.markers import DISTANCE_MAX_NS, PLACEMENT_COLUMNS, PlacedMarkers, place_markers
+from storage.formats.options import FormatOptions
+from storage.formats.slice import Slice
+from storage.schema import Array
+from storage.sessions.folder import Marker
+from storage.sessions.footer import NOTES_KEY
+from tests.builders.arrays import PERIOD_NS, make_array
+from tests.builders.frames import make_frames
+from tests.storage.formats.exports import NO_TIMES, TABLES, export
+
+UTC_NS = 10**18
+OFFSET_NS = 7_000_000_000
+"""Server's UTC minus the node's."""
+GAP_NS = 10_000_000_000
+ROWS = 50
+
+
+def session() -> tuple[FrameBatch, Array]:
+    """Two parts of one stream's clock, ten seconds between them; numbers begin at 0 again."""
+    rows = np.arange(ROWS)
+    second = rows >= 30
+    frames = make_frames(
+        np.where(second, rows - 30, rows), 2, t_mono_ns=PERIOD_NS * rows + GAP_NS * second
+    )
+    return frames, second.astype(np.uint16)
+
+
+def clock(*, measured: bool = True) -> ClockTable:
+    rows = OffsetRows(np.array([0]), np.array([OFFSET_NS]), np.array([1000]))
+    streams = [StreamClockFacts("a", UTC_NS, True)]
+    return ClockTable({"a": rows} if measured else {}, streams, ["a", "a"])
+
+
+def times(every: int = ROWS) -> Iterator[dict[str, Array]]:
+    frames, part = session()
+    for a in range(0, ROWS, every):
+        piece = frames.slice_rows(a, a + every)
+        yield {name: getattr(piece, name) for name in PLACEMENT_COLUMNS} | {
+            "part": part[a : a + every]
+        }
+
+
+def at(*t_ns: int, labels: Sequence[str] = ()) -> list[Marker]:
+    """Events at instants of the node's clock, counted from the first frame's."""
+    begin = int(session()[0].t_ns[0]) + OFFSET_NS
+    names = labels or [f"mark {i}" for i in range(len(t_ns))]
+    return [
+        Marker(id=f"{i:012x}", label=name, t_ns=begin + t)
+        for i, (t, name) in enumerate(zip(t_ns, names, strict=True))
+    ]
+
+
+def placed(
+    events: Sequence[Marker], part: Slice | None = None, *, every: int = ROWS
+) -> PlacedMarkers:
+    return place_markers(events, times(every), clock(), part or Slice())
+
+
+def frames_of(marks: PlacedMarkers) -> list[tuple[int, int] | None]:
+    return [mark.frame for mark in marks.markers]
+
+
+def test_a_mark_is_at_the_frame_nearest_to_it_in_the_servers_time() -> None:
+    near = int(0.4 * PERIOD_NS)
+    marks = placed(at(0, 5 * PERIOD_NS + near, 6 * PERIOD_NS - near, GAP_NS + 30 * PERIOD_NS))
+    assert frames_of(marks) == [(0, 0), (0, 5), (0, 6), (1, 0)]
+    assert [mark.distance_ns for mark in marks.markers] == [0, near, near, 0]
+    assert marks.excluded == ()
+    assert all(mark.uncertainty_ns and mark.uncertainty_ns >= 1000 for mark in marks.markers)
+
+
+def test_of_two_frames_that_are_as_near_the_earlier_one_has_the_mark() -> None:
+    assert frames_of(placed(at(5 * PERIOD_NS + PERIOD_NS // 2))) == [(0, 5)]
+
+
+def test_marks_before_between_and_after_frames_are_at_one_within_a_second_or_at_none() -> None:
+    last = 29 * PERIOD_NS
+    end = GAP_NS + (ROWS - 1) * PERIOD_NS
+    marks = placed(
+        at(
+            *(-DISTANCE_MAX_NS - 1, -DISTANCE_MAX_NS),
+            *(last + DISTANCE_MAX_NS, last + DISTANCE_MAX_NS + 1),
+            *(end + DISTANCE_MAX_NS, end + DISTANCE_MAX_NS + 1),
+        )
+    )
+    assert frames_of(marks) == [None, (0, 0), (0, 29), None, (1, 19), None]
+    assert [mark.exclusion_reason for mark in marks.excluded] == [
+        "no frame within a second of it"
+    ] * 3
+
+
+def test_marks_at_the_ends_of_time_are_at_no_frame() -> None:
+    far = [Marker(id="0" * 12, label="far", t_ns=t_ns) for t_ns in (0, 2**63 - 1)]
+    assert frames_of(placed(far)) == [None, None]
+
+
+def test_several_marks_at_one_frame_are_joined_in_the_order_of_their_instants() -> None:
+    marks = placed(
+        at(3 * PERIOD_NS + 9, 3 * PERIOD_NS + 5, 3 * PERIOD_NS + 5, labels=["c", "a", "b"])
+    )
+    frames, part = session()
+    column = marks.get_frame_labels(frames.seq, part)
+    assert column[3] == "a; b; c"
+    assert [label for label in column if label is not None] == ["a; b; c"]
+
+
+def test_a_mark_outside_the_slice_is_said_to_be() -> None:
+    part = Slice(10 * PERIOD_NS * 1e-9, 20 * PERIOD_NS * 1e-9)
+    marks = placed(at(9 * PERIOD_NS, 10 * PERIOD_NS, 19 * PERIOD_NS, 20 * PERIOD_NS), part)
+    assert frames_of(marks) == [(0, 9), (0, 10), (0, 19), (0, 20)]
+    assert [bool(mark.exclusion_reason) for mark in marks.markers] == [True, False, False, True]
+
+
+def test_without_a_measured_clock_a_mark_is_at_no_frame_and_the_reason_says_so() -> None:
+    (mark,) = place_markers(at(0), times(), clock(measured=False), Slice()).excluded
+    assert mark.frame is None
+    assert "clock" in mark.exclusion_reason
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    every=st.integers(1, ROWS),
+    t_ns=st.lists(st.integers(-2 * DISTANCE_MAX_NS, GAP_NS + 2 * DISTANCE_MAX_NS), max_size=8),
+)
+def test_any_pieces_give_the_frames_that_a_search_of_all_frames_gives(
+    every: int, t_ns: list[int]
+) -> None:
+    frames, part = session()
+    t_server_ns = [int(t) + OFFSET_NS for t in frames.t_ns]
+    expected: list[tuple[int, int] | None] = []
+    for event in sorted(at(*t_ns), key=lambda event: event.t_ns):
+        row = min(range(ROWS), key=lambda i: abs(t_server_ns[i] - event.t_ns))  # the first of ties
+        is_near = abs(t_server_ns[row] - event.t_ns) <= DISTANCE_MAX_NS
+        expected.append((int(part[row]), int(frames.seq[row])) if is_near else None)
+    assert frames_of(placed(at(*t_ns), every=every)) == expected
+
+
+# --- in a file ------------------------------------------------------------------------------------
+
+
+def exported(
+    to: str,
+    marks: PlacedMarkers | None,
+    columns: tuple[str, ...] = (),
+    options: FormatOptions = NO_TIMES,
+) -> bytes:
+    frames, part = session()
+    pieces = (
+        (frames.slice_rows(a, a + 20), {"part": part[a : a + 20]}) for a in range(0, ROWS, 20)
+    )
+    return b"".join(
+        export(
+            make_frame_source(pieces),
+            make_array(),
+            {},
+            to,
+            Slice(columns=columns),
+            None,
+            marks,
+            options=options,
+        )
+    )
+
+
+def read(content: bytes, to: str) -> pa.Table:
+    if to == "parquet":
+        return pq.read_table(io.BytesIO(content))
+    return pa.ipc.open_file(content).read_all()
+
+
+@pytest.mark.parametrize("to", ["parquet", "arrow"])
+def test_the_column_is_the_last_one_and_all_others_keep_their_bits(to: str) -> None:
+    table = read(exported(to, placed(at(3 * PERIOD_NS, labels=["stone"]))), to)
+    plain = read(exported(to, None), to)
+    assert table.column_names == [*plain.column_names, "marker"]
+    assert table.drop_columns(["marker"]).equals(plain)
+    labels = table.column("marker").to_pylist()
+    assert labels[3] == "stone"
+    assert labels.count(None) == ROWS - 1
+
+
+def test_in_csv_the_other_columns_keep_their_bytes() -> None:
+    whole = FormatOptions(times=False, about=False)
+    marked = placed(at(3 * PERIOD_NS, labels=["stone"]))
+    lines = exported("csv", marked, options=whole).splitlines()
+    plain = exported("csv", None, options=whole).splitlines()
+    ends = [line.removeprefix(other) for line, other in zip(lines, plain, strict=True)]
+    assert ends == [b',"marker"', *[b',"stone"' if row == 3 else b"," for row in range(ROWS)]]
+
+
+@pytest.mark.parametrize("to", TABLES)
+def test_without_any_mark_the_column_is_there_and_empty(to: str) -> None:
+    content = exported(to, PlacedMarkers(()), ("marker",))
+    if to == "csv":
+        assert content == b'"marker"\n' + b"\n" * ROWS
+    else:
+        assert read(content, to).column("marker").to_pylist() == [None] * ROWS
+
+
+def test_a_column_that_was_not_asked_for_says_how_to_have_it() -> None:
+    with pytest.raises(UsageError, match="marks"):
+        exported("arrow", None, ("marker",))
+
+
+def test_the_notes_say_where_each_mark_is_and_why_one_is_at_no_frame() -> None:
+    marks = placed(at(3 * PERIOD_NS, -5 * DISTANCE_MAX_NS, labels=["stone", "early"]))
+    metadata = read(exported("arrow", marks), "arrow").schema.metadata
+    early, stone = json.loads(metadata[NOTES_KEY])["marks"]
+    assert (stone["label"], stone["part"], stone["seq"], stone["left_out"]) == ("stone", 0, 3, None)
+    assert (early["label"], early["seq"]) == ("early", None)
+    assert early["left_out"] == "no frame within a second of it"

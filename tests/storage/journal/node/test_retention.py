@@ -1,0 +1,158 @@
+"""What a node keeps: everything, for as long as a session needs it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from devices.errors import StorageError
+from storage.intervals import NO_END, Intervals
+from storage.journal.node import journal as node_journal
+from storage.journal.node import retention
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.retention_requests import RetentionRequest
+from storage.journal.node.stream import NodeStream
+from tests.builders.arrays import make_array
+from tests.storage.journal.node.leg import Start, fill, given, store
+from tests.waiting import until
+
+
+def test_every_frame_is_on_disk_within_the_promise_and_can_be_given_at_any_time(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    fill(journal, stream, 0, 99)
+    assert given(stream, 15, 44) == [10, 20, 30, 40]
+    until(lambda: stream.stored == Intervals([(0, 99)]))
+    assert given(stream, 15, 44) == [10, 20, 30, 40]
+    assert stream.available == Intervals([(0, 99)])
+    assert journal.warnings == ()
+
+
+def test_two_processes_do_not_use_one_nodes_folder(start: Start, tmp_path: Path) -> None:
+    start()
+    with pytest.raises(StorageError, match="another foottile process"):
+        NodeJournal(tmp_path, "leg")
+    NodeJournal(tmp_path, "arm").close()
+
+
+def test_an_empty_stream_leaves_nothing(journal: NodeJournal, stream: NodeStream) -> None:
+    until(lambda: stream.journal is not None)
+    journal.close()
+    assert not stream.folder.exists()
+
+
+def wants(*numbers: tuple[int, int | None]) -> RetentionRequest:
+    return RetentionRequest(streams={"0" * 32: numbers}, known=("0" * 32,))
+
+
+def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "RING_DURATION_NS", 200_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    journal.update_retention_request("laptop", wants((200, 249)))
+    fill(journal, stream, 0, 599)
+    stream.record_acknowledgement("laptop", 100, 149)
+    evicted = Intervals([(0, 99), (150, 199), (250, 489)])
+    until(lambda: stream.lost.by_reason == {"evicted": evicted})
+    assert stream.stored.restricted_to(0, 489) == Intervals([(200, 249)])
+    stream.record_acknowledgement("laptop", 200, 249)
+    until(lambda: not stream.stored.restricted_to(0, 489))
+    until(lambda: "evicted" in stream.notes.lost)
+
+
+def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of_room(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "RING_DURATION_NS", 200_000_000)
+    monkeypatch.setattr(node_journal, "_CLEANUP_INTERVAL_S", 0.0)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    folder = tmp_path / "journal" / "leg"
+    folder.mkdir(parents=True)
+    (folder / "wanted.json").write_bytes(b"damaged")
+    journal = start(budget_bytes=60_000)
+    assert "wanted.json.damaged-1" in " ".join(journal.problems)
+    stream = journal.begin_stream(make_array())
+    store(journal, stream, 0, 299)
+    time.sleep(2 * node_journal.SYNC_INTERVAL_S)  # for several looks at what is old
+    assert stream.stored == Intervals([(0, 299)])
+    monkeypatch.setattr(retention, "_BUDGET_CHECK_INTERVAL_S", 0.0)
+    store(journal, stream, 300, 1499)
+    until(lambda: stream.stored.first != 0)
+    assert stream.stored.last == 1499
+    assert journal.warnings == ()
+
+
+def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    monkeypatch.setattr(node_journal, "MAX_WAITING_BYTES", 20_000)
+    journal = start(budget_bytes=60_000)
+    stream = journal.begin_stream(make_array())
+    fill(journal, stream, 0, 99)
+    until(lambda: not stream.waiting_bytes)
+    journal.update_retention_request("laptop", wants((100, None)))
+    for first in range(100, 1000, 50):
+        fill(journal, stream, first, first + 49)
+        until(lambda: not stream.waiting_bytes or journal.warnings)
+    assert "is full" in journal.warnings[0]
+    fill(journal, stream, 1000, 1999)
+    lost = stream.lost.by_reason
+    assert lost["evicted"] == Intervals([(0, 99)])
+    full = lost["disk_full"].count
+    assert full > 500
+    held = stream.available
+    assert held.count + full + 100 == 2000
+    # A server has taken some of them after all: there is room, and it goes on.
+    stream.record_acknowledgement("laptop", 100, 1999)
+    fill(journal, stream, 2000, 2009)
+    until(lambda: journal.warnings == () and stream.stored.last == 2009)
+    assert "disk_full" not in stream.lost.to_pairs()
+
+
+def test_what_sessions_need_and_no_server_has_is_undelivered(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    journal.update_retention_request("laptop", wants((50, None)))
+    fill(journal, stream, 0, 99)
+    assert journal.undelivered_numbers(stream) == Intervals([(50, 99)])
+    stream.record_acknowledgement("laptop", 0, 79)
+    assert journal.undelivered_numbers(stream) == Intervals([(80, 99)])
+    assert journal.retention_requests.required_numbers_of("0" * 32) == Intervals([(50, NO_END)])
+
+
+def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "RING_DURATION_NS", 100_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    journal.retention_requests.set_local_numbers({stream.stream_id: Intervals([(0, NO_END)])})
+    fill(journal, stream, 0, 399)
+    stream.record_acknowledgement("laptop", 0, 399)
+    until(lambda: stream.stored.last == 399)
+    time.sleep(0.2)  # several looks
+    assert stream.stored == Intervals([(0, 399)])
+
+
+def test_what_one_server_has_another_still_gets(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "RING_DURATION_NS", 100_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
+    journal.update_retention_request("laptop", wants((0, 199)))
+    store(journal, stream, 0, 399)
+    stream.record_acknowledgement("other", 0, 399)
+    until(lambda: not stream.stored.restricted_to(200, 299))
+    assert stream.stored.restricted_to(0, 199) == Intervals([(0, 199)])
+    assert journal.undelivered_numbers(stream) == Intervals([(0, 199)])
+
+
+def test_frames_that_were_not_handed_over_are_named(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    fill(journal, stream, 0, 9)
+    fill(journal, stream, 30, 39)
+    assert stream.lost.to_pairs() == {"node_busy": ((10, 29),)}

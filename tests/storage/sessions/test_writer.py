@@ -1,0 +1,373 @@
+"""What is in the file of a sealed session, column by column."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.frames import (
+    NO_SERVO_AGE,
+    NO_SERVO_COUNTS,
+    NOT_READ,
+    FrameBatch,
+)
+from storage.schema import CONTACT_UNKNOWN
+from storage.sessions import reader
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
+from tests.builders.arrays import make_array
+from tests.builders.frames import any_frames, assert_same_bits
+from tests.storage.sessions.session_files import frames, read, write
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    rows=st.integers(1, 40),
+    tiles=st.integers(1, 9),
+    seed=st.integers(0, 2**32 - 1),
+    cut=st.integers(0, 40),
+)
+def test_frames_survive_the_file(
+    tmp_path_factory: pytest.TempPathFactory, rows: int, tiles: int, seed: int, cut: int
+) -> None:
+    path = tmp_path_factory.mktemp("round") / "session.parquet"
+    rng = np.random.default_rng(seed)
+    batch = any_frames(
+        rows,
+        tiles,
+        seed,
+        t_mono_ns=np.sort(rng.integers(0, 10**15, rows)),
+        # Of all that is not a number the file keeps only that it is none.
+        reference_force_n=rng.choice([np.nan, np.inf, -np.inf, -0.0, 1e-40, 29.97], rows),
+    )
+    with SealedFileWriter(path, make_array(tiles), {}) as writer:
+        for piece in (batch.slice_rows(0, cut), batch.slice_rows(cut, rows)):
+            if len(piece):
+                writer.append_frames(piece, {})
+    with SealedFileReader(path) as session:
+        assert session.info == make_array(tiles)
+        assert session.frame_count == rows
+        assert_same_bits(session.read_frames(), batch)
+
+
+def test_the_columns_are_flat_and_those_of_the_contract_in_order(tmp_path: Path) -> None:
+    schema = pq.read_schema(write(tmp_path / "s.parquet", frames(5)))
+    assert " ".join(schema.names) == (
+        "seq t_mono_ns t_ns pressure_raw_0 pressure_raw_1 temperature_raw_0 temperature_raw_1 "
+        "sample_offset_us_0 sample_offset_us_1 servo_counts servo_age_us tile_flags_0 tile_flags_1 "
+        "frame_flags reference_force_n"
+    )
+    types = {name: str(schema.field(name).type) for name in schema.names}
+    assert types["seq"] == "uint64"
+    assert types["t_ns"] == "int64"
+    assert types["pressure_raw_1"] == "uint16"
+    assert types["sample_offset_us_0"] == types["servo_counts"] == "int32"
+    assert types["tile_flags_1"] == types["frame_flags"] == "uint8"
+    assert types["reference_force_n"] == "float"
+
+
+def test_units_survive_the_file(tmp_path: Path) -> None:
+    schema = pq.read_schema(write(tmp_path / "s.parquet", frames(5)))
+    said = {field.name: field.metadata or {} for field in schema}
+    assert all(metadata[b"unit"] and metadata[b"description"] for metadata in said.values())
+    assert said["t_ns"][b"unit"] == b"ns"
+    assert said["pressure_raw_1"][b"unit"] == b"counts"
+
+
+DELTA = {
+    "seq",
+    "t_mono_ns",
+    "t_ns",
+    "pressure_raw_0",
+    "pressure_raw_1",
+    "servo_counts",
+    "servo_age_us",
+    "part",
+}
+
+
+def test_integers_are_delta_encoded_or_have_a_dictionary_and_only_floats_are_split_into_their_bytes(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "s.parquet"
+    write(
+        path,
+        frames(500),
+        part=np.zeros(500, dtype=np.uint16),
+        grf_n=np.random.default_rng(0).normal(size=500),
+        contact=np.ones(500, dtype=np.uint8),
+        estimate_flags=np.ones(500, dtype=np.uint16),
+        true_grf_n=np.random.default_rng(1).normal(size=500),
+        phase=np.array(["rest"] * 500),
+    )
+    group = pq.ParquetFile(path).metadata.row_group(0)
+    chunks = [group.column(i) for i in range(group.num_columns)]
+    assert {chunk.compression for chunk in chunks} == {"ZSTD"}
+    # Of numbers of 32 and 64 bits; of levels and dictionaries, too, which everybody reads.
+    common = {"RLE", "PLAIN"}
+    found = {chunk.path_in_schema: set(chunk.encodings) - common for chunk in chunks}
+    expected = {
+        chunk.path_in_schema: {
+            "BYTE_STREAM_SPLIT"
+            if chunk.physical_type in ("FLOAT", "DOUBLE")
+            else "DELTA_BINARY_PACKED"
+            if chunk.path_in_schema in DELTA
+            else "RLE_DICTIONARY"
+        }
+        for chunk in chunks
+    }
+    assert found == expected
+    assert len({encoding for each in expected.values() for encoding in each}) == 3
+
+
+def as_noisy_integers_were_split(schema: pa.Schema) -> dict[str, Any]:
+    steady = {"servo_counts", "part"}
+    return {
+        "compression": "zstd",
+        "use_dictionary": False,
+        "write_page_checksum": True,
+        "column_encoding": {
+            field.name: "DELTA_BINARY_PACKED"
+            if field.type in (pa.int64(), pa.uint64()) or field.name in steady
+            else "BYTE_STREAM_SPLIT"
+            for field in schema
+        },
+    }
+
+
+def as_all_integers_were_delta_encoded(schema: pa.Schema) -> dict[str, Any]:
+    floats = [pa.types.is_floating(field.type) for field in schema]
+    names = ["BYTE_STREAM_SPLIT" if is_float else "DELTA_BINARY_PACKED" for is_float in floats]
+    return {
+        "compression": "zstd",
+        "use_dictionary": False,
+        "write_page_checksum": True,
+        "column_encoding": dict(zip(schema.names, names, strict=True)),
+    }
+
+
+@pytest.mark.parametrize(
+    "older_options", [as_all_integers_were_delta_encoded, as_noisy_integers_were_split]
+)
+def test_a_file_with_the_encodings_of_an_older_version_is_read_as_ever(
+    older_options: Callable[[pa.Schema], dict[str, Any]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = write(tmp_path / "now.parquet", frames(500))
+    monkeypatch.setattr("storage.sessions.writer.parquet_options", older_options)
+    before = write(tmp_path / "before.parquet", frames(500))
+    with SealedFileReader(now) as one, SealedFileReader(before) as other:
+        assert_same_bits(one.read_frames(), other.read_frames())
+        assert one.content_sha256 == other.content_sha256
+
+
+def test_a_column_says_to_what_it_was_rounded(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    notes = {"rounded_to": {"grf_n": 0.0625, "pressure_raw": "much"}}
+    with SealedFileWriter(path, make_array(), notes) as writer:
+        writer.append_frames(frames(5), {"grf_n": np.zeros(5), "grf_sigma_n": np.zeros(5)})
+    said = {field.name: field.metadata or {} for field in pq.read_schema(path)}
+    assert said["grf_n"][b"rounded_to"] == b"0.0625"
+    assert [name for name, metadata in said.items() if b"rounded_to" in metadata] == ["grf_n"]
+
+
+def test_a_quiet_hour_is_small(tmp_path: Path) -> None:
+    # performance.md: some 6 bytes a frame of four tiles where CSV takes 54
+    rng = np.random.default_rng(3)
+    rows = 20_000
+    quiet = replace(
+        frames(rows, 4),
+        pressure_raw=(380 + np.rint(rng.normal(0, 1.3, (rows, 4)))).astype(np.uint16),
+        temperature_raw=(480 + np.rint(rng.normal(0, 0.5, (rows, 4)))).astype(np.uint16),
+        sample_offset_us=np.tile(np.array([0, 0, 0, 0], dtype=np.int32), (rows, 1)),
+        servo_counts=np.full(rows, NO_SERVO_COUNTS, dtype=np.int32),
+        servo_age_us=np.full(rows, NO_SERVO_AGE, dtype=np.int32),
+        tile_flags=np.zeros((rows, 4), dtype=np.uint8),
+        frame_flags=np.zeros(rows, dtype=np.uint8),
+        reference_force_n=np.full(rows, np.nan, dtype=np.float32),
+    )
+    assert write(tmp_path / "s.parquet", quiet).stat().st_size < 8 * rows
+
+
+def test_what_is_not_known_is_null_in_the_file_and_what_it_was_in_memory(tmp_path: Path) -> None:
+    batch = replace(
+        frames(4),
+        pressure_raw=np.array([[300, NOT_READ]] * 4, dtype=np.uint16),
+        temperature_raw=np.array([[NOT_READ, 480]] * 4, dtype=np.uint16),
+        servo_counts=np.array([0, NO_SERVO_COUNTS, -1, 7], dtype=np.int32),
+        servo_age_us=np.array([NO_SERVO_AGE, 0, 5, 5], dtype=np.int32),
+        reference_force_n=np.array([np.nan, 0.0, -1.0, np.inf], dtype=np.float32),
+    )
+    contact = np.array([0, 1, CONTACT_UNKNOWN, 1], dtype=np.uint8)
+    grf_n = np.array([np.nan, 1.0, -0.0, np.inf])
+    path = write(tmp_path / "s.parquet", batch, contact=contact, grf_n=grf_n)
+    table = pq.read_table(path)
+
+    def nulls(name: str) -> list[bool | None]:
+        return table.column(name).is_null().to_pylist()
+
+    assert nulls("pressure_raw_0") == [False] * 4
+    assert nulls("pressure_raw_1") == [True] * 4
+    assert nulls("temperature_raw_0") == [True] * 4
+    assert nulls("servo_counts") == [False, True, False, False]
+    assert nulls("servo_age_us") == [True, False, False, False]
+    assert nulls("reference_force_n") == [True, False, False, False]
+    assert nulls("contact") == [False, False, True, False]
+    assert nulls("grf_n") == [True, False, False, False]
+    assert not any(table.column("seq").is_null().to_pylist())
+    with SealedFileReader(path) as session:
+        ((back, extra),) = session.read_batches("contact", "grf_n")
+    assert_same_bits(back, batch)
+    assert extra["contact"].tolist() == contact.tolist()
+    np.testing.assert_array_equal(extra["grf_n"], grf_n)
+
+
+def test_what_is_always_known_cannot_be_null(tmp_path: Path) -> None:
+    schema = pq.read_schema(write(tmp_path / "s.parquet", frames(3)))
+    known = {name for name in schema.names if not schema.field(name).nullable}
+    assert known == {
+        *("seq", "t_mono_ns", "t_ns", "frame_flags", "tile_flags_0", "tile_flags_1"),
+        *("sample_offset_us_0", "sample_offset_us_1"),
+    }
+
+
+def test_estimates_are_kept_in_single_truth_in_double_precision_and_notes_as_text(
+    tmp_path: Path,
+) -> None:
+    third = np.full(3, 1 / 3)
+    path = write(
+        tmp_path / "s.parquet",
+        frames(3),
+        force_n=np.array([[1 / 3, np.nan], [2e-3, 0.1], [1e9, -1.0]]),
+        true_grf_n=third,
+        pressed_tile=np.array(["T01", None, "T02"], dtype=object),
+        estimate_flags=np.array([0, 511, 3], dtype=np.uint16),
+    )
+    with SealedFileReader(path) as session:
+        assert session.has_columns("force_n", "true_grf_n", "pressed_tile")
+        assert not session.has_columns("force_n", "grf_n")
+        ((_, extra),) = session.read_batches(
+            "force_n", "true_grf_n", "pressed_tile", "estimate_flags"
+        )
+    assert extra["force_n"].dtype == np.float32
+    np.testing.assert_array_equal(
+        extra["force_n"], np.array([[1 / 3, np.nan], [2e-3, 0.1], [1e9, -1.0]], np.float32)
+    )
+    assert extra["true_grf_n"].tobytes() == third.tobytes()
+    assert extra["pressed_tile"].tolist() == ["T01", None, "T02"]
+    assert extra["estimate_flags"].tolist() == [0, 511, 3]
+
+
+def test_notes_survive_and_may_be_added_before_the_first_group(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    with SealedFileWriter(path, make_array(), {"seed": 7, "scene": {"name": "mud"}}) as writer:
+        writer.append_frames(frames(3), {})
+        writer.add_notes({"lag_ms": 9.2})
+    with SealedFileReader(path) as session:
+        assert session.notes == {"seed": 7, "scene": {"name": "mud"}, "lag_ms": 9.2}
+
+
+def test_the_same_session_is_the_same_bytes(tmp_path: Path) -> None:
+    notes: dict[str, object] = {"b": 1, "a": 2}
+    one = write(tmp_path / "one.parquet", frames(300), notes)
+    two = write(tmp_path / "two.parquet", frames(300), dict(reversed(notes.items())))
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_an_integer_that_does_not_fit_its_column_is_an_error_and_not_another_integer(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(pa.ArrowInvalid):
+        write(tmp_path / "s.parquet", frames(2), estimate_flags=np.array([1, 65536 + 1]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_that_was_read_is_closed(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", frames(3))
+
+    def is_open() -> bool:
+        return str(path) in {os.path.realpath(fd) for fd in Path("/proc/self/fd").iterdir()}
+
+    with SealedFileReader(path) as session:
+        assert len(session.read_frames()) == 3
+        assert is_open()
+    assert not is_open()
+
+
+def group_seconds(path: Path) -> list[float]:
+    with SealedFileReader(path) as session:
+        return [
+            float(batch.t_mono_ns[-1] - batch.t_mono_ns[0]) * 1e-9
+            for batch, _ in session.read_batches()
+        ]
+
+
+def test_a_row_group_is_about_a_minute(tmp_path: Path) -> None:
+    # 150 s in pieces of a second
+    path, batch = tmp_path / "s.parquet", frames(3000, period_ns=50_000_000)
+    with SealedFileWriter(path, make_array(), {}) as writer:
+        for begin in range(0, 3000, 20):
+            writer.append_frames(batch.slice_rows(begin, begin + 20), {})
+    seconds = group_seconds(path)
+    assert len(seconds) == 3
+    assert all(59.0 <= s <= 62.0 for s in seconds[:-1])
+    assert_same_bits(read(path), batch)
+
+
+def test_one_long_batch_is_cut_into_row_groups_of_a_minute_too(tmp_path: Path) -> None:
+    # else whoever reads it one group at a time holds all of it at once
+    batch = frames(3000, period_ns=200_000_000)  # ten minutes
+    path = write(tmp_path / "s.parquet", batch)
+    assert all(s <= 62.0 for s in group_seconds(path))
+    assert_same_bits(read(path), batch)
+
+
+def test_row_groups_grow_with_the_session_to_five_minutes_and_no_frame_is_lost(
+    tmp_path: Path,
+) -> None:
+    # a footer costs every reader time for each of them
+    batch = frames(10 * 3600, period_ns=1_000_000_000)
+    path = write(tmp_path / "s.parquet", batch)
+    groups = pq.ParquetFile(path).metadata
+    rows = [groups.row_group(i).num_rows for i in range(groups.num_row_groups)]
+    assert rows[:59] == [60] * 59
+    assert max(rows) == 300
+    assert len(rows) < 200
+    assert_same_bits(read(path), batch)
+
+
+def test_a_long_row_group_is_read_in_pieces(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = frames(5000)
+    path = write(tmp_path / "s.parquet", batch)
+    monkeypatch.setattr(reader, "_PIECE_VALUES", 1)
+    with SealedFileReader(path) as session:
+        pieces = [piece for piece, _ in session.read_batches()]
+    assert [len(piece) for piece in pieces] == [1024] * 4 + [904]
+    assert_same_bits(FrameBatch.concatenate(pieces), batch)
+
+
+def test_a_gap_of_an_hour_is_no_reason_for_a_group_of_its_own_for_every_frame(
+    tmp_path: Path,
+) -> None:
+    batch = frames(300)
+    t_mono_ns = batch.t_mono_ns + np.where(np.arange(300) >= 150, 3_600_000_000_000, 0)
+    path = tmp_path / "s.parquet"
+    with SealedFileWriter(path, make_array(), {}) as writer:
+        for begin in range(0, 300, 10):
+            writer.append_frames(
+                replace(batch, t_mono_ns=t_mono_ns).slice_rows(begin, begin + 10), {}
+            )
+    assert pq.ParquetFile(path).num_row_groups <= 3

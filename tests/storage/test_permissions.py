@@ -1,0 +1,82 @@
+"""What a process writes is its user's, whatever the umask was."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from storage.durable_files import make_synced_folder, write_atomically
+from storage.permissions import restrict_to_owner
+
+
+@pytest.fixture(autouse=True)
+def _umask() -> Iterator[None]:
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+def mode_of(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def written(folder: Path) -> tuple[int, int]:
+    """Modes of a folder and a file that are made in it."""
+    make_synced_folder(folder / "inner")
+    write_atomically(folder / "inner" / "file", b"x")
+    return mode_of(folder / "inner"), mode_of(folder / "inner" / "file")
+
+
+def test_a_folder_that_is_made_is_its_users(tmp_path: Path) -> None:
+    restrict_to_owner(tmp_path / "a" / "data")
+    assert mode_of(tmp_path / "a" / "data") == 0o700
+    assert written(tmp_path / "a" / "data") == (0o700, 0o600)
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        (),
+        ("server_id", "journal"),
+        (".lock",),
+        (".lock", ".writable", "journal", "nodes", "server_id", "sessions", "token", "trash"),
+        (".lock", "server_id.damaged-1", ".server_id.4711.815.0123abcd.tmp"),
+    ],
+    ids=str,
+)
+def test_a_folder_of_ours_that_all_could_read_is_closed(
+    tmp_path: Path, found: tuple[str, ...]
+) -> None:
+    for name in found:
+        (tmp_path / name).touch()
+    tmp_path.chmod(0o755)
+    restrict_to_owner(tmp_path)
+    assert mode_of(tmp_path) == 0o700
+
+
+@pytest.mark.parametrize("name", ["journal", "nodes", "sessions", "Documents"])
+def test_somebodys_home_stays_as_it_is_but_what_we_write_there_is_closed(
+    tmp_path: Path, name: str
+) -> None:
+    (tmp_path / "thesis.tex").touch()
+    (tmp_path / name).mkdir()
+    tmp_path.chmod(0o755)
+    for _ in range(2):
+        restrict_to_owner(tmp_path)
+        assert mode_of(tmp_path) == 0o755
+        assert written(tmp_path) == (0o700, 0o600)
+        for ours in (".lock", "server_id"):  # what a start leaves is there at the second one
+            (tmp_path / ours).touch()
+
+
+@pytest.mark.parametrize("mode", [0o750, 0o770, 0o2750])
+def test_a_group_that_the_owner_let_in_may_read(tmp_path: Path, mode: int) -> None:
+    tmp_path.chmod(mode)
+    restrict_to_owner(tmp_path)
+    assert mode_of(tmp_path) == mode
+    folder, file = written(tmp_path)
+    assert (folder & 0o777, file) == (0o750, 0o640)

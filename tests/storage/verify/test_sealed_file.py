@@ -1,0 +1,304 @@
+"""A sealed file proves itself: every kind of damage is found from the file alone."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError
+from devices.frames import FrameBatch
+from storage.parquet_hash import FOOTER_HASH_KEY, FORMAT_KEY, read_stated_and_actual_hash
+from storage.sessions.folder import Ledger, Part, PartLedger
+from storage.sessions.reader import SealedFileReader
+from storage.sessions.writer import SealedFileWriter
+from storage.verify.sealed_file import find_ledger_contradictions, verify_sealed_file
+from tests.builders.arrays import UTC_NS, make_array
+from tests.builders.frames import make_frames
+
+BOOTS = ("a" * 32, "b" * 32)
+
+
+def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
+    """Frames in which everything is known."""
+    rng = np.random.default_rng(len(numbers))
+    pressure_raw, temperature_raw = rng.integers(0, 100, (2, len(numbers), 1))
+    known: dict[str, Any] = {"servo_counts": 5, "servo_age_us": 7, "reference_force_n": 9.0}
+    return make_frames(
+        numbers,
+        1,
+        utc_offset_ns=offset_ns,
+        pressure_raw=pressure_raw,
+        temperature_raw=temperature_raw,
+        **known,
+    )
+
+
+def counted(first: int, last: int, boot: int = 0, **lost: int) -> PartLedger:
+    length = last - first + 1
+    return PartLedger(
+        stream_id=BOOTS[boot],
+        seq_first=first,
+        seq_last=last,
+        recorded=length - sum(lost.values()),
+        lost=lost,
+        pending=0,
+    )
+
+
+def notes_of(*parts: PartLedger) -> dict[str, Any]:
+    lossy = any(part.lost for part in parts)
+    ledger = Ledger(complete=not lossy, lossy=lossy, parts=parts, missed_slots=0)
+    session_parts = [
+        Part(
+            stream_id=part.stream_id, seq_first=part.seq_first, seq_last=part.seq_last
+        ).model_dump()
+        for part in parts
+    ]
+    session = {"id": "20200101T000000Z-000000", "node": "bench", "parts": session_parts}
+    return {"ledger": ledger.model_dump(mode="json"), "session": session}
+
+
+def write(path: Path, notes: dict[str, Any], *parts: FrameBatch) -> Path:
+    with SealedFileWriter(path, make_array(1, stream_id=BOOTS[0]), notes) as writer:
+        for number, batch in enumerate(parts):
+            if len(batch):
+                writer.append_frames(batch, {"part": np.full(len(batch), number, np.uint16)})
+    return path
+
+
+def walk(path: Path) -> Path:
+    """Two parts, 60 frames of 100 and three frames lost."""
+    present = [n for n in range(10, 70) if n not in (20, 21, 40)]
+    parts = (counted(10, 69, disk_full=3), counted(0, 39, boot=1))
+    lost = {"lost": {BOOTS[0]: {"disk_full": [[20, 21], [40, 40]]}}}
+    batches = (frames(*present), frames(*range(40), offset_ns=5))
+    return write(path, notes_of(*parts) | lost, *batches)
+
+
+def problems(path: Path) -> str:
+    return "; ".join(verify_sealed_file(path).problems)
+
+
+def rewritten(path: Path, table: pa.Table, notes: dict[str, Any] | None = None) -> Path:
+    """The table sealed again by our own writer: hashes agree, whatever it says."""
+    with SealedFileReader(path) as reader:
+        info, said = reader.info, notes if notes is not None else reader.notes
+    names = [name.removesuffix("_0") for name in table.column_names]
+    values = {}
+    for name, flat in zip(names, table.column_names, strict=True):
+        column = table.column(flat).to_numpy()
+        values[name] = column[:, None] if flat.endswith("_0") else column
+    part = {"part": values.pop("part")}
+    with SealedFileWriter(path, info, said) as writer:
+        writer.append_frames(FrameBatch(**values), part)
+    return path
+
+
+# --- what is whole --------------------------------------------------------------------------------
+
+
+def test_a_whole_file_proves_its_ledger(tmp_path: Path) -> None:
+    report = verify_sealed_file(walk(tmp_path / "s.parquet"))
+    assert (report.problems, report.unproven) == ([], [])
+    assert report.frame_count == 97
+    assert report.ledger is not None
+    assert [part.recorded for part in report.ledger.parts] == [57, 40]
+    assert report.session["id"] == "20200101T000000Z-000000"
+
+
+def test_a_file_of_no_session_is_proven_as_far_as_it_goes(tmp_path: Path) -> None:
+    report = verify_sealed_file(write(tmp_path / "s.parquet", {}, frames(*range(50))))
+    assert report.problems == []
+    assert report.ledger is not None
+    assert report.ledger.complete
+    assert "no recorded session" in " ".join(report.unproven)
+    gap = verify_sealed_file(write(tmp_path / "gap.parquet", {}, frames(0, 1, 5)))
+    assert "frames 2 to 4 are missing, and nothing says why" in "; ".join(gap.problems)
+
+
+def test_a_file_of_the_older_format_says_what_it_cannot_prove(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = walk(tmp_path / "s.parquet")
+    table = pq.read_table(path)
+    metadata = {**table.schema.metadata, FORMAT_KEY: b"1"}
+    pq.write_table(table.replace_schema_metadata(metadata), path)
+    report = verify_sealed_file(path)
+    assert report.problems == []
+    assert "without hashes" in " ".join(report.unproven)
+    with SealedFileReader(path) as reader:
+        assert reader.content is None
+
+
+def test_what_is_no_sealed_file_is_refused_and_not_called_damaged(tmp_path: Path) -> None:
+    foreign = tmp_path / "foreign.parquet"
+    pq.write_table(pa.table({"a": [1]}), foreign)
+    text = tmp_path / "notes.txt"
+    text.write_text("a walk")
+    for path in (foreign, text, tmp_path / "none.parquet", tmp_path):
+        with pytest.raises(FileFormatError, match=path.name):
+            verify_sealed_file(path)
+
+
+# --- damage ---------------------------------------------------------------------------------------
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_one_flipped_bit_anywhere_is_found(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.getbasetemp() / "flipped"
+    folder.mkdir(exist_ok=True)
+    path = folder / "whole.parquet"
+    if not path.exists():
+        walk(path)
+    content = bytearray(path.read_bytes())
+    at = data.draw(st.integers(0, len(content) - 1))
+    content[at] ^= 1 << data.draw(st.integers(0, 7))
+    flipped = folder / "frames.parquet"
+    flipped.write_bytes(content)
+    assert verify_sealed_file(flipped).problems != []
+
+
+def test_a_file_that_was_cut_anywhere_is_damaged(tmp_path: Path) -> None:
+    content = walk(tmp_path / "s.parquet").read_bytes()
+    path = tmp_path / "frames.parquet"
+    for size in (*range(0, len(content), 101), len(content) - 1):
+        path.write_bytes(content[:size])
+        assert verify_sealed_file(path).problems != [], size
+
+
+def test_bytes_behind_its_end_are_damage(tmp_path: Path) -> None:
+    path = walk(tmp_path / "frames.parquet")
+    path.write_bytes(path.read_bytes() + b"\0")
+    assert problems(path)
+
+
+def test_a_footer_hash_of_another_footer_is_found_though_the_file_hash_agrees(
+    tmp_path: Path,
+) -> None:
+    # slices of such a file would be refused
+    path = walk(tmp_path / "s.parquet")
+    before = FOOTER_HASH_KEY + b"\x18\x40"
+    head, rest = path.read_bytes().split(before)
+    flipped = head + before + (b"0" if rest[:1] != b"0" else b"1") + rest[1:]
+    stated, _ = read_stated_and_actual_hash(path) or ("", "")
+    unhashed = flipped.replace(stated.encode(), b"0" * 64)
+    digits = hashlib.sha256(unhashed).hexdigest().encode()
+    path.write_bytes(flipped.replace(stated.encode(), digits))
+    assert problems(path) == "its footer's own hash is of another footer"
+
+
+def test_a_file_that_another_program_wrote_anew_says_so(tmp_path: Path) -> None:
+    path = walk(tmp_path / "s.parquet")
+    pq.write_table(pq.read_table(path), path)
+    assert problems(path) == "it has no hashes: another program has rewritten it"
+
+
+def test_a_row_group_that_is_gone_is_missed(tmp_path: Path) -> None:
+    path = walk(tmp_path / "s.parquet")
+    table = pq.read_table(path)
+    assert pq.ParquetFile(path).num_row_groups == 2
+    rewritten(path, table.slice(0, 57))
+    found = problems(path)
+    assert "part 1: 0 frames, and the ledger has 40" in found
+    assert "part 1: 40 frames are missing (0 to 39), and the ledger accounts for 0" in found
+
+
+def test_rows_that_were_taken_out_are_missed_and_named(tmp_path: Path) -> None:
+    path = walk(tmp_path / "s.parquet")
+    table = pq.read_table(path)
+    rewritten(path, pa.concat_tables([table.slice(0, 30), table.slice(31)]))
+    found = problems(path)
+    assert "part 0: 56 frames, and the ledger has 57" in found
+    assert "missing and not named lost" in found
+
+
+def test_a_row_that_stands_twice_is_seen(tmp_path: Path) -> None:
+    path = walk(tmp_path / "s.parquet")
+    table = pq.read_table(path)
+    rewritten(path, pa.concat_tables([table.slice(0, 5), table.slice(4)]))
+    found = problems(path)
+    assert "part 0: frame 14 follows frame 14" in found
+    assert "58 frames, and the ledger has 57" in found
+
+
+def test_frames_in_another_order_are_seen(tmp_path: Path) -> None:
+    path = walk(tmp_path / "s.parquet")
+    table = pq.read_table(path)
+    rewritten(path, pa.concat_tables([table.slice(3, 4), table.slice(0, 3), table.slice(7)]))
+    assert "frame 10 follows frame 16" in problems(path)
+
+
+def test_a_shifted_time_is_seen(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", {}, frames(0, 1, 2, offset_ns=UTC_NS + 1))
+    assert "the array's anchor" in problems(path)
+    batch = frames(0, 1, 2)
+    t_ns = batch.t_ns + np.array([0, 0, 9])
+    path = write(tmp_path / "two.parquet", {}, replace(batch, t_ns=t_ns))
+    assert "t_ns of frame 2 is not" in problems(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"recorded": 58, "lost": {"disk_full": 2}}, "57 frames, and the ledger has 58"),
+        ({"recorded": 58}, "the ledger counts 61 frames, and 10 to 69 are 60"),
+        ({"seq_last": 68}, "frames 69 to 69 are outside"),
+        ({"lost": {"disk_full": 4}, "pending": -1}, "the ledger counts"),
+        ({"seq_first": 9, "recorded": 58}, "4 frames are missing"),
+    ],
+)
+def test_an_edited_ledger_is_held_against_the_frames(
+    tmp_path: Path, change: dict[str, Any], said: str
+) -> None:
+    path = walk(tmp_path / "s.parquet")
+    with SealedFileReader(path) as reader:
+        notes = json.loads(json.dumps(reader.notes))
+    notes["ledger"]["parts"][0] |= change
+    rewritten(path, pq.read_table(path), notes)
+    assert said in problems(path)
+    assert "of other parts than its session" in problems(path) or "seq" not in str(change)
+
+
+def test_numbers_that_are_named_lost_have_to_be_those_that_are_missing(tmp_path: Path) -> None:
+    path = walk(tmp_path / "s.parquet")
+    with SealedFileReader(path) as reader:
+        notes = json.loads(json.dumps(reader.notes))
+    notes["lost"] = {BOOTS[0]: {"disk_full": [[20, 20], [40, 41]]}}
+    rewritten(path, pq.read_table(path), notes)
+    assert "frames 21 are missing and not named lost" in problems(path)
+
+
+@pytest.mark.parametrize("notes", [{"ledger": 7}, {"ledger": {}}, {"lost": 3}, {"session": 4}])
+def test_notes_that_are_not_readable_are_a_problem_and_no_crash(
+    tmp_path: Path, notes: dict[str, Any]
+) -> None:
+    path = write(tmp_path / "s.parquet", notes_of(counted(0, 2)) | notes, frames(0, 1, 2))
+    report = verify_sealed_file(path)
+    assert bool(report.problems) == ("session" not in notes)
+
+
+def test_a_ledger_that_contradicts_itself_is_seen() -> None:
+    def said(complete: bool, lossy: bool, *parts: PartLedger) -> list[str]:
+        return find_ledger_contradictions(
+            Ledger(complete=complete, lossy=lossy, parts=parts, missed_slots=0)
+        )
+
+    assert said(True, False, counted(0, 9)) == []
+    assert said(False, True, counted(0, 9, evicted=3)) == []
+    assert len(said(False, False, counted(0, 9, evicted=3))) == 1
+    assert len(said(True, True, counted(0, 9, evicted=3))) == 1
+    assert len(said(True, True, counted(0, 9))) == 1
+    assert said(True, False, counted(5, 4)) == []
