@@ -38,7 +38,7 @@ def asked(server: Server, name: str, part: dict[str, float], **headers: str) -> 
     """Seconds until a picture is there, and its bytes."""
     query = {"points": POINTS, **part}
     began_s = time.perf_counter()
-    answer = server.http.get(f"/sessions/{name}/overview", params=query, headers=headers)
+    answer = server.http.get(f"/sessions/{name}/timeseries", params=query, headers=headers)
     answer.raise_for_status()
     return time.perf_counter() - began_s, len(answer.content)
 

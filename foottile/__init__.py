@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from foottile.live import Live as Live
     from foottile.live_protocol import Loss as Loss
     from foottile.server import Server as Server
-    from foottile.sessions import Mark as Mark
+    from foottile.sessions import Marker as Marker
     from foottile.sessions import Session as Session
     from foottile.with_asyncio import AsyncServer as AsyncServer
 
@@ -43,7 +43,7 @@ _PLACES = {
     "FramesLostWarning": "errors",
     "Live": "live",
     "Loss": "live_protocol",
-    "Mark": "sessions",
+    "Marker": "sessions",
     "NoAnswerError": "errors",
     "RefusedError": "errors",
     "Server": "server",

@@ -36,7 +36,7 @@ class Data:
         start_s: from so many seconds after the first frame on; None: from the beginning.
         end_s: before so many seconds; None: to the end.
         clock: of `server` there are also `t_server_ns`, each frame's instant in the server's UTC,
-            as marks have it, and its bound `t_server_uncertainty_ns`.
+            as markers have it, and its bound `t_server_uncertainty_ns`.
     """
 
     _http: Http

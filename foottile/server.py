@@ -167,9 +167,9 @@ class Server(Closing):
         items: list[dict[str, Any]] = self.http.get(path, has="items")["items"]
         return items
 
-    def ticket(self, *, may: str = "press") -> dict[str, Any]:
-        """A ticket for somebody who may `look` or `press`; this needs the server's token."""
-        return self.http.send("POST", "/tickets", {"may": may})
+    def ticket(self, *, role: str = "operator") -> dict[str, Any]:
+        """Return an invite for an `operator` or a `viewer`; this needs the server's token."""
+        return self.http.send("POST", "/tickets", {"role": role})
 
     def live(
         self,

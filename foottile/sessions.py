@@ -1,4 +1,4 @@
-"""Sessions: what is known of one, its frames and marks, and how it is ended."""
+"""Sessions: what is known of one, its frames and markers, and how it is ended."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LOOK_EVERY_S = 0.2
 
 
 @dataclass(frozen=True)
-class Mark:
+class Marker:
     """Something that was marked.
 
     Attributes:
@@ -35,7 +35,7 @@ class Mark:
     t_ns: int
 
     @classmethod
-    def of(cls, facts: Mapping[str, Any]) -> Mark:
+    def of(cls, facts: Mapping[str, Any]) -> Marker:
         """As the server says it."""
         return cls(facts["id"], facts["label"], facts["t_ns"])
 
@@ -140,29 +140,30 @@ class Session:
             columns: names, of all tiles (`force_n`) or one (`force_n_0`); none: all.
             start_s: from so many seconds after the first frame on.
             end_s: before so many seconds.
-            clock: of `server` there are also `t_server_ns`, to compare with marks, and its bound.
+            clock: of `server` there are also `t_server_ns`, to compare with markers, and its bound.
         """
         names = (columns,) if isinstance(columns, str) else tuple(columns)
         return Data(self._http, self.id, names, start_s, end_s, clock)
 
-    def marks(self) -> list[Mark]:
+    def markers(self) -> list[Marker]:
         """What was marked in it, in order of time.
 
         Raises:
             FootTileError: no answer, or it is gone.
         """
         return [
-            Mark.of(each) for each in self._http.get(f"{self._path}/markers", has="items")["items"]
+            Marker.of(each)
+            for each in self._http.get(f"{self._path}/markers", has="items")["items"]
         ]
 
-    def mark(self, label: str, *, t_ns: int | None = None) -> Mark:
-        """Mark this moment, or another one of the server's UTC; sent twice, it is marked once.
+    def add_marker(self, label: str, *, t_ns: int | None = None) -> Marker:
+        """Marker this moment, or another one of the server's UTC; sent twice, it is marked once.
 
         Raises:
             FootTileError: no answer, or it is refused.
         """
         body = {"label": label, "t_ns": t_ns, "id": uuid.uuid4().hex[:12]}
-        return Mark.of(self._http.send("POST", f"{self._path}/markers", body, again=True))
+        return Marker.of(self._http.send("POST", f"{self._path}/markers", body, again=True))
 
     def describe(
         self,

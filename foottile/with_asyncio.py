@@ -21,7 +21,7 @@ from foottile.errors import FootTileError
 from foottile.live_protocol import Asked, Loss, Policy
 from foottile.live_state import LiveState
 from foottile.server import Server
-from foottile.sessions import Mark, Session
+from foottile.sessions import Marker, Session
 from foottile.websocket import AsyncConnection
 
 T = TypeVar("T")
@@ -98,13 +98,13 @@ class AsyncSession:
         await asyncio.to_thread(self.now.refresh)
         return self
 
-    async def marks(self) -> list[Mark]:
-        """As `Session.marks`."""
-        return await asyncio.to_thread(self.now.marks)
+    async def markers(self) -> list[Marker]:
+        """As `Session.markers`."""
+        return await asyncio.to_thread(self.now.markers)
 
-    async def mark(self, label: str, *, t_ns: int | None = None) -> Mark:
-        """As `Session.mark`."""
-        return await asyncio.to_thread(self.now.mark, label, t_ns=t_ns)
+    async def add_marker(self, label: str, *, t_ns: int | None = None) -> Marker:
+        """As `Session.add_marker`."""
+        return await asyncio.to_thread(self.now.add_marker, label, t_ns=t_ns)
 
     async def describe(self, **changes: Any) -> Self:
         """As `Session.make_array_info`."""

@@ -3,7 +3,7 @@
 interface Session {
   id: string; name: string; node: string; state: string; complete: boolean | "lossy"; problem: string | null;
   started_t_ns: number; stopped_t_ns: number | null; duration_s: number; frames: number; pending_frames: number;
-  pending_reason: "frames" | "end" | null; lost: Record<string, number>; max_lost_tail_frames: number; missed_slots: number; marks: number;
+  pending_reason: "frames" | "end" | null; lost: Record<string, number>; max_lost_tail_frames: number; missed_slots: number; marker_count: number;
   bytes: number | null; sha256: string | null; parts: object[]; subject: string; notes: string; tags: string[];
   take: string | null; scene: string; calibration_id: string | null; absolute_scale: "measured" | "assumed" | null;
   revision: string;
@@ -77,14 +77,14 @@ interface Frame {
 /** Point of a trace on the live page. */
 interface TilePoint { timeS: number; tiles: Record<string, (number | null)[]> | null; gap?: boolean }
 
-/** Of GET /sessions/ID/array. */
+/** Of GET /sessions/ID/tiles. */
 interface ArrayInfo {
   node: string; tiles: Tile[]; servo: object | null; nominal_rate_hz: number; calibration: object | null; lag_ms: number | null;
   estimates_problem: string | null;
 }
 
 interface Overview {
-  begin_t_ns: number; duration_s: number; frames_in_bin: number; serials: string[]; provisional?: boolean; behind?: boolean;
+  begin_t_ns: number; duration_s: number; frames_in_bin: number; serials: string[]; provisional?: boolean; catching_up?: boolean;
   time_axis: { part: number; shift_ns: number; by: "node" | "server" | "joined" }[];
   columns: Record<string, (number | null)[]>;
 }

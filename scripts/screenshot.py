@@ -87,7 +87,8 @@ def session(browser: Browser) -> None:
         http.post(f"/sessions/{id_}/stop", timeout=30.0)
         while http.get(f"/sessions/{id_}").json()["state"] != "sealed":
             time.sleep(0.2)
-        begin_ns = http.get(f"/sessions/{id_}/overview", params={"points": 1}).json()["begin_t_ns"]
+        series = http.get(f"/sessions/{id_}/timeseries", params={"points": 1}).json()
+        begin_ns = series["begin_t_ns"]
         stances = http.get(f"/sessions/{id_}/stances").json()
         # Two whole ones with little time between.
         whole = [

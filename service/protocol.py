@@ -7,7 +7,7 @@
                                      <--  welcome (missing frames, retention request)
     stream, then Arrow messages      -->
                                      <--  ack (frames on the server's disk)
-                                     <--  wanted (retention request)
+                                     <--  retain (retention request)
     probe                            <->  probe        eight at a time, for the clocks' offset
     clock, status, lost              -->
 
@@ -52,7 +52,7 @@ from storage.intervals import NO_END
 _T = TypeVar("_T")
 
 SUBPROTOCOL = "foottile.v1"
-PROTOCOL = 3
+PROTOCOL = 4
 INGEST_PATH = "/api/v1/ingest"
 LIVE_PATH = "/api/v1/live"
 MESSAGE_BYTES_MAX = 1 << 20
@@ -234,7 +234,7 @@ class StreamNumbers(StrictModel):
 class RetentionMessage(StrictModel):
     """Retention request: frames for the node to retain until acknowledged, whatever their age."""
 
-    type: Literal["wanted"] = "wanted"
+    type: Literal["retain"] = "retain"
     streams: tuple[StreamNumbers, ...]
     """Frames of sessions that are not yet sealed, by stream."""
     recording: bool

@@ -104,7 +104,7 @@ def make_app(
         ),
     )
     api.add_api_route(
-        "", index.get_index, operation_id="getIndex", summary="All routes", tags=["server"]
+        "", index.get_index, operation_id="listRoutes", summary="All routes", tags=["server"]
     )
     for module in (
         health,

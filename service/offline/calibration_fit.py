@@ -220,7 +220,7 @@ def _read_marked_programme(session: SealedFileReader) -> RigProgramme:
         raise CalibrationError(
             "not an indentation recording",
             where=str(session.path),
-            expected="columns pressed_tile and phase beside reference_force_n, or marks such as "
+            expected="columns pressed_tile and phase beside reference_force_n, or markers such as "
             "`T01 load`",
             remedy="Record one with a rig, or `foottile simulate --scene indentation`",
         )

@@ -137,7 +137,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     data = read_reference(reference_path, options.stated)
     with SealedFileReader(path) as session:
         columns, force_n = _read_columns(session)
-        marks, notes = _read_trial_markers(session, path, columns)
+        markers, notes = _read_trial_markers(session, path, columns)
         notes += [remark] if (remark := session.time_axis.describe_shift()) else []
         tiles, identity = session.info.tiles, session.source_reference
     known = np.isfinite(columns["grf_n"])
@@ -172,7 +172,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         else None
     )
     notes += describe_clock_contradiction(alignment, by_clocks)
-    trials, what = split_into_trials(pairs.columns["t_ns"], pairs.columns["part"], marks)
+    trials, what = split_into_trials(pairs.columns["t_ns"], pairs.columns["part"], markers)
     return Comparison(
         session={"file": str(path), **identity},
         reference=data.where,
@@ -236,16 +236,16 @@ def _read_trial_markers(
     if not beside.is_file():
         return [], []
     placed = place_session_markers(session, read_markers(beside).markers, Slice())
-    marks = []
-    for mark in placed.markers:
-        if mark.frame is not None:
-            at = (columns["part"] == mark.frame[0]) & (columns["seq"] == mark.frame[1])
-            marks.append(TrialMarker(mark.marker.label, int(columns["t_ns"][at][0])))
+    markers = []
+    for marker in placed.markers:
+        if marker.frame is not None:
+            at = (columns["part"] == marker.frame[0]) & (columns["seq"] == marker.frame[1])
+            markers.append(TrialMarker(marker.marker.label, int(columns["t_ns"][at][0])))
     lost = [
-        f"mark {one.marker.label!r} begins no trial: {one.exclusion_reason}"
+        f"marker {one.marker.label!r} begins no trial: {one.exclusion_reason}"
         for one in placed.excluded
     ]
-    return marks, lost
+    return markers, lost
 
 
 def _compute_clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:

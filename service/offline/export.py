@@ -116,7 +116,9 @@ def _write_export(
     with open_for_atomic_write(out) as file:
         for chunk in chunks:
             file.write(chunk)
-    left_out = [mark for export in exports if export.markers for mark in export.markers.excluded]
+    left_out = [
+        marker for export in exports if export.markers for marker in export.markers.excluded
+    ]
     remarks = [
         f"{export.display_name}: {remark}"
         for export in exports

@@ -88,7 +88,7 @@ def _parse_step_marker(event: Marker, serials: Sequence[str], where: str) -> tup
     begins = any(re.match(rf"{re.escape(known)}\b", label) for known in serials)
     if begins or phase in TILE_STEPS or label.lower() in IDLE_PHASES:
         raise CalibrationError(
-            f"mark {label[:80]!r} is no calibration step",
+            f"marker {label[:80]!r} is no calibration step",
             where=where,
             expected=f"{_EXPECTED_FORM}, of a tile of {', '.join(serials)}",
             remedy="Rename or remove it on the session's page",

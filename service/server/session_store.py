@@ -323,11 +323,11 @@ class SessionStore:
                 check_revision(
                     if_revision,
                     marker_revision(event),
-                    f"mark {event.label!r} of session {session_id}",
+                    f"marker {event.label!r} of session {session_id}",
                 )
                 return event
         raise UnknownError(
-            f"session {session_id} has no mark {marker_id[:40]!r}",
+            f"session {session_id} has no marker {marker_id[:40]!r}",
             remedy="It may have been removed",
         )
 

@@ -83,7 +83,7 @@ class NodeWeighing:
     problem: str | None = None
     """Why it failed."""
     calibration: Calibration | None = None
-    marks: list[tuple[str, bool]] = field(default_factory=list)
+    markers: list[tuple[str, bool]] = field(default_factory=list)
     """Ids of markers, and whether each begins a step."""
     task: asyncio.Task[None] | None = None
     """Seals and fits."""
@@ -285,17 +285,17 @@ class Weighings:
                     event = self._sessions.add_marker(
                         weighing.session_id, label, node.to_server_t_ns(t_ns)
                     )
-                    weighing.marks.append((event.id, True))
+                    weighing.markers.append((event.id, True))
                 case End(t_ns):
                     event = self._sessions.add_marker(
                         weighing.session_id, "end", node.to_server_t_ns(t_ns)
                     )
-                    weighing.marks.append((event.id, False))
+                    weighing.markers.append((event.id, False))
                     weighing.progress_s, weighing.warning = time.monotonic(), None
                 case Withdraw(reason):
                     weighing.warning = reason
-                    while weighing.marks:
-                        marker_id, is_begin = weighing.marks.pop()
+                    while weighing.markers:
+                        marker_id, is_begin = weighing.markers.pop()
                         with suppress(UnknownError):  # a person was quicker
                             self._sessions.remove_marker(weighing.session_id, marker_id)
                         if is_begin:

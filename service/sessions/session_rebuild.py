@@ -75,7 +75,7 @@ def _session_from_files(folder: Path, what: str) -> Session | None:
     lost = ["subject, notes and tags"]
     events = _read_sidecar(read_markers, folder / MARKERS_NAME)
     if events is None:
-        lost.append("marks")
+        lost.append("markers")
     clock = _read_sidecar(read_clock_file, folder / CLOCK_NAME)
     if clock is None:
         lost.append("clock measurements")

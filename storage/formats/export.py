@@ -44,7 +44,7 @@ CLOCK_NAMES: tuple[ClockName, ...] = get_args(ClockName)
 _DERIVED_COLUMN_REMEDIES = {
     column.name: "Ask for the clock `server` as well" for column in SERVER_TIME_COLUMNS
 }
-_DERIVED_COLUMN_REMEDIES |= {column.name: "Ask for marks as well" for column in MARKER_COLUMNS}
+_DERIVED_COLUMN_REMEDIES |= {column.name: "Ask for markers as well" for column in MARKER_COLUMNS}
 
 _TIME_NAMES = tuple(column.name for column in TIME_COLUMNS)
 
@@ -159,7 +159,7 @@ class Export:
         if self.clock is not None:
             notes["clock"] = self.clock.summarize().model_dump(mode="json")
         if self.markers is not None:
-            notes["marks"] = [mark.as_dict() for mark in self.markers.markers]
+            notes["markers"] = [marker.as_dict() for marker in self.markers.markers]
         return notes
 
     @property

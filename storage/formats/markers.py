@@ -71,11 +71,11 @@ class PlacedMarkers:
     def __init__(self, markers: Sequence[PlacedMarker]) -> None:
         self.markers = tuple(markers)
         self._labels: dict[tuple[int, int], str] = {}
-        for mark in self.markers:
-            if mark.frame is not None:
-                earlier = self._labels.get(mark.frame)
-                label = mark.marker.label
-                self._labels[mark.frame] = (
+        for marker in self.markers:
+            if marker.frame is not None:
+                earlier = self._labels.get(marker.frame)
+                label = marker.marker.label
+                self._labels[marker.frame] = (
                     label if earlier is None else earlier + LABEL_SEPARATOR + label
                 )
         self._seqs = np.array([seq for _, seq in self._labels], dtype=np.uint64)
@@ -83,7 +83,7 @@ class PlacedMarkers:
     @property
     def excluded(self) -> tuple[PlacedMarker, ...]:
         """Markers that are not in the data."""
-        return tuple(mark for mark in self.markers if mark.exclusion_reason)
+        return tuple(marker for marker in self.markers if marker.exclusion_reason)
 
     def get_frame_labels(self, seq: Array, part: Array | None) -> Array:
         """Return the labels of frames, object[n]: text, or None without a marker.

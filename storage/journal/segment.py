@@ -50,8 +50,7 @@ class Segment:
 
     Attributes:
         path: the file; its index has the same name with another suffix.
-        stored: numbers of frames, without numbers that were invalidated or are in another segment as
-            well.
+        stored: numbers of its frames, without invalidated ones and those of other segments.
         t_ns_first: instant of its oldest frame, in the node's UTC.
         t_ns_last: instant of its newest frame.
         size_bytes: length of both files.

@@ -1,4 +1,4 @@
-"""`import foottile`: sessions, marks, recording and tares from a program."""
+"""`import foottile`: sessions, markers, recording and tares from a program."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def server(running: Running) -> Iterator[foottile.Server]:
 def recorded(server: foottile.Server, tared: FakeNode, name: str = "trial") -> foottile.Session:
     with server.record("bench", name, tags=["mud"]) as session:
         tared.deliver(300, [20.0, 60.0], alive=True)
-        session.mark("a stone")
+        session.add_marker("a stone")
         tared.send(10, now=True)
         session.stop()
         tared.send(10, now=True)
@@ -56,7 +56,7 @@ def test_a_session_is_recorded_marked_found_and_read(
 ) -> None:
     session = recorded(server, tared)
     assert (session.state, session.complete, session.node) == ("sealed", True, "bench")
-    assert [mark.label for mark in session.marks()] == ["a stone"]
+    assert [marker.label for marker in session.markers()] == ["a stone"]
     now = datetime.now(UTC)
     found = list(server.sessions("trial", node="bench", tag="mud", since=now - timedelta(1)))
     assert [each.id for each in found] == [session.id]
@@ -214,7 +214,7 @@ def test_all_of_it_is_there_for_asyncio(running: Running, tared: FakeNode, tmp_p
             assert [node["node"] for node in await server.nodes()] == ["bench"]
             async with await server.record("bench", "async") as session:
                 await asyncio.to_thread(tared.deliver, 100, [20.0, 60.0], alive=True)
-                await session.mark("now")
+                await session.add_marker("now")
                 await session.stop()
                 await asyncio.to_thread(tared.send, 10, now=True)
                 await session.wait()

@@ -109,7 +109,7 @@ def test_the_matlab_example_runs_in_octave(
     if octave is None:
         pytest.skip("there is no Octave here")
     with client.connect(running.url) as server, server.record("left", "one") as session:
-        session.mark("so")
+        session.add_marker("so")
     (block,) = blocks("matlab")
     block = "function websave(file, url), urlwrite(url, file); end\n" + block
     with client.connect(running.url) as server:

@@ -26,7 +26,7 @@ from tests.hostile.data_folders import copied, digest, sha
 from tests.waiting import until
 
 BOOTS = ("a" * 32, "b" * 32)
-_NODE_SAYS = ("wanted.json", "stream.json")
+_NODE_SAYS = ("retention.json", "stream.json")
 
 
 def node_folder(folder: Path) -> Path:
@@ -50,7 +50,7 @@ def node_folder(folder: Path) -> Path:
                 journal.queue_batch(stream, message)
         in_flight.close()
         until(partial(_is_stored, stream))
-    until((live / "journal" / "leg" / "wanted.json").exists)
+    until((live / "journal" / "leg" / "retention.json").exists)
     until(lambda: not (live / "journal" / "leg" / BOOTS[0] / "in_flight").exists())
     shutil.copytree(live, folder)  # as SIGKILL leaves it
     journal.close()

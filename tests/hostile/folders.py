@@ -81,7 +81,7 @@ def make_server(data: Path) -> None:
 def make_node(root: Path) -> None:
     """A node's that recorded by itself and was killed."""
     folder = _journal(root, make_array(stream_id=BOOT))
-    wanted = RetentionRequests(folder.parent / "wanted.json")
+    wanted = RetentionRequests(folder.parent / "retention.json")
     write_secrets(folder.parent / SECRETS_NAME, {SERVER_ID: SECRET})
     wanted.update_server_request(
         SERVER_ID, RetentionRequest(streams={BOOT: ((0, None),)}, known=(BOOT,))

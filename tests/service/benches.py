@@ -1,4 +1,4 @@
-"""A bench recording as a server has one: frames without notes of the mill, its steps as marks."""
+"""A bench recording as a server has one: frames without notes of the mill, its steps as markers."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def pressed(cache: Path) -> Path:
 
 
 def steps_of(pressed_tile: np.ndarray, phase: np.ndarray, t_ns: np.ndarray) -> list[Marker]:
-    """A mark wherever what is done becomes something else, as a controller would make it."""
+    """A marker wherever what is done becomes something else, as a controller would make it."""
     said = [
         ("soak" if what == "soak" else "end") if tile is None else f"{tile} {what}"
         for tile, what in zip(pressed_tile, phase, strict=True)

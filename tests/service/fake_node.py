@@ -255,7 +255,7 @@ class FakeNode:
                 acked.add(message.seq_first, message.seq_last)
                 if message.stream_id == self.stream_id:
                     self.acked.add(message.seq_first, message.seq_last)
-            if message.type == "wanted":
+            if message.type == "retain":
                 self.wanted = message
             if message.type == kind:
                 return message

@@ -140,7 +140,7 @@ def test_a_viewer_sees_the_calibration_and_cannot_change_it(
     script: Callable[..., Scripted], open_page: OpenPage
 ) -> None:
     server = script(token=TOKEN)
-    ticket = server.running.http.post("/tickets", json={"may": "look"}).json()["ticket"]
+    ticket = server.running.http.post("/tickets", json={"role": "viewer"}).json()["ticket"]
     plan = {"tiles": ["T01"], "weights": ["10 N", "20 N", "30 N", "40 N", "50 N"]}
     with Play(server.node, alive=True):
         page = open_page(f"{server.url}/calibrate#ticket={ticket}")

@@ -114,7 +114,7 @@ def test_a_viewer_sees_calibrations_and_cannot_press(
 ) -> None:
     server = script(token=TOKEN)
     calibration = kept(server, "T01", "T02", name="left leg")
-    ticket = server.running.http.post("/tickets", json={"may": "look"}).json()["ticket"]
+    ticket = server.running.http.post("/tickets", json={"role": "viewer"}).json()["ticket"]
     page = open_page(f"{server.url}#ticket={ticket}")
     expect(page.locator("#login")).to_have_text("viewer (read-only)")
     page.click("#calibration")

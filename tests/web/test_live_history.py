@@ -89,7 +89,7 @@ def test_traces_of_tiles_begin_with_what_was_before(
     with Play(scripted.node, 20.0):
         page = open_page(scripted.url)
         expect(page.locator(LIVE)).to_have_count(1)
-        with page.expect_response("**/recent?*tiles=force_n") as asked:
+        with page.expect_response("**/history?*tiles=force_n") as asked:
             page.click("#as-traces")
         assert len(asked.value.json()["tiles"]["seq"]) > 50
         until(lambda: page.evaluate(DRAWN.replace("#trace", "#tile-traces")) > 100)

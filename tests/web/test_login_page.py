@@ -21,8 +21,8 @@ PHONE = (390, 844)
 _LIVE = "body[data-live=true]"
 
 
-def address(server: Scripted, may: str = "press") -> str:
-    answer = server.running.http.post("/tickets", json={"may": may})
+def address(server: Scripted, role: str = "operator") -> str:
+    answer = server.running.http.post("/tickets", json={"role": role})
     (url,) = answer.json()["urls"]
     return str(url)
 
@@ -39,13 +39,13 @@ def test_a_phone_that_opens_a_ticket_may_record_and_a_second_one_may_not(
         url = address(server)
         page = open_page(url, *PHONE)
         expect(page.locator(_LIVE)).to_have_count(1)
-        expect(page.locator("body")).to_have_attribute("data-may", "press")
+        expect(page.locator("body")).to_have_attribute("data-role", "operator")
         assert page.url == f"{server.url}/"
         assert page.evaluate("document.cookie") == ""
         page.evaluate("document.getElementById('record').click()")
         expect(page.locator("#recordings li")).to_have_count(1)
         page.reload()
-        expect(page.locator("body")).to_have_attribute("data-may", "press")
+        expect(page.locator("body")).to_have_attribute("data-role", "operator")
         expect(page.locator("#login")).to_be_hidden()
 
         second = open_page(url, *PHONE)
@@ -69,10 +69,10 @@ def test_a_link_that_is_opened_twice_in_one_browser_says_nothing_while_its_login
     server = script(token=TOKEN)
     for link in (server.running.link(), f"{server.url}/#token={TOKEN}"):
         page = open_page(link)
-        expect(page.locator("body")).to_have_attribute("data-may", "press")
+        expect(page.locator("body")).to_have_attribute("data-role", "operator")
         again = page.context.new_page()
         again.goto(link)
-        expect(again.locator("body")).to_have_attribute("data-may", "press")
+        expect(again.locator("body")).to_have_attribute("data-role", "operator")
         expect(again.locator("#login")).to_be_hidden()
         expect(again.locator("#token-dialog")).to_have_count(0)
         assert again.url == f"{server.url}/"
@@ -84,7 +84,7 @@ def test_a_viewer_is_offered_nothing_and_the_server_refuses_it(
     server = script(token=TOKEN)
     with Play(server.node):
         server.node.record(name="by another one")
-        page = open_page(address(server, "look"), *PHONE)
+        page = open_page(address(server, "viewer"), *PHONE)
         expect(page.locator(_LIVE)).to_have_count(1)
         expect(page.locator("#login")).to_have_text("viewer (read-only)")
         expect(page.locator("#recordings li")).to_have_count(1)

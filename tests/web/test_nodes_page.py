@@ -247,7 +247,7 @@ def test_a_viewer_sees_all_nodes_and_is_offered_no_button(
     script: Callable[..., Scripted], open_page: OpenPage
 ) -> None:
     server = script(token=TOKEN)
-    ticket = server.running.http.post("/tickets", json={"may": "look"}).json()["ticket"]
+    ticket = server.running.http.post("/tickets", json={"role": "viewer"}).json()["ticket"]
     with Play(server.node):
         page = open_page(f"{server.url}/nodes#ticket={ticket}")
         expect(page.locator(live("bench"))).to_have_count(1)

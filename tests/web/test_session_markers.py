@@ -139,7 +139,7 @@ def test_a_viewer_drags_no_marker_and_is_offered_to_change_none(
 ) -> None:
     server = script(token=TOKEN)
     session = with_marker(server)
-    ticket = server.running.http.post("/tickets", json={"may": "look"}).json()["ticket"]
+    ticket = server.running.http.post("/tickets", json={"role": "viewer"}).json()["ticket"]
     page = opened(session, open_page, f"ticket={ticket}")
     expect(page.locator("#login")).to_have_text("viewer (read-only)")
     expect(page.get_by_label("Edit marker a stone")).to_be_hidden()

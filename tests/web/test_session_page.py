@@ -189,7 +189,7 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         expect(page.locator("#overlay-legend")).to_contain_text("mean")
         received.wait_for("/data")
         assert len(received.bytes_of) > 15
-        numbers = ("/overview", "/stances/overlay")
+        numbers = ("/timeseries", "/stances/overlay")
         bins = sum(
             size for url, size in received.bytes_of.items() if url.split("?")[0].endswith(numbers)
         )
@@ -206,7 +206,7 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         page.goto(walk.running.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
         expect(page.locator("#last-session")).to_contain_text("Not recording")
-        received.wait_for("/recent")
+        received.wait_for("/history")
         assert received.bytes_in_all < 120_000, received.bytes_of
         more = {url: size for url, size in of_page.items() if url not in received.bytes_of}
         assert 0 < sum(more.values()) < 100_000, more

@@ -40,7 +40,7 @@ class Rolling(FakeNode):
         batch = replace(
             batch, tile_flags=tile_flags, servo_counts=counts, servo_age_us=np.zeros_like(counts)
         )
-        if status:
+        if flags:
             pressure_raw = batch.pressure_raw.copy()
             pressure_raw[:, 1] = NOT_READ
             batch = replace(batch, pressure_raw=pressure_raw)
@@ -59,7 +59,7 @@ def session(server: Running) -> Recording:
     node.send(200, [0.0, 0.0], alive=True)
     node.send(ROLLED, over)
     node.send(SATURATED, [20.0, 200.0], alive=True)
-    node.send(UNREAD, [20.0, 0.0], alive=True, status=TileFlag.NO_ANSWER)
+    node.send(UNREAD, [20.0, 0.0], alive=True, tile_flags=TileFlag.NO_ANSWER)
     node.send(200, [0.0, 0.0], alive=True)
     first = node.seq
     node.frames(LOST)
@@ -105,7 +105,7 @@ def shows(page: Page, stored: dict[str, np.ndarray], row: int) -> None:
     for i in range(2):
         bar = page.locator(f"#bars .tile >> nth={i}")
         force_n, sigma_n = (float(stored[f"{of}_{i}"][row]) for of in ("force_n", "force_sigma_n"))
-        if stored[f"status_{i}"][row]:
+        if stored[f"tile_flags_{i}"][row]:
             expect(bar).to_have_attribute("data-fault", "true")
         elif np.isnan(sigma_n):
             expect(bar).to_have_attribute("data-state", "saturated")
@@ -145,7 +145,7 @@ def test_the_frames_were_worth_comparing(stored: dict[str, np.ndarray]) -> None:
     """Else the test before this one could not fail."""
     rows = slice(200 + ROLLED, 200 + ROLLED + SATURATED)
     assert np.isnan(stored["force_sigma_n_1"][rows]).any()
-    assert (stored["status_1"] > 0).sum() == UNREAD
+    assert (stored["tile_flags_1"] > 0).sum() == UNREAD
     assert np.isnan(stored["grf_n"].astype(float)).any()
     assert len(set(np.round(stored["cop_x_m"][300:800].astype(float), 5))) > 40
     assert np.ptp(stored["angle_rad"].astype(float)) > 0.5

@@ -33,7 +33,7 @@ const id = encodeURIComponent;
 /** @param {Record<string, string | number>} query */
 const encoded = (query) => new URLSearchParams(Object.entries(query).map(([name, value]) => [name, String(value)]));
 export const recent = (node, seconds, before, tiles) =>
-  call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
+  call("GET", `/nodes/${id(node)}/history?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, { body: {} });
 /** @type {(node: string, fingerprint: string) => Promise<void>} */
 export const acceptReplacement = (node, fingerprint) => call("POST", `/nodes/${id(node)}/accept-replacement`, { body: { fingerprint } });
@@ -84,7 +84,7 @@ export const comparisonSeries = (session, name, query, stop) =>
   call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${encoded(query)}`, { stop });
 export const newestSessions = (limit) => call("GET", `/sessions?limit=${limit}`);
 /** @type {(session: string) => Promise<ArrayInfo>} */
-export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`);
+export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/tiles`);
 export const ledgerOf = (session) => call("GET", `/sessions/${id(session)}/ledger`);
 /** Verify all files on the server: slow for a long session. @type {(session: string) => Promise<Verified>} */
 export const verifyFiles = (session) => call("GET", `/sessions/${id(session)}/verification`, { timeoutS: 300 });
@@ -92,10 +92,10 @@ export const verifyFiles = (session) => call("GET", `/sessions/${id(session)}/ve
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
 /** @type {(session: string, query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} */
 export const overview = (session, query, stop) =>
-  call("GET", `/sessions/${id(session)}/overview?${encoded(query)}`, { stop });
+  call("GET", `/sessions/${id(session)}/timeseries?${encoded(query)}`, { stop });
 /** Return some seconds of a session's frames, as CSV. */
 export const samples = (session, query) =>
-  call("GET", `/sessions/${id(session)}/data?${encoded({ format: "csv", marks: "false", ...query })}`, { type: "text/csv" });
+  call("GET", `/sessions/${id(session)}/data?${encoded({ format: "csv", markers: "false", ...query })}`, { type: "text/csv" });
 /** @type {(session: string, changes: object, said?: string | null) => Promise<Session>} */
 export const changeSession = (session, changes, said = null) =>
   call("PATCH", `/sessions/${id(session)}`, { body: changes, said });
@@ -105,7 +105,7 @@ export const changeMarker = (session, marker, changes, said) =>
 export const removeMarker = (session, marker, said) =>
   call("DELETE", `/sessions/${id(session)}/markers/${id(marker)}`, { said });
 /** @type {(session: string) => Promise<Session>} */
-export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
+export const sealSession = (session) => call("POST", `/sessions/${id(session)}/abandon-missing`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);
 export const listTrash = () => call("GET", "/trash");
 /** @type {(session: string) => Promise<Session>} */
@@ -117,6 +117,6 @@ export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).joi
 export const listFormats = () => call("GET", "/formats");
 /** Return the address of a download, with markers if there are any; Parquet without is the sealed file. */
 export const dataAddress = (session, format, part = "") =>
-  `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marks ? "&marks=true" : ""}${part}`;
+  `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marker_count ? "&markers=true" : ""}${part}`;
 /** Return the address of a download of a take. */
 export const takeDataAddress = (take, format, part = "") => `${PREFIX}/takes/${id(take)}/data?format=${format}${part}`;

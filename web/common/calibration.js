@@ -22,7 +22,7 @@ class CalibrationDialog {
     /** @type {NodeCalibration | null} */
     this.used = null;
     this.inUse = el("p", { id: "calibration-used" });
-    this.back = el("button", { type: "button", cls: "small presses", id: "calibration-back", text: "Use the node’s calibration" });
+    this.back = el("button", { type: "button", cls: "small requires-operator", id: "calibration-back", text: "Use the node’s calibration" });
     this.back.hidden = true;
     this.list = el("ul", { id: "calibrations", "aria-label": "Calibrations on the server, newest first" });
     this.none = el("p", { text: "None on the server yet. Calibrate with weights, or upload a file from “foottile calibrate”." });
@@ -30,7 +30,7 @@ class CalibrationDialog {
     this.message = el("p", { id: "calibration-said", role: "alert" });
     this.file = el("input", { type: "file", id: "calibration-file", accept: ".json,application/json" });
     const guided = el("a", { id: "calibration-guided", href: `/calibrate?node=${encodeURIComponent(node)}`, text: "Calibrate with weights …" });
-    const upload = el("label", { cls: "presses", text: "Upload calibration file " }, this.file);
+    const upload = el("label", { cls: "requires-operator", text: "Upload calibration file " }, this.file);
     this.element = el("dialog", { id: "calibration-dialog", "aria-labelledby": "calibration-title" },
       el("h2", { id: "calibration-title", text: `Calibration of ${node}` }), this.inUse, this.back,
       el("p", { cls: "soft", text: "Applies from the next frame. A running recording keeps its calibration." }),
@@ -82,7 +82,7 @@ class CalibrationDialog {
         el("span", { cls: missing.length ? "misfit" : "fit", text: fits })));
     if (isUsed) item.append(el("span", { cls: "used", text: "in use" }));
     else if (!missing.length) {
-      const assign = el("button", { type: "button", cls: "small presses", text: "Use this", "aria-label": `Use ${calibration.name} for ${this.node}` });
+      const assign = el("button", { type: "button", cls: "small requires-operator", text: "Use this", "aria-label": `Use ${calibration.name} for ${this.node}` });
       assign.addEventListener("click", () => this.run(() => this.assign(calibration)));
       item.append(assign);
     }

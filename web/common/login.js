@@ -19,9 +19,9 @@ let refused = ""; // why a ticket or token of the URL was refused
 let chip = null;
 
 /** Return true if controls are shown: not to viewers. Without a login the page asks for one on use. */
-export const isOperator = () => state?.may !== "look";
+export const isOperator = () => state?.role !== "viewer";
 /** Return true if a private server requires a login. */
-export const needsLogin = () => Boolean(state?.private) && state.may === null;
+export const needsLogin = () => Boolean(state?.private) && state.role === null;
 
 /** Log in with a ticket or token of the URL, and remove it there, so that it is not shared by accident. */
 export async function logInFromUrl() {
@@ -39,7 +39,7 @@ export async function logInFromUrl() {
   if (answer.ok) return;
   refused = answer.detail;
   await look();
-  if (state?.may) refused = ""; // logged in already: URL opened twice
+  if (state?.role) refused = ""; // logged in already: URL opened twice
   draw();
 }
 
@@ -69,7 +69,7 @@ export function askToLogIn() {
 
 async function dialogUntilLogin() {
   if (!refused) await look(); // may have ended
-  let why = refused ? asSentence(refused) : state?.ended ? ENDED : state?.may === "look" ? VIEWER : needsLogin() ? PRIVATE : LOGIN_NEEDED;
+  let why = refused ? asSentence(refused) : state?.ended ? ENDED : state?.role === "viewer" ? VIEWER : needsLogin() ? PRIVATE : LOGIN_NEEDED;
   refused = "";
   for (;;) {
     const token = await enterToken(why);
@@ -106,7 +106,7 @@ async function logIn(body, token) {
   const answer = await request("POST", body, token);
   if (!answer.ok) return answer;
   const now = await request("GET");
-  return now.ok && state.may === null ? { ok: false, status: 0, detail: COOKIE_BLOCKED } : now;
+  return now.ok && state.role === null ? { ok: false, status: 0, detail: COOKIE_BLOCKED } : now;
 }
 
 /** Get or change the login; resolve to the result. */
@@ -131,8 +131,8 @@ async function request(method, body, token = null) {
 
 /** Show the login state beside the title; a click opens the dialog. */
 function draw() {
-  document.body.dataset.may = state?.may ?? "";
-  const text = state?.ended ? "login ended" : refused ? "not logged in" : state?.may === "look" ? "viewer (read-only)" : needsLogin() ? "private" : "";
+  document.body.dataset.role = state?.role ?? "";
+  const text = state?.ended ? "login ended" : refused ? "not logged in" : state?.role === "viewer" ? "viewer (read-only)" : needsLogin() ? "private" : "";
   if (!chip) {
     chip = el("button", { type: "button", id: "login", cls: "small" });
     document.querySelector("header h1").after(chip);

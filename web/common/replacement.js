@@ -11,7 +11,7 @@ export class ReplacementWarning {
     /** @type {{node: string, replacement: Replacement | null} | null} */
     this.node = null;
     this.text = el("span");
-    const accept = el("button", { type: "button", cls: "small presses", text: "Accept …" });
+    const accept = el("button", { type: "button", cls: "small requires-operator", text: "Accept …" });
     accept.addEventListener("click", () => quietly(() => this.accept()));
     this.element = el("p", { cls: "replacement", role: "status" }, this.text, " ", accept);
     this.element.hidden = true;

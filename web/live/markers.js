@@ -57,11 +57,11 @@ export class MarkerQueue {
   }
 
   draw() {
-    const presses = new Map(this.queue.map(({ event }) => [`${event.t_ns} ${event.label}`, event.label]));
-    const count = presses.size;
+    const marked = new Map(this.queue.map(({ event }) => [`${event.t_ns} ${event.label}`, event.label]));
+    const count = marked.size;
     const box = byId("waiting-markers");
     box.hidden = !count;
-    const labels = [...presses.values()].map((label) => `“${label}”`).join(", ");
+    const labels = [...marked.values()].map((label) => `“${label}”`).join(", ");
     setText(box, count
       ? `${count === 1 ? "1 marker" : `${count} markers`} not sent yet, time kept: ${labels}. Closing this page loses ${count === 1 ? "it" : "them"}.`
       : "");

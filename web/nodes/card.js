@@ -170,10 +170,10 @@ export class Card {
     setData(this.element, "recording", String(recording));
     if (!session) return;
     const [short, long] = stateText(session);
-    const key = JSON.stringify([session.id, session.name, short, long, recording ? Math.floor(session.duration_s) : session.frames, session.marks]);
+    const key = JSON.stringify([session.id, session.name, short, long, recording ? Math.floor(session.duration_s) : session.frames, session.marker_count]);
     if (key === this.sessionKey) return;
     this.sessionKey = key;
-    const markers = session.marks ? `, ${session.marks} marker${session.marks === 1 ? "" : "s"}` : "";
+    const markers = session.marker_count ? `, ${session.marker_count} marker${session.marker_count === 1 ? "" : "s"}` : "";
     const frames = `${session.frames.toLocaleString("en-GB")} frames`;
     const state = recording ? `recording, ${duration(Math.floor(session.duration_s))}` : `${short}, ${frames}`;
     this.sessionLine.replaceChildren(

@@ -131,7 +131,7 @@ export class Markers {
     byId("markers-list").replaceChildren(...this.placed.map((marker) => {
       const go = el("button", { type: "button", cls: "small", text: `${timeText(marker.timeS, 0.01)}  ${marker.label}` });
       go.addEventListener("click", () => this.on.go(marker.timeS));
-      const edit = el("button", { type: "button", cls: "small presses", text: "✎", title: "Rename, move or remove", "aria-label": `Edit marker ${marker.label}` });
+      const edit = el("button", { type: "button", cls: "small requires-operator", text: "✎", title: "Rename, move or remove", "aria-label": `Edit marker ${marker.label}` });
       edit.addEventListener("click", () => this.edit(marker));
       return el("li", { "data-time-s": marker.timeS.toFixed(6) }, go, edit);
     }));

@@ -64,7 +64,7 @@ export class Plotted {
       if (first) byId("plots-card").hidden = true;
       throw error;
     });
-    const grown = this.session.marks !== session.marks || whole.estimated !== this.plots.whole?.estimated;
+    const grown = this.session.marker_count !== session.marker_count || whole.estimated !== this.plots.whole?.estimated;
     this.session = session;
     this.showWhole(whole);
     if (first) {
@@ -345,7 +345,7 @@ export class Plotted {
 
   /** Update the download links. */
   drawLinks() {
-    const session = { ...this.session, marks: this.plots.markers.length };
+    const session = { ...this.session, marker_count: this.plots.markers.length };
     const stance = this.stances.stances[this.stances.current];
     this.downloads.draw(session, this.view, views.isWhole(this.view, this.durationS), stance);
   }

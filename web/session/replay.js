@@ -60,7 +60,7 @@ export class Replay {
     this.writeLag();
   }
 
-  /** Set tiles and calibration; the foot is drawn from then on. @param {ArrayInfo} array of GET /sessions/ID/array */
+  /** Set tiles and calibration; the foot is drawn from then on. @param {ArrayInfo} array of GET /sessions/ID/tiles */
   setArray(array) {
     this.array = array;
     this.writeLag();

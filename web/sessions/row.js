@@ -33,7 +33,7 @@ export function makeRow(session, pick, menu) {
     cell("c-start", "Started", localTime(new Date(session.started_t_ns / 1e6)).slice(0, 16)),
     cell("c-duration", "Duration", now["c-duration"]),
     framesCell,
-    cell("c-markers", session.marks === 1 ? "Marker" : "Markers", Number.isFinite(session.marks) ? String(session.marks) : "–"),
+    cell("c-markers", session.marker_count === 1 ? "Marker" : "Markers", Number.isFinite(session.marker_count) ? String(session.marker_count) : "–"),
     cell("c-size", "Size", bytes(session.bytes)),
     state,
     el("div", { cls: "c-do", role: "cell" }, menu));

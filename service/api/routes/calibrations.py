@@ -226,15 +226,15 @@ async def upload_calibration(
     return CalibrationSummaryView.from_summary(summary)
 
 
-@router.get("/calibrations/fits", operation_id="listFits", summary="Fits")
-async def list_fits(server: ServerState) -> Page[FitView]:
+@router.get("/calibrations/jobs", operation_id="listCalibrationJobs", summary="Fits")
+async def list_calibration_jobs(server: ServerState) -> Page[FitView]:
     """Return the last jobs since the server was started, newest first."""
     return Page(items=[FitView.from_job(fit) for fit in server.calibration_jobs.list_jobs()])
 
 
 @router.post(
-    "/calibrations/fits",
-    operation_id="startFit",
+    "/calibrations/jobs",
+    operation_id="startCalibrationJob",
     summary="Fit a calibration",
     status_code=HTTPStatus.ACCEPTED,
     responses=problem_responses(
@@ -243,7 +243,7 @@ async def list_fits(server: ServerState) -> Page[FitView]:
         _422="Invalid body, or the sessions are too long.",
     ),
 )
-async def start_fit(body: StartFit, server: ServerState, response: Response) -> FitView:
+async def start_calibration_job(body: StartFit, server: ServerState, response: Response) -> FitView:
     """Fit every tile in bench recordings, as `foottile calibrate` does.
 
     The job runs beside the server; poll it for its progress.
@@ -253,30 +253,30 @@ async def start_fit(body: StartFit, server: ServerState, response: Response) -> 
         options["reference_delay_ms"] = repr(body.reference_delay_ms)
         options["reference_delay_sigma_ms"] = repr(body.reference_delay_sigma_ms)
     fit = server.calibration_jobs.start_job(body.name, body.sessions, options)
-    response.headers["Location"] = f"/api/v1/calibrations/fits/{fit.id}"
+    response.headers["Location"] = f"/api/v1/calibrations/jobs/{fit.id}"
     return FitView.from_job(fit)
 
 
 @router.get(
-    "/calibrations/fits/{fit_id}",
-    operation_id="getFit",
+    "/calibrations/jobs/{job_id}",
+    operation_id="getCalibrationJob",
     summary="Fit progress",
     responses=problem_responses(_404="No such fit."),
 )
-async def get_fit(fit_id: str, server: ServerState) -> FitView:
+async def get_calibration_job(job_id: str, server: ServerState) -> FitView:
     """Return a job's progress, and the id of the calibration once it is done."""
-    return FitView.from_job(server.calibration_jobs.get_job(fit_id))
+    return FitView.from_job(server.calibration_jobs.get_job(job_id))
 
 
 @router.delete(
-    "/calibrations/fits/{fit_id}",
-    operation_id="cancelFit",
+    "/calibrations/jobs/{job_id}",
+    operation_id="cancelCalibrationJob",
     summary="Cancel a fit",
     responses=problem_responses(_404="No such fit."),
 )
-async def cancel_fit(fit_id: str, server: ServerState) -> FitView:
+async def cancel_calibration_job(job_id: str, server: ServerState) -> FitView:
     """Cancel a running job without a result; an ended one is unchanged."""
-    return FitView.from_job(await server.calibration_jobs.cancel_job(fit_id))
+    return FitView.from_job(await server.calibration_jobs.cancel_job(job_id))
 
 
 @router.get(
@@ -353,7 +353,7 @@ async def assign_calibration(
 
 @router.delete(
     "/nodes/{node}/calibration",
-    operation_id="takeBackCalibration",
+    operation_id="unassignCalibration",
     summary="Unassign a calibration",
     responses={
         **_NO_NODE,

@@ -21,15 +21,15 @@ _INVALID_TICKET = (
 )
 _NO_CREDENTIALS = "A login needs a ticket, or the token as Authorization: Bearer TOKEN"
 
-RoleName = Literal["look", "press"]
-_ROLES: dict[str, Role] = {"look": Role.VIEWER, "press": Role.OPERATOR}
+RoleName = Literal["viewer", "operator"]
+_ROLES: dict[str, Role] = {"viewer": Role.VIEWER, "operator": Role.OPERATOR}
 
 
 class LoginView(View):
     """Present permissions of the client."""
 
     private: bool = Field(description="True: reading needs a login, too.")
-    may: RoleName | None = Field(
+    role: RoleName | None = Field(
         description="Role by the credentials of the request; null: none. Without any, reading is "
         "allowed unless the server is private."
     )
@@ -50,14 +50,14 @@ class NewTicket(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    may: RoleName = Field(default="press", description="`look`: viewer; `press`: operator.")
+    role: RoleName = Field(default="operator", description="Role of the login.")
 
 
 class TicketView(View):
     """Ticket, a one-time login."""
 
     ticket: str
-    may: RoleName
+    role: RoleName
     ends_t_ns: int = Field(description="End of its validity, server's UTC.")
     urls: list[str] = Field(
         description="URLs of the live page with the ticket; the first browser that opens one is "
@@ -129,17 +129,17 @@ async def log_out(request: Request, response: Response, logins: LoginsState) -> 
 
 @router.post(
     "/tickets",
-    operation_id="giveTicket",
+    operation_id="createInvite",
     summary="Create a one-time login",
     status_code=HTTPStatus.CREATED,
 )
 async def create_ticket(body: NewTicket, request: Request, logins: LoginsState) -> TicketView:
     """Create a ticket, valid once and for five minutes. Needs the token; a login is not enough."""
-    ticket = logins.tickets.create(_ROLES[body.may])
+    ticket = logins.tickets.create(_ROLES[body.role])
     urls = request.app.state.find_urls() or (str(request.base_url).rstrip("/"),)
     return TicketView(
         ticket=ticket,
-        may=body.may,
+        role=body.role,
         ends_t_ns=server_utc_ns() + round(TICKET_S * 1e9),
         urls=[add_ticket(url, ticket) for url in urls],
     )
@@ -155,7 +155,7 @@ def _make_view(
 ) -> LoginView:
     return LoginView(
         private=logins.is_private,
-        may=None if right is None else "look" if right is Role.VIEWER else "press",
+        role=None if right is None else "viewer" if right is Role.VIEWER else "operator",
         ended=has_ended,
         ends_t_ns=None if left_s is None else server_utc_ns() + round(left_s * 1e9),
     )

@@ -134,12 +134,12 @@ async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
 
 
 @router.get(
-    "/{node}/recent",
-    operation_id="getRecent",
+    "/{node}/history",
+    operation_id="getHistory",
     summary="History of the last minute",
     responses=_UNKNOWN,
 )
-async def get_recent(
+async def get_history(
     node: str, query: Annotated[RecentQuery, Query()], server: ServerState
 ) -> RecentView:
     """Return the GRF of the last seconds, up to a minute, from the server's memory.

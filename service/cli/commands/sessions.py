@@ -222,7 +222,7 @@ def export_command(
     markers: Annotated[
         bool | None,
         typer.Option(
-            "--marks/--no-marks",
+            "--markers/--no-markers",
             help="Add the column event: what people marked, at the frame nearest in time; default: "
             "if there are events beside the frames.",
         ),
@@ -291,12 +291,12 @@ def export_command(
         else:
             done = export_session(sources[0], path, wanted)
     say(f"{path}: {done.size_bytes} bytes")
-    for mark in done.left_out_markers:
-        remark(f"mark {mark.marker.label!r} is not in it: {mark.exclusion_reason}")
+    for marker in done.left_out_markers:
+        remark(f"marker {marker.marker.label!r} is not in it: {marker.exclusion_reason}")
     for text in done.remarks:
         remark(text)
     if done.is_markers_file_missing:
-        remark(f"without marks: there is no {MARKERS_NAME} beside {sources[0].name}")
+        remark(f"without markers: there is no {MARKERS_NAME} beside {sources[0].name}")
 
 
 def _clock_named(clock: str) -> ClockName:

@@ -32,7 +32,7 @@ NEAR_BASELINE_KPA = 1.5
 """Largest distance of an unloaded bubble from its baseline in the rig: 5 K, by p0 / T0."""
 LOADED_KPA = 3.0
 """Distance above the rig baseline, 10 K by p0 / T0, from which a tile counts as loaded, even if the
-user or a flag marks it as unloaded."""
+user or a flag markers it as unloaded."""
 QUIET_FACTOR = 1.5
 """Largest scatter of an unloaded tile over that in the rig."""
 STILL_SIGMAS = 4.0

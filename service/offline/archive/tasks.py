@@ -188,7 +188,9 @@ class ExportTask:
         """See `SessionTask`."""
         name = f"{Path(FRAMES_NAME).stem}.{get_format(self.export.to).ending}"
         done = export_session(get_sealed_frames_path(source), result_folder / name, self.export)
-        left_out = {mark.marker.label: mark.exclusion_reason for mark in done.left_out_markers}
+        left_out = {
+            marker.marker.label: marker.exclusion_reason for marker in done.left_out_markers
+        }
         return {"bytes": done.size_bytes, "marks_left_out": left_out}
 
 

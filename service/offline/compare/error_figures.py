@@ -120,7 +120,7 @@ def compute_errors(
     if not judged:
         raise ComparisonError(
             "no trial has a frame at which the reference is known",
-            expected="marks within what reference and session have in common",
+            expected="markers within what reference and session have in common",
         )
     names = judged[0].figures
     figures = {

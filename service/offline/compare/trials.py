@@ -77,12 +77,12 @@ def split_into_trials(
         markers: markers in any order.
     """
     if markers:
-        ordered = sorted(markers, key=lambda mark: mark.t_ns)
-        bounds = [mark.t_ns for mark in ordered] + [np.iinfo(np.int64).max]
+        ordered = sorted(markers, key=lambda marker: marker.t_ns)
+        bounds = [marker.t_ns for marker in ordered] + [np.iinfo(np.int64).max]
         return [
-            Trial(f"{i + 1}: {mark.label}", (t_ns >= bounds[i]) & (t_ns < bounds[i + 1]))
-            for i, mark in enumerate(ordered)
-        ], "from mark to mark"
+            Trial(f"{i + 1}: {marker.label}", (t_ns >= bounds[i]) & (t_ns < bounds[i + 1]))
+            for i, marker in enumerate(ordered)
+        ], "from marker to marker"
     return [
         Trial(f"part {number}", part == number) for number in np.unique(part).tolist()
     ], "each contiguous recording"

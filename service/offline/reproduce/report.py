@@ -203,7 +203,7 @@ _EXPERIMENT_TEXTS = {
     ROLLING.name: (
         "The foot's arc rolls over a plate under the leg's weight; a pressure plate sees its "
         "footprint. The paper's sentence: the COP's error is below 4 mm. Where the foot stands on "
-        "the plate is known to half a millimetre and a degree, as if it had been put on a mark, "
+        "the plate is known to half a millimetre and a degree, as if it had been put on a marker, "
         "so distances have that in them, but for those about their mean.",
     ),
     POPPY.name: (

@@ -181,7 +181,7 @@ def _metadata_texts(
     reaction: GroundReaction, export: Export, filling: int, events: int
 ) -> dict[str, str]:
     contact_count = len(reaction.events) - reaction.marker_count
-    text = f"{reaction.marker_count} marks, {contact_count} begins and ends of contact"
+    text = f"{reaction.marker_count} markers, {contact_count} begins and ends of contact"
     if events > EVENTS_MAX:
         text += (
             f"; the last {events - EVENTS_MAX} are left out, {EVENTS_MAX} being the most: see "
@@ -231,20 +231,20 @@ def _extra_channels(reaction: GroundReaction, export: Export) -> Iterator[Channe
 def _event_parameters(
     reactions: Sequence[GroundReaction], exports: Sequence[Export]
 ) -> dict[str, Any]:
-    marks: list[tuple[float, str, str]] = []
+    markers: list[tuple[float, str, str]] = []
     contacts: list[tuple[float, str, str]] = []
     for reaction, export in zip(reactions, exports, strict=True):
         node = export.array_info.node
         named = to_ascii(node)[:_TEXT_MAX] if len(reactions) > 1 else "General"
         context = _CONTEXTS_BY_NODE.get(node.lower(), named)
         events = [(at_s, context, label) for at_s, label in reaction.events]
-        marks += events[: reaction.marker_count]
+        markers += events[: reaction.marker_count]
         contacts += events[reaction.marker_count :]
-    written = [*sorted(marks), *sorted(contacts)][:EVENTS_MAX]
+    written = [*sorted(markers), *sorted(contacts)][:EVENTS_MAX]
     return {
         "USED": np.array([len(written)]),
         "CONTEXTS": [context or "General" for _, context, _ in written],
-        "LABELS": [to_ascii(label)[:_TEXT_MAX] or "mark" for _, _, label in written],
+        "LABELS": [to_ascii(label)[:_TEXT_MAX] or "marker" for _, _, label in written],
         "DESCRIPTIONS": [" "] * len(written),
         "TIMES": np.array([divmod(at_s, 60.0) for at_s, *_ in written]).reshape(-1, 2).T,
     }

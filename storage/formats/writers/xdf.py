@@ -197,7 +197,7 @@ class _SessionEncoder:
         """Return the header of the stream of markers; empty without markers."""
         if self._export.markers is None:
             return b""
-        self._marker_stream, header = self._add_stream("marks", "Markers", ["label"], "string")
+        self._marker_stream, header = self._add_stream("markers", "Markers", ["label"], "string")
         return header
 
     def encode_frames(self, piece: Mapping[str, Array]) -> bytes:

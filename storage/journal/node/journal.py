@@ -86,7 +86,7 @@ class NodeJournal:
             if not is_recovery:
                 self._lock_folder(root, is_shared=True)
                 self._lock_folder(self.folder, is_shared=False)
-            self.retention_requests = RetentionRequests(self.folder / "wanted.json")
+            self.retention_requests = RetentionRequests(self.folder / "retention.json")
             self._are_requests_changed = not self.retention_requests.has_checksum
             self.problems = list(self.retention_requests.problems)
             """Damage found, and how it was handled, as messages."""

@@ -41,7 +41,7 @@ def test_a_number_that_nobody_means_is_refused_with_a_reason(
     http = running.http
     described = http.get("/openapi.json").json()
     places = {"session_id": session.id, "node": "bench", "tare_id": "x"}
-    places |= {"take_id": "x", "marker_id": "x", "name": "x", "calibration_id": "x", "fit_id": "x"}
+    places |= {"take_id": "x", "marker_id": "x", "name": "x", "calibration_id": "x", "job_id": "x"}
     tried = 0
     for path, operations in described["paths"].items():
         url = path.removeprefix("/api/v1").format(**places)

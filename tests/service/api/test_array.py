@@ -15,9 +15,9 @@ def test_a_session_says_where_its_tiles_are_and_how_its_forces_were_estimated(
     node = running.node()
     session = tared.record()
     tared.deliver(50, [20.0, 60.0])
-    recording = running.http.get(f"{session.url}/array").json()
+    recording = running.http.get(f"{session.url}/tiles").json()
     tared.finish(session)
-    sealed = running.http.get(f"{session.url}/array").json()
+    sealed = running.http.get(f"{session.url}/tiles").json()
     for said in (recording, sealed):
         assert said["tiles"] == node["tiles"]
         assert said["servo"] == node["servo"]
@@ -40,7 +40,7 @@ def test_without_a_calibration_it_says_why_there_are_no_forces(
     session = node.record()
     node.deliver(50, [0.0, 30.0])
     node.finish(session)
-    said = running.http.get(f"{session.url}/array").json()
+    said = running.http.get(f"{session.url}/tiles").json()
     assert said["calibration"] is None
     assert said["lag_ms"] is None
     assert said["estimates_problem"] == "the node had no calibration"
@@ -49,4 +49,4 @@ def test_without_a_calibration_it_says_why_there_are_no_forces(
 
 
 def test_of_a_session_that_is_not_there_there_is_no_array(running: Running) -> None:
-    assert_refused(running.http.get("/sessions/none/array"), 404, "none")
+    assert_refused(running.http.get("/sessions/none/tiles"), 404, "none")

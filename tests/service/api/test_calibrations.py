@@ -280,14 +280,14 @@ def test_a_choice_that_is_damaged_is_no_other_ones(running: Running, tared: Fake
 
 @pytest.fixture
 def with_bench(bench_cache: Path, tmp_path: Path, serve_with: ServeWith) -> Running:
-    """A server with a bench recording, sealed, with the mill's steps as marks."""
+    """A server with a bench recording, sealed, with the mill's steps as markers."""
     benches.put(benches.pressed(bench_cache), tmp_path / "data-0")
     return serve_with()
 
 
 def fit(running: Running, **body: object) -> httpx.Response:
     asked = {"sessions": [benches.SESSION_ID], "name": "left, =leg", "reference": "the mill"}
-    return running.http.post("/calibrations/fits", json=asked | body)
+    return running.http.post("/calibrations/jobs", json=asked | body)
 
 
 def ended(running: Running, begun: httpx.Response) -> dict[str, Any]:
@@ -312,14 +312,14 @@ def test_a_bench_session_is_fitted_here_and_what_cannot_be_says_why(with_bench: 
     assert (kept["reference"], kept["serials"]) == ("the mill", ["T01"])
 
     session = running.http.get(f"/sessions/{benches.SESSION_ID}/markers").json()["items"]
-    step = next(mark for mark in session if mark["label"] == "T01 load")
+    step = next(marker for marker in session if marker["label"] == "T01 load")
     url = f"/sessions/{benches.SESSION_ID}/markers/{step['id']}"
     running.http.patch(url, json={"label": "T01 laod"})
     failed = ended(running, fit(running))
     assert failed["state"] == "failed"
     assert "'T01 laod' is no calibration step" in failed["problem"]
     assert len(listed(running)) == 1
-    assert [one["state"] for one in running.http.get("/calibrations/fits").json()["items"]] == [
+    assert [one["state"] for one in running.http.get("/calibrations/jobs").json()["items"]] == [
         "failed",
         "done",
     ]
@@ -356,4 +356,4 @@ def test_what_cannot_be_fitted_is_refused_at_once(
         assert fit(running, **wrong).status_code == 422, wrong
     monkeypatch.setattr("service.server.calibration_jobs.FRAMES_MAX", 10)
     assert_refused(fit(running), 422, "at most 10 in one fit")
-    assert running.http.get("/calibrations/fits").json()["items"] == []
+    assert running.http.get("/calibrations/jobs").json()["items"] == []

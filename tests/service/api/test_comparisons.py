@@ -84,7 +84,7 @@ def test_figures_intervals_limits_and_the_reference_at_any_zoom(compared: Record
 
 def test_the_reference_lies_where_our_force_is(compared: Recording) -> None:
     columns = asked(compared, f"/{NAME}/series", points=8000)["columns"]
-    ours = compared.running.http.get(f"{compared.url}/overview", params={"points": 8000}).json()
+    ours = compared.running.http.get(f"{compared.url}/timeseries", params={"points": 8000}).json()
     by_time = dict(zip(ours["columns"]["t_first_s"], ours["columns"]["grf_n_max"], strict=True))
     pairs = [
         (by_time[t_s], theirs_n)

@@ -74,7 +74,7 @@ def table(answer: httpx.Response) -> dict[str, list[str]]:
 
 
 def overview(session: Recording, **query: Any) -> dict[str, Any]:
-    answer = session.running.http.get(f"{session.url}/overview", params=query)
+    answer = session.running.http.get(f"{session.url}/timeseries", params=query)
     assert answer.status_code == 200, answer.text
     content: dict[str, Any] = answer.json()
     return content
@@ -125,8 +125,8 @@ def test_a_mark_is_at_a_frame_of_its_own_part(
     query = {"format": "csv", "clock": "server", "columns": "part,time_s,t_server_ns"}
     rows = table(sealed.data(**query))
     row = int(np.argmin(np.abs(np.array(rows["time_s"], float) - at_s)))
-    mark = {"label": "here", "t_ns": int(rows["t_server_ns"][row])}
-    assert running.http.post(f"{sealed.url}/markers", json=mark).status_code == 201
+    marker = {"label": "here", "t_ns": int(rows["t_server_ns"][row])}
+    assert running.http.post(f"{sealed.url}/markers", json=marker).status_code == 201
     part = {"start_s": max(0.0, at_s - 0.05), "end_s": at_s + 0.05}
     marked = table(sealed.data(format="csv", columns="part,time_s,event", **part))
     (event,) = [i for i, label in enumerate(marked["marker"]) if label]

@@ -36,7 +36,7 @@ _OF_NOW = {"date", "content-length"}
 def routes_of(sealed: Sealed) -> list[str]:
     """Every address that can be got, of the index, with names of this server filled in."""
     take = sealed.session.now()["take"]
-    names = {"session_id": sealed.id, "node": "bench", "take_id": take, "fit_id": "none"}
+    names = {"session_id": sealed.id, "node": "bench", "take_id": take, "job_id": "none"}
     names |= {"calibration_id": "none", "name": "none"}
     listed = asked(sealed.running, "GET", "/api/v1").json()["routes"]
     paths = [

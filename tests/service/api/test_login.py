@@ -30,8 +30,8 @@ def private(serve_with: ServeWith) -> Running:
     return serve_with(token=TOKEN, is_private=True)
 
 
-def ticket(running: Running, may: str = "press") -> dict[str, Any]:
-    answer = running.http.post("/tickets", json={"may": may}, headers=BEARER)
+def ticket(running: Running, role: str = "operator") -> dict[str, Any]:
+    answer = running.http.post("/tickets", json={"role": role}, headers=BEARER)
     assert answer.status_code == 201, answer.text
     given: dict[str, Any] = answer.json()
     return given
@@ -48,11 +48,11 @@ def browser(running: Running) -> httpx.Client:
 
 
 @contextmanager
-def logged_in(running: Running, may: str = "press") -> Iterator[httpx.Client]:
+def logged_in(running: Running, role: str = "operator") -> Iterator[httpx.Client]:
     with browser(running) as client:
-        answer = client.post("/login", json={"ticket": ticket(running, may)["ticket"]})
+        answer = client.post("/login", json={"ticket": ticket(running, role)["ticket"]})
         assert answer.status_code == 200, answer.text
-        assert answer.json()["may"] == may
+        assert answer.json()["role"] == role
         yield client
 
 
@@ -94,8 +94,8 @@ def test_an_old_ticket_is_refused(guarded: Running, monkeypatch: pytest.MonkeyPa
 
 def test_the_token_becomes_a_cookie_too(guarded: Running) -> None:
     with browser(guarded) as client:
-        assert client.post("/login", json={}, headers=BEARER).json()["may"] == "press"
-        assert client.get("/login").json()["may"] == "press"
+        assert client.post("/login", json={}, headers=BEARER).json()["role"] == "operator"
+        assert client.get("/login").json()["role"] == "operator"
 
 
 @pytest.mark.parametrize("given", [None, "Bearer x", "Bearer", f"Basic {TOKEN}"])
@@ -112,7 +112,7 @@ def test_a_login_is_not_renewed_by_itself(guarded: Running) -> None:
 
 
 def test_a_viewer_looks_and_cannot_press(guarded: Running) -> None:
-    with logged_in(guarded, "look") as viewer:
+    with logged_in(guarded, "viewer") as viewer:
         for method, path in CHANGES:
             answer = viewer.request(method, path, json={})
             assert_refused(answer, 403, "may not change anything")
@@ -120,9 +120,9 @@ def test_a_viewer_looks_and_cannot_press(guarded: Running) -> None:
 
 
 def test_a_login_gives_no_tickets_and_is_no_node(guarded: Running) -> None:
-    for may in ("look", "press"):
-        with logged_in(guarded, may) as client:
-            assert_refused(client.post("/tickets", json={"may": may}), 403, "token")
+    for role in ("viewer", "operator"):
+        with logged_in(guarded, role) as client:
+            assert_refused(client.post("/tickets", json={"role": role}), 403, "token")
             (cookie,) = client.cookies.jar
             headers = {"Cookie": f"{cookie.name}={cookie.value}"}
             with (
@@ -152,7 +152,7 @@ def test_what_is_no_login_is_refused(guarded: Running, body: object) -> None:
     assert guarded.http.post("/login", json=body).status_code == 422
 
 
-@pytest.mark.parametrize("body", [{"may": "own"}, {"may": 3}, {"may": None}, [], {"more": 1}])
+@pytest.mark.parametrize("body", [{"role": "own"}, {"role": 3}, {"role": None}, [], {"more": 1}])
 def test_what_is_no_ticket_is_not_given(guarded: Running, body: object) -> None:
     assert guarded.http.post("/tickets", json=body, headers=BEARER).status_code == 422
 
@@ -163,7 +163,7 @@ def test_what_is_no_ticket_is_not_given(guarded: Running, body: object) -> None:
 def test_cookies_that_are_none_of_ours_are_nobody(guarded: Running, value: str) -> None:
     cookie = f"foottile_{guarded.port}={value.format(name=f'foottile_{guarded.port}')}"
     headers = [(b"Cookie", cookie.encode("latin-1")), (b"Origin", guarded.url.encode())]
-    assert guarded.http.get("/login", headers=headers).json()["may"] is None
+    assert guarded.http.get("/login", headers=headers).json()["role"] is None
     answer = guarded.http.post("/nodes/x/tare", headers=headers)
     assert answer.status_code == 401
 
@@ -176,7 +176,7 @@ def test_a_login_ends_with_the_server_and_it_says_so(guarded: Running) -> None:
         guarded.restart()
         after = client.get("/login").json()
         assert after["ended"]
-        assert after["may"] is None
+        assert after["role"] is None
         assert_refused(client.post("/nodes/x/tare"), 401, "has expired", "restarted")
         assert client.get("/nodes").status_code == 200
 
@@ -252,9 +252,9 @@ def test_a_private_server_shows_pages_without_data(private: Running) -> None:
         assert httpx.get(private.url + path, trust_env=False).status_code == 200, path
 
 
-@pytest.mark.parametrize("may", ["look", "press"])
-def test_who_has_logged_in_sees_a_private_server(private: Running, may: str) -> None:
-    with logged_in(private, may) as client:
+@pytest.mark.parametrize("role", ["viewer", "operator"])
+def test_who_has_logged_in_sees_a_private_server(private: Running, role: str) -> None:
+    with logged_in(private, role) as client:
         for path in readable(private):
             assert client.get(private.url + path).status_code not in (401, 403), path
         (cookie,) = client.cookies.jar

@@ -35,7 +35,7 @@ def hopped(tared: FakeNode) -> Recording:
 
 
 def asked(session: Recording, **query: Any) -> Any:
-    answer = session.running.http.get(f"{session.url}/overview", params=query)
+    answer = session.running.http.get(f"{session.url}/timeseries", params=query)
     assert answer.status_code == 200, answer.text
     return answer.json()
 
@@ -84,7 +84,7 @@ def test_some_columns_come_with_the_instants_and_as_arrow_they_are_the_same(
     plain = asked(hopped, **query)
     names = {"t_first_s", "t_last_s", "grf_n_min", "grf_n_max", "force_n_1_min", "force_n_1_max"}
     assert set(plain["columns"]) == names
-    url = f"{hopped.url}/overview"
+    url = f"{hopped.url}/timeseries"
     answer = hopped.running.http.get(url, params=query, headers={"Accept": ARROW})
     with pa.ipc.open_stream(answer.content) as stream:
         table = stream.read_all()
@@ -103,7 +103,7 @@ def test_some_columns_come_with_the_instants_and_as_arrow_they_are_the_same(
 
 
 def test_as_json_it_goes_compressed_to_who_takes_that_and_is_the_same(hopped: Recording) -> None:
-    http, url = hopped.running.http, f"{hopped.url}/overview"
+    http, url = hopped.running.http, f"{hopped.url}/timeseries"
     packed = http.get(url, headers={"Accept-Encoding": "gzip"})
     plain = http.get(url, headers={"Accept-Encoding": "identity"})
     assert packed.headers["content-encoding"] == "gzip"
@@ -149,14 +149,14 @@ def test_it_is_proven_by_verify_and_of_its_frames(hopped: Recording) -> None:
 
 def test_what_cannot_be_shown_is_said(hopped: Recording, tared: FakeNode) -> None:
     http = hopped.running.http
-    assert_refused(http.get(f"{hopped.url}/overview", params={"points": 0}), 422, "points")
-    assert_refused(http.get(f"{hopped.url}/overview", params={"columns": "grv"}), 422, "'grv'")
+    assert_refused(http.get(f"{hopped.url}/timeseries", params={"points": 0}), 422, "points")
+    assert_refused(http.get(f"{hopped.url}/timeseries", params={"columns": "grv"}), 422, "'grv'")
     late = {"start_s": 2, "end_s": 1}
-    assert_refused(http.get(f"{hopped.url}/overview", params=late), 422, "ends at 1 s")
+    assert_refused(http.get(f"{hopped.url}/timeseries", params=late), 422, "ends at 1 s")
     assert asked(hopped, start_s=500)["columns"]["t_first_s"] == []
     recording = tared.record()
-    assert_refused(http.get(f"{recording.url}/overview"), 409, "no frames yet")
-    gone = "/sessions/20200101T000000Z-000000/overview"
+    assert_refused(http.get(f"{recording.url}/timeseries"), 409, "no frames yet")
+    gone = "/sessions/20200101T000000Z-000000/timeseries"
     assert_refused(http.get(gone), 404, "20200101T000000Z-000000")
 
 

@@ -19,7 +19,7 @@ HELD_BACK = 6
 
 
 def asked(session: Recording, **query: Any) -> Any:
-    answer = session.running.http.get(f"{session.url}/overview", params=query)
+    answer = session.running.http.get(f"{session.url}/timeseries", params=query)
     assert answer.status_code == 200, answer.text
     return answer.json()
 
@@ -82,7 +82,7 @@ def test_a_long_session_is_caught_up_with_answer_by_answer(
     session = tared.record()
     tared.deliver(2000, waves(2000))
     monkeypatch.setattr(service.sessions.preview, "UPDATE_BUDGET_S", 0.0)
-    assert_refused(session.running.http.get(f"{session.url}/overview"), 409, "no frames yet")
+    assert_refused(session.running.http.get(f"{session.url}/timeseries"), 409, "no frames yet")
     monkeypatch.setattr(service.sessions.preview, "UPDATE_BUDGET_S", 100.0)
     assert frames_of(session) >= 2000 - HELD_BACK
     assert asked(session)["catching_up"] is False

@@ -50,7 +50,7 @@ def test_no_answer_names_the_data_folder(
             name="bench",
             comparison="x",
             calibration_id="x",
-            fit_id="x",
+            job_id="x",
             take_id="x",
             marker_id="x",
         )

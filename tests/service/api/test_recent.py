@@ -12,7 +12,7 @@ from tests.service.fake_node import FakeNode
 from tests.service.running import Running, assert_refused
 from tests.waiting import PATIENCE_S, until
 
-RECENT = "/nodes/bench/recent"
+RECENT = "/nodes/bench/history"
 
 
 def test_a_peak_that_nobody_watched_is_in_it(running: Running, tared: FakeNode) -> None:
@@ -96,4 +96,4 @@ def test_what_cannot_be_asked_is_refused(running: Running, tared: FakeNode, quer
 
 
 def test_a_node_that_nobody_knows_has_no_past(running: Running) -> None:
-    assert_refused(running.http.get("/nodes/nobody/recent"), 404, "nobody")
+    assert_refused(running.http.get("/nodes/nobody/history"), 404, "nobody")

@@ -92,7 +92,7 @@ def test_of_tiles_in_one_row_neither_file_nor_answer_has_a_number_across_it(
     assert any(row["cop_x_m"] for row in rows)
     assert {row["cop_y_m"] for row in rows} == {""}
     get = session.running.http.get
-    bins = get(f"{session.url}/overview").json()["columns"]
+    bins = get(f"{session.url}/timeseries").json()["columns"]
     assert any(value is not None for value in bins["cop_x_m_max"])
     for name in ("cop_y_m_min", "cop_y_m_max", "cop_y_low_m_min", "cop_y_high_m_max"):
         assert set(bins[name]) == {None}

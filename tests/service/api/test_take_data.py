@@ -46,7 +46,9 @@ def test_every_format_that_holds_several_has_all_sessions_in_the_order_of_their_
         assert [each["node"] for each in said] == ["left", "right"]
         assert all(each["complete"].lower() in ("true", "complete") for each in said)
         assert answer.headers["foottile-complete"] == "true"
-        assert answer.headers["foottile-marks"] == "placed=0, left-out=1"  # it was not so long ago
+        assert (
+            answer.headers["foottile-markers"] == "placed=0, left-out=1"
+        )  # it was not so long ago
         name = f"both_take-{take.id}.{FORMATS[to].ending}"
         assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
 

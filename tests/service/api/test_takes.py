@@ -132,8 +132,8 @@ def test_marking_a_take_marks_all_of_it_at_one_instant_and_once(
         assert answer.status_code == 201
         assert nodes_of(answer.json()) == ["left", "right", "spare"]
     for session in made["sessions"]:
-        marks = running.http.get(f"/sessions/{session['id']}/markers").json()["items"]
-        assert [{name: mark[name] for name in event} for mark in marks] == [event]
+        markers = running.http.get(f"/sessions/{session['id']}/markers").json()["items"]
+        assert [{name: marker[name] for name in event} for marker in markers] == [event]
     now = running.http.post(f"/takes/{made['id']}/markers", json={"label": "now"}).json()
     instants = {
         running.http.get(f"/sessions/{session['id']}/markers").json()["items"][-1]["t_ns"]

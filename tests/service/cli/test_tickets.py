@@ -125,14 +125,14 @@ def test_what_keeps_others_away_is_remarked(
     assert bool(said) is bool(word)
 
 
-@pytest.mark.parametrize(("option", "may"), [((), "press"), (("--read-only",), "look")])
+@pytest.mark.parametrize(("option", "role"), [((), "operator"), (("--read-only",), "viewer")])
 def test_ticket_prints_an_address_that_lets_in_who_opens_it(
     serve_with: ServeWith,
     run: Run,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     option: tuple[str, ...],
-    may: str,
+    role: str,
 ) -> None:
     running = serve_with(token=TOKEN)
     (tmp_path / "token").write_text(TOKEN + "\n")
@@ -143,7 +143,7 @@ def test_ticket_prints_an_address_that_lets_in_who_opens_it(
     assert address == running.url + "/"
     assert "--host 0.0.0.0" in done.err
     answer = httpx.post(f"{address}api/v1/login", json={"ticket": ticket}, trust_env=False)
-    assert answer.json()["may"] == may
+    assert answer.json()["role"] == role
 
 
 def test_ticket_as_json_by_the_token_of_the_environment(
@@ -152,7 +152,7 @@ def test_ticket_as_json_by_the_token_of_the_environment(
     running = serve_with(token=TOKEN)
     monkeypatch.setenv("FOOTTILE_TOKEN", TOKEN)
     done = run("invite", "--server", running.url, "--json")
-    assert json.loads(done.out)["may"] == "press"
+    assert json.loads(done.out)["role"] == "operator"
     assert TOKEN not in done.out
 
 

@@ -210,7 +210,7 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     before = streaming(running)
     session = running.record("leg", name="damaged")
     own = tmp_path / "node" / "journal" / "leg"
-    until((own / "wanted.json").exists)
+    until((own / "retention.json").exists)
     until(lambda: running.node("leg")["last_seq"] > before["last_seq"] + 200)
     process.process.kill()
     process.ended(5.0)
@@ -221,16 +221,16 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     assert left is not None
     assert left[1] is not None
     taken = int(left[1].seq[-1])
-    (own / "wanted.json").write_bytes(b"")
+    (own / "retention.json").write_bytes(b"")
     os.truncate(stream / "stream.json", 40)
     (stream / "in_flight").unlink()
     (stream / "in_flight").symlink_to("/dev/zero")
     again = leg()
-    for name in ("wanted.json", "stream.json", "in_flight"):
+    for name in ("retention.json", "stream.json", "in_flight"):
         again.said(f"{name}.damaged-1", 30.0)
     until(lambda: running.node("leg")["stream_id"] != before["stream_id"])
     streaming(running)
-    until(lambda: "wanted.json" in " ".join(running.node("leg")["warnings"]))
+    until(lambda: "retention.json" in " ".join(running.node("leg")["warnings"]))
     session.stop()
     found = session.sealed(40.0)
     first, second = session.ledger()["parts"]
@@ -253,7 +253,7 @@ def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
     streaming(running)
     session = running.record("leg", name="apart")
     # A server that is stopped before it has told the node leaves it with frames that nobody wants.
-    told = tmp_path / "node" / "journal" / "leg" / "wanted.json"
+    told = tmp_path / "node" / "journal" / "leg" / "retention.json"
     until(lambda: told.exists() and running.node("leg")["stream_id"] in told.read_text())
     running.stop()
     process.said("not connected to")

@@ -48,7 +48,7 @@ def session_of(number: int, scene: str, state: str = "sealing", **facts: object)
 def sealed(
     data: Path, number: int, *peaks_n: float, scene: str = "mud", is_calibrated: bool = True
 ) -> Path:
-    """A sealed session of such hops, with a mark at its beginning."""
+    """A sealed session of such hops, with a marker at its beginning."""
     loads_n = hops_n(*peaks_n)
     batch = frames(loads_n, lead=200)
     info = array(1e9 / PERIOD_NS).model_copy(

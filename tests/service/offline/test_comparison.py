@@ -1,4 +1,4 @@
-"""A sealed session in its folder, compared: its marks are trials, its own clock is taken."""
+"""A sealed session in its folder, compared: its markers are trials, its own clock is taken."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ def seal(
     return path
 
 
-def mark(folder: Path, **labels: float) -> None:
-    """Write marks at these seconds."""
+def marker(folder: Path, **labels: float) -> None:
+    """Write markers at these seconds."""
     begin_ns = int(make_frames(1, 2, period_ns=PERIOD_NS).t_ns[0])
     session = Session(
         id="20200101T000000Z-000000",
@@ -91,9 +91,9 @@ def mark(folder: Path, **labels: float) -> None:
 def test_marks_of_the_session_are_its_trials(tmp_path: Path) -> None:
     path = seal(tmp_path / "ours", bias_n=0.3)
     other = seal(tmp_path / "theirs")
-    mark(tmp_path / "ours", walk=2.0, turn=11.0, gone=500.0)
+    marker(tmp_path / "ours", walk=2.0, turn=11.0, gone=500.0)
     found = compare_session(path, other, OWN)
-    assert found.trial_definition == "from mark to mark"
+    assert found.trial_definition == "from marker to marker"
     assert [trial.name for trial in found.errors.trials] == ["1: walk", "2: turn"]
     for trial in found.errors.trials:
         assert trial.figures["grf_bias_n"] == pytest.approx(0.3, abs=0.02)

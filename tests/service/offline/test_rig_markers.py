@@ -1,4 +1,4 @@
-"""A calibration from a recording of a server: what the mill did is in its marks."""
+"""A calibration from a recording of a server: what the mill did is in its markers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def recorded(bench_cache: Path, tmp_path: Path) -> Path:
-    """Folder of a bench session, sealed, with its marks."""
+    """Folder of a bench session, sealed, with its markers."""
     return benches.put(benches.pressed(bench_cache), tmp_path)
 
 
@@ -27,7 +27,7 @@ def session_in(folder: Path) -> Session:
 
 
 def marked(folder: Path, *events: Marker) -> Path:
-    """The same, with other marks."""
+    """The same, with other markers."""
     write_markers(session_in(folder).model_copy(update={"markers": events}), folder)
     return folder / FRAMES_NAME
 
@@ -82,7 +82,7 @@ def test_a_step_that_is_misspelt_is_refused_and_no_stroke_goes_on(
 
 def test_without_a_step_or_a_table_of_marks_it_is_no_bench(recorded: Path) -> None:
     path = marked(recorded, session_in(recorded).markers[0])
-    with pytest.raises(CalibrationError, match="marks such as `T01 load`"):
+    with pytest.raises(CalibrationError, match="markers such as `T01 load`"):
         read_indentations([path])
     (recorded / "markers.parquet").unlink()
     with pytest.raises(CalibrationError, match="not an indentation recording"):

@@ -37,7 +37,7 @@ def test_what_is_given_up_of_a_stream_whose_end_is_known_is_counted_frame_by_fra
     session.stop()
     tared.connect(earlier=tuple(each.said() for each in tared.before))
     assert session.now()["pending_reason"] == "end"
-    answer = session.running.http.post(f"{session.url}/seal")
+    answer = session.running.http.post(f"{session.url}/abandon-missing")
     assert answer.status_code == 200, answer.text
     sealed = session.sealed()
     assert sealed["lost"] == {"given_up": 30}

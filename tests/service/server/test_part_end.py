@@ -280,15 +280,15 @@ def test_the_node_is_told_what_sessions_need_whenever_that_changes(tared: FakeNo
 
     assert told() == ([], False)
     first = tared.record()
-    tared.receive("wanted")
+    tared.receive("retain")
     assert told() == ([(tared.stream_id, [(70, None)])], True)
     tared.deliver(50)
     second = tared.record(pre_roll_s=0.02)
     tared.finish(first)
     tared.finish(second)
-    until(lambda: told() == ([], False) or (tared.receive("wanted") and False))
+    until(lambda: told() == ([], False) or (tared.receive("retain") and False))
     third = tared.record()
-    until(lambda: told()[1] or (tared.receive("wanted") and False))
+    until(lambda: told()[1] or (tared.receive("retain") and False))
     tared.restart()
     [before] = tared.before
     tared.connect(earlier=(before.said(),))

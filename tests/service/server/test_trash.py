@@ -123,7 +123,7 @@ def test_a_session_that_is_being_sealed_is_not_deleted(
     ("method", "path"),
     [
         ("DELETE", "/sessions/20200101T000000Z-000000"),
-        ("POST", "/sessions/20200101T000000Z-000000/seal"),
+        ("POST", "/sessions/20200101T000000Z-000000/abandon-missing"),
         ("POST", "/trash/20200101T000000Z-000000/restore"),
         ("POST", "/trash/..%2fx/restore"),
         ("POST", "/trash/x/restore"),
@@ -153,7 +153,7 @@ def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_empt
     tared.connect()
     assert tared.wanted.streams
     running.http.delete("/trash")
-    tared.receive("wanted")
+    tared.receive("retain")
     assert tared.wanted.streams == ()
 
 
@@ -215,7 +215,7 @@ def test_a_session_whose_node_never_comes_back_can_be_sealed_without_it(
     running: Running, tared: FakeNode
 ) -> None:
     session = pending(tared)
-    answer = running.http.post(f"{session.url}/seal")
+    answer = running.http.post(f"{session.url}/abandon-missing")
     assert answer.status_code == 200, answer.text
     done = session.sealed()
     assert (done["complete"], done["frames"]) == ("lossy", 50)
@@ -237,7 +237,7 @@ def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
     tared.send(10, now=True)
     until(lambda: session.now()["parts"][0]["seq_last"] == 169)
     assert session.now()["pending_frames"] == 30
-    running.http.post(f"{session.url}/seal")
+    running.http.post(f"{session.url}/abandon-missing")
     done = session.sealed()
     assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 70, {"given_up": 30})
     ledger = session.ledger()
@@ -246,9 +246,9 @@ def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
 
 def test_only_a_pending_session_can_be_given_up(running: Running, tared: FakeNode) -> None:
     recording = tared.record()
-    assert_refused(running.http.post(f"{recording.url}/seal"), 409, "Stop it first")
+    assert_refused(running.http.post(f"{recording.url}/abandon-missing"), 409, "Stop it first")
     tared.finish(recording)
-    assert running.http.post(f"{recording.url}/seal").status_code == 409
+    assert running.http.post(f"{recording.url}/abandon-missing").status_code == 409
 
 
 # --- damage ---------------------------------------------------------------------------------------

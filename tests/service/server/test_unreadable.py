@@ -64,7 +64,7 @@ def _tares(folder: Path) -> None:
 
 
 def _wanted(folder: Path) -> None:
-    wanted = RetentionRequests(folder / "wanted.json")
+    wanted = RetentionRequests(folder / "retention.json")
     wanted.update_server_request("other", NEEDED)
     wanted.save()
 
@@ -121,14 +121,14 @@ def test_a_node_goes_on_and_writes_what_servers_need_only_once_it_was_read(
 ) -> None:
     _wanted(tmp_path)
     with unreadable(monkeypatch, errno.EACCES):
-        wanted = RetentionRequests(tmp_path / "wanted.json")
+        wanted = RetentionRequests(tmp_path / "retention.json")
         assert wanted.is_unknown
         assert "frames are kept" in wanted.problems[0]
         assert wanted.update_server_request("laptop", NEEDED)
         with pytest.raises(StorageError):
             wanted.save()
     wanted.save()
-    again = RetentionRequests(tmp_path / "wanted.json")
+    again = RetentionRequests(tmp_path / "retention.json")
     assert not again.update_server_request("other", NEEDED)
     assert not again.update_server_request("laptop", NEEDED)
 
@@ -231,7 +231,7 @@ def test_who_gives_up_what_cannot_be_read_keeps_what_followed_it(
         tared.reboot()
         tared.connect()
         stopped_after_fifty(tared, recording)
-        assert running.http.post(f"{recording.url}/seal").status_code == 200
+        assert running.http.post(f"{recording.url}/abandon-missing").status_code == 200
         sealed = recording.sealed()
     assert (sealed["complete"], sealed["frames"]) == ("lossy", 50)
 

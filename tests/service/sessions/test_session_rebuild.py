@@ -22,7 +22,7 @@ LOST = {"subject": "", "notes": "", "tags": ()}
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """A sealed session with marks, clock and estimates."""
+    """A sealed session with markers, clock and estimates."""
     folder = stream(tmp_path, info_of(), (0, 599), next_seq=600)
     ClockLog(folder).append(
         ClockOffset(stream_id=BOOT, t_mono_ns=10**9, server_minus_node_ns=5, uncertainty_ns=300)
@@ -86,7 +86,7 @@ def test_one_that_is_gone_is_made_again_and_lost_marks_are_said(data: Path) -> N
     (folder / "markers.parquet").write_bytes(b"PAR1")
     (one,) = book(data).iterate_newest_first()
     assert one.markers == ()
-    assert str(one.problem).endswith("lost are subject, notes and tags, marks")
+    assert str(one.problem).endswith("lost are subject, notes and tags, markers")
     recover_folder(data)
     assert find_verdict(verify_path(data)) == "complete"
 

@@ -63,7 +63,7 @@ def times(every: int = ROWS) -> Iterator[dict[str, Array]]:
 def at(*t_ns: int, labels: Sequence[str] = ()) -> list[Marker]:
     """Events at instants of the node's clock, counted from the first frame's."""
     begin = int(session()[0].t_ns[0]) + OFFSET_NS
-    names = labels or [f"mark {i}" for i in range(len(t_ns))]
+    names = labels or [f"marker {i}" for i in range(len(t_ns))]
     return [
         Marker(id=f"{i:012x}", label=name, t_ns=begin + t)
         for i, (t, name) in enumerate(zip(t_ns, names, strict=True))
@@ -76,17 +76,19 @@ def placed(
     return place_markers(events, times(every), clock(), part or Slice())
 
 
-def frames_of(marks: PlacedMarkers) -> list[tuple[int, int] | None]:
-    return [mark.frame for mark in marks.markers]
+def frames_of(markers: PlacedMarkers) -> list[tuple[int, int] | None]:
+    return [marker.frame for marker in markers.markers]
 
 
 def test_a_mark_is_at_the_frame_nearest_to_it_in_the_servers_time() -> None:
     near = int(0.4 * PERIOD_NS)
-    marks = placed(at(0, 5 * PERIOD_NS + near, 6 * PERIOD_NS - near, GAP_NS + 30 * PERIOD_NS))
-    assert frames_of(marks) == [(0, 0), (0, 5), (0, 6), (1, 0)]
-    assert [mark.distance_ns for mark in marks.markers] == [0, near, near, 0]
-    assert marks.excluded == ()
-    assert all(mark.uncertainty_ns and mark.uncertainty_ns >= 1000 for mark in marks.markers)
+    markers = placed(at(0, 5 * PERIOD_NS + near, 6 * PERIOD_NS - near, GAP_NS + 30 * PERIOD_NS))
+    assert frames_of(markers) == [(0, 0), (0, 5), (0, 6), (1, 0)]
+    assert [marker.distance_ns for marker in markers.markers] == [0, near, near, 0]
+    assert markers.excluded == ()
+    assert all(
+        marker.uncertainty_ns and marker.uncertainty_ns >= 1000 for marker in markers.markers
+    )
 
 
 def test_of_two_frames_that_are_as_near_the_earlier_one_has_the_mark() -> None:
@@ -96,15 +98,15 @@ def test_of_two_frames_that_are_as_near_the_earlier_one_has_the_mark() -> None:
 def test_marks_before_between_and_after_frames_are_at_one_within_a_second_or_at_none() -> None:
     last = 29 * PERIOD_NS
     end = GAP_NS + (ROWS - 1) * PERIOD_NS
-    marks = placed(
+    markers = placed(
         at(
             *(-DISTANCE_MAX_NS - 1, -DISTANCE_MAX_NS),
             *(last + DISTANCE_MAX_NS, last + DISTANCE_MAX_NS + 1),
             *(end + DISTANCE_MAX_NS, end + DISTANCE_MAX_NS + 1),
         )
     )
-    assert frames_of(marks) == [None, (0, 0), (0, 29), None, (1, 19), None]
-    assert [mark.exclusion_reason for mark in marks.excluded] == [
+    assert frames_of(markers) == [None, (0, 0), (0, 29), None, (1, 19), None]
+    assert [marker.exclusion_reason for marker in markers.excluded] == [
         "no frame within a second of it"
     ] * 3
 
@@ -115,26 +117,31 @@ def test_marks_at_the_ends_of_time_are_at_no_frame() -> None:
 
 
 def test_several_marks_at_one_frame_are_joined_in_the_order_of_their_instants() -> None:
-    marks = placed(
+    markers = placed(
         at(3 * PERIOD_NS + 9, 3 * PERIOD_NS + 5, 3 * PERIOD_NS + 5, labels=["c", "a", "b"])
     )
     frames, part = session()
-    column = marks.get_frame_labels(frames.seq, part)
+    column = markers.get_frame_labels(frames.seq, part)
     assert column[3] == "a; b; c"
     assert [label for label in column if label is not None] == ["a; b; c"]
 
 
 def test_a_mark_outside_the_slice_is_said_to_be() -> None:
     part = Slice(10 * PERIOD_NS * 1e-9, 20 * PERIOD_NS * 1e-9)
-    marks = placed(at(9 * PERIOD_NS, 10 * PERIOD_NS, 19 * PERIOD_NS, 20 * PERIOD_NS), part)
-    assert frames_of(marks) == [(0, 9), (0, 10), (0, 19), (0, 20)]
-    assert [bool(mark.exclusion_reason) for mark in marks.markers] == [True, False, False, True]
+    markers = placed(at(9 * PERIOD_NS, 10 * PERIOD_NS, 19 * PERIOD_NS, 20 * PERIOD_NS), part)
+    assert frames_of(markers) == [(0, 9), (0, 10), (0, 19), (0, 20)]
+    assert [bool(marker.exclusion_reason) for marker in markers.markers] == [
+        True,
+        False,
+        False,
+        True,
+    ]
 
 
 def test_without_a_measured_clock_a_mark_is_at_no_frame_and_the_reason_says_so() -> None:
-    (mark,) = place_markers(at(0), times(), clock(measured=False), Slice()).excluded
-    assert mark.frame is None
-    assert "clock" in mark.exclusion_reason
+    (marker,) = place_markers(at(0), times(), clock(measured=False), Slice()).excluded
+    assert marker.frame is None
+    assert "clock" in marker.exclusion_reason
 
 
 @settings(max_examples=60, deadline=None)
@@ -160,7 +167,7 @@ def test_any_pieces_give_the_frames_that_a_search_of_all_frames_gives(
 
 def exported(
     to: str,
-    marks: PlacedMarkers | None,
+    markers: PlacedMarkers | None,
     columns: tuple[str, ...] = (),
     options: FormatOptions = NO_TIMES,
 ) -> bytes:
@@ -176,7 +183,7 @@ def exported(
             to,
             Slice(columns=columns),
             None,
-            marks,
+            markers,
             options=options,
         )
     )
@@ -218,14 +225,14 @@ def test_without_any_mark_the_column_is_there_and_empty(to: str) -> None:
 
 
 def test_a_column_that_was_not_asked_for_says_how_to_have_it() -> None:
-    with pytest.raises(UsageError, match="marks"):
+    with pytest.raises(UsageError, match="markers"):
         exported("arrow", None, ("marker",))
 
 
 def test_the_notes_say_where_each_mark_is_and_why_one_is_at_no_frame() -> None:
-    marks = placed(at(3 * PERIOD_NS, -5 * DISTANCE_MAX_NS, labels=["stone", "early"]))
-    metadata = read(exported("arrow", marks), "arrow").schema.metadata
-    early, stone = json.loads(metadata[NOTES_KEY])["marks"]
+    markers = placed(at(3 * PERIOD_NS, -5 * DISTANCE_MAX_NS, labels=["stone", "early"]))
+    metadata = read(exported("arrow", markers), "arrow").schema.metadata
+    early, stone = json.loads(metadata[NOTES_KEY])["markers"]
     assert (stone["label"], stone["part"], stone["seq"], stone["left_out"]) == ("stone", 0, 3, None)
     assert (early["label"], early["seq"]) == ("early", None)
     assert early["left_out"] == "no frame within a second of it"

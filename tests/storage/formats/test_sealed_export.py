@@ -127,8 +127,8 @@ def outcome(chunks: Callable[[], Any]) -> pa.Table | str:
 
 def sliced(path: Path, part: Slice, clock: ClockName, events: Sequence[Marker]) -> pa.Table | str:
     with SealedFileReader(path, only_slices=True) as reader:
-        marks = place_session_markers(reader, events, part) if events else None
-        wanted = make_sealed_export(reader, part, clock=clock, markers=marks, options=NO_TIMES)
+        markers = place_session_markers(reader, events, part) if events else None
+        wanted = make_sealed_export(reader, part, clock=clock, markers=markers, options=NO_TIMES)
         return outcome(lambda: ARROW.encode(wanted))
 
 
@@ -146,7 +146,7 @@ def of_the_whole(
             "part": extra["part"]
         }
         axis = reader.time_axis
-        marks = place_markers(events, [times], table, part, axis=axis) if events else None
+        markers = place_markers(events, [times], table, part, axis=axis) if events else None
         return outcome(
             lambda: export(
                 make_frame_source([(frames, extra)], axis=axis),
@@ -155,7 +155,7 @@ def of_the_whole(
                 "arrow",
                 part,
                 table if clock == "server" else None,
-                marks,
+                markers,
                 reader.source_reference,
             )
         )
@@ -201,7 +201,7 @@ def test_a_slice_by_statistics_is_the_slice_of_the_whole_table(
     frames, extra = recorded(parts)
     path = sealed(folder / "s.parquet", frames, extra, group_ns, **options)
     events = [
-        Marker(id=f"{i:012x}", label=f"mark {i}", t_ns=UTC_NS + round(at_s * 1e9))
+        Marker(id=f"{i:012x}", label=f"marker {i}", t_ns=UTC_NS + round(at_s * 1e9))
         for i, at_s in enumerate(marks_s)
     ]
     rows = [  # of the first part's clock, which may step; of the others nothing is known
@@ -219,7 +219,7 @@ def test_a_slice_by_statistics_is_the_slice_of_the_whole_table(
 
 
 def test_why_a_mark_stands_nowhere_is_known_from_the_whole_file(tmp_path: Path) -> None:
-    """Two streams that no clock was compared with share a row group: it may hold the mark."""
+    """Two streams that no clock was compared with share a row group: it may hold the marker."""
     parts = [Boot(6, at_s * SECOND_NS, UTC_NS, 0, 0) for at_s in (0, 100, 110)]
     frames, extra = recorded(parts)
     path = sealed(tmp_path / "s.parquet", frames, extra, 60 * SECOND_NS)
@@ -230,8 +230,8 @@ def test_why_a_mark_stands_nowhere_is_known_from_the_whole_file(tmp_path: Path) 
     found = sliced(path, Slice(), "node", events)
     assert same(found, of_the_whole(path, frames, extra, Slice(), "node", events)), found
     with SealedFileReader(path) as reader:
-        (mark,) = place_session_markers(reader, events, Slice()).markers
-    assert mark.exclusion_reason == "no frame within a second of it"
+        (marker,) = place_session_markers(reader, events, Slice()).markers
+    assert marker.exclusion_reason == "no frame within a second of it"
 
 
 # --- what is read ---------------------------------------------------------------------------------

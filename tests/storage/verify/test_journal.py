@@ -70,7 +70,7 @@ def problems(folder: Path) -> str:
 
 
 def opened(folder: Path) -> Path:
-    """As it is while it is written: the mark of the end is not there yet."""
+    """As it is while it is written: the marker of the end is not there yet."""
     path = index_of(folder)
     path.write_bytes(path.read_bytes()[: -RECORD_DTYPE.itemsize])
     return folder

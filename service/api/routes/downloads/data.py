@@ -77,10 +77,10 @@ async def get_data(
 ) -> Response:
     """Return a session in a selected format; `GET /formats` lists them.
 
-    Parquet without slice, columns, server's clock or marks is the stored file: with ranges, a
+    Parquet without slice, columns, server's clock or markers is the stored file: with ranges, a
     strong ETag that is its SHA-256, and a digest. Any other file is made on request and streamed;
     while a session is recorded it has the present frames. `Foottile-Complete` states whether frames
-    are missing, `Foottile-Marks` the number of markers in it and of markers left out.
+    are missing, `Foottile-Markers` the number of markers in it and of markers left out.
     """
     session = require_frames(server.sessions.get_session(session_id))
     ledger = server.recorder.get_ledger(session_id)
@@ -142,12 +142,14 @@ async def _export_response(
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
     if has_matching_etag(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    marks = None
+    markers = None
     if query.has_markers:
-        marks = await run_in_threadpool(_place_markers, session, query, server)
-        headers |= marker_headers([marks])
+        markers = await run_in_threadpool(_place_markers, session, query, server)
+        headers |= marker_headers([markers])
     stem = make_file_stem(session.name, session.id, query.slice)
-    return await export_response(_write_export(session, query, server, marks), query, stem, headers)
+    return await export_response(
+        _write_export(session, query, server, markers), query, stem, headers
+    )
 
 
 def _place_markers(session: Session, query: DataQuery, server: Server) -> PlacedMarkers:
@@ -166,7 +168,7 @@ def _place_markers(session: Session, query: DataQuery, server: Server) -> Placed
 
 
 def _write_export(
-    session: Session, query: DataQuery, server: Server, marks: PlacedMarkers | None
+    session: Session, query: DataQuery, server: Server, markers: PlacedMarkers | None
 ) -> Chunks:
     if session.sha256 is None:
         sources = server.recorder.collect_inputs(session.id)
@@ -184,7 +186,7 @@ def _write_export(
                 frames.notes,
                 query.slice,
                 clock,
-                marks,
+                markers,
                 source,
                 query.options,
             )
@@ -194,6 +196,6 @@ def _write_export(
         session.id, only_slices=not query.slice.is_whole_session
     ) as reader:
         export = make_sealed_export(
-            reader, query.slice, clock=query.clock, markers=marks, options=query.options
+            reader, query.slice, clock=query.clock, markers=markers, options=query.options
         )
         yield from query.format_spec.encode(export)

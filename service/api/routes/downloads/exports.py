@@ -53,11 +53,11 @@ async def compute_export_etag(session: Session, query: ExportQuery, server: Serv
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def marker_headers(marks: list[PlacedMarkers]) -> dict[str, str]:
+def marker_headers(markers: list[PlacedMarkers]) -> dict[str, str]:
     """Return the header with the number of markers in the file."""
-    total = sum(len(each.markers) for each in marks)
-    left_out = sum(len(each.excluded) for each in marks)
-    return {"Foottile-Marks": f"placed={total - left_out}, left-out={left_out}"}
+    total = sum(len(each.markers) for each in markers)
+    left_out = sum(len(each.excluded) for each in markers)
+    return {"Foottile-Markers": f"placed={total - left_out}, left-out={left_out}"}
 
 
 def make_file_stem(name: str, id_: str, part: Slice) -> str:

@@ -76,11 +76,13 @@ async def get_take_data(
     }
     if has_matching_etag(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    marks = None
+    markers = None
     if query.has_markers:
-        marks = [await run_in_threadpool(_place_markers, each, query, server) for each in sessions]
-        headers |= marker_headers(marks)
-    chunks = _write_exports(sessions, query, server, marks)
+        markers = [
+            await run_in_threadpool(_place_markers, each, query, server) for each in sessions
+        ]
+        headers |= marker_headers(markers)
+    chunks = _write_exports(sessions, query, server, markers)
     stem = make_file_stem(sessions[0].name, f"take-{take_id}", query.slice)
     return await export_response(chunks, query, stem, headers)
 
@@ -91,7 +93,10 @@ def _place_markers(session: Session, query: TakeDataQuery, server: Server) -> Pl
 
 
 def _write_exports(
-    sessions: list[Session], query: TakeDataQuery, server: Server, marks: list[PlacedMarkers] | None
+    sessions: list[Session],
+    query: TakeDataQuery,
+    server: Server,
+    markers: list[PlacedMarkers] | None,
 ) -> Chunks:
     part = query.slice
     with ExitStack() as opened:
@@ -102,7 +107,7 @@ def _write_exports(
                 ),
                 part,
                 clock=query.clock_name,
-                markers=None if marks is None else marks[number],
+                markers=None if markers is None else markers[number],
                 options=query.options,
             )
             for number, session in enumerate(sessions)

@@ -44,14 +44,14 @@ class ArrayView(View):
 
 
 @router.get(
-    "/{session_id}/array",
-    operation_id="getArray",
+    "/{session_id}/tiles",
+    operation_id="listTiles",
     summary="Tiles",
     responses=problem_responses(
         _404="No such session, or nothing was recorded.", _409="It is damaged."
     ),
 )
-async def get_array(session_id: str, server: ServerState) -> ArrayView:
+async def list_tiles(session_id: str, server: ServerState) -> ArrayView:
     """Return the tiles' positions and ranges, and the look-ahead of the estimates."""
     session = server.sessions.get_session(session_id)
     if session.state == "sealed" and session.sha256 is None:

@@ -83,8 +83,8 @@ class OverviewView(BaseModel):
 
 
 @router.get(
-    "/{session_id}/overview",
-    operation_id="getOverview",
+    "/{session_id}/timeseries",
+    operation_id="getTimeseries",
     summary="Time series at any zoom",
     response_model=OverviewView,
     responses={
@@ -97,7 +97,7 @@ class OverviewView(BaseModel):
         ),
     },
 )
-async def get_overview(
+async def get_timeseries(
     session_id: str,
     query: Annotated[OverviewQuery, Query()],
     request: Request,

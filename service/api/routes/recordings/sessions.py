@@ -1,4 +1,4 @@
-"""Routes of sessions: start, stop, list, describe, mark."""
+"""Routes of sessions: start, stop, list, describe, marker."""
 
 from __future__ import annotations
 
@@ -179,8 +179,8 @@ async def stop_session(session_id: str, server: ServerState) -> SessionView:
 
 
 @router.post(
-    "/{session_id}/seal",
-    operation_id="sealSession",
+    "/{session_id}/abandon-missing",
+    operation_id="abandonMissing",
     summary="Seal without what is missing",
     responses={**_UNKNOWN, **problem_responses(_409="It is not pending."), **FULL},
 )
@@ -307,7 +307,7 @@ async def delete_session(session_id: str, server: ServerState, if_match: IfMatch
 
 @router.post(
     "/{session_id}/markers",
-    operation_id="markEvent",
+    operation_id="addMarker",
     summary="Add a marker",
     status_code=HTTPStatus.CREATED,
     responses={**_UNKNOWN, **FULL},
@@ -320,7 +320,7 @@ async def add_marker(session_id: str, body: AddMarker, server: ServerState) -> M
 
 @router.patch(
     "/{session_id}/markers/{marker_id}",
-    operation_id="changeEvent",
+    operation_id="changeMarker",
     summary="Rename or move a marker",
     responses={**_NO_EVENT, **CHANGED, **FULL},
 )
@@ -341,7 +341,7 @@ async def change_marker(
 
 @router.delete(
     "/{session_id}/markers/{marker_id}",
-    operation_id="deleteEvent",
+    operation_id="deleteMarker",
     summary="Delete a marker",
     status_code=HTTPStatus.NO_CONTENT,
     response_model=None,
@@ -356,7 +356,7 @@ async def delete_marker(
 
 @router.get(
     "/{session_id}/markers",
-    operation_id="listEvents",
+    operation_id="listMarkers",
     summary="Markers",
     response_model=Page[MarkerView],
     responses={

@@ -105,6 +105,6 @@ def _measure_settled(
             f"the {step} lasted {1e-9 * (t_ns[-1] - t_ns[0]):.1f} s with {known.sum()} readings",
             where=where,
             expected=f"{1e-9 * STEP_MIN_NS:g} s or more of readings",
-            remedy="Remove the marks of this step on the session's page, or record once more",
+            remedy="Remove the markers of this step on the session's page, or record once more",
         )
     return float(last.mean()), float(last.std(ddof=1)), float(last.mean() - first.mean())

@@ -54,7 +54,7 @@ def _encode(export: Export) -> Iterator[bytes]:
     yield from _encode_meanings(quantities)
     yield encode_variable("tiles", make_tile_struct(export))
     if export.markers is not None:
-        yield encode_variable("marks", make_marker_struct(export))
+        yield encode_variable("markers", make_marker_struct(export))
     for column in quantities:
         if pa.types.is_string(column.type):
             for name, values in read_quantity(export, column).items():
@@ -88,7 +88,7 @@ def _make_struct_fields(export: Export) -> dict[str, StructField]:
     }
     fields["tiles"] = StructField.from_value(make_tile_struct(export))
     if export.markers is not None:
-        fields["marks"] = StructField.from_value(make_marker_struct(export))
+        fields["markers"] = StructField.from_value(make_marker_struct(export))
     for column in _quantities_with_server_time(export):
         if pa.types.is_string(column.type):
             fields |= {

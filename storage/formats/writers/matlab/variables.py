@@ -110,18 +110,18 @@ def make_marker_struct(export: Export) -> dict[str, Any]:
 
     Rows count from 1; NaN: no frame of this file.
     """
-    marks = export.markers.markers if export.markers is not None else ()
+    markers = export.markers.markers if export.markers is not None else ()
     keys = ["seq", "part"] if "part" in export.frame_source.quantity_names else ["seq"]
     pieces = list(replace(export, markers=None, clock=None).read_chunks(keys))
     seq = np.concatenate([piece["seq"] for piece in pieces])
     part = np.concatenate([piece.get("part", np.zeros(len(piece["seq"]))) for piece in pieces])
     rows = []
-    for mark in marks:
-        of_part, number = mark.frame or (-1, 0)
+    for marker in markers:
+        of_part, number = marker.frame or (-1, 0)
         at = np.flatnonzero((part == of_part) & (seq == number))
         rows.append(float(at[0] + 1) if len(at) else np.nan)
     return {
-        "label": np.array([mark.marker.label for mark in marks], dtype=object),
-        "t_ns": np.array([mark.marker.t_ns for mark in marks], dtype=np.int64),
+        "label": np.array([marker.marker.label for marker in markers], dtype=object),
+        "t_ns": np.array([marker.marker.t_ns for marker in markers], dtype=np.int64),
         "row": np.array(rows, dtype=np.float64),
     }

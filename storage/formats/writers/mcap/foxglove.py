@@ -87,7 +87,7 @@ class FoxgloveEncoder:
             "foottile.Frame", "protobuf", descriptors.SerializeToString()
         )
         self._frames = channels.register_channel(f"{topic_prefix}/frames", "protobuf", frame, {})
-        self._marks = _register_channel(channels, f"{topic_prefix}/marks", Log)
+        self._markers = _register_channel(channels, f"{topic_prefix}/markers", Log)
         self._scene = _register_channel(channels, f"{topic_prefix}/foot", SceneUpdate)
 
     def encode_messages(self, frames: FrameChunk) -> Iterator[Message]:
@@ -98,10 +98,12 @@ class FoxgloveEncoder:
         beside: dict[int, list[Message]] = {}
         t_ns = frames.t_ns.tolist()
         for row, text in frames.markers:
-            mark = Log(
+            marker = Log(
                 timestamp=_timestamp(t_ns[row]), level=Log.INFO, message=text, name=self._info.node
             )
-            beside.setdefault(row, []).append((t_ns[row], self._marks, mark.SerializeToString()))
+            beside.setdefault(row, []).append(
+                (t_ns[row], self._markers, marker.SerializeToString())
+            )
         for row, content in zip(frames.drawn_rows, self._encode_scenes(frames), strict=True):
             beside.setdefault(row, []).append((t_ns[row], self._scene, content))
         channel = self._frames

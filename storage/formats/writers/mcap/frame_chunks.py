@@ -96,10 +96,10 @@ def read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChunk
         shown = np.flatnonzero(np.diff(turns, prepend=last_shown))
         last_shown = int(turns[-1]) if len(turns) else last_shown
         events = piece.get("marker", ())
-        marks = [(row, text) for row, text in enumerate(events) if text is not None]
+        markers = [(row, text) for row, text in enumerate(events) if text is not None]
         bound_ns = piece.get(SERVER_TIME_COLUMNS[1].name)
         worst_ns = None if bound_ns is None else int(bound_ns.max(initial=0))
-        yield FrameChunk(t_ns, piece, shown.tolist(), marks, worst_ns)
+        yield FrameChunk(t_ns, piece, shown.tolist(), markers, worst_ns)
 
 
 def compute_tile_colour(force_n: float) -> tuple[float, float, float, float]:

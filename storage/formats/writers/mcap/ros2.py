@@ -96,7 +96,7 @@ class Ros2Encoder:
         self._markers = self._register_topic(
             f"{topic_prefix}/foot", "visualization_msgs/msg/MarkerArray"
         )
-        self._marks = self._register_topic(f"{topic_prefix}/marks", "std_msgs/msg/String")
+        self._markers = self._register_topic(f"{topic_prefix}/markers", "std_msgs/msg/String")
 
     def encode_messages(self, frames: FrameChunk) -> Iterator[Message]:
         """Yield the encoded messages of a chunk of frames, in order."""
@@ -109,7 +109,7 @@ class Ros2Encoder:
         beside: dict[int, list[Message]] = {}
         for row, text in frames.markers:
             content = self._encode_cdr(self._make_message("std_msgs/msg/String", text))
-            beside.setdefault(row, []).append((t_ns[row], self._marks, content))
+            beside.setdefault(row, []).append((t_ns[row], self._markers, content))
         for row, content in zip(frames.drawn_rows, self._encode_drawings(frames), strict=True):
             beside.setdefault(row, []).append((t_ns[row], self._markers, content))
         for row, at_ns in enumerate(t_ns):

@@ -217,7 +217,7 @@ def _encode_mot_rows(rows: Floats, columns: Sequence[str]) -> bytes:
 def _make_event_table(reaction: GroundReaction) -> pa.Table:
     times = pa.array([at_s for at_s, _ in reaction.events], pa.float64())
     labels = pa.array([label for _, label in reaction.events], pa.string())
-    kinds = ["mark"] * reaction.marker_count + ["contact"] * (
+    kinds = ["marker"] * reaction.marker_count + ["contact"] * (
         len(reaction.events) - reaction.marker_count
     )
     return pa.table([times, labels, pa.array(kinds, pa.string())], names=["time", "event", "kind"])

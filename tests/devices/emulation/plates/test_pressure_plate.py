@@ -39,7 +39,7 @@ def foot_of(*domes: tuple[float, float, float]) -> PlateLoad:
 
 
 def even(foot: PlateLoad) -> PressurePlate:
-    """A plate whose cells are all alike, with the foot right on its mark."""
+    """A plate whose cells are all alike, with the foot right on its marker."""
     plate = PressurePlate.draw(foot.dome_places_m, make_rng("plate"), make_rng("trial"))
     return replace(
         plate,

@@ -1,4 +1,4 @@
-"""`foottile calibrate`: several files, refusals, and the mark of an assumed scale."""
+"""`foottile calibrate`: several files, refusals, and the marker of an assumed scale."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
         """A guide whose prompts somebody follows."""
 
         def push(self, t_ns: npt.NDArray[np.int64], kpa: Floats) -> list[Action]:
-            # By now the prompt is there, and the marks before it are made.
+            # By now the prompt is there, and the markers before it are made.
             known = parse_weight(self.weights[self.number]) if self.step == "put on" else None
             if known is not None:
                 play.force_n = known.force_n

@@ -61,8 +61,8 @@ def test_sessions_marks_and_frames_are_views_of_what_is_in_the_folders(made: Pat
     assert "no estimates" in sessions[3]["problem"]
     counted = answer("SELECT session_id, count(*) AS n FROM frames GROUP BY 1 ORDER BY 1", made)
     assert [row["n"] for row in counted] == [row["frames"] for row in sessions]
-    marks = answer("SELECT session_id, label FROM markers ORDER BY 1", made)
-    assert marks == [{"session_id": session_id, "label": "=off"} for session_id in IDS[:4]]
+    markers = answer("SELECT session_id, label FROM markers ORDER BY 1", made)
+    assert markers == [{"session_id": session_id, "label": "=off"} for session_id in IDS[:4]]
 
 
 def test_frames_have_the_numbers_of_the_sealed_file(made: Path) -> None:

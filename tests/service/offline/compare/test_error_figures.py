@@ -205,10 +205,10 @@ def test_frames_in_a_gap_of_the_reference_are_not_there() -> None:
 
 def test_marks_cut_trials_and_what_is_before_the_first_is_in_none() -> None:
     t_ns = BEGAN_NS + np.arange(10, dtype=np.int64)
-    marks = [TrialMarker("b", BEGAN_NS + 6), TrialMarker("a", BEGAN_NS + 2)]
-    trials, what = split_into_trials(t_ns, np.zeros(10, np.uint16), marks)
+    markers = [TrialMarker("b", BEGAN_NS + 6), TrialMarker("a", BEGAN_NS + 2)]
+    trials, what = split_into_trials(t_ns, np.zeros(10, np.uint16), markers)
     assert [(trial.name, trial.rows.sum()) for trial in trials] == [("1: a", 4), ("2: b", 4)]
-    assert what == "from mark to mark"
+    assert what == "from marker to marker"
 
 
 def test_without_marks_each_part_is_a_trial() -> None:

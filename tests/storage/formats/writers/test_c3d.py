@@ -137,7 +137,7 @@ def test_contacts_are_events_of_their_usual_names(plain: Read) -> None:
 LABELS = ("Foot Strike", "Foot Off")
 
 
-def marks(labels: dict[int, str]) -> PlacedMarkers:
+def markers(labels: dict[int, str]) -> PlacedMarkers:
     return PlacedMarkers(
         [
             PlacedMarker(Marker(id=str(row), label=text, t_ns=0), (0, row), 0, 0)
@@ -147,7 +147,7 @@ def marks(labels: dict[int, str]) -> PlacedMarkers:
 
 
 def test_marks_are_events_in_letters_that_every_reader_knows() -> None:
-    found = Read(export_of_walk(markers=marks({3: "Stoß «links» 😀", 7: "=1+1", 9: "x" * 400})))
+    found = Read(export_of_walk(markers=markers({3: "Stoß «links» 😀", 7: "=1+1", 9: "x" * 400})))
     labels = [label for label, _ in found.events()][:3]
     assert labels == ["StoU+00DF U+00ABlinksU+00BB U+1F600", "=1+1", "x" * 100]
     assert found.events()[0][1] == pytest.approx(3 / RATE_HZ)
@@ -156,10 +156,10 @@ def test_marks_are_events_in_letters_that_every_reader_knows() -> None:
 def test_of_more_events_than_a_list_holds_marks_come_first_and_the_rest_is_said() -> None:
     columns = walk()
     columns["contact"] = np.tile(np.array([0, 1], dtype=np.uint8), ROWS // 2)
-    found = Read(export_of_walk(columns, markers=marks({500: "here"})))
+    found = Read(export_of_walk(columns, markers=markers({500: "here"})))
     assert len(found.events()) == 255
     assert found.events()[0][0] == "here"
-    assert "1 marks, 999 begins and ends of contact; the last 745 are left out" in found.text(
+    assert "1 markers, 999 begins and ends of contact; the last 745 are left out" in found.text(
         "EVENTS"
     )
 
@@ -343,7 +343,7 @@ def test_names_of_nodes_and_serials_are_shown_and_not_obeyed() -> None:
 
 
 def tap() -> PlacedMarkers:
-    return marks({10: "tap"})
+    return markers({10: "tap"})
 
 
 def test_two_feet_are_two_platforms_on_the_servers_axis() -> None:

@@ -34,13 +34,15 @@ _TEXT = "{urn:oasis:names:tc:opendocument:xmlns:text:1.0}"
 
 def exported(to: str, options: FormatOptions) -> bytes:
     first = int(frames().seq[0])
-    marks = [
+    markers = [
         PlacedMarker(Marker(id=str(i), label=label, t_ns=0), (0, first + i), 0, 0)
         for i, label in enumerate(LABELS)
     ]
     content = make_frame_source(cut(frames(), extra(), 20))
     chunks = export(
-        *(content, make_array(), NOTES, to, Slice()), markers=PlacedMarkers(marks), options=options
+        *(content, make_array(), NOTES, to, Slice()),
+        markers=PlacedMarkers(markers),
+        options=options,
     )
     return b"".join(chunks)
 

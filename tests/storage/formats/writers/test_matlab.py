@@ -27,12 +27,13 @@ from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import make_array
 from tests.storage.formats.exports import ROWS, extra, frames
 from tests.storage.formats.walks import DOCUMENT
-from tests.storage.formats.writers.test_mcap import LABEL, marks
+from tests.storage.formats.writers.test_mcap import LABEL, markers
 
 SCRIPT = """
 s = load("{path}");
 assert(isa(s.t_ns, "int64") && isequal(size(s.force_n), [{rows} 2]));
-fprintf("%d %s %.3f %d %s\\n", s.t_ns(3), s.units.grf_n, s.time_s(3), s.marks.row, s.about.session);
+fprintf("%d %s %.3f %d %s\\n", ...
+  s.t_ns(3), s.units.grf_n, s.time_s(3), s.markers.row, s.about.session);
 fprintf("%s\\n", datestr(double(s.t_ns(1)) / 86400e9 + 719529, "yyyy-mm-dd HH:MM:SS"));
 p = load("{path}", "grf_n");
 assert(isequal(fieldnames(p), {{"grf_n"}}));
@@ -49,7 +50,7 @@ def sealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def written(path: Path, part: Slice | None = None) -> bytes:
     with SealedFileReader(path) as reader:
-        export = make_sealed_export(reader, part or Slice(), markers=marks(), options=NO_OPTIONS)
+        export = make_sealed_export(reader, part or Slice(), markers=markers(), options=NO_OPTIONS)
         return b"".join(MATLAB.encode(export))
 
 
@@ -88,7 +89,7 @@ def test_units_tiles_marks_and_facts_are_structs(sealed: Path) -> None:
     assert found["tiles"]["serial"].tolist() == [tile.serial for tile in make_array().tiles]
     places = [[tile.x_m, tile.y_m, tile.z_m] for tile in make_array().tiles]
     assert found["tiles"]["position_m"].tolist() == places
-    assert (found["marks"]["label"], found["marks"]["row"]) == (LABEL, 13)
+    assert (found["markers"]["label"], found["markers"]["row"]) == (LABEL, 13)
     about = found["about"]
     assert (about["session"], about["resampled"], about["complete"]) == ("s", "nothing", "null")
     assert json.loads(about["array_info"])["node"] == make_array().node
@@ -98,10 +99,10 @@ def test_units_tiles_marks_and_facts_are_structs(sealed: Path) -> None:
 def test_a_slice_has_its_frames_and_columns_and_seconds_of_the_session(sealed: Path) -> None:
     found = loaded(written(sealed, Slice(0.02, 0.04, ("time_s", "force_n_1"))))
     assert [name for name in found if not name.startswith("__")] == [
-        *("about", "units", "meaning", "tiles", "marks", "time_s", "force_n")
+        *("about", "units", "meaning", "tiles", "markers", "time_s", "force_n")
     ]
     np.testing.assert_allclose(found["time_s"], 0.02 + 0.002 * np.arange(10), atol=1e-12)
-    assert found["marks"]["row"] == 3
+    assert found["markers"]["row"] == 3
     assert loaded(written(sealed, Slice(0.051, 0.0515)))["t_ns"].size == 0
 
 

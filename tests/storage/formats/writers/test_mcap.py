@@ -48,7 +48,7 @@ def estimates() -> dict[str, Array]:
     return extra() | {"grf_n": grf_n, **cop}
 
 
-def marks() -> PlacedMarkers:
+def markers() -> PlacedMarkers:
     clock = ClockTable(
         {"a": OffsetRows(np.array([0]), np.array([0]), np.array([1]))},
         [StreamClockFacts("a", 0, True)],
@@ -72,7 +72,7 @@ def written(
     content = make_frame_source(cut(frames(), estimates() if columns is None else columns, every))
     info = make_array(2, node=node)
     chunks = export(
-        content, info, NOTES, "mcap", part or Slice(), None, marks(), {"session": "s"}, options
+        content, info, NOTES, "mcap", part or Slice(), None, markers(), {"session": "s"}, options
     )
     return b"".join(chunks)
 
@@ -126,7 +126,7 @@ def test_every_frame_is_a_message_with_its_columns_at_its_instant() -> None:
 
 
 def test_a_mark_is_a_line_of_log_at_its_frame() -> None:
-    ((message, log),) = foxglove(written())["/left/marks"]
+    ((message, log),) = foxglove(written())["/left/markers"]
     at_ns = int(frames().t_ns[12])
     assert message.log_time == at_ns
     assert log.timestamp.seconds * 10**9 + log.timestamp.nanos == at_ns
@@ -174,8 +174,8 @@ def test_the_file_says_what_it_is(options: FormatOptions) -> None:
     assert "x forward" in said["axes"]
     assert said["resampled"] == "nothing"
     assert json.loads(said["serials"]) == [tile.serial for tile in make_array(2).tiles]
-    (mark,) = json.loads(said["notes"])["marks"]
-    assert mark["label"] == LABEL
+    (marker,) = json.loads(said["notes"])["markers"]
+    assert marker["label"] == LABEL
 
 
 # --- those of ROS 2 -------------------------------------------------------------------------------
@@ -258,7 +258,7 @@ def test_markers_show_the_tiles_and_a_mark_is_a_text(tmp_path: Path) -> None:
         places = [(m.pose.position.x, m.pose.position.y, m.pose.position.z) for m in drawn]
         assert places == [(tile.x_m, tile.y_m, tile.z_m) for tile in tiles]
         assert (arrow.action == arrow.ADD) == (len(arrow.points) == 2)
-    ((t_ns, text),) = messages["/left/marks"]
+    ((t_ns, text),) = messages["/left/markers"]
     assert (t_ns, text.data) == (int(frames().t_ns[12]), LABEL)
 
 

@@ -199,7 +199,7 @@ def test_marks_and_contacts_lie_beside_it(tmp_path: Path) -> None:
         export_of_walk(markers=PlacedMarkers([PlacedMarker(event, (0, 3), 0, 0)])), tmp_path
     )
     events = pacsv.read_csv(next(tmp_path.glob("*_events.csv"))).to_pylist()
-    assert events[0] == {"time": 3 / RATE_HZ, "event": "'=HYPERLINK(1)", "kind": "mark"}
+    assert events[0] == {"time": 3 / RATE_HZ, "event": "'=HYPERLINK(1)", "kind": "marker"}
     rows = [round(row["time"] * RATE_HZ) for row in events[1:]]
     assert rows == [row for stance in STANCES for row in stance]
     assert found.notes["MARKS"] == 1

@@ -22,7 +22,7 @@ from storage.schema import Array
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.storage.formats.exports import NOTES, ROWS, cut, export, extra, frames
 from tests.storage.formats.walks import lines_of_documents
-from tests.storage.formats.writers.test_mcap import LABEL, marks
+from tests.storage.formats.writers.test_mcap import LABEL, markers
 
 BOOTS = ["0" * 32, "1" * 32]
 
@@ -47,7 +47,7 @@ def written(
         "xdf",
         part or Slice(),
         clock,
-        marks(),
+        markers(),
         source,
         options,
     )
@@ -74,7 +74,7 @@ def series(stream: Any, name: str) -> Array:
 def test_every_frame_is_a_sample_at_its_instant_with_nan_for_what_is_not_known(every: int) -> None:
     batch, columns = frames(), extra()
     streams, _ = read(written(every=every))
-    assert set(streams) == {"left frames", "left counters", "left marks"}
+    assert set(streams) == {"left frames", "left counters", "left markers"}
     of_frames, counters = streams["left frames"], streams["left counters"]
     for stream in (of_frames, counters):
         at_ns = (stream["time_stamps"] * 1e9).astype(np.int64)
@@ -103,7 +103,7 @@ def test_channels_have_units_and_serials_and_footers_count_the_samples() -> None
 
 
 def test_a_mark_is_a_sample_of_text_at_its_frame() -> None:
-    stream = read(written())[0]["left marks"]
+    stream = read(written())[0]["left markers"]
     assert stream["time_series"] == [[LABEL]]
     assert abs(stream["time_stamps"][0] - frames().t_ns[12] * 1e-9) < 1e-6
     assert stream["info"]["type"] == ["Markers"]
@@ -202,7 +202,7 @@ def test_at_a_constant_rate_samples_are_even_in_one_stream_and_empty_where_frame
         columns=columns, every=every, taken=taken, options=FormatOptions(rate="constant")
     )
     streams, _ = read(content)
-    assert set(streams) == {"left frames", "left counters", "left marks"}
+    assert set(streams) == {"left frames", "left counters", "left markers"}
     stream = streams["left frames"]
     rate_hz = float(stream["info"]["nominal_srate"][0])
     assert rate_hz == pytest.approx(1e9 / PERIOD_NS)
@@ -210,7 +210,7 @@ def test_at_a_constant_rate_samples_are_even_in_one_stream_and_empty_where_frame
     np.testing.assert_allclose(np.diff(stream["time_stamps"]), 1.0 / rate_hz, atol=5e-7)
     force_n = np.where(taken, columns["force_n"][:, 0], np.nan).astype(np.float32)
     np.testing.assert_array_equal(series(stream, "force_n_0"), force_n)
-    assert streams["left marks"]["time_series"] == [[LABEL]]
+    assert streams["left markers"]["time_series"] == [[LABEL]]
 
 
 def test_a_constant_rate_keeps_the_clock_offset() -> None:

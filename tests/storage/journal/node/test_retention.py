@@ -71,9 +71,9 @@ def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of
     monkeypatch.setattr("storage.journal.open_segments.SEGMENT_DURATION_NS", 20_000_000)
     folder = tmp_path / "journal" / "leg"
     folder.mkdir(parents=True)
-    (folder / "wanted.json").write_bytes(b"damaged")
+    (folder / "retention.json").write_bytes(b"damaged")
     journal = start(budget_bytes=60_000)
-    assert "wanted.json.damaged-1" in " ".join(journal.problems)
+    assert "retention.json.damaged-1" in " ".join(journal.problems)
     stream = journal.begin_stream(make_array())
     store(journal, stream, 0, 299)
     time.sleep(2 * node_journal.SYNC_INTERVAL_S)  # for several looks at what is old

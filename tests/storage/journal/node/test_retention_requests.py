@@ -11,7 +11,7 @@ from storage.journal.node.retention_requests import RetentionRequest, RetentionR
 
 
 def test_a_servers_word_outlives_the_process(tmp_path: Path) -> None:
-    wanted = RetentionRequests(tmp_path / "wanted.json")
+    wanted = RetentionRequests(tmp_path / "retention.json")
     assert wanted.update_server_request(
         "laptop", RetentionRequest(streams={"a": ((5, 9), (20, None))})
     )
@@ -19,7 +19,7 @@ def test_a_servers_word_outlives_the_process(tmp_path: Path) -> None:
         "laptop", RetentionRequest(streams={"a": ((5, 9), (20, None))})
     )
     wanted.save()
-    again = RetentionRequests(tmp_path / "wanted.json")
+    again = RetentionRequests(tmp_path / "retention.json")
     assert again.required_numbers_of("a") == Intervals([(5, 9), (20, NO_END)])
     assert again.required_numbers_of("b") == Intervals()
 
@@ -27,7 +27,7 @@ def test_a_servers_word_outlives_the_process(tmp_path: Path) -> None:
 def test_while_a_session_is_recorded_a_stream_nobody_has_heard_of_belongs_to_it(
     tmp_path: Path,
 ) -> None:
-    wanted = RetentionRequests(tmp_path / "wanted.json")
+    wanted = RetentionRequests(tmp_path / "retention.json")
     wanted.update_server_request(
         "laptop", RetentionRequest(streams={"b": ((7, None),)}, recording=True, known=("a", "b"))
     )
@@ -37,7 +37,7 @@ def test_while_a_session_is_recorded_a_stream_nobody_has_heard_of_belongs_to_it(
 
 
 def test_one_server_does_not_give_up_what_another_needs(tmp_path: Path) -> None:
-    wanted = RetentionRequests(tmp_path / "wanted.json")
+    wanted = RetentionRequests(tmp_path / "retention.json")
     wanted.update_server_request("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
     wanted.update_server_request("other", RetentionRequest(streams={"a": ((5, 14),)}))
     wanted.set_local_numbers({"a": Intervals([(100, 109)])})
@@ -53,25 +53,25 @@ DAMAGES = (b"", b"{", b"[]", b"null", b'{"servers": 7}', b"\xff", b"[" * 100_000
 def test_a_damaged_file_is_set_aside_and_as_long_as_it_is_there_all_may_be_wanted(
     tmp_path: Path, content: bytes
 ) -> None:
-    path = tmp_path / "wanted.json"
+    path = tmp_path / "retention.json"
     path.write_bytes(content)
     wanted = RetentionRequests(path)
     assert wanted.is_unknown
-    assert "wanted.json.damaged-1" in " ".join(wanted.problems)
-    assert path.with_name("wanted.json.damaged-1").read_bytes() == content
+    assert "retention.json.damaged-1" in " ".join(wanted.problems)
+    assert path.with_name("retention.json.damaged-1").read_bytes() == content
     wanted.update_server_request("laptop", RetentionRequest(streams={"a": ((0, 9),)}))
     wanted.save()
     again = RetentionRequests(path)
     assert again.required_numbers_of("a") == Intervals([(0, 9)])
     assert again.is_unknown
     assert "Delete" in again.problems[0]
-    path.with_name("wanted.json.damaged-1").unlink()
+    path.with_name("retention.json.damaged-1").unlink()
     assert not RetentionRequests(path).is_unknown
     assert RetentionRequests(path).problems == []
 
 
 def test_a_flipped_bit_is_noticed_wherever_it_is(tmp_path: Path) -> None:
-    path = tmp_path / "wanted.json"
+    path = tmp_path / "retention.json"
     wanted = RetentionRequests(path)
     wanted.update_server_request(
         "laptop", RetentionRequest(streams={"a": ((0, 9),)}, recording=True, known=("a",))
@@ -81,11 +81,11 @@ def test_a_flipped_bit_is_noticed_wherever_it_is(tmp_path: Path) -> None:
     for at in range(len(whole)):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :])
         assert RetentionRequests(path).is_unknown
-        path.with_name("wanted.json.damaged-1").unlink()
+        path.with_name("retention.json.damaged-1").unlink()
 
 
 def test_a_file_of_an_older_version_is_read_and_called_unproven(tmp_path: Path) -> None:
-    path = tmp_path / "wanted.json"
+    path = tmp_path / "retention.json"
     path.write_text('{"servers":{"laptop":{"streams":{"a":[[0,9]]}}}}')
     wanted = RetentionRequests(path)
     assert wanted.required_numbers_of("a") == Intervals([(0, 9)])

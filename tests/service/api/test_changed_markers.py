@@ -13,7 +13,7 @@ from tests.service.running import Running, assert_refused
 
 @pytest.fixture
 def session(tared: FakeNode) -> Recording:
-    """A sealed session of 200 frames with two marks, of which nobody cares when."""
+    """A sealed session of 200 frames with two markers, of which nobody cares when."""
     session = tared.record()
     tared.deliver(200, [20.0, 60.0], alive=True)
     tared.finish(session)
@@ -23,7 +23,7 @@ def session(tared: FakeNode) -> Recording:
     return session
 
 
-def marks(session: Recording) -> dict[str, dict[str, object]]:
+def markers(session: Recording) -> dict[str, dict[str, object]]:
     items = session.running.http.get(f"{session.url}/markers").json()["items"]
     return {item["label"]: item for item in items}
 
@@ -31,7 +31,7 @@ def marks(session: Recording) -> dict[str, dict[str, object]]:
 def test_a_mark_is_renamed_and_moved_also_in_the_table_beside_and_in_downloads(
     session: Recording,
 ) -> None:
-    http, before = session.running.http, marks(session)
+    http, before = session.running.http, markers(session)
     url = f"{session.url}/markers/{before['a stone']['id']}"
     renamed = http.patch(url, json={"label": "a boulder"}).json()
     assert renamed["t_ns"] == before["a stone"]["t_ns"]
@@ -40,7 +40,7 @@ def test_a_mark_is_renamed_and_moved_also_in_the_table_beside_and_in_downloads(
     t_ns = int(session.column("t_ns")[50]) + clock["offset_ns"]
     moved = http.patch(url, json={"t_ns": t_ns}).json()
     assert (moved["label"], moved["t_ns"]) == ("a boulder", t_ns)
-    assert {m["label"]: m["t_ns"] for m in marks(session).values()} == {
+    assert {m["label"]: m["t_ns"] for m in markers(session).values()} == {
         "a boulder": t_ns,
         "mud": before["mud"]["t_ns"],
     }
@@ -53,13 +53,13 @@ def test_a_mark_is_renamed_and_moved_also_in_the_table_beside_and_in_downloads(
 
 
 def test_a_mark_is_removed(session: Recording) -> None:
-    http, before = session.running.http, marks(session)
+    http, before = session.running.http, markers(session)
     url = f"{session.url}/markers/{before['mud']['id']}"
     assert http.delete(url).status_code == 204
-    assert list(marks(session)) == ["a stone"]
+    assert list(markers(session)) == ["a stone"]
     assert session.now()["marker_count"] == 1
-    assert_refused(http.delete(url), 404, "no mark")
-    assert_refused(http.patch(url, json={"label": "x"}), 404, "no mark")
+    assert_refused(http.delete(url), 404, "no marker")
+    assert_refused(http.patch(url, json={"label": "x"}), 404, "no marker")
     assert http.delete("/sessions/none/markers/0").status_code == 404
     for wrong in ({"label": ""}, {"t_ns": -1}, {"t_ns": 1.5}, {"name": "x"}):
         url = f"{session.url}/markers/{before['a stone']['id']}"
@@ -67,21 +67,21 @@ def test_a_mark_is_removed(session: Recording) -> None:
 
 
 def test_who_changes_what_somebody_else_has_changed_meanwhile_is_told(session: Recording) -> None:
-    http, mark = session.running.http, marks(session)["mud"]
-    url = f"{session.url}/markers/{mark['id']}"
-    mine = {"If-Match": f'"{mark["revision"]}"'}
+    http, marker = session.running.http, markers(session)["mud"]
+    url = f"{session.url}/markers/{marker['id']}"
+    mine = {"If-Match": f'"{marker["revision"]}"'}
     assert http.patch(url, json={"label": "water"}, headers=mine).status_code == 200
     late = http.patch(url, json={"label": "sand"}, headers=mine)
     assert_refused(late, 412, "changed by another client")
     assert_refused(http.delete(url, headers=mine), 412, "changed by another client")
-    assert set(marks(session)) == {"a stone", "water"}
+    assert set(markers(session)) == {"a stone", "water"}
 
     said = {"If-Match": session.now()["revision"]}
     assert http.patch(session.url, json={"notes": "mine"}, headers=said).status_code == 200
     late = http.patch(session.url, json={"notes": "yours"}, headers=said)
     assert_refused(late, 412, "changed by another client")
     assert session.now()["notes"] == "mine"
-    # A mark is another thing, and who does not care says nothing.
+    # A marker is another thing, and who does not care says nothing.
     now = {"If-Match": session.now()["revision"]}
     http.post(f"{session.url}/markers", json={"label": "a third"})
     assert http.patch(session.url, json={"tags": ["wet"]}, headers=now).status_code == 200

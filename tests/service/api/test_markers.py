@@ -42,7 +42,7 @@ def session(running: Running, node: FakeNode) -> Recording:
     return session
 
 
-def mark(session: Recording, label: str, *, frame: int = MARKED, **body: Any) -> dict[str, Any]:
+def marker(session: Recording, label: str, *, frame: int = MARKED, **body: Any) -> dict[str, Any]:
     """Mark the instant of a frame, in the server's time."""
     t_ns = int(session.column("t_ns")[frame]) + HOUR_NS
     answer = session.running.http.post(
@@ -59,7 +59,7 @@ def labels(table: pa.Table) -> dict[int, str]:
 
 def test_a_mark_made_after_sealing_is_at_its_frame_in_every_format(session: Recording) -> None:
     sealed = session.data().content
-    mark(session, "a stone")
+    marker(session, "a stone")
     arrow = session.data(format="arrow")
     assert labels(pa.ipc.open_file(arrow.content).read_all()) == {MARKED: "a stone"}
     parquet = session.data(markers="true")
@@ -67,19 +67,19 @@ def test_a_mark_made_after_sealing_is_at_its_frame_in_every_format(session: Reco
     rows = list(csv.DictReader(io.StringIO(session.data(format="csv").text)))
     assert {i: row["marker"] for i, row in enumerate(rows) if row["marker"]} == {MARKED: "a stone"}
     for answer in (arrow, parquet):
-        assert answer.headers["foottile-marks"] == "placed=1, left-out=0"
+        assert answer.headers["foottile-markers"] == "placed=1, left-out=0"
     assert session.data().content == sealed  # as it was sealed, with the hash that it had
 
 
 def test_marks_can_be_left_out_and_parquet_has_them_on_request_only(session: Recording) -> None:
-    mark(session, "a stone")
+    marker(session, "a stone")
     for query in (
         {},
         {"format": "csv", "markers": "false"},
         {"format": "arrow", "markers": "false"},
     ):
         answer = session.data(**query)
-        assert "foottile-marks" not in answer.headers
+        assert "foottile-markers" not in answer.headers
         assert b"marker" not in answer.content[:1000]
     refused = session.running.http.get(
         f"{session.url}/data", params={"columns": "marker", "format": "parquet"}
@@ -88,7 +88,7 @@ def test_marks_can_be_left_out_and_parquet_has_them_on_request_only(session: Rec
 
 
 def test_all_other_columns_have_the_bits_of_the_sealed_file(session: Recording) -> None:
-    mark(session, "a stone")
+    marker(session, "a stone")
     whole = session.data(markers="true", format="parquet")
     table = pq.read_table(io.BytesIO(whole.content)).drop_columns(["marker", "time_s", "time_utc"])
     assert table.equals(
@@ -103,19 +103,19 @@ def test_the_tag_changes_with_every_mark_and_not_without_one(session: Recording)
         assert tag.startswith('"')
         seen = {"If-None-Match": tag}
         assert session.running.http.get(url, params=query, headers=seen).status_code == 304
-        mark(session, "one more")
+        marker(session, "one more")
         again = session.running.http.get(url, params=query, headers=seen)
         assert again.status_code == 200
         assert again.headers["etag"] != tag
     assert session.data().headers["etag"] == f'"{session.now()["sha256"]}"'
     plain = {"format": "csv", "markers": "false"}
     tag = session.data(**plain).headers["etag"]
-    mark(session, "of no concern")
+    marker(session, "of no concern")
     assert session.data(**plain).headers["etag"] == tag
 
 
 def test_what_has_marks_has_no_ranges_and_is_never_pieced_together(session: Recording) -> None:
-    mark(session, "a stone")
+    marker(session, "a stone")
     whole = session.data(markers="true")
     assert whole.headers["accept-ranges"] == "none"
     sealed = session.now()["sha256"]
@@ -135,16 +135,16 @@ def test_what_has_marks_has_no_ranges_and_is_never_pieced_together(session: Reco
 
 
 def test_a_mark_far_from_every_frame_is_counted_as_left_out(session: Recording) -> None:
-    mark(session, "years ago", t_ns=5)
-    mark(session, "a stone")
+    marker(session, "years ago", t_ns=5)
+    marker(session, "a stone")
     answer = session.data(format="arrow")
-    assert answer.headers["foottile-marks"] == "placed=1, left-out=1"
+    assert answer.headers["foottile-markers"] == "placed=1, left-out=1"
     table = pa.ipc.open_file(answer.content).read_all()
     assert labels(table) == {MARKED: "a stone"}
-    early, _ = json.loads(table.schema.metadata[b"foottile.notes"])["marks"]
+    early, _ = json.loads(table.schema.metadata[b"foottile.notes"])["markers"]
     assert (early["label"], early["left_out"]) == ("years ago", "no frame within a second of it")
     sliced = session.data(format="csv", end_s=0.01, columns="seq,event")
-    assert sliced.headers["foottile-marks"] == "placed=0, left-out=2"
+    assert sliced.headers["foottile-markers"] == "placed=0, left-out=2"
 
 
 def test_a_session_that_is_still_recorded_has_its_marks_at_their_frames(
@@ -165,12 +165,12 @@ def test_a_session_that_is_still_recorded_has_its_marks_at_their_frames(
 
 
 def test_a_session_says_how_many_marks_it_has(session: Recording) -> None:
-    assert session.now()["marks"] == 0
-    event = mark(session, "a stone")
-    mark(session, "a stone", id=event["id"])  # sent twice is marked once
-    mark(session, "another")
-    assert session.now()["marks"] == 2
-    assert [s["marks"] for s in session.running.sessions()] == [2]
+    assert session.now()["marker_count"] == 0
+    event = marker(session, "a stone")
+    marker(session, "a stone", id=event["id"])  # sent twice is marked once
+    marker(session, "another")
+    assert session.now()["marker_count"] == 2
+    assert [s["marker_count"] for s in session.running.sessions()] == [2]
 
 
 @pytest.mark.parametrize("label", ["\ud800", "ab\udfff", ""])
@@ -180,7 +180,7 @@ def test_a_label_that_is_no_text_is_refused(session: Recording, label: str) -> N
         f"{session.url}/markers", content=content, headers={"Content-Type": "application/json"}
     )
     assert_refused(answer, 422, "label")
-    assert session.now()["marks"] == 0
+    assert session.now()["marker_count"] == 0
 
 
 def test_a_mark_that_is_sent_again_after_a_full_disk_is_in_the_table_too(
@@ -203,7 +203,7 @@ def test_a_mark_that_is_sent_again_after_a_full_disk_is_in_the_table_too(
 
 
 def test_the_table_of_events_is_given_as_it_is_stored(session: Recording, node: FakeNode) -> None:
-    mark(session, "a stone")
+    marker(session, "a stone")
     answer = session.running.http.get(f"{session.url}/markers", params={"format": "parquet"})
     assert answer.content == (session.folder / "markers.parquet").read_bytes()
     recording = node.record()
@@ -217,9 +217,9 @@ def test_the_table_of_events_is_given_as_it_is_stored(session: Recording, node: 
 
 @pytest.fixture
 def pulled(session: Recording, tmp_path: Path) -> Path:
-    """The session's folder with two marks, one of them at no frame, pulled."""
-    mark(session, "a stone")
-    mark(session, "years ago", t_ns=5)
+    """The session's folder with two markers, one of them at no frame, pulled."""
+    marker(session, "a stone")
+    marker(session, "years ago", t_ns=5)
     with foottile.connect(session.running.url) as server:
         pull_session(server, session.id, tmp_path / "out")
     return tmp_path / "out" / session.id
@@ -240,7 +240,9 @@ def test_an_export_of_a_pulled_session_has_the_marks_and_names_those_it_has_not(
     asked = {} if to == "arrow" else {"markers": "true"}
     assert out.read_bytes() == session.data(format=to, **asked).content
     bare = tmp_path / f"bare.{to}"
-    assert command(monkeypatch, "export", pulled, "--format", to, "--no-marks", "--out", bare) == 0
+    assert (
+        command(monkeypatch, "export", pulled, "--format", to, "--no-markers", "--out", bare) == 0
+    )
     assert bare.read_bytes() != out.read_bytes()
 
 
@@ -254,8 +256,8 @@ def test_an_export_of_a_file_without_its_folder_says_that_it_has_no_marks(
     alone.write_bytes((pulled / "frames.parquet").read_bytes())
     arguments = (alone, "--format", "csv", "--out", tmp_path / "out.csv")
     assert command(monkeypatch, "export", *arguments) == 0
-    assert "without marks" in capsys.readouterr().err
-    assert command(monkeypatch, "export", *arguments, "--marks") == 2
+    assert "without markers" in capsys.readouterr().err
+    assert command(monkeypatch, "export", *arguments, "--markers") == 2
     assert "markers.parquet" in capsys.readouterr().err
 
 
@@ -285,7 +287,7 @@ def test_a_damaged_table_of_events_is_an_error_and_marks_can_be_left_out(
     assert command(monkeypatch, "export", *arguments) == 1
     assert "markers.parquet" in capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
-    assert command(monkeypatch, "export", *arguments, "--no-marks") == 0
+    assert command(monkeypatch, "export", *arguments, "--no-markers") == 0
 
 
 SET: dict[str, list[dict[str, object]]] = {
