@@ -55,8 +55,8 @@ def test_another_subprotocol_is_refused(
 @pytest.mark.parametrize(
     ("first", "says"),
     [
-        ('{"type":"hello","protocol":2,"array_info":{}}', "protocol 2; this server speaks 3: node"),
-        ('{"type":"identify","protocol":4,"more":0}', "protocol 4; this server speaks 3: server"),
+        ('{"type":"hello","protocol":2,"array_info":{}}', "protocol 2; this server speaks 4: node"),
+        ('{"type":"identify","protocol":5,"more":0}', "protocol 5; this server speaks 4: server"),
     ],
 )
 def test_another_protocol_number_is_refused(
@@ -79,7 +79,7 @@ def test_another_protocol_number_is_refused(
         '{"type":"identify"}',
         '{"type":"goodbye"}',
         '{"type":"probe","id":1}',
-        '{"type":"identify","protocol":3,"node":null}',
+        '{"type":"identify","protocol":4,"node":null}',
         '{"type":"identify","😀":1}',
     ],
     ids=lambda first: repr(first[:30]),
