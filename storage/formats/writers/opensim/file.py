@@ -190,7 +190,7 @@ def _make_notes(foot: ExportedFoot, filled: pa.Table) -> dict[str, object]:
         "FILLED": "unknown numbers, as the format has no number for them: every stretch is in the "
         "table of filled stretches",
         "BODY": foot.body,
-        "LOAD_COLUMNS": f"{foot.column_prefix}ground_force_vx and the eight behind it",
+        "COLUMNS": f"{foot.column_prefix}ground_force_vx and the eight behind it",
         "NOT_MEASURED": "shear and free moment: 0",
         "ROWS": len(foot.loads.table),
         "FILLED_ROWS": dict(by_reason),

@@ -118,7 +118,7 @@ info = ArrayInfo.model_validate_json(sys.stdin.readline())
 keeper = InFlightWriter(Path(sys.argv[1]), info)
 for seq in range(10_000_000):
     row = FrameRow(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
-    keeper.put(row)
+    keeper.write_frame(row)
     if seq % 1000 == 999:
         print(seq, flush=True)
 """
