@@ -20,7 +20,7 @@ from pathlib import Path
 from recording_data import FULL_RATE_HZ, Extent, Recording, batches, emulated, lengthened
 from side_by_side import note, spread, table
 
-from devices.acquisition import FrameRow
+from devices.acquisition import AcquiredFrame
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
@@ -155,8 +155,8 @@ def node_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
 
 def in_flight_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
     """`InFlight.put` for each frame, as the loop that takes frames calls it."""
-    columns = [getattr(recording.frames, name).tolist() for name in FrameRow._fields]
-    rows = [FrameRow(*values) for values in zip(*columns, strict=True)]
+    columns = [getattr(recording.frames, name).tolist() for name in AcquiredFrame._fields]
+    rows = [AcquiredFrame(*values) for values in zip(*columns, strict=True)]
     keeper = InFlightWriter(folder, recording.info)
     tiles = recording.frames.tile_count
     size = 4 + sum(

@@ -59,7 +59,7 @@ class ServoSource(Protocol):
         """True if the number of whole turns in the last returned position is known."""
 
 
-class FrameRow(NamedTuple):
+class AcquiredFrame(NamedTuple):
     """One new frame: a row of the columns of `FrameBatch`."""
 
     seq: int
@@ -78,7 +78,7 @@ class FrameRow(NamedTuple):
 class FrameSink(Protocol):
     """Sink that receives every frame at once, before its batch is complete."""
 
-    def write_frame(self, frame: FrameRow) -> None:
+    def write_frame(self, frame: AcquiredFrame) -> None:
         """Store one frame. It must be quick: the loop waits."""
 
 
@@ -211,7 +211,7 @@ class Acquisition:
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_flags |= FrameFlag.SERVO_STALE
         # Positional for speed: this runs for every frame.
-        frame = FrameRow(
+        frame = AcquiredFrame(
             self._next_seq,
             t_mono_ns,
             t_mono_ns + self._anchor.offset_ns,
@@ -224,7 +224,7 @@ class Acquisition:
             [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
             scan.tile_flags,
         )
-        for name, value in zip(FrameRow._fields, frame, strict=True):
+        for name, value in zip(AcquiredFrame._fields, frame, strict=True):
             columns[name][row] = value
         if self._frame_sink is not None:
             self._frame_sink.write_frame(frame)

@@ -154,7 +154,7 @@ def apply_viscous_flow(
 
 
 @dataclass(frozen=True)
-class GasState:
+class BubbleState:
     """Gas of all domes, and its state.
 
     Attributes:
@@ -173,7 +173,7 @@ class GasState:
     last_ln_p: Floats
 
     @classmethod
-    def from_parts(cls, parts: Sequence[DomeProperties], seal_k: float) -> GasState:
+    def from_parts(cls, parts: Sequence[DomeProperties], seal_k: float) -> BubbleState:
         """Build the gas of domes, at rest."""
         constants = np.array(
             [(part.seal_kpa, seal_k, part.wall_per_kpa, part.kappa) for part in parts]
@@ -235,7 +235,7 @@ def compute_gas_kpa(
         wall_k: (times, domes), temperature of the wall.
         volume: (times, domes), relative volume of the unstretched bubble.
         head_kpa: (times, domes), pressure around it above the atmosphere's.
-        constants: (domes, 4), as of `GasState`.
+        constants: (domes, 4), as of `BubbleState`.
         gain: (domes, modes), gain of a mode's drive within a step.
         decay: (domes, modes), decay within a step.
         modes_k: (domes, modes), state.

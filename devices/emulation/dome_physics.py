@@ -17,7 +17,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.emulation.dome_equations import (
-    GasState,
+    BubbleState,
     ViscousBranches,
     apply_creep,
     apply_play_hysteresis,
@@ -86,7 +86,7 @@ class Domes:
         self._loading_gain = np.ones(len(parts))
         self._last_force_n = np.zeros(len(parts))
         self._rubber = _RubberModel(parts)
-        self._gas = GasState.from_parts(parts, self._seal_k)
+        self._gas = BubbleState.from_parts(parts, self._seal_k)
 
         self._next = 0  # grid index of the first point that is not computed
         self._latest_index = 0  # the highest requested grid index

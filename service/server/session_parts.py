@@ -217,7 +217,7 @@ def _extend_once(session: Session, node: ServerNode) -> list[Session]:
             info,
             begin_t_ns,
             scene_content=scene_content,
-            calibration=node.estimator.chosen_calibration,
+            calibration=node.estimator.configured_calibration,
             calibration_source=node.estimator.calibration_source,
         )
     ]

@@ -53,7 +53,7 @@ def read_load_trace(path: Path, options: ReferenceOptions | None = None) -> Load
     columns, names = _read_columns(path, options or ReferenceOptions())
 
     def numbers(name: str, *, may_be_empty: bool = False) -> Floats:
-        return _checked_column(columns, names, name, where, may_be_empty=may_be_empty)
+        return _require_column(columns, names, name, where, may_be_empty=may_be_empty)
 
     time_s, _ = respace_repeated_times(numbers("time_s"))
     if len(time_s) < 2:
@@ -177,7 +177,7 @@ def _lowercase_names(table: ForceTable) -> dict[str, Column]:
     return columns
 
 
-def _checked_column(
+def _require_column(
     columns: dict[str, Column], names: list[str], name: str, where: str, *, may_be_empty: bool
 ) -> Floats:
     if name not in columns:

@@ -33,7 +33,7 @@ _SIDECARS = (MARKERS_NAME, CLOCK_NAME, STANCES_NAME)
 
 
 @dataclass(frozen=True)
-class SealedSession:
+class ZippedSession:
     """Sealed session to put into a zip file."""
 
     folder: Path
@@ -41,7 +41,7 @@ class SealedSession:
     """SHA-256 of its frames' file."""
 
 
-def stream_zip(sessions: Iterable[SealedSession]) -> Generator[bytes, None, None]:
+def stream_zip(sessions: Iterable[ZippedSession]) -> Generator[bytes, None, None]:
     """Yield a zip file in chunks: a folder for each session, which `foottile verify` accepts.
 
     Raises:

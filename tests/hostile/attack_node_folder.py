@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.acquisition import FrameRow
+from devices.acquisition import AcquiredFrame
 from devices.errors import FootTileError
 from devices.frames import FrameBatch
 from storage.intervals import Intervals, OpenPairs
@@ -129,9 +129,9 @@ def _is_stored(stream: NodeStream) -> bool:
     return stream.stored.last == 199 and stream.is_synced
 
 
-def rows_of(frames: FrameBatch) -> list[FrameRow]:
+def rows_of(frames: FrameBatch) -> list[AcquiredFrame]:
     """Frames one by one, as acquisition has them."""
     return [
-        FrameRow(*(getattr(frames, name)[i].tolist() for name in FrameRow._fields))
+        AcquiredFrame(*(getattr(frames, name)[i].tolist() for name in AcquiredFrame._fields))
         for i in range(len(frames))
     ]

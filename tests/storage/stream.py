@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.acquisition import FrameRow
+from devices.acquisition import AcquiredFrame
 from devices.frames import ArrayInfo, FrameBatch
 from storage.journal.node.in_flight import InFlightWriter
 from storage.schema import wire_schema
@@ -35,6 +35,6 @@ def take_in_flight(folder: Path, batch: FrameBatch, info: ArrayInfo | None = Non
     keeper = InFlightWriter(folder, info or make_array())
     for row in range(len(batch)):
         keeper.write_frame(
-            FrameRow(*(getattr(batch, name)[row].tolist() for name in FrameRow._fields))
+            AcquiredFrame(*(getattr(batch, name)[row].tolist() for name in AcquiredFrame._fields))
         )
     keeper.close()

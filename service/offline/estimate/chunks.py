@@ -109,14 +109,14 @@ def estimate_next_chunk(
                 taken.append(group)
                 yield from session.read_batches(*what.kept_columns, row_groups=[group])
 
-        def given() -> Iterator[BatchWithColumns]:
+        def yield_estimates() -> Iterator[BatchWithColumns]:
             yield from stream.estimate_batches(
                 iterate_checking_order(source_frames(), where=str(source)), is_final=False
             )
             if done + len(taken) == len(rows):
                 yield from stream.estimate_batches((), is_final=True)
 
-        frames = _write_frames(chunks_folder / f"{number:04}.parquet", what, given())
+        frames = _write_frames(chunks_folder / f"{number:04}.parquet", what, yield_estimates())
     with open_for_atomic_write(chunks_folder / f"{number:04}.npz") as file:
         np.savez(file, allow_pickle=False, **stream.state_dict())
     made = _ChunkIndex(number, done + len(taken), frames, {})

@@ -59,7 +59,7 @@ class NodeEstimator:
         return [problem for problem in texts if problem is not None]
 
     @property
-    def chosen_calibration(self) -> Calibration | None:
+    def configured_calibration(self) -> Calibration | None:
         """Calibration to use for its tiles: the assigned one, else the node's own.
 
         It may not fit them; the calibration in use is `live.calibration`.
@@ -71,7 +71,7 @@ class NodeEstimator:
 
     @property
     def calibration_source(self) -> Literal["node", "server"]:
-        """Origin of `chosen_calibration`."""
+        """Origin of `configured_calibration`."""
         chosen = self.assignment.current is not None or self.assignment.problem is not None
         return "server" if chosen else "node"
 
@@ -151,7 +151,7 @@ class NodeEstimator:
         self._has_failed = False
         try:
             tare = self.tare_history.tare_for_estimates(self.info)
-            self.live = LiveEstimator(self.info, self.chosen_calibration, tare, self.live)
+            self.live = LiveEstimator(self.info, self.configured_calibration, tare, self.live)
         except Exception as error:
             self._disable(error)
             return

@@ -31,7 +31,7 @@ ROWS_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
-class EstimateChange:
+class EstimateInputsChange:
     """Change of calibration or tare; without both, frames are not estimated.
 
     Attributes:
@@ -56,7 +56,7 @@ class EstimateChange:
 def estimate_again(
     batches: Iterable[FrameBatch],
     info: ArrayInfo,
-    changes: Iterable[EstimateChange],
+    changes: Iterable[EstimateInputsChange],
     *,
     is_final: bool,
 ) -> Iterator[EstimatedBatch]:
@@ -87,7 +87,7 @@ def estimate_again(
         yield from run.flush()
 
 
-def _make_run(info: ArrayInfo, change: EstimateChange) -> EstimateRun | None:
+def _make_run(info: ArrayInfo, change: EstimateInputsChange) -> EstimateRun | None:
     calibration, tare = change.calibration, change.tare
     if calibration is None or tare is None:
         return None
@@ -196,10 +196,10 @@ def _list_changes(
     calibration: Calibration | None,
     begin: int,
     last: int,
-) -> list[EstimateChange]:
+) -> list[EstimateInputsChange]:
     """Return the changes of calibration and tare within these frames, in order."""
     recorded = [
-        EstimateChange(each.calibration, each.tare, seq=each.seq)
+        EstimateInputsChange(each.calibration, each.tare, seq=each.seq)
         for each in node.estimator.epochs_of(stream.stream_id)
     ]
     before = [change for change in recorded if change.seq is not None and change.seq <= begin]
@@ -214,4 +214,4 @@ def _list_changes(
     if t_ns is None or until_ns is None:
         return recorded
     tares = node.estimator.tare_history.tares_between(stream.info, t_ns, until_ns)
-    return [*(EstimateChange(calibration, tare, t_ns=tare.t_ns) for tare in tares), *recorded]
+    return [*(EstimateInputsChange(calibration, tare, t_ns=tare.t_ns) for tare in tares), *recorded]

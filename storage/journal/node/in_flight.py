@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.acquisition import FrameRow, RangeDetector
+from devices.acquisition import AcquiredFrame, RangeDetector
 from devices.errors import DamagedFileError, StorageError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from storage.durable_files import make_synced_folder, read_small_file, translate_storage_errors
@@ -27,7 +27,7 @@ ROW_COUNT = 8192
 _MAGIC = b"FootTile in flight 1\n"
 _HEAD = struct.Struct("<21sHII36sI")
 """Magic, tiles, rows, length of the description, kernel's boot id, CRC-32 of the two before."""
-_ORDER = FrameRow._fields
+_ORDER = AcquiredFrame._fields
 _CODES = {"uint64": "Q", "int64": "q", "int32": "i", "float32": "f", "uint16": "H", "uint8": "B"}
 
 
@@ -67,7 +67,7 @@ class InFlightWriter:
         head = _HEAD.pack(_MAGIC, tiles, ROW_COUNT, len(description), stream_id, check)
         self._map[: self._begin] = head + description
 
-    def write_frame(self, frame: FrameRow) -> None:
+    def write_frame(self, frame: AcquiredFrame) -> None:
         """Write one frame to its row."""
         (
             seq,

@@ -17,7 +17,7 @@ import pytest
 
 import storage.formats.zip_stream
 from service.api.routes.common import file_response
-from storage.formats.zip_stream import SealedSession, stream_zip
+from storage.formats.zip_stream import ZippedSession, stream_zip
 from storage.parquet_hash import compute_sha256
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode
@@ -67,7 +67,7 @@ def test_a_zip_is_whole_whatever_the_date_of_a_file(
     folder.mkdir()
     for name in FILES:
         (folder / name).write_bytes(name.encode())
-    sealed = SealedSession(folder, compute_sha256(folder / "frames.parquet"))
+    sealed = ZippedSession(folder, compute_sha256(folder / "frames.parquet"))
     date_files(monkeypatch, dated_s)
     content = b"".join(stream_zip([sealed]))
     with zipfile.ZipFile(io.BytesIO(content)) as file:
@@ -197,7 +197,7 @@ def test_its_memory_does_not_grow_with_the_files(tmp_path: Path) -> None:
     sha256 = compute_sha256(folder / "frames.parquet")
     tracemalloc.start()
     try:
-        sent = sum(len(piece) for piece in stream_zip([SealedSession(folder, sha256)]))
+        sent = sum(len(piece) for piece in stream_zip([ZippedSession(folder, sha256)]))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

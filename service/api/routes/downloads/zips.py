@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from devices.errors import StateError, UnknownError, UsageError
 from service.api.routes.common import ServerState, problem_responses, require_file
 from service.api.routes.downloads.exports import iterate_chunks
-from storage.formats.zip_stream import SealedSession, stream_zip
+from storage.formats.zip_stream import ZippedSession, stream_zip
 from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
@@ -67,7 +67,7 @@ async def get_zip(
     )
 
 
-def _require_sealed(session: Session, folder: Path) -> SealedSession:
+def _require_sealed(session: Session, folder: Path) -> ZippedSession:
     if session.state != "sealed":
         raise StateError(
             f"session {session.id} is {session.state}, and a zip file has sealed ones only",
@@ -76,4 +76,4 @@ def _require_sealed(session: Session, folder: Path) -> SealedSession:
     if session.sha256 is None:
         raise UnknownError(f"session {session.id}: {session.problem}")
     require_file(folder / FRAMES_NAME)
-    return SealedSession(folder, session.sha256)
+    return ZippedSession(folder, session.sha256)

@@ -91,8 +91,8 @@ def format_broad_report(bench: BroadBenchmarkResult) -> str:
 
 def _goals(bench: BroadBenchmarkResult) -> list[str]:
     errors, sigmas = (
-        _asked(compare_errors_with_goals(bench.results)),
-        _asked(compare_uncertainty_with_goals(bench.results)),
+        _format_goals(compare_errors_with_goals(bench.results)),
+        _format_goals(compare_uncertainty_with_goals(bench.results)),
     )
     missed = [row for row in sigmas if row[-1] == "NO"]
     head = ("figure", "mode", "measured", "goal", "met")
@@ -107,7 +107,7 @@ def _goals(bench: BroadBenchmarkResult) -> list[str]:
     ]
 
 
-def _asked(goals: Sequence[Goal]) -> list[tuple[str, ...]]:
+def _format_goals(goals: Sequence[Goal]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for goal in goals:
         value = "-" if math.isnan(goal.value) else f"{goal.value:.3g}"
