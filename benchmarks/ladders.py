@@ -95,7 +95,7 @@ def ladders_of(scene: Scene) -> tuple[ComparedModelSet, ...]:
         offered = tuple(name for name in MODEL_NAMES if name != "ambient" or has_bare_tile)
     ladders = list_model_sets(offered)
     named = tuple(name for name in MODEL_NAMES if name in scene.models)
-    if any(rung.models == named for rung in ladders):
+    if any(model_set.models == named for model_set in ladders):
         return ladders
     return (ComparedModelSet("the scene's", named, False, None, None, False), *ladders)
 
@@ -108,8 +108,8 @@ def drawn(case: Case, data: Path, draws: int) -> Iterator[tuple[DrawResult, Draw
         calibration = find_calibration(scene.calibration, serials, parts_seed=draw)
         recording, _ = record_with_calibration(scene, case.seconds, draw, calibration, foot)
         accuracy = {
-            (mode, rung.label): compute_recording_accuracy(recording, rung.models, lag_ms)
-            for rung in ladders_of(scene)
+            (mode, model_set.label): compute_recording_accuracy(recording, model_set.models, lag_ms)
+            for model_set in ladders_of(scene)
             for mode, lag_ms in LAGS_MS.items()
         }
         yield DrawResult(draw, len(recording.frames), accuracy, ()), recording
@@ -153,13 +153,13 @@ def tables(case: Case, data: Path, draws: int) -> Iterator[str]:
     yield from ("", f"### {case.name}", "", what, "")
     yield f"| ladder | {' | '.join(head)} |"
     yield f"|---{'|--:' * len(head)}|"
-    for rung in ladders:
+    for model_set in ladders:
         cells = []
         for mode in LAGS_MS:
-            m = figures[mode, rung.label]
+            m = figures[mode, model_set.label]
             us = f"{m.ns_per_frame.median / 1e3:.1f}"
             cells += [
-                f"**{us}**" if rung.label in fronts[mode] else us,
+                f"**{us}**" if model_set.label in fronts[mode] else us,
                 *(
                     cell(m.figures[name].median, scale, digits)
                     for name, scale, digits in (
@@ -170,7 +170,7 @@ def tables(case: Case, data: Path, draws: int) -> Iterator[str]:
                 ),
                 cell(m.coverage["all"].share, 100.0, 0),
             ]
-        label = f"{rung.label} (named)" if rung.models == named else rung.label
+        label = f"{model_set.label} (named)" if model_set.models == named else model_set.label
         yield f"| {label} | {' | '.join(cells)} |"
 
 
@@ -180,7 +180,7 @@ def on_front(
     """Labels of the ladders that no other beats in both time and GRF error."""
     points = [
         (m.ns_per_frame.median, m.figures["grf_mae_n"].median)
-        for m in (figures[mode, rung.label] for rung in ladders)
+        for m in (figures[mode, model_set.label] for model_set in ladders)
     ]
     return {ladders[i].label for i in find_pareto_front(points)}
 

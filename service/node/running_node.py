@@ -275,8 +275,8 @@ class RunningNode:
         """Report stalls of acquisition and problems of the disk, and their end."""
         while True:
             await asyncio.sleep(_WARNINGS_INTERVAL_S)
-            troubles = (*self._stall_warnings(), *self._journal.warnings)
-            kinds = tuple(trouble.partition(";")[0] for trouble in troubles)
+            warnings = (*self._stall_warnings(), *self._journal.warnings)
+            kinds = tuple(warning.partition(";")[0] for warning in warnings)
             for kind in kinds:
                 if kind not in self._reported_warnings:
                     self._report(kind)

@@ -98,13 +98,13 @@ class ServerConnection:
         self._link.callbacks.on_retention_request(self._link.server_id, wanted, known)
 
     async def _send_status(self) -> None:
-        said = {stream.array_info.stream_id: stream.lost for stream in self._link.hello.earlier}
-        said[self._link.hello.array_info.stream_id] = self._link.hello.lost
+        reported = {stream.array_info.stream_id: stream.lost for stream in self._link.hello.earlier}
+        reported[self._link.hello.array_info.stream_id] = self._link.hello.lost
         while True:
             for stream_id, stream in self._link.callbacks.get_streams().items():
                 lost = stream.lost.to_pairs()
-                if stream_id in said and lost != said[stream_id]:
-                    said[stream_id] = lost
+                if stream_id in reported and lost != reported[stream_id]:
+                    reported[stream_id] = lost
                     await self._link.socket.send(
                         encode_message(LossReport(stream_id=stream_id, lost=lost))
                     )

@@ -84,9 +84,9 @@ def write_comparison(
     found = compare_session(session_path, reference_path, options)
     figures = found.errors.figures
     missed = tuple(
-        said
+        missed_limit
         for name, limit in limits.items()
-        if (said := _describe_missed_limit(name, figures[name].mean, limit)) is not None
+        if (missed_limit := _describe_missed_limit(name, figures[name].mean, limit)) is not None
     )
     text = format_comparison_report(
         title,

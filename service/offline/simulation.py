@@ -138,7 +138,7 @@ class EmulatedRun:
 
     def run_frames(self) -> Iterator[tuple[FrameBatch, Extra]]:
         """Yield frames with the emulation's columns: requested truth, and the indenter's notes."""
-        mill = self.world.indenter
+        indenter = self.world.indenter
         batches = self.acquisition.acquire_batches(lambda: self._clock.now_ns() >= self.end_ns)
         # No live view, so frames are batched; the result is bit-identical for any batch size.
         while gathered := list(islice(batches, _BATCHED_READS)):
@@ -146,8 +146,8 @@ class EmulatedRun:
             extra: dict[str, npt.NDArray[Any]] = {}
             if self._options.with_truth:
                 extra |= asdict(self.world.compute_truth(batch.t_mono_ns))
-            if mill is not None:
-                extra |= mill.get_operator_notes(batch.t_mono_ns)
+            if indenter is not None:
+                extra |= indenter.get_operator_notes(batch.t_mono_ns)
                 # Without a loaded tile, the sensor's reading is no reference.
                 idle = np.array([tile is None for tile in extra["pressed_tile"]])
                 force_n = np.where(idle, np.float32(np.nan), batch.reference_force_n)

@@ -50,13 +50,13 @@ def open_reference_sensor(
         return None
     emulated = None
     if reference.port == EMULATED:
-        mill = world.indenter if world is not None else None
-        if world is None or mill is None:
+        indenter = world.indenter if world is not None else None
+        if world is None or indenter is None:
             raise UsageError(
-                f"scene {scene.name!r} has an emulated reference sensor and no emulated mill",
+                f"scene {scene.name!r} has an emulated reference sensor and no emulated indenter",
                 remedy='Set ground.kind = "indentation", or reference.port to a device',
             )
-        emulated = mill.make_adc(reference, world.clock)
+        emulated = indenter.make_adc(reference, world.clock)
     device = open_spi(reference.port, emulated)
     stack.callback(device.close)
     return ReferenceForceSensor(Mcp3208(device, where=reference.port), reference)

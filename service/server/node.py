@@ -63,7 +63,7 @@ class ServerNode:
         self.hello_t_ns: int | None = None
         """Arrival time of the last hello, server's UTC."""
         self.storage_problem: str | None = None
-        self.troubles: tuple[str, ...] = ()
+        self.warnings: tuple[str, ...] = ()
         """Faults of its array or disk, from its last status."""
         self.fault_counts: dict[str, dict[str, int]] = {}
         """Faults of the present stream by serial and reason, from its last status."""
@@ -180,7 +180,7 @@ class ServerNode:
         """
         if hello.array_info.stream_id != self.stream_id or self.last_seq is None:
             self.last_seq = self.last_t_ns = None
-            self.troubles, self.fault_counts = (), {}
+            self.warnings, self.fault_counts = (), {}
             self.refused_ahead_frames = 0
             self._rate_meter.clear()
         self.hello = hello

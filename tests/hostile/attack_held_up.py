@@ -71,7 +71,7 @@ def held_up(play: Play) -> Outcome:
             if after["stream_id"] != before["stream_id"] or not during["connected"]:
                 outcome.failed(f"after {stopped_s:g} s: another stream, or away")
             elif not said or too_fast:
-                outcome.failed(f"after {stopped_s:g} s: {during['troubles']}, {after['rate_hz']}")
+                outcome.failed(f"after {stopped_s:g} s: {during['warnings']}, {after['rate_hz']}")
             else:
                 outcome.saw(f"stopped for {stopped_s:g} s: frames go on in the same stream")
         outcome.figures["longest until twenty frames"] = f"{longest_s:.1f} s"

@@ -75,11 +75,11 @@ def test_a_warning_says_since_when_and_why_and_stays_open(
         expect(note.locator("time")).to_contain_text("or earlier")
 
 
-def tell(scripted: Scripted, *troubles: str) -> None:
+def tell(scripted: Scripted, *warnings: str) -> None:
     def change() -> None:
         server: Any = scripted.running.server
         node = server.nodes.get("bench")
-        node.troubles = troubles
+        node.warnings = warnings
         server.tell_node(node)
 
     scripted.running.call(change)

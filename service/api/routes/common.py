@@ -103,7 +103,7 @@ FULL = problem_responses(_507="The data folder cannot be written.")
 
 IfMatch = Annotated[
     str | None,
-    Header(description="Revision that you have seen (`said`); else the change is refused."),
+    Header(description="Revision that you have seen (`revision`); else the change is refused."),
 ]
 IdempotencyKey = Annotated[
     str | None,

@@ -139,8 +139,8 @@ def select_creep_terms(
     best, *others = [*fits, full_fit]
     for more in others:
         better = best.left_out_squares - more.left_out_squares
-        is_told = _compute_p_value(problem, more, best) < _P_VALUE_MAX
-        if is_told and better.sum() > np.sqrt(len(better)) * better.std():
+        is_significant = _compute_p_value(problem, more, best) < _P_VALUE_MAX
+        if is_significant and better.sum() > np.sqrt(len(better)) * better.std():
             best = more
     return best
 
@@ -183,9 +183,9 @@ def _find_least_significant(
             continue
         less = problem.fit(replace(parts, **without), fit.scatter)
         chance = _compute_p_value(problem, fit, less)
-        is_told = chance < _P_VALUE_MAX
-        if chance > greatest and not (is_told and size.most_n > _FORCE_MIN_N):
-            why = f"at most {size.most_n:.2f} N" if is_told else "not determined"
+        is_significant = chance < _P_VALUE_MAX
+        if chance > greatest and not (is_significant and size.most_n > _FORCE_MIN_N):
+            why = f"at most {size.most_n:.2f} N" if is_significant else "not determined"
             found, greatest = (name, f"{size.words}: {why}", less), chance
     return found
 

@@ -190,8 +190,8 @@ def convert_curve_to_range(coefficients: Sequence[float]) -> Floats:
 
 def _select_best_soak(soaks: Sequence[TemperatureEffect | str]) -> TemperatureEffect | str:
     """Return the effect with the least uncertain rise, else the last soak's reason."""
-    told = [warm for warm in soaks if isinstance(warm, TemperatureEffect)]
-    return min(told, key=lambda warm: warm.kpa_per_k.sigma) if told else soaks[-1]
+    effects = [soak for soak in soaks if isinstance(soak, TemperatureEffect)]
+    return min(effects, key=lambda effect: effect.kpa_per_k.sigma) if effects else soaks[-1]
 
 
 _BEFORE_S = 0.02  # shown before the event

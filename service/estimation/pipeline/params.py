@@ -138,17 +138,17 @@ def make_kernel_params(plan: EstimationPlan) -> KernelParams:
 
 
 def _make_foot_params(plan: EstimationPlan) -> RecordArray[FootParams]:
-    ladder, servo = plan.model_set, plan.info.servo
+    model_set, servo = plan.model_set, plan.info.servo
     columns: dict[str, Any] = {
-        "has_unwrap": ladder.has_unwrap,
-        "has_temperature": ladder.temperature is not None,
-        "has_ambient": ladder.ambient is not None,
-        "has_gas": ladder.gas is not None,
-        "has_hysteresis": ladder.hysteresis is not None,
-        "has_flow": ladder.flow is not None,
-        "has_rubber": ladder.rubber is not None,
-        "has_skew": ladder.has_skew,
-        "has_denoise": ladder.has_denoise,
+        "has_unwrap": model_set.has_unwrap,
+        "has_temperature": model_set.temperature is not None,
+        "has_ambient": model_set.ambient is not None,
+        "has_gas": model_set.gas is not None,
+        "has_hysteresis": model_set.hysteresis is not None,
+        "has_flow": model_set.flow is not None,
+        "has_rubber": model_set.rubber is not None,
+        "has_skew": model_set.has_skew,
+        "has_denoise": model_set.has_denoise,
         "has_fault_detection": plan.fault_limits is not None,
         "has_thermal_drift": plan.fault_limits is not None
         and plan.fault_limits.thermal_kpa_per_count is not None,
@@ -188,7 +188,7 @@ def _make_foot_params(plan: EstimationPlan) -> RecordArray[FootParams]:
 
 
 def _make_tile_params(plan: EstimationPlan) -> RecordArray[TileParams]:
-    tare, ladder, watch = plan.tare, plan.model_set, plan.fault_limits
+    tare, model_set, watch = plan.tare, plan.model_set, plan.fault_limits
     tiles = TileParams.array(
         len(plan.info.tiles),
         **vars(plan.compensation),
@@ -214,19 +214,19 @@ def _make_tile_params(plan: EstimationPlan) -> RecordArray[TileParams]:
         "sample_delay_sigma_s": plan.sample_delay_sigma_s,
         "sample_delay_common_sigma_s": plan.sample_delay_common_sigma_s,
         "chip_max_kpa": plan.chip_max_kpa,
-        "range_low_kpa": ladder.static_curves.range_low_kpa
+        "range_low_kpa": model_set.static_curves.range_low_kpa
         - SIGNIFICANCE_SIGMAS * plan.unloaded_sigma_kpa,
         "saturation": plan.saturation.to_records(),
-        "is_gas_known": ladder.is_gas_known,
-        "gas_misfit": ladder.gas_misfit,
-        "rubber_misfit": ladder.rubber_misfit,
+        "is_gas_known": model_set.is_gas_known,
+        "gas_misfit": model_set.gas_misfit,
+        "rubber_misfit": model_set.rubber_misfit,
         "position_m": plan.tile_positions_m,
         "mount_gain": plan.mount_gain,
         "mount_gain_sigma": plan.mount_gain_sigma,
         "axis_rad": plan.axis_rad,
         "tilt_loss": plan.tilt_loss,
         "variance_inflation": plan.variance_inflation,
-        "static": ladder.static_curves.to_records(),
+        "static": model_set.static_curves.to_records(),
     }
     models: dict[
         str,
@@ -238,12 +238,12 @@ def _make_tile_params(plan: EstimationPlan) -> RecordArray[TileParams]:
         | CreepModel
         | None,
     ] = {
-        "temperature": ladder.temperature,
-        "ambient": ladder.ambient,
-        "gas": ladder.gas,
-        "flow": ladder.flow,
-        "hysteresis": ladder.hysteresis,
-        "rubber": ladder.rubber,
+        "temperature": model_set.temperature,
+        "ambient": model_set.ambient,
+        "gas": model_set.gas,
+        "flow": model_set.flow,
+        "hysteresis": model_set.hysteresis,
+        "rubber": model_set.rubber,
     }
     load_bearing |= {
         name: model.to_records() for name, model in models.items() if model is not None

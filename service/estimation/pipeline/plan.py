@@ -144,7 +144,7 @@ def make_plan(
     bearing = np.flatnonzero([not tile.reference for tile in info.tiles])
     if not len(bearing):
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
-    ladder = make_model_set(info, calibration, tare, models)
+    model_set = make_model_set(info, calibration, tare, models)
     entries = [calibration.get_tile(info.tiles[i].serial) for i in bearing]
     for i, entry in zip(bearing, entries, strict=True):
         tile = info.tiles[i]
@@ -163,7 +163,7 @@ def make_plan(
     )
     still_kpa = np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)[bearing]
     unloaded_n = float(
-        np.sqrt(((ladder.static_curves.slope_at_zero_n_per_kpa * still_kpa) ** 2).sum())
+        np.sqrt(((model_set.static_curves.slope_at_zero_n_per_kpa * still_kpa) ** 2).sum())
     )
     gains = [calibration.find_mount_gain(info.tiles[i].serial) for i in bearing]
     axis_rad = compute_tile_axes_rad(positions_m[bearing])
@@ -174,7 +174,7 @@ def make_plan(
         models=tuple(name for name in MODEL_NAMES if name in models),
         lag_ns=round(lag_ms * 1e6),
         compensation=Compensation(info.tiles),
-        model_set=ladder,
+        model_set=model_set,
         load_bearing_columns=bearing,
         reference_columns=np.flatnonzero([tile.reference for tile in info.tiles]),
         baseline_kpa=baseline_kpa,
@@ -194,15 +194,15 @@ def make_plan(
         sample_delay_common_sigma_s=np.array([e.effects.late_common_s for e in entries]),
         chip_max_kpa=chip_end_kpa,
         saturation=make_saturation_bounds(
-            ladder.static_curves, ladder.gas, baseline_kpa, chip_end_kpa
+            model_set.static_curves, model_set.gas, baseline_kpa, chip_end_kpa
         ),
         fault_limits=make_fault_limits(
             info,
             calibration,
             tare,
             chip_end_kpa,
-            is_gas_corrected=ladder.is_gas_known & (ladder.gas is not None),
-            has_thermal_drift=ladder.temperature is None,
+            is_gas_corrected=model_set.is_gas_known & (model_set.gas is not None),
+            has_thermal_drift=model_set.temperature is None,
         ),
         unloaded_sigma_kpa=still_kpa,
         tile_positions_m=positions_m[bearing],
@@ -248,13 +248,13 @@ def _compute_chip_max_kpa(entry: TileCalibration, baseline_kpa: float) -> float:
 
 def compute_settling_time_s(plan: EstimationPlan) -> float:
     """Return the time in seconds until the models have settled."""
-    ladder, longest_s = plan.model_set, 0.0
-    if ladder.gas is not None:
-        longest_s = max(longest_s, float((ladder.gas.gamma * ladder.gas.tau_s).max()))
-    if ladder.rubber is not None:
+    model_set, longest_s = plan.model_set, 0.0
+    if model_set.gas is not None:
+        longest_s = max(longest_s, float((model_set.gas.gamma * model_set.gas.tau_s).max()))
+    if model_set.rubber is not None:
         longest_s = max(
-            longest_s, float(ladder.rubber.tau_s[ladder.rubber.creep_fraction > 0.0].max())
+            longest_s, float(model_set.rubber.tau_s[model_set.rubber.creep_fraction > 0.0].max())
         )
-    if ladder.temperature is not None:
-        longest_s = max(longest_s, float(np.abs(ladder.temperature.lag_s).max()))
+    if model_set.temperature is not None:
+        longest_s = max(longest_s, float(np.abs(model_set.temperature.lag_s).max()))
     return max(SETTLING_MIN_S, SETTLING_TIME_CONSTANTS * longest_s)

@@ -73,9 +73,9 @@ def open_filesystem(uri: str) -> tuple[fs.FileSystem, str]:
     """
     if not is_remote(uri):
         return _make_local_filesystem(), os.path.abspath(uri)
-    said = urlsplit(uri)
-    if said.scheme == "s3":
-        return _make_s3_filesystem(), f"{said.netloc}{said.path}".rstrip("/")
+    parsed = urlsplit(uri)
+    if parsed.scheme == "s3":
+        return _make_s3_filesystem(), f"{parsed.netloc}{parsed.path}".rstrip("/")
     return _open_fsspec(uri)
 
 

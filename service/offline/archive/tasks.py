@@ -224,9 +224,9 @@ class CompareTask:
 
     def describe_options(self) -> dict[str, Any]:
         """Return the options as JSON values, with the reference by its hash."""
-        said = hash_file_or_session(self.reference)
+        sha256 = hash_file_or_session(self.reference)
         options = {**vars(self.compare), "stated": asdict(self.compare.stated)}
-        return {"reference_sha256": said, "limits": self.limits, **options}
+        return {"reference_sha256": sha256, "limits": self.limits, **options}
 
     def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
         """See `SessionTask`."""
@@ -269,7 +269,7 @@ class InvalidTask:
 
 def _copy_session_files(source: Path, work: Path) -> None:
     """Complete the session's folder: `session.json`, and copies of the source's sidecar files."""
-    said = read_session_metadata(source)
+    metadata = read_session_metadata(source)
     out = work / FRAMES_NAME
     with SealedFileReader(out, skip_verification=True) as session:
         about: Mapping[str, Any] = {
@@ -282,5 +282,5 @@ def _copy_session_files(source: Path, work: Path) -> None:
     for name in _SIDECAR_NAMES:
         if (content := read_bytes_or_none(source / name)) is not None:
             (work / name).write_bytes(content)
-    text = json.dumps({**said.content, **about}, indent=1).encode()
+    text = json.dumps({**metadata.content, **about}, indent=1).encode()
     (work / SESSION_NAME).write_bytes(append_checksum(text))

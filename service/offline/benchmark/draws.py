@@ -80,19 +80,19 @@ def time_model_sets(
     stream = RepeatedRecording(recording.frames)
     plans: dict[tuple[str, str], EstimationPlan] = {}
     failures = []
-    for rung in model_sets:
+    for model_set in model_sets:
         for mode in LAGS_MS:
             try:
-                plan = make_recording_plan(recording, rung.models, LAGS_MS[mode])
+                plan = make_recording_plan(recording, model_set.models, LAGS_MS[mode])
                 measure_ns_per_frame(
                     plan, stream, _WARM_UP_STEPS * BATCH_FRAMES[mode], BATCH_FRAMES[mode]
                 )
             except Exception as error:
                 failures.append(
-                    MeasurementFailure(f"time of {rung.label}, {mode}", describe_error(error))
+                    MeasurementFailure(f"time of {model_set.label}, {mode}", describe_error(error))
                 )
             else:
-                plans[mode, rung.label] = plan
+                plans[mode, model_set.label] = plan
     times: dict[tuple[str, str], list[float]] = {key: [] for key in plans}
     for _ in range(repetitions):
         for (mode, label), plan in plans.items():
@@ -293,14 +293,14 @@ def run_draw(task: DrawTask) -> DrawResult:
         )
     accuracy: dict[tuple[str, str], Accuracy] = {}
     failures = []
-    for rung in task.model_sets:
+    for model_set in task.model_sets:
         for mode, lag_ms in LAGS_MS.items():
             try:
-                accuracy[mode, rung.label] = compute_recording_accuracy(
-                    recording, rung.models, lag_ms
+                accuracy[mode, model_set.label] = compute_recording_accuracy(
+                    recording, model_set.models, lag_ms
                 )
             except Exception as error:
-                what = f"draw {task.draw}, {rung.label}, {mode}"
+                what = f"draw {task.draw}, {model_set.label}, {mode}"
                 failures.append(MeasurementFailure(what, describe_error(error)))
     return DrawResult(task.draw, len(recording.frames), accuracy, tuple(failures))
 

@@ -160,7 +160,7 @@ class SceneFigures:
     @property
     def default_model_set(self) -> ComparedModelSet:
         """The scene's full model set."""
-        return next(rung for rung in self.model_sets if rung.is_full_set)
+        return next(model_set for model_set in self.model_sets if model_set.is_full_set)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON representation."""
@@ -174,17 +174,20 @@ class SceneFigures:
             "draws": self.draw_count,
             "frames": self.frames,
             "failures": self.failures,
-            "rungs": [
+            "model_sets": [
                 {
-                    "label": rung.label,
-                    "models": list(rung.models),
-                    "adds": rung.added_model,
-                    "lacks": rung.missing_model,
-                    "spare": rung.extra_model,
-                    "default": rung.is_full_set,
-                    **{mode: self.figures_by_mode_and_label[mode, rung.label] for mode in LAGS_MS},
+                    "label": model_set.label,
+                    "models": list(model_set.models),
+                    "added_model": model_set.added_model,
+                    "missing_model": model_set.missing_model,
+                    "extra_model": model_set.extra_model,
+                    "is_full_set": model_set.is_full_set,
+                    **{
+                        mode: self.figures_by_mode_and_label[mode, model_set.label]
+                        for mode in LAGS_MS
+                    },
                 }
-                for rung in self.model_sets
+                for model_set in self.model_sets
             ],
         }
 
@@ -196,10 +199,10 @@ def summarize_model_sets(
 ) -> dict[tuple[str, str], ModelSetFigures]:
     """Summarize every model set in every mode, by mode and label."""
     measured = {}
-    whole = next(rung for rung in model_sets if rung.is_full_set)
-    for rung in model_sets:
+    whole = next(model_set for model_set in model_sets if model_set.is_full_set)
+    for model_set in model_sets:
         for mode, lag_ms in LAGS_MS.items():
-            key = mode, rung.label
+            key = mode, model_set.label
             judged = [d.accuracy[key] for d in draws if key in d.accuracy]
             both = [
                 (d.accuracy[key], d.accuracy[mode, whole.label])

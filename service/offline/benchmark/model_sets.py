@@ -69,7 +69,7 @@ def list_model_sets(
         built.append(
             ComparedModelSet(label, models, True, added, less.get(models), models == whole)
         )
-    seen = {rung.models for rung in built}
+    seen = {model_set.models for model_set in built}
     ablated = [
         ComparedModelSet(f"whole -{name}", models, False, None, name, False)
         for models, name in less.items()

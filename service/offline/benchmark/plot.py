@@ -34,18 +34,18 @@ GOAL_DASHES = (0, (5, 4))
 
 @dataclass(frozen=True)
 class _Point:
-    rung: ComparedModelSet
+    model_set: ComparedModelSet
     ns: float
     error_n: Quantiles
 
     @property
     def name(self) -> str:
-        if self.rung.is_built_up:
-            return self.rung.label
+        if self.model_set.is_built_up:
+            return self.model_set.label
         return (
-            f"++{self.rung.extra_model}"
-            if self.rung.extra_model
-            else f"\N{MINUS SIGN}{self.rung.missing_model}"
+            f"++{self.model_set.extra_model}"
+            if self.model_set.extra_model
+            else f"\N{MINUS SIGN}{self.model_set.missing_model}"
         )
 
 
@@ -89,19 +89,19 @@ def _plot_mode(axes: Axes, figures: SceneFigures, mode: str, goal_n: float | Non
     """Draw points, bars, front and goal of one mode."""
     colour, shape = STYLES[mode]
     marks = []
-    for rung in figures.model_sets:
-        m = figures.figures_by_mode_and_label[mode, rung.label]
-        mark = _Point(rung, m.ns_per_frame.median, m.figures["grf_mae_n"])
+    for model_set in figures.model_sets:
+        m = figures.figures_by_mode_and_label[mode, model_set.label]
+        mark = _Point(model_set, m.ns_per_frame.median, m.figures["grf_mae_n"])
         if math.isfinite(mark.ns) and math.isfinite(mark.error_n.median):
             marks.append(mark)
     for mark in marks:
-        error_n, is_full_set = mark.error_n, mark.rung.is_full_set
+        error_n, is_full_set = mark.error_n, mark.model_set.is_full_set
         axes.errorbar(
             *([mark.ns], [error_n.median]),
             yerr=[[error_n.median - error_n.p5], [error_n.p95 - error_n.median]],
             marker=shape,
             markersize=12 if is_full_set else 6.5,
-            markerfacecolor=colour if mark.rung.is_built_up else "white",
+            markerfacecolor=colour if mark.model_set.is_built_up else "white",
             markeredgecolor="black" if is_full_set else colour,
             markeredgewidth=2.0 if is_full_set else 1.2,
             ecolor=colour,
@@ -203,7 +203,7 @@ def _place_labels(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_
     if not marks:
         return
     # The full model set and the built-up ones first: they get the best places.
-    marks = sorted(marks, key=lambda m: (not m.rung.is_full_set, not m.rung.is_built_up))
+    marks = sorted(marks, key=lambda m: (not m.model_set.is_full_set, not m.model_set.is_built_up))
     ns, errors_n = [m.ns for m in marks], [m.error_n.median for m in marks]
     front = find_pareto_front(list(zip(ns, errors_n, strict=True)))
     bars = [([m.ns, m.ns], [m.error_n.p5, m.error_n.p95]) for m in marks]
@@ -218,9 +218,9 @@ def _place_labels(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_
         x_lines=list(x_lines),
         y_lines=list(y_lines),
         min_distance=0.018,
-        textsize=[9.5 if m.rung.is_full_set else 8.5 for m in marks],
-        fontweight=["bold" if m.rung.is_full_set else "normal" for m in marks],
-        textcolor=["black" if m.rung.is_full_set else colour for m in marks],
+        textsize=[9.5 if m.model_set.is_full_set else 8.5 for m in marks],
+        fontweight=["bold" if m.model_set.is_full_set else "normal" for m in marks],
+        textcolor=["black" if m.model_set.is_full_set else colour for m in marks],
         linecolor=colour,
         linewidth=0.6,
     )

@@ -139,16 +139,16 @@ def _format_coverage(figures: SceneFigures) -> list[str]:
 def _format_budget(figures: SceneFigures) -> list[str]:
     """Format the error budget: the increase of the error without each model."""
     rows = []
-    for rung in figures.model_sets:
-        if rung.missing_model is None and rung.extra_model is None:
+    for model_set in figures.model_sets:
+        if model_set.missing_model is None and model_set.extra_model is None:
             continue
         row = [
-            f"without {rung.missing_model}"
-            if rung.missing_model
-            else f"with {rung.extra_model}, too"
+            f"without {model_set.missing_model}"
+            if model_set.missing_model
+            else f"with {model_set.extra_model}, too"
         ]
         for mode in LAGS_MS:
-            more = figures.figures_by_mode_and_label[mode, rung.label].beyond_whole
+            more = figures.figures_by_mode_and_label[mode, model_set.label].beyond_whole
             row += [
                 format_quantiles(more["grf_mae_n"], 1.0, 3, sign="+"),
                 format_quantiles(more["cop_p95_m"], 1e3, 2, sign="+"),
@@ -181,10 +181,10 @@ def _format_goals(goals: Sequence[Goal], draws: int) -> list[str]:
 
 def _rows(figures: SceneFigures) -> list[tuple[tuple[str, str], ModelSetFigures]]:
     return [
-        ((f"**{rung.label}**" if rung.is_full_set else rung.label, mode), measured)
-        for rung in figures.model_sets
+        ((f"**{model_set.label}**" if model_set.is_full_set else model_set.label, mode), measured)
+        for model_set in figures.model_sets
         for mode in LAGS_MS
-        for measured in (figures.figures_by_mode_and_label[mode, rung.label],)
+        for measured in (figures.figures_by_mode_and_label[mode, model_set.label],)
     ]
 
 

@@ -127,16 +127,16 @@ def run_benchmark(options: BenchmarkOptions, on_progress: Callable[[str], None])
     """
     scenes = []
     for scene in map(options.apply_emulation_options, options.scenes):
-        ladder = list_model_sets(scene.models, extra_models=_list_supported_models(scene))
+        model_set = list_model_sets(scene.models, extra_models=_list_supported_models(scene))
         if options.full_only:
-            ladder = tuple(rung for rung in ladder if rung.is_full_set)
-        tasks = [DrawTask(scene, options.seconds, seed, ladder) for seed in range(options.draws)]
+            model_set = tuple(model_set for model_set in model_set if model_set.is_full_set)
+        tasks = [DrawTask(scene, options.seconds, seed, model_set) for seed in range(options.draws)]
         draws: list[DrawResult] = []
         for draw in run_draws(tasks, options.process_count):
             draws.append(draw)
             on_progress(f"{scene.name}: {len(draws)} of {options.draws} draws")
         draws.sort(key=lambda draw: draw.draw)
-        scenes.append(_measure_scene(scene, ladder, draws, options, on_progress))
+        scenes.append(_measure_scene(scene, model_set, draws, options, on_progress))
     made = datetime.now(UTC).isoformat(timespec="seconds")
     return BenchmarkResult(options, made, SOFTWARE_VERSION, describe_machine(), tuple(scenes))
 
@@ -150,7 +150,7 @@ def _list_supported_models(scene: Scene) -> tuple[str, ...]:
 
 def _measure_scene(
     scene: Scene,
-    ladder: tuple[ComparedModelSet, ...],
+    model_set: tuple[ComparedModelSet, ...],
     draws: Sequence[DrawResult],
     options: BenchmarkOptions,
     tell: Callable[[str], None],
@@ -165,7 +165,7 @@ def _measure_scene(
     tell(f"{scene.name}: timing")
     recording = record_draw(scene, options.seconds, good[0].draw)
     frames = {"live": options.live_frames, "offline": options.offline_frames}
-    times_ns, not_timed = time_model_sets(recording, ladder, frames, options.repetitions)
+    times_ns, not_timed = time_model_sets(recording, model_set, frames, options.repetitions)
     return SceneFigures(
         scene=scene.name,
         tile_count=len(scene.tile),
@@ -174,8 +174,8 @@ def _measure_scene(
         assumed_scale=_is_scale_assumed(recording),
         draw_count=len(good),
         frames=Quantiles.from_values([float(draw.frames) for draw in good]),
-        model_sets=ladder,
-        figures_by_mode_and_label=summarize_model_sets(ladder, good, times_ns),
+        model_sets=model_set,
+        figures_by_mode_and_label=summarize_model_sets(model_set, good, times_ns),
         failures=(*failures, *not_timed),
     )
 

@@ -116,22 +116,25 @@ def assign_blocks(scores: Floats, samples: Ints, weight: Floats) -> Ints:
     memory = max(1.0, *(estimate_correlation_samples(column) for column in scores.T))
     # A long rest has no information: only informative time counts, as the number of correlation
     # times of equal weight (Kish's effective sample size).
-    told = np.bincount(((samples - samples[0]) / memory).astype(np.intp), weight)
-    length, least = memory * told.sum() ** 2 / (told**2).sum(), CORRELATION_TIMES_PER_BLOCK * memory
+    weights = np.bincount(((samples - samples[0]) / memory).astype(np.intp), weight)
+    length, least = (
+        memory * weights.sum() ** 2 / (weights**2).sum(),
+        CORRELATION_TIMES_PER_BLOCK * memory,
+    )
     blocks = int(np.clip(length / least, MIN_BLOCKS, MAX_BLOCKS))
     least = min(least, length / blocks)
-    told = np.cumsum(weight) / weight.sum()
+    shares = np.cumsum(weight) / weight.sum()
     edges, begin, before = [], 0, 0.0
     for left in range(blocks, 1, -1):
         # Its share of the remaining information, and at least the correlation-limited length.
-        end = int(np.searchsorted(told, before + (1.0 - before) / left)) + 1
+        end = int(np.searchsorted(shares, before + (1.0 - before) / left)) + 1
         end = max(end, int(np.searchsorted(samples, samples[begin] + least)))
         end = min(end, int(np.searchsorted(samples, samples[-1] + 1 - least * (left - 1))))
         end = max(end, begin + 1)
         if end >= len(samples):
             break
         edges.append(end)
-        begin, before = end, float(told[end - 1])
+        begin, before = end, float(shares[end - 1])
     return np.asarray(np.searchsorted(edges, np.arange(len(samples)), side="right"))
 
 
@@ -201,8 +204,8 @@ def compute_phase_covariance(
     phase = np.zeros(len(force_n), dtype=np.intp)
     for side, of_side in enumerate((~rises, rises)):
         rows = np.flatnonzero(of_side)[np.argsort(force_n[of_side], kind="stable")]
-        told = np.cumsum(telling[rows])
-        half = int(np.searchsorted(told, 0.5 * told[-1])) if len(told) else 0
+        shares = np.cumsum(telling[rows])
+        half = int(np.searchsorted(shares, 0.5 * shares[-1])) if len(shares) else 0
         phase[rows] = 2 * side + (np.arange(len(rows)) > half)
     moved = _compute_leave_one_out_shifts(*_sum_by_group(jacobian, score, curvature, phase))
     centred = moved - moved.mean(axis=0)

@@ -111,8 +111,8 @@ def estimate_session(
         watched = given if judged is None else judged.observe(given, stream)
         frames = write_estimates(out, what, notes, stream, watched, on_remark)
     if not frames or stream.plan is None:
-        said = "the session has no frames" + ("" if part.is_whole_session else " in that time")
-        raise FileFormatError(said, where=str(source))
+        problem = "the session has no frames" + ("" if part.is_whole_session else " in that time")
+        raise FileFormatError(problem, where=str(source))
     found = () if judged is None else judged.finish(stream.plan)
     return EstimateResult(frames, stream.plan, begin_t_ns, *found)
 
@@ -200,6 +200,6 @@ def _make_part_notes(
     session: SealedFileReader, notes: Mapping[str, object], part: Slice, stretch: EstimationRange
 ) -> dict[str, object]:
     """Return the notes that hold for a part of the session."""
-    notes = {name: said for name, said in notes.items() if name not in _WHOLE_SESSION_NOTES}
+    notes = {name: note for name, note in notes.items() if name not in _WHOLE_SESSION_NOTES}
     seconds = {"start_s": part.start_s, "end_s": part.end_s, "warm_up_s": stretch.warm_up_s}
     return {**notes, "part_of": {**session.source_reference, **seconds}}

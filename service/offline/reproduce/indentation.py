@@ -101,8 +101,8 @@ def calibrate_tile(scene: Scene, *, seed: int, parts_seed: int) -> Calibration:
 def _record_indentation(
     scene: Scene, seed: int, parts_seed: int
 ) -> Iterator[Mapping[str, Sequence[MillRecording]]]:
-    with tempfile.TemporaryDirectory(prefix="foottile-mill-") as work:
-        recording = Path(work) / "mill.parquet"
+    with tempfile.TemporaryDirectory(prefix="foottile-indentation-") as work:
+        recording = Path(work) / "indentation.parquet"
         foot = EmulatedFoot(seed=seed, parts_seed=parts_seed)
         run_simulation(SimulationOptions(scene, foot=foot), recording, None)
         yield read_indentations([recording])

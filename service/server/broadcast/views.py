@@ -286,7 +286,7 @@ class NodeView(View):
             backlog_frames=node.backlog_frames,
             missed_slots=node.present_stream.missed_slots,
             warnings=[
-                *node.troubles,
+                *node.warnings,
                 *node.refusal_warnings,
                 *([COMPILING_NOTE] if is_compiling() else []),
             ],

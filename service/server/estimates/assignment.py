@@ -95,12 +95,12 @@ def _read_assignment(path: Path) -> AssignedCalibration | None:
     """
     text = read_checksummed_json(path).text
     try:
-        said = json.loads(text)
-        if said["calibration"] is None:
+        document = json.loads(text)
+        if document["calibration"] is None:
             return None
-        content = json.dumps(said["calibration"])
+        content = json.dumps(document["calibration"])
         calibration = Calibration.from_json(content, where=str(path))
-        return AssignedCalibration(calibration, int(said["t_ns"]))
+        return AssignedCalibration(calibration, int(document["t_ns"]))
     except (CalibrationError, ValueError, KeyError, TypeError, RecursionError) as error:
         what = " ".join(str(error).split())[:200]
         raise DamagedFileError(f"no assigned calibration: {what}", where=str(path)) from error

@@ -116,11 +116,11 @@ class NodeJournal:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about storage, as messages."""
-        trouble = self._disk_problem
-        if trouble is None:
+        problem = self._disk_problem
+        if problem is None:
             return ()
         waiting_s = sum(stream.waiting_s for stream in self.streams)
-        return (f"{trouble[1]}; {waiting_s:.0f} s of frames wait in memory",)
+        return (f"{problem[1]}; {waiting_s:.0f} s of frames wait in memory",)
 
     def begin_stream(self, info: ArrayInfo) -> NodeStream:
         """Start a new stream and mark earlier ones as ended."""
@@ -185,8 +185,8 @@ class NodeJournal:
 
     def _drop_oldest(self) -> bool:
         """Drop the batch that has waited longest; False if only the newest is left."""
-        trouble = self._disk_problem
-        reason = trouble[0] if trouble is not None else DISK_SLOW
+        problem = self._disk_problem
+        reason = problem[0] if problem is not None else DISK_SLOW
         newest = self.streams[-1]
         return any(
             stream.drop_oldest_waiting(

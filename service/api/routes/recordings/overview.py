@@ -170,7 +170,7 @@ def _encode(
     session: Session,
     seen: BinnedSlice,
     serials: list[str],
-    said: dict[str, bool],
+    remarks: dict[str, bool],
     query: OverviewQuery,
     *,
     as_arrow: bool,
@@ -184,7 +184,7 @@ def _encode(
         "frames_in_bin": seen.frames_per_bin,
         "time_axis": seen.time_axis.to_json_list(),
         "serials": serials,
-        **said,
+        **remarks,
     }
     if not as_arrow:
         text = encode_columns_json(about, columns)

@@ -246,7 +246,7 @@ async def _receive_messages(socket: WebSocket, server: Server, link: NodeLink) -
                 server.recorder.record_clock_offset(node, parsed, server_utc_ns())
             case NodeStatus():
                 node.present_stream.missed_slots = parsed.missed_slots
-                node.troubles, node.fault_counts = parsed.warnings, parsed.counts
+                node.warnings, node.fault_counts = parsed.warnings, parsed.counts
                 server.notify_node_changed(node)
             case LossReport():
                 _find_announced_stream(node, parsed.stream_id).set_losses(parsed.lost)

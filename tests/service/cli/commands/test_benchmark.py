@@ -39,13 +39,13 @@ def test_bench_writes_json_tables_and_plot(run: Run, scene: Path, tmp_path: Path
     assert (rolling["draws"], rolling["failures"]) == (2, [])
     assert not all(goal["met"] for goal in rolling["goals"]), "said, and no failure unless asked"
     assert rolling["absolute_scale"] == "assumed"
-    for rung in rolling["rungs"]:
+    for model_set in rolling["model_sets"]:
         for mode, lag_ms in (("live", 10.0), ("offline", 100.0)):
-            assert rung[mode]["lag_ms"] == lag_ms
-            assert rung[mode]["ns_per_frame"]["n"] == 3
-            assert rung[mode]["figures"]["grf_mae_n"]["n"] == 2
-            assert rung[mode]["coverage"]["all"]["frames"] > 1000
-    assert sum(rung["default"] for rung in rolling["rungs"]) == 1
+            assert model_set[mode]["lag_ms"] == lag_ms
+            assert model_set[mode]["ns_per_frame"]["n"] == 3
+            assert model_set[mode]["figures"]["grf_mae_n"]["n"] == 2
+            assert model_set[mode]["coverage"]["all"]["frames"] > 1000
+    assert sum(model_set["is_full_set"] for model_set in rolling["model_sets"]) == 1
     text = (folder / "bench.md").read_text()
     assert "an emulated foot" in text
     assert "forces in newtons are unreliable" in text

@@ -88,7 +88,7 @@ def test_a_rung_that_failed_in_one_draw_has_the_figures_of_the_others() -> None:
 
 def test_a_model_left_out_is_compared_draw_by_draw() -> None:
     ladder = list_model_sets(("unwrap", "static"), all_models=("unwrap", "static"))
-    whole, less = (("live", rung.label) for rung in ladder)
+    whole, less = (("live", model_set.label) for model_set in ladder)
     draws = [
         DrawResult(0, 20, {whole: accuracy(0.1), less: accuracy(0.3)}, ()),
         DrawResult(1, 20, {whole: accuracy(0.5), less: accuracy(0.8)}, ()),

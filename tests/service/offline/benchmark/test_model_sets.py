@@ -27,20 +27,24 @@ def test_a_scene_with_one_model_has_one_rung() -> None:
 
 
 def test_rungs_are_built_up_by_what_matters_and_applied_in_the_order_of_the_models() -> None:
-    built = [rung for rung in list_model_sets(LADDER, all_models=LADDER) if rung.is_built_up]
-    assert [rung.added_model for rung in built] == [
+    built = [
+        model_set
+        for model_set in list_model_sets(LADDER, all_models=LADDER)
+        if model_set.is_built_up
+    ]
+    assert [model_set.added_model for model_set in built] == [
         *(None, "denoise", "skew", "gas", "rubber", "hysteresis", "temperature", "ambient"),
     ]
     assert built[3].models == ("unwrap", "gas", "static", "skew", "denoise")
-    assert [rung.is_full_set for rung in built] == [False] * 7 + [True]
+    assert [model_set.is_full_set for model_set in built] == [False] * 7 + [True]
     assert built[-1].models == LADDER
 
 
 def test_every_model_but_static_is_left_out_of_the_whole_once() -> None:
     less = {
-        rung.missing_model: rung.models
-        for rung in list_model_sets(LADDER, all_models=LADDER)
-        if rung.missing_model
+        model_set.missing_model: model_set.models
+        for model_set in list_model_sets(LADDER, all_models=LADDER)
+        if model_set.missing_model
     }
     assert set(less) == set(LADDER) - {"static"}
     for name, models in less.items():
@@ -50,9 +54,9 @@ def test_every_model_but_static_is_left_out_of_the_whole_once() -> None:
 def test_no_ladder_comes_twice_and_every_label_is_its_own() -> None:
     for scene in (LADDER, LADDER[3:], ("static", "denoise"), ("unwrap", "gas", "static")):
         made = list_model_sets(scene, all_models=LADDER)
-        assert len({rung.models for rung in made}) == len(made)
-        assert len({rung.label for rung in made}) == len(made)
-        assert sum(rung.is_full_set for rung in made) == 1
+        assert len({model_set.models for model_set in made}) == len(made)
+        assert len({model_set.label for model_set in made}) == len(made)
+        assert sum(model_set.is_full_set for model_set in made) == 1
 
 
 def test_the_rung_before_the_last_is_also_the_whole_without_the_last() -> None:
@@ -77,7 +81,11 @@ def test_the_first_rung_is_built_up_even_if_it_lacks_but_one_model() -> None:
 
 def test_models_that_there_are_not_are_left_out_and_named() -> None:
     existing = ("unwrap", "gas", "static")
-    (default,) = (rung for rung in list_model_sets(LADDER, all_models=existing) if rung.is_full_set)
+    (default,) = (
+        model_set
+        for model_set in list_model_sets(LADDER, all_models=existing)
+        if model_set.is_full_set
+    )
     assert default.models == existing
     assert list_missing_models(LADDER, all_models=existing) == tuple(
         m for m in LADDER if m not in existing
@@ -86,7 +94,11 @@ def test_models_that_there_are_not_are_left_out_and_named() -> None:
 
 def test_a_model_that_nobody_thought_of_comes_last() -> None:
     made = list_model_sets(("unwrap", "static", "magic", "gas"), all_models=("magic", *LADDER))
-    assert [rung.added_model for rung in made if rung.is_built_up] == [None, "gas", "magic"]
+    assert [model_set.added_model for model_set in made if model_set.is_built_up] == [
+        None,
+        "gas",
+        "magic",
+    ]
 
 
 def test_the_ladder_of_today_is_compared() -> None:
@@ -97,8 +109,8 @@ def test_models_that_a_scene_does_without_are_tried_on_top_of_its_whole() -> Non
     made = list_model_sets(
         ("unwrap", "static", "denoise"), all_models=LADDER, extra_models=("gas", "denoise")
     )
-    more = [rung for rung in made if rung.extra_model]
-    assert [(rung.label, rung.models) for rung in more] == [
+    more = [model_set for model_set in made if model_set.extra_model]
+    assert [(model_set.label, model_set.models) for model_set in more] == [
         ("whole +gas", ("unwrap", "gas", "static", "denoise"))
     ]
-    assert not any(rung.is_full_set or rung.is_built_up for rung in more)
+    assert not any(model_set.is_full_set or model_set.is_built_up for model_set in more)

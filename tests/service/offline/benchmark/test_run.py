@@ -15,7 +15,7 @@ def test_draws_in_processes_of_their_own_give_the_same() -> None:
     scene = load_scene("rolling").model_copy(
         update={"calibration": "paper-eq2-shape", "models": ("unwrap", "static")}
     )
-    (whole,) = (rung for rung in list_model_sets(scene.models) if rung.is_full_set)
+    (whole,) = (model_set for model_set in list_model_sets(scene.models) if model_set.is_full_set)
     tasks = [DrawTask(scene, 1.0, draw, (whole,)) for draw in (0, 1)]
     there = sorted(run_draws(tasks, process_count=2), key=lambda d: d.draw)
     # By their texts: what is not known in either is no difference.

@@ -1,4 +1,4 @@
-"""A recording over and over again is one stream, and timing it takes every rung."""
+"""A recording over and over again is one stream, and timing it takes every model_set."""
 
 from __future__ import annotations
 
