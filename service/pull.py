@@ -63,7 +63,7 @@ def refuse_data_folder(folder: Path) -> None:
             raise UsageError(what, where=str(place), remedy=remedy)
     path = folder / SESSION_NAME
     try:
-        content = json.loads(read_checksummed_json(path).text)
+        content = json.loads(read_checksummed_json(path))
     except FileNotFoundError:
         return
     except ValueError:  # includes DamagedFileError

@@ -43,8 +43,7 @@ def rebuild_session(sessions: SessionsFolder, session_id: str) -> Session | None
     folder = sessions.get_path(session_id)
     path = folder / SESSION_NAME
     try:
-        if read_checksummed_json(path).has_checksum:
-            return None  # intact, but of another version
+        read_checksummed_json(path)
     except FileNotFoundError:
         what = f"its {SESSION_NAME} was gone"
     except StorageError:
@@ -52,7 +51,7 @@ def rebuild_session(sessions: SessionsFolder, session_id: str) -> Session | None
     except DamagedFileError:
         what = f"its {SESSION_NAME} was damaged"
     else:
-        what = f"its {SESSION_NAME} was not readable"
+        return None  # intact, but of another version
     session = _session_from_files(folder, what)
     if session is not None:
         if path.exists() or path.is_symlink():

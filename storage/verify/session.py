@@ -144,7 +144,7 @@ def _verify_once(
     metadata = (
         make_session_metadata(session)
         if session is not None
-        else parse_session_metadata(folder, text, report.problems, report.unproven)
+        else parse_session_metadata(folder, text, report.problems)
     )
     if metadata is None:
         if (folder / FRAMES_NAME).is_file():

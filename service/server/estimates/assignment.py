@@ -93,7 +93,7 @@ def _read_assignment(path: Path) -> AssignedCalibration | None:
         DamagedFileError: the file is damaged.
         StorageError: it cannot be read now.
     """
-    text = read_checksummed_json(path).text
+    text = read_checksummed_json(path)
     try:
         said = json.loads(text)
         if said["calibration"] is None:
