@@ -69,11 +69,11 @@ def _session_from_files(folder: Path, what: str) -> Session | None:
     except FileFormatError:
         return None
     notes = file.notes
-    if file.problems or file.content_sha256 is None or file.session.get("id") != folder.name:
+    if file.problems or file.session.get("id") != folder.name:
         return None
     lost = ["subject, notes and tags"]
-    events = _read_sidecar(read_markers, folder / MARKERS_NAME)
-    if events is None:
+    markers = _read_sidecar(read_markers, folder / MARKERS_NAME)
+    if markers is None:
         lost.append("markers")
     clock = _read_sidecar(read_clock_file, folder / CLOCK_NAME)
     if clock is None:
@@ -84,7 +84,7 @@ def _session_from_files(folder: Path, what: str) -> Session | None:
         "scene_content": notes.get("scene") or {},
         "calibration": notes.get("calibration"),
         "calibration_source": notes.get("calibration_source", "node"),
-        "markers": events.markers if events is not None else (),
+        "markers": markers or (),
         "clock": clock.offsets if clock is not None else (),
         "problem": f"{what} and was rebuilt from {FRAMES_NAME}; lost are {', '.join(lost)}",
         "ledger": file.ledger,

@@ -139,17 +139,17 @@ def read_series(folder: Path) -> pa.Table | None:
     """
     path = folder / SERIES_NAME
     try:
-        read = read_hashed_table(path)
+        table = read_hashed_table(path)
     except FileNotFoundError:
         return None
-    if not read.has_hash or not read.table.schema.remove_metadata().equals(SERIES_SCHEMA):
+    if not table.schema.remove_metadata().equals(SERIES_SCHEMA):
         raise DamagedFileError(
             "is no series of a comparison",
             where=str(path),
-            expected="columns " + ", ".join(SERIES_SCHEMA.names) + ", with a hash",
+            expected="columns " + ", ".join(SERIES_SCHEMA.names),
             remedy="Compare again",
         )
-    return read.table
+    return table
 
 
 def read_series_footer(folder: Path) -> pq.FileMetaData:

@@ -119,7 +119,7 @@ def session_readings(folder: Path) -> Readings:
             SessionsFolder(folder.parent).load(folder.name).model_dump_json().encode()
         ),
         "frames": lambda: _frames(folder / FRAMES_NAME),
-        "markers": lambda: repr(read_markers(folder / MARKERS_NAME).markers).encode(),
+        "markers": lambda: repr(read_markers(folder / MARKERS_NAME)).encode(),
         "clock": lambda: _clock(folder / FRAMES_NAME),
     }
     wanted = readers if folder.name == SEALED else {"session"}
