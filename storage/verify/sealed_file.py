@@ -170,9 +170,7 @@ def parse_lost_numbers(notes: dict[str, Any]) -> dict[str, Losses]:
         FileFormatError: they cannot be parsed.
     """
     try:
-        return {
-            b: Losses(pairs) for b, pairs in _LOST.validate_python(notes.get("lost", {})).items()
-        }
+        return {b: Losses(pairs) for b, pairs in _LOST.validate_python(notes.get("lost")).items()}
     except (ValidationError, ValueError) as error:
         raise FileFormatError(f"the numbers that are lost are not readable: {error}") from error
 
@@ -282,13 +280,13 @@ def _check_ledger(report: SealedFileReport) -> None:
     try:
         report.ledger = Ledger.model_validate(stated)
         lost = parse_lost_numbers(report.notes)
-        parts = _PARTS.validate_python(report.session.get("parts", ()))
+        parts = _PARTS.validate_python(report.session.get("parts"))
     except (ValidationError, FileFormatError) as error:
         report.problems.append(f"its ledger is not readable: {error}")
         return
     report.problems += find_ledger_mismatches(report.parts, report.ledger, lost)
     intervals = [(p.stream_id, p.seq_first, p.seq_last) for p in parts]
-    if parts and intervals != [(p.stream_id, p.seq_first, p.seq_last) for p in report.ledger.parts]:
+    if intervals != [(p.stream_id, p.seq_first, p.seq_last) for p in report.ledger.parts]:
         report.problems.append("its ledger is of other parts than its session")
 
 

@@ -20,7 +20,7 @@ from storage.journal.journal import Journal
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD_DTYPE, read_schema_and_first_offset
 from storage.journal.segment_writer import SegmentWriter
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
-from storage.schema import legacy_wire_schema, read_array_info, wire_schema
+from storage.schema import read_array_info, wire_schema
 from storage.verify.journal import verify_journal
 from storage.verify.segment import verify_segment
 from storage.wire import EncodedBatch, encode_frames
@@ -344,17 +344,3 @@ def test_no_flip_in_a_segments_header_gives_another_array(tmp_path: Path) -> Non
             assert same, f"flipped at {at}"
             continue
         assert problems(folder) != ""
-
-
-def test_segments_of_older_versions_without_a_hash_are_read(tmp_path: Path) -> None:
-    info = array()
-    writer = SegmentWriter(
-        tmp_path / f"{0:020}.arrows", legacy_wire_schema(info).serialize().to_pybytes()
-    )
-    batch = frames(0, 4)
-    writer.append(
-        EncodedBatch.from_frames_and_payload(batch, encode_frames(batch, wire_schema(info)))
-    )
-    writer.close()
-    report = verify_segment(tmp_path / f"{0:020}.arrows")
-    assert (report.problems, report.stored.count, report.info) == ([], 5, info)
