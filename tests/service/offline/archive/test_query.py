@@ -152,7 +152,7 @@ def test_a_damaged_footer_leaves_the_session_out_of_frames_and_sessions(data: Pa
     assert list(archive.left_out_reasons) == [str(data / "sessions" / IDS[0])]
 
 
-def test_stances_that_an_older_session_lacks_are_made_and_kept(data: Path) -> None:
+def test_stances_that_a_session_lacks_are_made_and_kept(data: Path) -> None:
     path = data / "sessions" / IDS[0] / "stances.parquet"
     written, rows = path.read_bytes(), answer(THIRD_IN_MUD, data)
     path.unlink()
