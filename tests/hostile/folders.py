@@ -107,7 +107,7 @@ def _session(data: Path, session_id: str, first: int, last: int) -> None:
         state="pending",
         stopped_t_ns=t_ns(last),
         parts=(Part(stream_id=BOOT, seq_first=first, seq_last=last),),
-        events=(Marker(id="e1", label="slip", t_ns=t_ns(first + 3)),),
+        markers=(Marker(id="e1", label="slip", t_ns=t_ns(first + 3)),),
         calibration=make_calibration("T01", "T02").model_dump(mode="json"),
     )
 
