@@ -51,7 +51,7 @@ Joiners and other zero-width marks are allowed: Persian, Hindi and emoji need th
 def check_user_text(text: str) -> str:
     """Check a text that a user sets, and return it.
 
-    Stricter than for stored texts: files of older versions may hold such characters.
+    Stricter than for texts that programs send or store.
 
     Raises:
         ValueError: it has an invisible or misleading character.

@@ -93,7 +93,7 @@ type OverviewQuery = { points: number; start_s?: number; end_s?: number; columns
 
 /** Of GET /sessions/ID/verification. */
 interface Verified {
-  complete: boolean; lossy: boolean; parts: { recorded: number }[]; sha256: string | null; problems: string[]; unproven: string[];
+  complete: boolean; lossy: boolean; parts: { recorded: number }[]; sha256: string | null; problems: string[];
 }
 
 interface Clock { streams: { stretches: { begin_t_ns: number; end_t_ns: number; offset_ns: number; drift_ppm: number }[] }[] }

@@ -29,7 +29,6 @@ log = logging.getLogger("foottile.storage")
 _TEMPORARY = re.compile(
     r"\.(?P<name>.+)\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp"
 )
-_OLDER_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
 _ENDED_STATES = {"Z", "X"}
 _START_TIME_FIELD = 19
 """Index of the start time in /proc/PID/stat, counted after the name."""
@@ -168,8 +167,6 @@ def is_stale_temporary(name: str) -> bool:
     """Return whether `name` is a temporary file of a process of this machine that has ended."""
     if match := _TEMPORARY.fullmatch(name):
         return _read_start_ticks(int(match["process"])) != int(match["started"])
-    if match := _OLDER_TEMPORARY.fullmatch(name):
-        return _read_start_ticks(int(match["process"])) is None
     return False
 
 
@@ -362,7 +359,7 @@ ASIDE_SUFFIX = ".damaged"
 
 def get_original_name(name: str) -> str:
     """Return the original name of a set-aside or temporary file."""
-    if match := _TEMPORARY.fullmatch(name) or _OLDER_TEMPORARY.fullmatch(name):
+    if match := _TEMPORARY.fullmatch(name):
         return match["name"]
     return name.partition(ASIDE_SUFFIX)[0]
 

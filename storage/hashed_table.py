@@ -1,13 +1,11 @@
 """Small Parquet tables with a hash of their bytes, such as markers and clocks of a session.
 
-The hash is in the footer (`storage.parquet_hash`), and every page has a checksum. Older versions
-wrote neither: such a table is read and reported as unproven, and gets both at the next write.
+The hash is in the footer (`storage.parquet_hash`), and every page has a checksum.
 """
 
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +23,6 @@ from storage.parquet_hash import (
     compute_stated_and_actual_hash,
     embed_hashes,
 )
-
-
-@dataclass(frozen=True)
-class HashedTable:
-    """Table read from a file, and whether a hash proves it."""
-
-    table: pa.Table
-    has_hash: bool
-    """False: an older version wrote it without a hash, so a change cannot be seen."""
 
 
 def write_hashed_table(
@@ -63,35 +52,32 @@ def write_hashed_table(
     write_atomically(path, sink.getvalue())
 
 
-def read_hashed_table(path: Path) -> HashedTable:
+def read_hashed_table(path: Path) -> pa.Table:
     """Read a table and verify its hash; the caller checks its columns.
 
     Raises:
         FileNotFoundError: there is no such file.
-        DamagedFileError: its hash is wrong, or it is no table.
+        DamagedFileError: its hash is wrong or missing, or it is no table.
         StorageError: it cannot be read now.
     """
     return parse_hashed_table(read_small_file(path), where=str(path))
 
 
-def parse_hashed_table(content: bytes, *, where: str) -> HashedTable:
+def parse_hashed_table(content: bytes, *, where: str) -> pa.Table:
     """Parse a table from a file's content and verify its hash.
 
     Raises:
-        DamagedFileError: its hash is wrong, or it is no table.
+        DamagedFileError: its hash is wrong or missing, or it is no table.
     """
-    hashes = compute_stated_and_actual_hash(content)
-    check_file_hash(hashes, {}, where=where)
+    check_file_hash(compute_stated_and_actual_hash(content), where=where)
     try:
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True) as file:
             # On this thread: if one of Arrow's released `content` last while the interpreter ends,
             # the process would abort.
             table = file.read(use_threads=False)
             table.validate(full=True)
-            metadata = table.schema.metadata or {}
     except Exception as error:  # damaged bytes may cause any error
         raise DamagedFileError(
             f"cannot be read as a table: {' '.join(str(error).split())[:300]}", where=where
         ) from error
-    check_file_hash(hashes, metadata, where=where)
-    return HashedTable(table, has_hash=hashes is not None)
+    return table

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,8 +21,6 @@ FOOTER_HASH_KEY = b"foottile.footer_sha256"
 FORMAT_KEY = b"foottile.format"
 """Key of the format version in the schema's metadata of frames, markers and clocks."""
 FORMAT = b"2"
-FORMAT_WITHOUT_HASH = b"1"
-"""Version of older files: the same format without a hash. They are read, not written."""
 HASH_PLACEHOLDER = b"0" * 64
 """Placeholder for the digits of a hash."""
 _THRIFT_TEXT_64 = b"\x18\x40"
@@ -85,37 +82,22 @@ def compute_stated_and_actual_hash(content: bytes) -> tuple[str, str] | None:
     return _hashes(io.BytesIO(content))
 
 
-def check_file_hash(
-    hashes: tuple[str, str] | None, metadata: Mapping[bytes, bytes], *, where: str
-) -> None:
+def check_file_hash(hashes: tuple[str, str] | None, *, where: str) -> None:
     """Refuse a Parquet file whose bytes have changed since it was written.
 
     Checksums of pages alone are not enough: a flip in the footer may give a column the name or the
-    place of another one. A file of another program, or of an older version, states no hash and no
-    format with a hash, and passes.
+    place of another one.
 
     Args:
         hashes: stated and actual, as of `read_stated_and_actual_hash`.
-        metadata: the metadata of its schema.
         where: for errors.
 
     Raises:
         DamagedFileError: its hash is wrong, or missing.
     """
-    if hashes is None and metadata.get(FORMAT_KEY, FORMAT_WITHOUT_HASH) != FORMAT_WITHOUT_HASH:
-        raise DamagedFileError(
-            "its hash is gone: it was changed, or another program has rewritten it",
-            where=where,
-            expected="the bytes as they were written",
-            remedy=f"{_REMEDY}; export it to work on it with other programs",
-        )
-    if hashes is not None and hashes[0] != hashes[1]:
-        raise DamagedFileError(
-            "its bytes have changed since it was sealed, by the hash in its footer",
-            where=where,
-            expected="the bytes as they were written",
-            remedy=_REMEDY,
-        )
+    _check_hash(
+        hashes, "its bytes have changed since it was sealed, by the hash in its footer", where
+    )
 
 
 def read_footer(path: Path) -> bytes:
@@ -149,7 +131,7 @@ def footer_stated_and_actual_hash(footer: bytes) -> tuple[str, str] | None:
     return stated, _footer_hash(footer, own, at)
 
 
-def check_footer_hash(hashes: tuple[str, str], *, where: str) -> None:
+def check_footer_hash(hashes: tuple[str, str] | None, *, where: str) -> None:
     """Refuse a footer whose bytes have changed since it was written.
 
     Args:
@@ -157,15 +139,21 @@ def check_footer_hash(hashes: tuple[str, str], *, where: str) -> None:
         where: for errors.
 
     Raises:
-        DamagedFileError: its hash is wrong.
+        DamagedFileError: its hash is wrong, or missing.
     """
-    if hashes[0] != hashes[1]:
-        raise DamagedFileError(
-            "the bytes of its footer have changed since it was sealed, by the footer's hash",
-            where=where,
-            expected="the bytes as they were written",
-            remedy=_REMEDY,
-        )
+    what = "the bytes of its footer have changed since it was sealed, by the footer's hash"
+    _check_hash(hashes, what, where)
+
+
+def _check_hash(hashes: tuple[str, str] | None, change: str, where: str) -> None:
+    if hashes is not None and hashes[0] == hashes[1]:
+        return
+    remedy = _REMEDY
+    if hashes is None:
+        change = "its hash is gone: it was changed, or another program has rewritten it"
+        remedy += "; export it to work on it with other programs"
+    expected = "the bytes as they were written"
+    raise DamagedFileError(change, where=where, expected=expected, remedy=remedy)
 
 
 def _hashes(file: BinaryIO) -> tuple[str, str] | None:

@@ -215,11 +215,6 @@ def wire_schema(info: ArrayInfo) -> pa.Schema:
     )
 
 
-def legacy_wire_schema(info: ArrayInfo) -> pa.Schema:
-    """Return the wire schema of older versions, which has no checksum of the description."""
-    return wire_schema(info).with_metadata({ARRAY_INFO_KEY: info.model_dump_json().encode()})
-
-
 def _sha256_hex(text: bytes) -> bytes:
     return hashlib.sha256(text).hexdigest().encode()
 

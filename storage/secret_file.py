@@ -29,7 +29,7 @@ def read_secrets(path: Path) -> dict[str, str]:
         StorageError: it cannot be read now.
     """
     try:
-        content = json.loads(read_checksummed_json(path).text)
+        content = json.loads(read_checksummed_json(path))
     except FileNotFoundError:
         return {}
     found = content.get("secrets") if isinstance(content, dict) else None

@@ -4,38 +4,28 @@ from __future__ import annotations
 
 import re
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import DamagedFileError
 from storage.durable_files import read_small_file, write_atomically
 
 SERVER_ID_NAME = "server_id"
-_FORM = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
+_FORM = re.compile(r"([0-9a-f]{32}) ([0-9a-f]{8})")
 
 
-@dataclass(frozen=True)
-class ServerId:
-    """Content of the file."""
-
-    id: str
-    has_checksum: bool
-    """False: an older version wrote it without a CRC-32."""
-
-
-def read_server_id(path: Path) -> ServerId:
+def read_server_id(path: Path) -> str:
     """Read the id and verify its CRC-32.
 
     Raises:
         FileNotFoundError: there is no such file.
-        DamagedFileError: its CRC-32 is wrong.
+        DamagedFileError: its CRC-32 is wrong or missing.
         StorageError: it cannot be read now.
     """
     text = read_small_file(path).decode("ascii", "replace").strip()
     found = _FORM.fullmatch(text)
-    if found is None or found[2] not in (None, _crc32_hex(found[1])):
+    if found is None or found[2] != _crc32_hex(found[1]):
         raise DamagedFileError("it is not the id that was written", where=str(path))
-    return ServerId(found[1], has_checksum=found[2] is not None)
+    return found[1]
 
 
 def write_server_id(path: Path, server_id: str) -> None:

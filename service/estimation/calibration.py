@@ -9,14 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import (
     Field,
-    SerializerFunctionWrapHandler,
     ValidationError,
-    model_serializer,
     model_validator,
 )
 
@@ -114,14 +112,6 @@ class TileCalibration(CalibrationPart):
                 raise ValueError("the curve beneath rubber does not rise all over its range")
         return self
 
-    @model_serializer(mode="wrap")
-    def _serialize_without_weights(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave absent weights out, so that ids of older calibrations stay the same."""
-        content: dict[str, Any] = written(self)
-        if self.weights is None:
-            content.pop("weights", None)
-        return content
-
     @property
     def range_u(self) -> tuple[float, float]:
         """Calibrated range in the polynomial's variable."""
@@ -143,14 +133,6 @@ class Calibration(CalibrationPart):
     """Serials that were loaded too, and the reason for having no curve."""
     mounted: MountCalibration | None = None
     """Mount calibration against a force plate; None: there is none."""
-
-    @model_serializer(mode="wrap")
-    def _serialize_without_mount(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit an absent mount calibration, so that ids of older calibrations stay the same."""
-        content: dict[str, Any] = written(self)
-        if self.mounted is None:
-            content.pop("mounted", None)
-        return content
 
     @property
     def id(self) -> str:

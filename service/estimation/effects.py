@@ -7,10 +7,10 @@ not offered for that tile, and `refused` has the reason.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
 from devices.arrays import Floats
 from devices.types import StrictModel, Text
@@ -143,14 +143,6 @@ class HysteresisEffect(CalibrationPart):
     def _check_invertible(self) -> Self:
         _check_fractions("parts of the plays", self.part)
         return self
-
-    @model_serializer(mode="wrap")
-    def _serialize_without_flow(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit an absent branch, so that ids of older calibrations stay the same."""
-        content: dict[str, Any] = written(self)
-        if self.flow is None:
-            content.pop("flow", None)
-        return content
 
 
 class TemperatureEffect(CalibrationPart):

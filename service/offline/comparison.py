@@ -235,7 +235,7 @@ def _read_trial_markers(
     beside = path.with_name(MARKERS_NAME)
     if not beside.is_file():
         return [], []
-    placed = place_session_markers(session, read_markers(beside).markers, Slice())
+    placed = place_session_markers(session, read_markers(beside), Slice())
     markers = []
     for marker in placed.markers:
         if marker.frame is not None:

@@ -103,7 +103,7 @@ def _prepare_export(reader: SealedFileReader, options: ExportOptions) -> tuple[E
             where=str(reader.path.parent),
             expected="a session's folder as a server sealed it or `foottile pull` fetched it",
         )
-    placed = None if stored is None else place_session_markers(reader, stored.markers, options.part)
+    placed = None if stored is None else place_session_markers(reader, stored, options.part)
     export = make_sealed_export(
         reader, options.part, clock=options.clock, markers=placed, options=options.options
     )

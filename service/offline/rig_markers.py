@@ -43,7 +43,7 @@ def read_rig_programme(session: SealedFileReader) -> RigProgramme | None:
         FileFormatError: the markers file is damaged.
     """
     try:
-        events = read_markers(session.path.with_name(MARKERS_NAME)).markers
+        events = read_markers(session.path.with_name(MARKERS_NAME))
     except FileNotFoundError:
         return None
     serials, where = session.info.serials, str(session.path.parent)

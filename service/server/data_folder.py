@@ -129,7 +129,7 @@ class DataFolder:
     def _read_id_at_path(self) -> str | None:
         """Read the id of the folder at the path; None if it has none."""
         with suppress(DamagedFileError, FileNotFoundError):
-            return read_server_id(self.path / SERVER_ID_NAME).id
+            return read_server_id(self.path / SERVER_ID_NAME)
         return None
 
     def _acquire_lock(self) -> ExitStack:
@@ -144,14 +144,14 @@ class DataFolder:
         return stack
 
     def _read_id(self) -> str | None:
-        """Read the id, rewriting it if it has no checksum; None if missing or damaged.
+        """Read the id; None if missing or damaged.
 
         Raises:
-            StorageError: it cannot be read or written now; no new id is made for that.
+            StorageError: it cannot be read now; no new id is made for that.
         """
         path = self.path / SERVER_ID_NAME
         try:
-            stored = read_server_id(path)
+            return read_server_id(path)
         except FileNotFoundError:
             return None
         except DamagedFileError as error:
@@ -160,7 +160,6 @@ class DataFolder:
             )
             log.warning("%s", self.problems[-1])
             return None
-        return stored.id if stored.has_checksum else self._write_id(stored.id)
 
     def _write_id(self, server_id: str) -> str:
         write_server_id(self.path / SERVER_ID_NAME, server_id)

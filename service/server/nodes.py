@@ -141,7 +141,7 @@ def _read_hello(path: Path) -> Hello:
         FileFormatError: it is of another protocol version.
         StorageError: it cannot be read now.
     """
-    text = read_checksummed_json(path).text
+    text = read_checksummed_json(path)
     again = "the node is unknown until it connects"
     try:
         content = json.loads(text)

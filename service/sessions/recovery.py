@@ -311,8 +311,7 @@ def _find_cut_files(data: Path) -> set[Path]:
 def _rewrite_markers(session: Session, folder: Path) -> bool:
     """Write `markers.parquet` again if it differs from `session.json`, which is written first."""
     try:
-        stored = read_markers(folder / MARKERS_NAME)
-        if stored.markers == session.markers and stored.has_hash:
+        if read_markers(folder / MARKERS_NAME) == session.markers:
             return False
     except FileNotFoundError:
         if not session.frames:

@@ -151,7 +151,7 @@ def open_streams(
 def read_hello(data: Path, node: str) -> dict[str, Any]:
     """Read the node's last hello on the server's disk; empty if there is none."""
     try:
-        content = json.loads(read_checksummed_json(data / "nodes" / node / "hello.json").text)
+        content = json.loads(read_checksummed_json(data / "nodes" / node / "hello.json"))
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}

@@ -43,8 +43,7 @@ def rebuild_session(sessions: SessionsFolder, session_id: str) -> Session | None
     folder = sessions.get_path(session_id)
     path = folder / SESSION_NAME
     try:
-        if read_checksummed_json(path).has_checksum:
-            return None  # intact, but of another version
+        read_checksummed_json(path)
     except FileNotFoundError:
         what = f"its {SESSION_NAME} was gone"
     except StorageError:
@@ -52,7 +51,7 @@ def rebuild_session(sessions: SessionsFolder, session_id: str) -> Session | None
     except DamagedFileError:
         what = f"its {SESSION_NAME} was damaged"
     else:
-        what = f"its {SESSION_NAME} was not readable"
+        return None  # intact, but of another version
     session = _session_from_files(folder, what)
     if session is not None:
         if path.exists() or path.is_symlink():
@@ -70,11 +69,11 @@ def _session_from_files(folder: Path, what: str) -> Session | None:
     except FileFormatError:
         return None
     notes = file.notes
-    if file.problems or file.content_sha256 is None or file.session.get("id") != folder.name:
+    if file.problems or file.session.get("id") != folder.name:
         return None
     lost = ["subject, notes and tags"]
-    events = _read_sidecar(read_markers, folder / MARKERS_NAME)
-    if events is None:
+    markers = _read_sidecar(read_markers, folder / MARKERS_NAME)
+    if markers is None:
         lost.append("markers")
     clock = _read_sidecar(read_clock_file, folder / CLOCK_NAME)
     if clock is None:
@@ -85,7 +84,7 @@ def _session_from_files(folder: Path, what: str) -> Session | None:
         "scene_content": notes.get("scene") or {},
         "calibration": notes.get("calibration"),
         "calibration_source": notes.get("calibration_source", "node"),
-        "markers": events.markers if events is not None else (),
+        "markers": markers or (),
         "clock": clock.offsets if clock is not None else (),
         "problem": f"{what} and was rebuilt from {FRAMES_NAME}; lost are {', '.join(lost)}",
         "ledger": file.ledger,

@@ -38,18 +38,18 @@ class RecordedTare:
     id: str
     serials: tuple[str, ...]
     tare: Tare
-    undone: bool = False
-    reason: str = ""
+    reason: str
     """Reason, as text."""
-    chips: tuple[tuple[int, ...], ...] | None = None
-    """Coefficients of the tiles' chips; None in tares of older versions."""
+    chips: tuple[tuple[int, ...], ...]
+    """Coefficients of the tiles' chips."""
+    undone: bool = False
 
     def is_of_array(self, info: ArrayInfo) -> bool:
         """Return whether it is of these tiles, by serials and chips.
 
         A swapped part has the same serial but another chip.
         """
-        return self.serials == info.serials and self.chips in (None, chip_coefficients(info))
+        return self.serials == info.serials and self.chips == chip_coefficients(info)
 
     @property
     def is_automatic(self) -> bool:
@@ -98,16 +98,13 @@ def read_tares(path: Path) -> TareFileContent:
         return _content_without_file(path)
     except DamagedFileError as error:
         return TareFileContent((LOST,), f"{error.what}: all of its tares are lost", is_damaged=True)
-    is_proven, what = False, "not a complete list of tares"
+    is_intact, what = True, "not a complete list of tares"
     try:
-        is_proven = parse_checksummed_json(text, where=str(path)).has_checksum
-        older = None if is_proven else _parse_older_version(text)
+        parse_checksummed_json(text, where=str(path))
     except DamagedFileError as error:
-        older, what = None, error.what
-    if older is not None:
-        return TareFileContent(older, "it is of an older version, which wrote no hashes: unproven")
+        is_intact, what = False, error.what
     entries, lost = _parse_intact(text)
-    if is_proven and lost == 0:
+    if is_intact and lost == 0:
         return TareFileContent(entries)
     return TareFileContent(entries, f"{what}: {_format_lost(lost)}", is_damaged=True)
 
@@ -201,26 +198,14 @@ def _parse_entry(content: Mapping[str, Any]) -> Entry | None:
 
 
 def _parse_tare(entry: Mapping[str, Any]) -> RecordedTare:
-    chips = entry.get("chips")
     return RecordedTare(
         str(entry["id"]),
         tuple(entry["serials"]),
         Tare.from_dict(entry["tare"], tiles=len(entry["serials"])),
+        str(entry["reason"]),
+        tuple(tuple(int(word) for word in words) for words in entry["chips"]),
         bool(entry["undone"]),
-        str(entry.get("reason") or REASONS.get(entry["tare"]["source"], "")),
-        None if chips is None else tuple(tuple(int(w) for w in words) for words in chips),
     )
-
-
-def _parse_older_version(text: bytes) -> tuple[RecordedTare, ...] | None:
-    """Parse a plain list of an older version, without hashes; None if it is none."""
-    try:
-        content = json.loads(text)
-        if not isinstance(content, list):
-            return None
-        return tuple(_parse_tare(entry) for entry in content) or None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return None
 
 
 def _hash(body: bytes) -> bytes:

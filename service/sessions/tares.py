@@ -179,7 +179,7 @@ class TareHistory:
         """
         reason = (reason or REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
         recorded = RecordedTare(
-            uuid.uuid4().hex[:12], info.serials, tare, reason=reason, chips=chip_coefficients(info)
+            uuid.uuid4().hex[:12], info.serials, tare, reason, chip_coefficients(info)
         )
         self._store(_thin_out((*self._entries, recorded)))
         return recorded

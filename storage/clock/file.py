@@ -54,12 +54,10 @@ class StoredClock:
     Attributes:
         rows_by_stream: measurements by stream_id.
         facts: facts about streams, by stream_id.
-        has_hash: False: an older version wrote it without a hash.
     """
 
     rows_by_stream: dict[str, OffsetRows]
     facts: dict[str, StreamClockFacts]
-    has_hash: bool
 
     @property
     def offsets(self) -> tuple[ClockOffset, ...]:
@@ -88,15 +86,14 @@ def read_clock_file(path: Path) -> StoredClock:
         FileNotFoundError: there is no such file.
         FileFormatError: it is damaged, no clock table, or a row has impossible numbers.
     """
-    read = read_hashed_table(path)
+    stored = read_hashed_table(path)
     try:
-        table = read.table.select(_SCHEMA.names).cast(_SCHEMA)
+        table = stored.select(_SCHEMA.names).cast(_SCHEMA)
         table.validate(full=True)
-        metadata = read.table.schema.metadata or {}
-        facts = _STREAMS.validate_json(metadata.get(STREAMS_KEY, b"[]"))
+        facts = _STREAMS.validate_json((stored.schema.metadata or {})[STREAMS_KEY])
         stream_ids = np.asarray(table.column("stream_id").to_pylist(), dtype=object)
         arrays = [table.column(name).to_numpy() for name in _NUMBERS]
-    except Exception as error:  # unproven bytes may cause any error
+    except Exception as error:  # other content may cause any error
         raise DamagedFileError(
             f"cannot be read as a clock table: {' '.join(str(error).split())[:300]}",
             where=str(path),
@@ -108,4 +105,4 @@ def read_clock_file(path: Path) -> StoredClock:
     }
     for stream_id, own in rows.items():
         check_rows_in_range(own, stream_id, str(path))
-    return StoredClock(rows, {stream.stream_id: stream for stream in facts}, read.has_hash)
+    return StoredClock(rows, {stream.stream_id: stream for stream in facts})

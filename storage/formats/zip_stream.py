@@ -29,7 +29,7 @@ _ZIP_DATES_S = (315_619_200, 4_354_732_800)
 Files of 1970, from a machine without a clock, get the nearest date.
 """
 _SIDECARS = (MARKERS_NAME, CLOCK_NAME, STANCES_NAME)
-"""Sidecars of a session. Each has its own checksum; older sessions lack some."""
+"""Sidecars of a session. Each has its own checksum; without estimates there are no stances."""
 
 
 @dataclass(frozen=True)

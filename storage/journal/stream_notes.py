@@ -67,13 +67,7 @@ class StreamNotes(BaseModel):
 
     @classmethod
     def load(cls, folder: Path) -> StreamNotes | None:
-        """Read `stream.json`; None if there is none. Raises as `load_with_proof`."""
-        notes, _ = cls.load_with_proof(folder)
-        return notes
-
-    @classmethod
-    def load_with_proof(cls, folder: Path) -> tuple[StreamNotes | None, bool]:
-        """Read `stream.json`; also return whether a checksum proves it (not in older versions).
+        """Read `stream.json`; None if there is none.
 
         Raises:
             DamagedFileError: its content has changed since it was written.
@@ -82,15 +76,13 @@ class StreamNotes(BaseModel):
         """
         path = folder / NOTES_FILE
         try:
-            read = read_checksummed_json(path)
+            text = read_checksummed_json(path)
         except FileNotFoundError:
-            return None, True
+            return None
         try:
-            return cls.model_validate_json(read.text), read.has_checksum
+            return cls.model_validate_json(text)
         except ValidationError as error:
             what = f"not a stream's notes: {' '.join(str(error).split())[:300]}"
-            if not read.has_checksum:
-                raise DamagedFileError(what, where=str(path)) from error
             # An unknown field is not dropped silently: it may bound the losses.
             raise FileFormatError(
                 f"{what}; another version wrote it, and it is left as it is",

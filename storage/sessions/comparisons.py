@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,19 +49,6 @@ SERIES_SCHEMA = pa.schema(
         for column in SERIES_COLUMNS
     ]
 )
-
-
-@dataclass(frozen=True)
-class ComparisonReport:
-    """Content of `compare.json`.
-
-    Attributes:
-        content: by name (docs/compare.md).
-        has_checksum: True: it has a checksum, which is right.
-    """
-
-    content: dict[str, Any]
-    has_checksum: bool
 
 
 def find_comparison_folders(session_folder: Path) -> dict[str, Path]:
@@ -105,8 +91,8 @@ def find_comparison_folder(session_folder: Path, name: str) -> Path:
     return found[name]
 
 
-def read_comparison_report(folder: Path) -> ComparisonReport:
-    """Read the report of a comparison and verify its checksum.
+def read_comparison_report(folder: Path) -> dict[str, Any]:
+    """Read the report of a comparison, by name (docs/compare.md), and verify its checksum.
 
     Raises:
         DamagedFileError: `compare.json` is missing, or was changed.
@@ -114,10 +100,10 @@ def read_comparison_report(folder: Path) -> ComparisonReport:
     """
     path = folder / REPORT_NAME
     try:
-        read = read_checksummed_json(path)
+        text = read_checksummed_json(path)
     except FileNotFoundError as error:
         raise DamagedFileError("the comparison has no report", where=str(path)) from error
-    content = json.loads(read.text)
+    content = json.loads(text)
     wanted = {"reference": str, "session": dict, "figures": dict, "alignment": dict, "notes": list}
     if not isinstance(content, dict) or not all(
         isinstance(content.get(name), kind) for name, kind in wanted.items()
@@ -128,7 +114,7 @@ def read_comparison_report(folder: Path) -> ComparisonReport:
             expected=", ".join(wanted),
             remedy="Compare again",
         )
-    return ComparisonReport(content, read.has_checksum)
+    return content
 
 
 def write_series(path: Path, table: pa.Table) -> None:
@@ -145,7 +131,7 @@ def write_series(path: Path, table: pa.Table) -> None:
 
 
 def read_series(folder: Path) -> pa.Table | None:
-    """Read the compared frames; None: an older version wrote no series.
+    """Read the compared frames; None: there were too many for a series.
 
     Raises:
         DamagedFileError: it was changed, or is no series.
@@ -153,17 +139,17 @@ def read_series(folder: Path) -> pa.Table | None:
     """
     path = folder / SERIES_NAME
     try:
-        read = read_hashed_table(path)
+        table = read_hashed_table(path)
     except FileNotFoundError:
         return None
-    if not read.has_hash or not read.table.schema.remove_metadata().equals(SERIES_SCHEMA):
+    if not table.schema.remove_metadata().equals(SERIES_SCHEMA):
         raise DamagedFileError(
             "is no series of a comparison",
             where=str(path),
-            expected="columns " + ", ".join(SERIES_SCHEMA.names) + ", with a hash",
+            expected="columns " + ", ".join(SERIES_SCHEMA.names),
             remedy="Compare again",
         )
-    return read.table
+    return table
 
 
 def read_series_footer(folder: Path) -> pq.FileMetaData:

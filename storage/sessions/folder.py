@@ -241,7 +241,7 @@ class SessionsFolder:
         """
         path = self.get_path(session_id) / "session.json"
         try:
-            session = Session.model_validate_json(read_checksummed_json(path).text)
+            session = Session.model_validate_json(read_checksummed_json(path))
         except FileNotFoundError as error:
             raise UnknownError(f"no session {session_id!r}") from error
         except ValidationError as error:
@@ -270,9 +270,7 @@ class SessionsFolder:
             if is_named or ASIDE_SUFFIX in path.name or not path.is_dir():
                 continue
             try:
-                session = Session.model_validate_json(
-                    read_checksummed_json(path / "session.json").text
-                )
+                session = Session.model_validate_json(read_checksummed_json(path / "session.json"))
             except FileNotFoundError:
                 if (path / FRAMES_NAME).is_file():
                     found.append(StraySession(path.name, self._make_stray_error(path, None), True))

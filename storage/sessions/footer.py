@@ -20,7 +20,6 @@ from devices.input_files import check_regular_file
 from storage.parquet_hash import (
     FORMAT,
     FORMAT_KEY,
-    FORMAT_WITHOUT_HASH,
     check_file_hash,
     check_footer_hash,
     footer_stated_and_actual_hash,
@@ -42,15 +41,13 @@ class SealedFileFooter:
 
     Attributes:
         metadata: pyarrow's metadata, with which the file is opened again.
-        format: version of the file's format.
         info: the array.
         notes: other facts for readers.
-        content: description of the file's content; None if another program wrote it last.
-        content_sha256: hash of the description; None in the same case.
+        content: description of the file's content.
+        content_sha256: hash of the description.
         column_names: names of the flat columns.
         frame_count: rows.
         size_bytes: length of the footer.
-        is_footer_verified: True: the footer's own hash is right.
         is_file_verified: True: the file's hash is right.
         span_ns: first and last instant on the session's time axis; None: not computed yet.
         time_axis: time axis of the session; None: not computed yet.
@@ -70,8 +67,7 @@ class SealedFileFooter:
             path: the file.
             skip_verification: skip the hashes: the file was verified already, or shall not be.
             only_slices: as for `verify_unless_done`.
-            file: the open file, if it is not on this machine: then the footer must have its own
-                hash.
+            file: the open file, if it is not on this machine.
 
         Raises:
             FileFormatError: no such file, not Parquet, not one of ours, or damaged.
@@ -92,19 +88,14 @@ class SealedFileFooter:
                 f"cannot be read as Parquet: {error}", where=where, expected="a sealed session"
             ) from error
         self.size_bytes = len(footer)
-        hashes = None if skip_verification else footer_stated_and_actual_hash(footer)
-        if hashes is not None:
-            check_footer_hash(hashes, where=where)
-        self.is_footer_verified = hashes is not None
         self.is_file_verified = False
         self.schema_metadata: Mapping[bytes, bytes] = schema.metadata or {}
-        self.format = self._read_format()
-        if file is not None and not self.is_footer_verified:
-            raise FileFormatError(
-                "its footer has no hash of its own: an older version wrote it",
-                where=where,
-                remedy="Copy the session to this machine",
-            )
+        hashes = footer_stated_and_actual_hash(footer)
+        if hashes is None:
+            self._check_format()  # of another program?
+        if not skip_verification:
+            check_footer_hash(hashes, where=where)
+        self._check_format()
         if not skip_verification and file is None:
             self.verify_unless_done(path, only_slices=only_slices)
         self.info = read_array_info(schema, where=where)
@@ -130,19 +121,18 @@ class SealedFileFooter:
         Args:
             path: the file.
             only_slices: the footer's own hash is enough, since pages are verified against their
-                checksums when they are read. Without a footer hash, as of an older version, the
-                whole file is verified.
+                checksums when they are read.
 
         Raises:
             FileFormatError: it is damaged.
         """
-        if self.is_file_verified or (only_slices and self.is_footer_verified):
+        if self.is_file_verified or only_slices:
             return
         try:
             hashes = read_stated_and_actual_hash(path)
         except OSError as error:
             raise FileFormatError(f"cannot be read: {error}", where=self._where) from error
-        check_file_hash(hashes, self.schema_metadata, where=self._where)
+        check_file_hash(hashes, where=self._where)
         self.is_file_verified = True
 
     @cached_property
@@ -170,23 +160,24 @@ class SealedFileFooter:
             return None
         return statistics.min, statistics.max
 
-    def _read_format(self) -> bytes:
+    def _check_format(self) -> None:
         version = self.schema_metadata.get(FORMAT_KEY)
-        if version not in (FORMAT, FORMAT_WITHOUT_HASH):
+        if version != FORMAT:
             raise FileFormatError(
                 f"its format is {version!r}" if version else "it states no format",
                 where=self._where,
                 expected=f"a session of format {FORMAT.decode()}, written by foottile",
                 remedy="Update foottile" if version else "",
             )
-        return version
 
-    def _read_content(self) -> tuple[str | None, dict[str, Any] | None]:
-        """Return the content's hash and description; None if another program wrote it last."""
+    def _read_content(self) -> tuple[str, dict[str, Any]]:
+        """Return the content's hash and description."""
         metadata = self.metadata.metadata or {}
         content, stated = metadata.get(CONTENT_KEY), metadata.get(CONTENT_HASH_KEY)
         if content is None or stated is None:
-            return None, None
+            raise FileFormatError(
+                "it has no hashes: another program has rewritten it", where=self._where
+            )
         found = compute_content_hash(
             self.schema_metadata[ARRAY_INFO_KEY], self.schema_metadata[NOTES_KEY], content
         )
@@ -196,7 +187,8 @@ class SealedFileFooter:
                 where=self._where,
                 expected=f"content with the hash {stated[:64]!r}, found {found}",
             )
-        return found, json.loads(content)
+        description: dict[str, Any] = json.loads(content)
+        return found, description
 
 
 def _parse_notes(text: bytes | None, *, where: str) -> dict[str, Any]:

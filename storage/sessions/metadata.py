@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from devices.errors import DamagedFileError, StorageError
-from storage.checksummed_json import is_checksum_right, read_checksummed_json, strip_checksum
+from storage.checksummed_json import parse_checksummed_json, read_checksummed_json
 from storage.durable_files import read_small_file
 from storage.sessions.folder import Ledger, Part, Session
 
@@ -33,7 +33,7 @@ class StoredMetadata:
 
 
 def parse_session_metadata(
-    folder: Path, session_json: bytes | None, problems: list[str], unproven: list[str]
+    folder: Path, session_json: bytes | None, problems: list[str]
 ) -> StoredMetadata | None:
     """Parse the metadata of a session's folder and verify its checksum.
 
@@ -41,7 +41,6 @@ def parse_session_metadata(
         folder: folder of the session.
         session_json: content of its `session.json`; None if it is missing or unreadable.
         problems: messages of damage are added here.
-        unproven: descriptions of facts without proof are added here.
 
     Returns:
         None if it cannot be parsed.
@@ -50,17 +49,15 @@ def parse_session_metadata(
         is_there = os.path.lexists(folder / SESSION_NAME)
         problems.append(f"{SESSION_NAME} {'cannot be read' if is_there else 'is missing'}")
         return None
-    unchanged = is_checksum_right(session_json)
-    if unchanged is False:
-        problems.append(f"{SESSION_NAME} was changed: its text does not match its hash")
     try:
-        if unchanged is None:
-            unproven.append(f"name, subject, notes and tags in {SESSION_NAME}: it has no hash")
-        body = strip_checksum(session_json)
+        body = parse_checksummed_json(session_json, where=SESSION_NAME)
         try:
             return make_session_metadata(Session.model_validate_json(body))
         except ValidationError:
-            return _parse_pulled_metadata(folder, json.loads(body), problems, unproven)
+            return _parse_pulled_metadata(folder, json.loads(body), problems)
+    except DamagedFileError as error:
+        problems.append(f"{SESSION_NAME}: {error.what}")
+        return None
     except (ValueError, KeyError, TypeError) as error:
         problems.append(f"{SESSION_NAME} is not readable: {shorten_error(error)}")
         return None
@@ -72,27 +69,24 @@ def make_session_metadata(session: Session) -> StoredMetadata:
 
 
 def _parse_pulled_metadata(
-    folder: Path, content: dict[str, Any], problems: list[str], unproven: list[str]
+    folder: Path, content: dict[str, Any], problems: list[str]
 ) -> StoredMetadata:
     """Parse a pulled session: the API's view of it, and markers and ledger beside it."""
-    text = _read_sidecar_json(folder / LEDGER_NAME, problems, unproven)
-    _read_sidecar_json(folder / PULLED_MARKERS_NAME, problems, unproven)
+    text = _read_sidecar_json(folder / LEDGER_NAME, problems)
+    _read_sidecar_json(folder / PULLED_MARKERS_NAME, problems)
     parts = tuple(Part.model_validate(part) for part in content["parts"])
     ledger = Ledger.model_validate_json(text) if text is not None else None
     return StoredMetadata({**content, "id": content["id"]}, parts, ledger, None)
 
 
-def _read_sidecar_json(path: Path, problems: list[str], unproven: list[str]) -> bytes | None:
+def _read_sidecar_json(path: Path, problems: list[str]) -> bytes | None:
     try:
-        read = read_checksummed_json(path)
+        return read_checksummed_json(path)
     except FileNotFoundError:
         return None
     except (DamagedFileError, StorageError) as error:
         problems.append(f"{path.name}: {error.what}")
         return None
-    if not read.has_checksum:
-        unproven.append(f"{path.name}: it has no hash")
-    return read.text
 
 
 def read_bytes_or_none(path: Path) -> bytes | None:

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from devices.errors import FileFormatError, UsageError
 from devices.frames import FrameBatch
-from storage.parquet_hash import FILE_HASH_KEY, FORMAT
+from storage.parquet_hash import FILE_HASH_KEY
 from storage.schema import (
     COLUMNS_BY_NAME,
     MEASURED_COLUMNS,
@@ -50,8 +50,8 @@ class SealedFileReader:
 
     Attributes:
         path: the file.
-        footer: its footer; `info`, `notes`, `format`, `content`, `content_sha256`, `column_names`
-            and `frame_count` are those of `storage.sessions.footer.SealedFileFooter`.
+        footer: its footer; `info`, `notes`, `content`, `content_sha256`, `column_names` and
+            `frame_count` are those of `storage.sessions.footer.SealedFileFooter`.
     """
 
     def __init__(
@@ -65,8 +65,7 @@ class SealedFileReader:
         """Open a sealed session and verify it.
 
         The whole file is verified against its hash. If only slices are read, the footer alone is
-        verified against its own hash; pages are always verified against their checksums. A file of
-        an older version, whose footer has no hash, is verified completely in any case.
+        verified against its own hash; pages are always verified against their checksums.
 
         Args:
             path: the file.
@@ -79,9 +78,7 @@ class SealedFileReader:
         """
         self.path = path
         self.footer, self._file = _open_with_footer(path, footer, skip_verification, only_slices)
-        self._has_true_statistics = self.footer.is_footer_verified or self.footer.format == FORMAT
         self.info, self.notes = self.footer.info, self.footer.notes
-        self.format = self.footer.format
         self.content, self.content_sha256 = self.footer.content, self.footer.content_sha256
         self.column_names = self.footer.column_names
         self.frame_count = self.footer.frame_count
@@ -213,7 +210,7 @@ class SealedFileReader:
     ) -> Iterator[dict[str, Array]]:
         """Yield flat columns of the row groups that may have frames of a time range.
 
-        Without a verified footer, or without its statistics, all row groups are read.
+        Without statistics in the footer, all row groups are read.
 
         Args:
             names: names of the columns, each n rows.
@@ -262,9 +259,7 @@ class SealedFileReader:
 
     def read_min_max_by_row_group(self, name: str) -> list[tuple[int, int] | None]:
         """Return minimum and maximum of a column in every row group; None: not certain."""
-        if self._has_true_statistics:
-            return self.footer.read_min_max_by_row_group(name)
-        return [None] * len(self.footer.rows_by_group)  # an older version wrote no proof
+        return self.footer.read_min_max_by_row_group(name)
 
     def _compute_time_axis(self) -> TimeAxis:
         if stated := self.notes.get(TIME_AXIS_NOTE):

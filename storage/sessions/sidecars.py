@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,16 +35,7 @@ def write_markers(session: Session, folder: Path) -> None:
     write_hashed_table(folder / MARKERS_NAME, pa.table(columns))
 
 
-@dataclass(frozen=True)
-class StoredMarkers:
-    """Content of `markers.parquet`."""
-
-    markers: tuple[Marker, ...]
-    has_hash: bool
-    """False: an older version wrote it without a hash."""
-
-
-def read_markers(path: Path) -> StoredMarkers:
+def read_markers(path: Path) -> tuple[Marker, ...]:
     """Read `markers.parquet` and verify its hash.
 
     Raises:
@@ -53,16 +43,15 @@ def read_markers(path: Path) -> StoredMarkers:
         DamagedFileError: its hash is wrong, or it is no table of markers.
         StorageError: it cannot be read now.
     """
-    read = read_hashed_table(path)
+    table = read_hashed_table(path)
     try:
-        events = TypeAdapter(tuple[Marker, ...]).validate_python(read.table.to_pylist())
-    except Exception as error:  # unproven bytes may cause any error
+        return TypeAdapter(tuple[Marker, ...]).validate_python(table.to_pylist())
+    except Exception as error:  # other content may cause any error
         raise DamagedFileError(
             f"cannot be read as a table of events: {' '.join(str(error).split())[:300]}",
             where=str(path),
             expected="columns id, label, t_ns without empty values",
         ) from error
-    return StoredMarkers(events, read.has_hash)
 
 
 def load_clock_table(reader: SealedFileReader) -> ClockTable:
@@ -80,14 +69,10 @@ def load_clock_table(reader: SealedFileReader) -> ClockTable:
             expected="a session's folder as a server sealed it",
             remedy="Leave the clock at `node`, or fetch the session's folder whole",
         )
-    stored, info = read_clock_file(path), reader.info
-    facts = dict(stored.facts)
-    facts.setdefault(
-        info.stream_id, StreamClockFacts(info.stream_id, info.utc_offset_ns, info.clock_set)
-    )
-    parts = read_stream_ids(reader)
+    stored, parts = read_clock_file(path), read_stream_ids(reader)
     streams = [
-        facts.get(stream_id, StreamClockFacts(stream_id)) for stream_id in dict.fromkeys(parts)
+        stored.facts.get(stream_id, StreamClockFacts(stream_id))
+        for stream_id in dict.fromkeys(parts)
     ]
     return ClockTable(stored.rows_by_stream, streams, parts, where=str(path))
 

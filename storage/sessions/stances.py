@@ -112,20 +112,20 @@ def read_stances(path: Path) -> StoredStances:
         OtherVersionError: its columns are those of another version.
         StorageError: it cannot be read now.
     """
-    read = read_hashed_table(path)
-    metadata = read.table.schema.metadata or {}
-    if not read.has_hash or FRAMES_HASH_KEY not in metadata:
+    table = read_hashed_table(path)
+    metadata = table.schema.metadata or {}
+    if FRAMES_HASH_KEY not in metadata:
         raise DamagedFileError(
             "is no table of stances",
             where=str(path),
             expected="a table with the hash of its frames",
             remedy="Delete it: it is made again from the frames",
         )
-    if not read.table.schema.equals(STANCE_SCHEMA):
+    if not table.schema.equals(STANCE_SCHEMA):
         raise OtherVersionError(
             "another version of foottile wrote it, with other columns",
             where=str(path),
             expected="columns " + ", ".join(STANCE_SCHEMA.names),
             remedy="None needed: it is made again from the frames",
         )
-    return StoredStances(read.table, metadata[FRAMES_HASH_KEY].decode("ascii", "replace"))
+    return StoredStances(table, metadata[FRAMES_HASH_KEY].decode("ascii", "replace"))

@@ -41,7 +41,6 @@ class DataFolderReport:
         sessions: reports of its sessions, including those in the trash.
         streams: reports of its journals.
         problems: messages of other damage.
-        unproven: other files without a hash.
         set_aside: files that were found damaged before, and wait for a person.
     """
 
@@ -49,7 +48,6 @@ class DataFolderReport:
     sessions: list[SessionReport] = field(default_factory=list)
     streams: list[StreamReport] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
-    unproven: list[str] = field(default_factory=list)
     set_aside: list[str] = field(default_factory=list)
 
     def to_json_dict(self) -> dict[str, Any]:
@@ -69,17 +67,7 @@ class DataFolderReport:
             ),
         ]
         unproven = [
-            *self.unproven,
-            *(
-                f"session {s.id or s.path.name}: {message}"
-                for s in sessions
-                for message in s.unproven
-            ),
-            *(
-                f"journal {j.node}/{j.stream_id}: {message}"
-                for j in streams
-                for message in j.unproven
-            ),
+            f"session {s.id or s.path.name}: {message}" for s in sessions for message in s.unproven
         ]
         return {
             "sessions": [session.to_json_dict() for session in sessions],
@@ -114,7 +102,7 @@ def verify_path(path: Path, *, data_folder: Path | None = None) -> Report:
         if path.suffix == ".json":
             others = OtherFilesReport()
             verify_json_file(path, path.name, others)
-            return DataFolderReport(path, problems=others.problems, unproven=others.unproven)
+            return DataFolderReport(path, problems=others.problems)
         return read_export(path) or verify_file_without_session(path)
     if not path.exists():
         raise FileFormatError("no such file or folder", where=str(path))
@@ -170,7 +158,7 @@ def verify_data_folder(path: Path) -> DataFolderReport:
                 report.sessions.append(session)
     others = verify_other_files(data, proven)
     report.problems += others.problems
-    report.unproven, report.set_aside = others.unproven, others.set_aside
+    report.set_aside = others.set_aside
     return report
 
 
@@ -223,7 +211,7 @@ def find_verdict(report: Report) -> Verdict:
         verdicts = {find_verdict(part) for part in parts}
     elif isinstance(report, SessionReport) and not report.is_in_trash:
         verdicts = {_ledger_verdict(report.ledger)}
-    if not isinstance(report, SegmentReport) and report.unproven:
+    if isinstance(report, SessionReport) and report.unproven:
         verdicts.add("unproven")
     order: tuple[Verdict, ...] = ("damaged", "pending", "lossy", "unproven")
     return next((verdict for verdict in order if verdict in verdicts), "complete")

@@ -12,9 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from storage.parquet_hash import FORMAT_KEY
-from storage.schema import ARRAY_INFO_KEY, COLUMNS_BY_NAME
-from storage.sessions.content_hash import CONTENT_KEY
+from storage.schema import COLUMNS_BY_NAME
 from storage.sessions.writer import EXPORT_COLUMN, EXPORT_KEY
 
 RECOGNISED_FORMATS = frozenset({"parquet", "arrow", "csv"})
@@ -70,15 +68,11 @@ def read_export(path: Path) -> ExportReport | None:
 def _read_parquet_export(path: Path) -> ExportReport | None:
     try:
         file = pq.ParquetFile(path, page_checksum_verification=True)
-        metadata, footer = file.schema_arrow.metadata or {}, file.metadata.metadata or {}
+        metadata = file.schema_arrow.metadata or {}
     except Exception:  # damaged bytes may cause any error
         return None
     with file:
-        # Exports of older versions have no key; they lack the entries of a sealed file.
-        is_older = (
-            ARRAY_INFO_KEY in metadata and FORMAT_KEY not in metadata and CONTENT_KEY not in footer
-        )
-        if EXPORT_KEY not in metadata and not is_older:
+        if EXPORT_KEY not in metadata:
             return None
         report = ExportReport(path, "parquet", _parse_source(metadata))
         try:
@@ -95,7 +89,7 @@ def _read_arrow_export(path: Path) -> ExportReport | None:
             file.seek(len(_ARROW_BEGIN))  # a stream begins there, which needs no footer
             with pa.ipc.open_stream(file) as stream:
                 metadata = stream.schema.metadata or {}
-            if EXPORT_KEY not in metadata and ARRAY_INFO_KEY not in metadata:
+            if EXPORT_KEY not in metadata:
                 return None
             report = ExportReport(path, "arrow", _parse_source(metadata))
             try:

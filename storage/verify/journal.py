@@ -37,7 +37,6 @@ class StreamReport:
         segment_count: number of segments.
         problems: messages of damage.
         remarks: other messages for people.
-        unproven: facts that these files cannot prove.
     """
 
     node: str
@@ -50,7 +49,6 @@ class StreamReport:
     segment_count: int = 0
     problems: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
-    unproven: list[str] = field(default_factory=list)
 
     def to_stream_state(self, obtainable: Intervals) -> StreamState:
         """Return the stream's state for ledgers.
@@ -101,7 +99,6 @@ class StreamReport:
             if self.notes is not None
             else 0,
             "problems": self.problems,
-            "unproven": self.unproven,
         }
 
 
@@ -116,9 +113,7 @@ def verify_journal(folder: Path) -> StreamReport:
     """
     report = StreamReport(folder.parent.name, folder.name)
     try:
-        report.notes, is_proven = StreamNotes.load_with_proof(folder)
-        if not is_proven:
-            report.unproven.append(f"{NOTES_FILE}: it has no hash")
+        report.notes = StreamNotes.load(folder)
     except (FileFormatError, StorageError) as error:
         report.problems.append(f"{NOTES_FILE}: {error.what}")
     if report.notes is not None:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from devices.errors import DamagedFileError, StorageError
-from storage.checksummed_json import ChecksummedJson, read_checksummed_json
+from storage.checksummed_json import read_checksummed_json
 from storage.durable_files import ASIDE_SUFFIX
-from storage.server_id import SERVER_ID_NAME, ServerId, read_server_id
+from storage.server_id import SERVER_ID_NAME, read_server_id
 
 
 @dataclass
@@ -23,12 +23,10 @@ class OtherFilesReport:
 
     Attributes:
         problems: messages of damage.
-        unproven: files without a hash.
         set_aside: files that were found damaged before, and wait for a person.
     """
 
     problems: list[str] = field(default_factory=list)
-    unproven: list[str] = field(default_factory=list)
     set_aside: list[str] = field(default_factory=list)
 
 
@@ -51,20 +49,20 @@ def verify_other_files(data_folder: Path, verified_folders: set[Path]) -> OtherF
     for place, folders, files in os.walk(data_folder, onerror=unreadable):
         here = Path(place)
         folders.sort()
-        is_proven = here in verified_folders
+        is_verified = here in verified_folders
         for name in sorted([*folders, *files]):
             path = here / name
             if ASIDE_SUFFIX in name:
                 found.set_aside.append(_relative_path(path, data_folder))
             elif path == data_folder / SERVER_ID_NAME:
                 _verify_with(path, name, read_server_id, found)
-            elif name.endswith(".json") and not name.startswith(".") and not is_proven:
+            elif name.endswith(".json") and not name.startswith(".") and not is_verified:
                 verify_json_file(path, _relative_path(path, data_folder), found)
         # A folder that was set aside, or that has the name of a file, is skipped.
         folders[:] = [
             name for name in folders if ASIDE_SUFFIX not in name and not name.endswith(".json")
         ]
-        if is_proven:
+        if is_verified:
             folders.clear()
     return found
 
@@ -77,12 +75,11 @@ def verify_json_file(path: Path, name: str, report: OtherFilesReport) -> None:
 def _verify_with(
     path: Path,
     name: str,
-    read: Callable[[Path], ChecksummedJson | ServerId],
+    read: Callable[[Path], object],
     found: OtherFilesReport,
 ) -> None:
     try:
-        if not read(path).has_checksum:
-            found.unproven.append(f"{name}: it has no hash")
+        read(path)
     except FileNotFoundError:
         return  # replaced or deleted meanwhile
     except (DamagedFileError, StorageError) as error:

@@ -15,7 +15,6 @@ from pydantic import TypeAdapter, ValidationError
 from devices.errors import FileFormatError
 from storage.intervals import Intervals, Losses, LossPairs, union
 from storage.parquet_hash import (
-    FORMAT_WITHOUT_HASH,
     footer_stated_and_actual_hash,
     read_footer,
     read_stated_and_actual_hash,
@@ -42,7 +41,6 @@ class SealedFileReport:
         ledger: the file's ledger; counted from the frames if it has none.
         parts: its frames, by part.
         frame_count: number of frames.
-        content_sha256: hash of the content; None of an older or rewritten file.
     """
 
     path: Path
@@ -52,7 +50,6 @@ class SealedFileReport:
     ledger: Ledger | None = None
     parts: list[PartFrameSummary] = field(default_factory=list)
     frame_count: int = 0
-    content_sha256: str | None = None
 
     @property
     def session(self) -> dict[str, Any]:
@@ -78,7 +75,7 @@ def verify_sealed_file(path: Path) -> SealedFileReport:
         )
     elif hashes is not None:
         own = footer_stated_and_actual_hash(read_footer(path))
-        if own is not None and own[0] != own[1]:
+        if own is None or own[0] != own[1]:
             report.problems.append("its footer's own hash is of another footer")
     try:
         with SealedFileReader(path, skip_verification=True) as reader:
@@ -167,15 +164,13 @@ def find_ledger_contradictions(ledger: Ledger) -> list[str]:
 
 
 def parse_lost_numbers(notes: dict[str, Any]) -> dict[str, Losses]:
-    """Parse the lost numbers in a file's notes, by stream_id; older files have none.
+    """Parse the lost numbers in a file's notes, by stream_id.
 
     Raises:
         FileFormatError: they cannot be parsed.
     """
     try:
-        return {
-            b: Losses(pairs) for b, pairs in _LOST.validate_python(notes.get("lost", {})).items()
-        }
+        return {b: Losses(pairs) for b, pairs in _LOST.validate_python(notes.get("lost")).items()}
     except (ValidationError, ValueError) as error:
         raise FileFormatError(f"the numbers that are lost are not readable: {error}") from error
 
@@ -192,7 +187,7 @@ def _read_hashes(path: Path) -> tuple[str, str] | None:
 def _verify_content(
     reader: SealedFileReader, report: SealedFileReport, *, has_file_hash: bool
 ) -> None:
-    report.notes, report.content_sha256 = reader.notes, reader.content_sha256
+    report.notes = reader.notes
     digest = ContentDigest()
     try:
         for table in reader.read_tables():
@@ -204,15 +199,9 @@ def _verify_content(
     report.parts = digest.order.parts
     report.frame_count = sum(part.frames for part in report.parts)
     report.problems += digest.order.problems
-    if reader.content is not None:
-        report.problems += _find_content_mismatches(reader.content, digest.describe_content())
-    if reader.content is None or not has_file_hash:
-        if reader.format == FORMAT_WITHOUT_HASH and reader.content is None:
-            report.unproven.append(
-                "that nothing in it was edited: an older foottile wrote it, without hashes"
-            )
-        else:
-            report.problems.append("it has no hashes: another program has rewritten it")
+    report.problems += _find_content_mismatches(reader.content, digest.describe_content())
+    if not has_file_hash:
+        report.problems.append("it has no hashes: another program has rewritten it")
     _check_offset(report, reader.info.utc_offset_ns)
 
 
@@ -291,13 +280,13 @@ def _check_ledger(report: SealedFileReport) -> None:
     try:
         report.ledger = Ledger.model_validate(stated)
         lost = parse_lost_numbers(report.notes)
-        parts = _PARTS.validate_python(report.session.get("parts", ()))
+        parts = _PARTS.validate_python(report.session.get("parts"))
     except (ValidationError, FileFormatError) as error:
         report.problems.append(f"its ledger is not readable: {error}")
         return
     report.problems += find_ledger_mismatches(report.parts, report.ledger, lost)
     intervals = [(p.stream_id, p.seq_first, p.seq_last) for p in parts]
-    if parts and intervals != [(p.stream_id, p.seq_first, p.seq_last) for p in report.ledger.parts]:
+    if intervals != [(p.stream_id, p.seq_first, p.seq_last) for p in report.ledger.parts]:
         report.problems.append("its ledger is of other parts than its session")
 
 

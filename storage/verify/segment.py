@@ -36,7 +36,7 @@ from storage.journal.segment_format import (
     seq_range_of,
 )
 from storage.message_batch import MessageBatchDecoder
-from storage.schema import legacy_wire_schema, read_array_info, wire_schema
+from storage.schema import read_array_info, wire_schema
 from storage.wire import decode_message
 
 _BATCHES_PER_CHECK = 256
@@ -276,7 +276,7 @@ def _read_schema(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, i
         if isinstance(error, DamagedFileError):
             report.problems.append(error.what)
         return None, 0
-    expected, older = wire_schema(report.info), legacy_wire_schema(report.info)
-    if not any(schema.equals(one, check_metadata=True) for one in (expected, older)):
+    expected = wire_schema(report.info)
+    if not schema.equals(expected, check_metadata=True):
         report.problems.append("its columns are not those of a stream of frames")
     return expected, length

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from devices.errors import FileFormatError, OtherVersionError, StorageError
-from storage.clock.file import CLOCK_NAME, StoredClock, read_clock_file
+from storage.clock.file import CLOCK_NAME, read_clock_file
 from storage.intervals import NO_END, Intervals
 from storage.parquet_hash import compute_sha256
 from storage.sessions.folder import FRAMES_NAME, Ledger, Marker, Session
@@ -25,7 +25,7 @@ from storage.sessions.metadata import (
     read_bytes_or_none,
 )
 from storage.sessions.overview import OVERVIEW_NAME, open_overview
-from storage.sessions.sidecars import MARKERS_NAME, StoredMarkers, read_markers
+from storage.sessions.sidecars import MARKERS_NAME, read_markers
 from storage.sessions.stances import STANCES_NAME, read_stances
 from storage.verify.journal import StreamReport, verify_journal
 from storage.verify.sealed_file import (
@@ -38,7 +38,7 @@ _MAX_ATTEMPTS = 3
 _DURATION_TOLERANCE_S = 1e-6
 
 StreamVerifier = Callable[[Path], StreamReport]
-_Stored = TypeVar("_Stored", StoredMarkers, StoredClock)
+_T = TypeVar("_T")
 
 
 @dataclass
@@ -144,7 +144,7 @@ def _verify_once(
     metadata = (
         make_session_metadata(session)
         if session is not None
-        else parse_session_metadata(folder, text, report.problems, report.unproven)
+        else parse_session_metadata(folder, text, report.problems)
     )
     if metadata is None:
         if (folder / FRAMES_NAME).is_file():
@@ -251,7 +251,7 @@ def _check_events(report: SessionReport, path: Path, events: tuple[Marker, ...] 
         events: expected markers; None: unknown, and the table may be missing.
     """
     stored = _read_sidecar(report, path, read_markers, is_optional=events is None)
-    if stored is not None and events is not None and stored.markers != events:
+    if stored is not None and events is not None and stored != events:
         report.problems.append(f"{path.name} has other events than {SESSION_NAME}")
 
 
@@ -301,10 +301,10 @@ def _check_overview(report: SessionReport, path: Path) -> None:
 
 
 def _read_sidecar(
-    report: SessionReport, path: Path, read: Callable[[Path], _Stored], *, is_optional: bool
-) -> _Stored | None:
+    report: SessionReport, path: Path, read: Callable[[Path], _T], *, is_optional: bool
+) -> _T | None:
     try:
-        stored = read(path)
+        return read(path)
     except FileNotFoundError:
         if not is_optional:
             report.problems.append(f"{path.name} is missing")
@@ -312,9 +312,6 @@ def _read_sidecar(
     except (FileFormatError, StorageError) as error:
         report.problems.append(f"{path.name}: {error.what}")
         return None
-    if not stored.has_hash:
-        report.unproven.append(f"{path.name}: an older foottile wrote it, without a hash")
-    return stored
 
 
 def _count_ledger(

@@ -48,9 +48,8 @@ def flips(play: Play) -> Outcome:
     frames, events, the server's time, calibrations, and a session that is sealed now from journal,
     tares and calibration. It fails if one of them crashes; if verify does not name the file, unless
     every number is the same to the bit; and, named or not, if a reader gives other numbers without
-    refusing, counting a loss, or saying a problem. Of a file that verify calls unproven, since an
-    older version wrote it, nothing can be refused. Rows of a clock log that are left out only widen
-    the bounds, and count as no other number.
+    refusing, counting a loss, or saying a problem. Rows of a clock log that
+    are left out only widen the bounds, and count as no other number.
     """
 
     def flipped(content: bytes, at: int) -> bytes:
@@ -142,10 +141,10 @@ def _try(
     where = f"{root.path.name}/{name}, byte {at}: {changed_to[at : at + 1]!r}"
     try:
         report = verify_path(copy)
-        said, unproven = _said(report), "\n".join(report.to_json_dict().get("unproven", ()))
+        said = _said(report)
         # Of a segment and its index either may be named.
         named = name.stem if name.suffix in (SUFFIX, INDEX_SUFFIX) else name.name
-        is_named, is_unproven = named in said, name.name in unproven
+        is_named = named in said
         after = root.read(copy, str(name))
     except Exception as error:  # whatever it is, it must not
         outcome.failed(f"{where}: {type(error).__name__}: {error}")
@@ -154,9 +153,7 @@ def _try(
         shutil.rmtree(copy)
     changed = {reader: text for reader, text in after.items() if before[reader] != text}
     silent = [reader for reader, text in changed.items() if not text.startswith(REFUSED)]
-    if silent and is_unproven:
-        outcome.saw("called unproven by verify, and read")
-    elif silent:
+    if silent:
         noticed = "named by verify" if is_named else "unnoticed"
         outcome.failed(f"{where}: {noticed}, and other numbers in {', '.join(silent)}")
     elif changed and not is_named:

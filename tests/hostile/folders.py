@@ -107,7 +107,7 @@ def _session(data: Path, session_id: str, first: int, last: int) -> None:
         state="pending",
         stopped_t_ns=t_ns(last),
         parts=(Part(stream_id=BOOT, seq_first=first, seq_last=last),),
-        events=(Marker(id="e1", label="slip", t_ns=t_ns(first + 3)),),
+        markers=(Marker(id="e1", label="slip", t_ns=t_ns(first + 3)),),
         calibration=make_calibration("T01", "T02").model_dump(mode="json"),
     )
 
@@ -119,7 +119,7 @@ def session_readings(folder: Path) -> Readings:
             SessionsFolder(folder.parent).load(folder.name).model_dump_json().encode()
         ),
         "frames": lambda: _frames(folder / FRAMES_NAME),
-        "markers": lambda: repr(read_markers(folder / MARKERS_NAME).markers).encode(),
+        "markers": lambda: repr(read_markers(folder / MARKERS_NAME)).encode(),
         "clock": lambda: _clock(folder / FRAMES_NAME),
     }
     wanted = readers if folder.name == SEALED else {"session"}

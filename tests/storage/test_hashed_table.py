@@ -24,9 +24,8 @@ def path(tmp_path: Path) -> Path:
 
 def test_what_is_written_is_read_and_proven_by_any_program(path: Path) -> None:
     read = read_hashed_table(path)
-    assert read.has_hash
-    assert read.table.to_pylist() == TABLE.to_pylist()
-    assert read.table.schema.metadata[b"foottile.streams"] == b"[]"
+    assert read.to_pylist() == TABLE.to_pylist()
+    assert read.schema.metadata[b"foottile.streams"] == b"[]"
     assert pq.read_table(path).to_pylist() == TABLE.to_pylist()
 
 
@@ -52,13 +51,7 @@ def test_no_cut_or_longer_file_is_read(path: Path, every_bytes: int) -> None:
             read_hashed_table(path)
 
 
-def test_a_table_of_an_older_version_is_read_and_unproven(path: Path) -> None:
-    pq.write_table(TABLE, path)
-    read = read_hashed_table(path)
-    assert (read.has_hash, read.table.to_pylist()) == (False, TABLE.to_pylist())
-
-
-def test_a_table_that_had_a_hash_and_has_none_is_damaged(path: Path) -> None:
+def test_a_table_without_a_hash_is_damaged(path: Path) -> None:
     pq.write_table(pq.read_table(path), path)
     with pytest.raises(DamagedFileError, match="its hash is gone"):
         read_hashed_table(path)

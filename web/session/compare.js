@@ -86,7 +86,7 @@ export class Compare {
     const found = await api.getComparison(this.session.id, name);
     if (wanted !== this.wanted) return;
     drawReport(found);
-    if (!found.has_series) return this.showText("Figures only: the comparison has no series (older version, or too long).");
+    if (!found.has_series) return this.showText("Figures only: the comparison has too many frames for a series.");
     const beside = this.beside(name, REFERENCE, (query, stop) => api.comparisonSeries(this.session.id, name, query, stop));
     await beside.begin(this.page.plots.plotWidth);
     if (wanted === this.wanted) this.show(beside);

@@ -33,11 +33,10 @@ export function verificationTexts(found, session, at) {
   const when = localTime(at).slice(-8);
   if (!whole) {
     const other = found.problems.length ? [] : ["the file of frames has changed since this page was loaded: reload"];
-    return { whole, summary: `Checked at ${when}: files are damaged. Keep them; a copy may be intact.`, details: [...found.problems, ...other, ...found.unproven] };
+    return { whole, summary: `Checked at ${when}: files are damaged. Keep them; a copy may be intact.`, details: [...found.problems, ...other] };
   }
   const proven = session.sha256 ? `all ${read} read again; frames, ledger, markers, clock, stances and hashes are consistent` : "no frames; files are consistent";
-  const rest = found.unproven.length ? ". Not verifiable:" : ".";
-  return { whole, summary: `Verified at ${when}: ${proven}${rest}`, details: found.unproven };
+  return { whole, summary: `Verified at ${when}: ${proven}.`, details: [] };
 }
 
 /** Card of ledger and verification. */

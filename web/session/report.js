@@ -61,7 +61,7 @@ function alignmentText({ alignment, contact_n: contactN, trials_are: trialsAre, 
   return parts.join(" ");
 }
 
-/** Draw the report. @param {{name: string, matches_current_data: boolean | null, is_proven: boolean, missed: string[], report: ComparisonReport}} found */
+/** Draw the report. @param {{name: string, matches_current_data: boolean | null, missed: string[], report: ComparisonReport}} found */
 export function drawReport(found) {
   const { report } = found;
   const limits = report.limits ?? {};
@@ -69,7 +69,6 @@ export function drawReport(found) {
   setText(byId("report-title"), `Comparison with ${report.reference}`);
   const doubts = [];
   if (found.matches_current_data === false) doubts.push("The comparison used other frames: compare again.");
-  if (!found.is_proven) doubts.push("The report has no checksum.");
   const judged = Object.keys(limits).length;
   if (judged) doubts.push(found.missed.length ? `${found.missed.length} of ${judged} limits missed.` : `All ${judged} limits met.`);
   setText(byId("report-summary"), [...doubts, alignmentText(report), "Errors: FootTile minus reference."].join(" "));

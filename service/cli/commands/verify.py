@@ -156,7 +156,7 @@ def _tell(report: Report, *, is_part: bool = False) -> None:
         remarks = report.remarks
     else:
         say(_stream_line(report))
-        remarks, unproven = report.remarks, report.unproven
+        remarks = report.remarks
     for problem in report.problems:
         say(f"  damaged: {problem}")
     for text in remarks:

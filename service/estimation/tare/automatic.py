@@ -111,7 +111,7 @@ def _reject_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) ->
     known = np.isfinite(begin).any(axis=0)
     moved = np.zeros(len(serials))
     moved[known] = np.abs(np.nanmean(begin[:, known], axis=0) - tare.temperature_raw_counts[known])
-    worst = int(np.argmax(np.nan_to_num(moved)))
+    worst = int(np.argmax(moved))
     if moved[worst] > TEMPERATURE_CHANGE_MAX_COUNTS:
         raise TareError(
             f"the temperature of tile {serials[worst]} has moved by {moved[worst]:.0f} counts in "
@@ -279,8 +279,8 @@ def _explain_excess_shift(
     which: str,
 ) -> str | None:
     """Return the reason why a baseline is too far from another one; None if it is near."""
-    warmer = np.nan_to_num(compute_warming_k(other, tare.temperature_raw_counts), nan=0.0)
-    explained_kpa = compute_thermal_shift_kpa(other, warmer)
+    warming_k = compute_warming_k(other, tare.temperature_raw_counts)
+    explained_kpa = compute_thermal_shift_kpa(other, warming_k)
     shift_kpa = tare.baseline_kpa - other.baseline_kpa
     excess_kpa = np.abs(shift_kpa - explained_kpa) - THERMAL_SHIFT_UNCERTAINTY * np.abs(
         explained_kpa
@@ -291,6 +291,6 @@ def _explain_excess_shift(
         return None
     return (
         f"tile {serials[worst]} reads {shift_kpa[worst]:+.2f} kPa against {which}, of which "
-        f"{abs(warmer[worst]):.1f} K explain {abs(explained_kpa[worst]):.2f} kPa: a light load, or "
-        "a baseline that has moved. If the foot is in the air, tare by hand"
+        f"{abs(warming_k[worst]):.1f} K explain {abs(explained_kpa[worst]):.2f} kPa: a light load, "
+        "or a baseline that has moved. If the foot is in the air, tare by hand"
     )

@@ -18,10 +18,18 @@ from devices.errors import TareError
 
 IntervalSource = Literal["interval", "lead", "recognised", "unloaded", "flight"]
 TareSource = IntervalSource | Literal["lost"]
-_LASTING_MAX = {"noise_lasting": 1.0, "noise_lasting_s": 3600.0}
 _KPA_MAX = 1000.0
 """Largest valid pressure: nine times a chip's range, and no square overflows."""
-_TADC_MAX = 1023.0
+_TILE_VALUES_MAX = {
+    "baseline_kpa": _KPA_MAX,
+    "baseline_sigma_kpa": _KPA_MAX,
+    "noise_kpa": _KPA_MAX,
+    "temperature_raw_counts": 1023.0,
+    "noise_lasting": 1.0,
+    "noise_lasting_s": 3600.0,
+}
+"""Largest valid value of each array."""
+_OPTIONAL = ("noise_lasting", "noise_lasting_s")
 
 
 @dataclass(frozen=True)
@@ -32,16 +40,14 @@ class Tare:
         baseline_kpa: absolute pressure unloaded.
         baseline_sigma_kpa: its standard uncertainty.
         noise_kpa: standard deviation of a single reading.
-        temperature_raw_counts: mean raw temperature; NaN in tares of older versions, which stored
-            none.
+        temperature_raw_counts: mean raw temperature.
         t_ns: instant at which the interval ended, in UTC.
         begin_s: begin of the interval, in seconds from the first frame.
         end_s: its end.
         frames: number of frames in the interval.
         source: origin of the interval; "lost": the tare is damaged on disk. Its arrays are NaN, and
             so is every force while it is in force.
-        noise_lasting: correlated part of the noise's variance, 0 for white noise; None in tares of
-            older versions, which assumed white noise.
+        noise_lasting: correlated part of the noise's variance; None: white noise is assumed.
         noise_lasting_s: time constant of that part; None likewise.
     """
 
@@ -95,26 +101,13 @@ class Tare:
             values |= {name: float(content[name]) for name in ("begin_s", "end_s")}
             if not -(2**63) <= values["t_ns"] < 2**63:
                 raise ValueError(f"t_ns is {values['t_ns']}")  # noqa: TRY301  # caught with the others
-            for name in ("baseline_kpa", "baseline_sigma_kpa", "noise_kpa"):
+            for name, largest in _TILE_VALUES_MAX.items():
+                if content[name] is None and name in _OPTIONAL:
+                    continue
                 values[name] = np.array(content[name], dtype=np.float64)
-                is_possible = (values[name] >= 0.0) & (values[name] <= _KPA_MAX)
+                is_possible = (values[name] >= 0.0) & (values[name] <= largest)
                 if values[name].shape != (tiles,) or not is_possible.all():
                     raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301  # caught with the others
-            counts = content.get("temperature_raw_counts") or [None] * tiles
-            values["temperature_raw_counts"] = np.array(
-                counts, dtype=np.float64
-            )  # None becomes NaN
-            is_none = (values["temperature_raw_counts"] < 0.0) | (
-                values["temperature_raw_counts"] > _TADC_MAX
-            )
-            if values["temperature_raw_counts"].shape != (tiles,) or is_none.any():
-                raise ValueError(f"temperature_raw_counts are not those of {tiles} tiles")  # noqa: TRY301  # caught with the others
-            for name in ("noise_lasting", "noise_lasting_s"):
-                if content.get(name) is not None:
-                    values[name] = np.array(content[name], dtype=np.float64)
-                    is_possible = (values[name] >= 0.0) & (values[name] <= _LASTING_MAX[name])
-                    if values[name].shape != (tiles,) or not is_possible.all():
-                        raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301  # caught with the others
             return cls(**values)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise TareError(f"a recorded tare is not readable: {error}") from error

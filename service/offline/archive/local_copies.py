@@ -131,9 +131,7 @@ def read_session_metadata(folder: Path) -> StoredMetadata:
         FileFormatError: `session.json` is missing or damaged.
     """
     problems: list[str] = []
-    metadata = parse_session_metadata(
-        folder, read_bytes_or_none(folder / SESSION_NAME), problems, []
-    )
+    metadata = parse_session_metadata(folder, read_bytes_or_none(folder / SESSION_NAME), problems)
     if problems or metadata is None:
         raise FileFormatError("; ".join(problems), where=str(folder))
     return metadata

@@ -159,9 +159,7 @@ class ResultStore:
     def _read_note(self, name: str, command: str) -> ResultNote | None:
         where = f"{self.out}/{name}/{_note_name(command)}"
         try:
-            return ResultNote(
-                **json.loads(parse_checksummed_json(read_bytes(where), where=where).text)
-            )
+            return ResultNote(**json.loads(parse_checksummed_json(read_bytes(where), where=where)))
         except (FileFormatError, TypeError, ValueError):
             return None
 

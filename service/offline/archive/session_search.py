@@ -98,9 +98,7 @@ def _load_sealed_session(
         except FootTileError as error:
             return str(error), None
     problems: list[str] = []
-    metadata = parse_session_metadata(
-        folder, read_bytes_or_none(folder / SESSION_NAME), problems, []
-    )
+    metadata = parse_session_metadata(folder, read_bytes_or_none(folder / SESSION_NAME), problems)
     if problems or metadata is None:
         return f"damaged: {'; '.join(problems)}", None
     content = metadata.content

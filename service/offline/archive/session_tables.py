@@ -234,4 +234,4 @@ def _read_markers(session: SealedSession) -> list[dict[str, Any]]:
         stored = read_markers(session.folder / MARKERS_NAME)
     except FileNotFoundError:
         return []
-    return [event.model_dump() for event in stored.markers]
+    return [event.model_dump() for event in stored]

@@ -204,7 +204,7 @@ def _list_finished_chunks(folder: Path) -> list[_ChunkIndex]:
         path = folder / f"{len(found):04}.json"
         try:
             index: dict[str, Any] = json.loads(
-                parse_checksummed_json(read_small_file(path), where=str(path)).text
+                parse_checksummed_json(read_small_file(path), where=str(path))
             )
         except FileNotFoundError:
             return found

@@ -83,9 +83,7 @@ class TareView(View):
     baseline_kpa: list[float] = Field(description="Absolute unloaded pressure, by tile.")
     baseline_sigma_kpa: list[float] = Field(description="Its standard uncertainty.")
     noise_kpa: list[float] = Field(description="Standard deviation of one reading.")
-    temperature_raw_counts: list[float | None] = Field(
-        description="Mean temperature counts, by tile; null in tares of older versions."
-    )
+    temperature_raw_counts: list[float] = Field(description="Mean temperature counts, by tile.")
     undone: bool
 
     @classmethod

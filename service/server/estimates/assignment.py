@@ -93,7 +93,7 @@ def _read_assignment(path: Path) -> AssignedCalibration | None:
         DamagedFileError: the file is damaged.
         StorageError: it cannot be read now.
     """
-    text = read_checksummed_json(path).text
+    text = read_checksummed_json(path)
     try:
         document = json.loads(text)
         if document["calibration"] is None:

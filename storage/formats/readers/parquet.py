@@ -21,7 +21,7 @@ from storage.formats.readers.table import (
     select_needed_names,
 )
 from storage.formats.readers.text import arrow_to_floats
-from storage.parquet_hash import check_file_hash, read_stated_and_actual_hash
+from storage.parquet_hash import FORMAT_KEY, check_file_hash, read_stated_and_actual_hash
 
 
 def read_parquet_table(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
@@ -36,7 +36,9 @@ def read_parquet_table(path: Path, is_needed: ColumnFilter, values_max: int) -> 
         check_regular_file(path)
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             schema = file.schema_arrow
-            check_file_hash(read_stated_and_actual_hash(path), schema.metadata or {}, where=where)
+            hashes = read_stated_and_actual_hash(path)
+            if hashes is not None or FORMAT_KEY in (schema.metadata or {}):
+                check_file_hash(hashes, where=where)
             needed = select_needed_names(schema.names, is_needed, where)
             check_table_size(file.metadata.num_rows, len(needed), values_max, where)
             table = file.read(columns=needed)

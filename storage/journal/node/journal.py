@@ -87,7 +87,6 @@ class NodeJournal:
                 self._lock_folder(root, is_shared=True)
                 self._lock_folder(self.folder, is_shared=False)
             self.retention_requests = RetentionRequests(self.folder / "retention.json")
-            self._are_requests_changed = not self.retention_requests.has_checksum
             self.problems = list(self.retention_requests.problems)
             """Damage found, and how it was handled, as messages."""
             self._retention = RetentionPolicy(

@@ -62,8 +62,6 @@ class RetentionRequests:
         self._path = path
         self._local: dict[str, Intervals] = {}
         self._servers: dict[str, RetentionRequest] = {}
-        self.has_checksum = True
-        """True if the file has a checksum; an older version wrote none."""
         self.problems: list[str] = []
         """Damage found, and how it was handled, as messages."""
         self._is_read = True
@@ -89,9 +87,7 @@ class RetentionRequests:
         """
         path = self._path
         try:
-            found = read_checksummed_json(path)
-            self.has_checksum = found.has_checksum
-            return _File.model_validate_json(found.text).servers
+            return _File.model_validate_json(read_checksummed_json(path)).servers
         except FileNotFoundError:
             pass
         except (DamagedFileError, ValidationError) as error:

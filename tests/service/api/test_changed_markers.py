@@ -44,7 +44,7 @@ def test_a_mark_is_renamed_and_moved_also_in_the_table_beside_and_in_downloads(
         "a boulder": t_ns,
         "mud": before["mud"]["t_ns"],
     }
-    stored = read_markers(session.folder / "markers.parquet").markers
+    stored = read_markers(session.folder / "markers.parquet")
     assert {(event.label, event.t_ns) for event in stored} >= {("a boulder", t_ns)}
     assert verify_session(session.folder).problems == []
     content = session.data(format="csv").content

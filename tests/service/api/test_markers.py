@@ -199,7 +199,7 @@ def test_a_mark_that_is_sent_again_after_a_full_disk_is_in_the_table_too(
     full[0] = False
     assert session.running.http.post(f"{session.url}/markers", json=body).status_code == 201
     stored = read_markers(session.folder / "markers.parquet")
-    assert [event.label for event in stored.markers] == ["a stone"]
+    assert [event.label for event in stored] == ["a stone"]
 
 
 def test_the_table_of_events_is_given_as_it_is_stored(session: Recording, node: FakeNode) -> None:

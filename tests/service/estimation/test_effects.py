@@ -101,12 +101,6 @@ def test_effects_survive_a_calibration_file_to_the_bit() -> None:
     assert again.id == calibration.id
 
 
-def test_a_calibration_of_before_there_was_a_branch_that_flows_keeps_its_id() -> None:
-    old = make_calibration(newton_tile("T01", effects=make_effects()))
-    assert old.id == "af3ae2a9155fbb5a"  # as c9783a7 had it
-    assert Calibration.from_json(old.to_json(), where="a file") == old
-
-
 def test_a_branch_that_flows_survives_a_calibration_file() -> None:
     flow = FlowEffect(part=p(0.08), stress_n=p(0.2), power=p(4.0))
     loop = HysteresisEffect(part=(p(0.1), p(0.1), p(0.1)), flow=flow)

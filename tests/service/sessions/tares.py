@@ -1,7 +1,8 @@
-"""Histories of tares, and the files that older versions wrote."""
+"""Histories of tares, and files of them with other content."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -14,6 +15,7 @@ from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare, TareSource
 from service.sessions.tare_file import RecordedTare
 from service.sessions.tares import TareHistory
+from storage.checksummed_json import write_checksummed_json
 from tests.builders.arrays import make_array, make_tile
 from tests.builders.calibrations import make_tare
 
@@ -55,14 +57,15 @@ def history(tmp_path: Path, *t_ns: int) -> TareHistory:
     return made
 
 
-def as_older(path: Path, change: Callable[[Any], None] = lambda _: None) -> None:
-    """The file as it was written before there were hashes, with a change."""
-    content = json.loads(path.read_bytes())["tares"]
-    for entry in content:
-        for name in ("number", "of", "sha256"):
-            del entry[name]
-    change(content)
-    path.write_text(json.dumps(content))
+def rewrite(path: Path, change: Callable[[Any], None]) -> None:
+    """Change the tares of a file, with right hashes."""
+    tares, lines = json.loads(path.read_bytes())["tares"], []
+    change(tares)
+    for entry in tares:
+        del entry["sha256"]
+        body = json.dumps(entry).encode()[:-1]
+        lines.append(body + b', "sha256": "' + hashlib.sha256(body).hexdigest().encode() + b'"}')
+    write_checksummed_json(path, b'{"tares": [\n' + b",\n".join(lines) + b"\n]}")
 
 
 def instants(tares: Sequence[Tare]) -> list[int]:

@@ -105,5 +105,5 @@ def test_a_stop_where_time_runs_back_fails_one_session_and_not_the_recovery(tmp_
 def test_notes_of_a_servers_stream_that_cannot_be_read_are_replaced(tmp_path: Path) -> None:
     folder = stream(servers(tmp_path), info_of(), (0, 99))
     (folder / "stream.json").write_bytes(b"{")
-    assert "is no JSON" in recover_folder(tmp_path).problems[0]
+    assert "it has no hash" in recover_folder(tmp_path).problems[0]
     assert recover_folder(tmp_path).is_empty

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from tests.service.sessions.tares import (
     INFO,
     OTHERS,
     array,
-    as_older,
     history,
     instants,
     same,
@@ -81,12 +79,6 @@ def test_a_tare_does_not_count_for_a_part_that_was_swapped(tmp_path: Path) -> No
     tares.add_tare(tare(2), swapped)
     assert instants(history(tmp_path).tares_between(INFO, 0, 100)) == [1]
 
-    def without(content: Any) -> None:
-        del content[0]["chips"]  # a still older version's knows only serials
-
-    as_older(tmp_path / "node" / "tares.json", without)
-    assert instants(history(tmp_path).tares_between(swapped, 0, 100)) == [1, 2]
-
 
 def test_ids_are_all_different(tmp_path: Path) -> None:
     tares = history(tmp_path, *range(30))
@@ -137,11 +129,6 @@ def test_every_tare_has_a_reason_in_words(tmp_path: Path) -> None:
     tares.add_tare(tare(2), INFO)
     tares.add_tare(tare(3), INFO, "new shoe")
     tares.add_tare(tare(4), INFO, "x" * 500)
-
-    def without(content: Any) -> None:
-        del content[1]["reason"]  # a still older version's
-
-    as_older(tmp_path / "node" / "tares.json", without)
     assert [recorded.reason for recorded in history(tmp_path).tares] == [
         "unloaded lead of the emulation",
         "by hand",

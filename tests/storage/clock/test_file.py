@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError, UsageError
 from storage.clock.file import read_clock_file, write_clock_file
 from storage.clock.log import ClockOffset
 from storage.clock.table import StreamClockFacts
+from storage.hashed_table import write_hashed_table
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.sidecars import load_clock_table
 from storage.sessions.writer import SealedFileWriter
@@ -46,7 +46,6 @@ def test_the_file_gives_back_rows_and_facts(tmp_path: Path) -> None:
     write_clock_file(tmp_path / "clock.parquet", rows, facts)
     stored = read_clock_file(tmp_path / "clock.parquet")
     read = stored.rows_by_stream
-    assert stored.has_hash
     assert stored.offsets == tuple(rows)
     assert {name: len(own) for name, own in read.items()} == {"one": 3, "two": 2}
     assert read["one"].offset_ns.tolist() == [row.server_minus_node_ns for row in rows[:3]]
@@ -86,7 +85,8 @@ def test_a_file_that_is_no_clock_table_is_refused(
     tmp_path: Path, columns: dict[str, pa.Array[Any]]
 ) -> None:
     path = tmp_path / "clock.parquet"
-    pq.write_table(pa.table(columns), path)
+    table = pa.table(columns).replace_schema_metadata({"foottile.streams": "[]"})
+    write_hashed_table(path, table)
     with pytest.raises(FileFormatError, match=r"clock\.parquet"):
         read_clock_file(path)
 
@@ -101,10 +101,10 @@ def test_a_file_that_is_no_parquet_is_refused(tmp_path: Path, content: bytes) ->
 
 def test_facts_that_are_not_understood_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "clock.parquet"
-    table = pa.table(numbers()).replace_schema_metadata({"foottile.streams": json.dumps([1])})
-    pq.write_table(table, path)
-    with pytest.raises(FileFormatError, match="clock table"):
-        read_clock_file(path)
+    for metadata in ({"foottile.streams": json.dumps([1])}, None):
+        write_hashed_table(path, pa.table(numbers()).replace_schema_metadata(metadata))
+        with pytest.raises(FileFormatError, match="clock table"):
+            read_clock_file(path)
 
 
 # --- beside a session -----------------------------------------------------------------------------
@@ -125,9 +125,8 @@ def parts(*stream_ids: str) -> dict[str, object]:
 
 def test_each_part_of_a_session_has_the_clock_of_its_stream(tmp_path: Path) -> None:
     path = sealed(tmp_path, parts("one", "two"))
-    write_clock_file(
-        tmp_path / "clock.parquet", measured("two", 3), [StreamClockFacts("two", 9, True)]
-    )
+    facts = [StreamClockFacts("one", 7, False), StreamClockFacts("two", 9, True)]
+    write_clock_file(tmp_path / "clock.parquet", measured("two", 3), facts)
     with SealedFileReader(path) as reader:
         table = load_clock_table(reader)
     one, two = table.summarize().streams
@@ -136,18 +135,10 @@ def test_each_part_of_a_session_has_the_clock_of_its_stream(tmp_path: Path) -> N
     assert two.stretches[0].begin_t_ns == 9
 
 
-def test_a_table_of_an_older_version_says_nothing_of_streams_and_is_read(tmp_path: Path) -> None:
-    path = sealed(tmp_path, parts("one", "two"))
-    pq.write_table(pa.table(numbers(stream_id=pa.array(["two"]))), tmp_path / "clock.parquet")
-    with SealedFileReader(path) as reader:
-        one, two = load_clock_table(reader).summarize().streams
-    assert (one.state, two.state) == ("unsynchronised", "measured")
-    assert two.stretches[0].begin_t_ns is None
-
-
 def test_a_file_that_was_never_recorded_is_of_one_stream(tmp_path: Path) -> None:
     path = sealed(tmp_path, {})
-    write_clock_file(tmp_path / "clock.parquet", measured("one", 3), [])
+    facts = [StreamClockFacts("one", 7, False)]
+    write_clock_file(tmp_path / "clock.parquet", measured("one", 3), facts)
     with SealedFileReader(path) as reader:
         (stream,) = load_clock_table(reader).summarize().streams
     assert (stream.stream_id, stream.state) == ("one", "measured")

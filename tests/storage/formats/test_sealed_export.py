@@ -34,7 +34,6 @@ from storage.sessions.writer import SealedFileWriter, parquet_options
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 from tests.storage.formats.exports import NO_TIMES, export
-from tests.storage.sessions.session_files import rewritten
 
 SECOND_NS = 1_000_000_000
 PERIOD_NS = SECOND_NS // 10
@@ -279,20 +278,6 @@ def test_a_slice_reads_its_own_row_groups_and_columns_and_no_page_besides(tmp_pa
         table_of(path, Slice(4.2, 6.5, ("force_n_1",)))
     with pytest.raises(FileFormatError, match="changed since it was sealed"):
         SealedFileReader(path)
-
-
-def test_statistics_that_nothing_proves_are_not_believed(tmp_path: Path) -> None:
-    # An older version wrote no hash: a flip in a footer would leave out frames without a word.
-    table = pq.read_table(ten_groups(tmp_path / "s.parquet"))
-    path = rewritten(tmp_path / "older.parquet", table)
-    with SealedFileReader(path, only_slices=True) as reader:
-        assert reader.read_min_max_by_row_group("t_ns") == [None]
-        assert reader.read_span_ns() == (
-            UTC_NS + table["t_mono_ns"][0].as_py(),
-            table["t_ns"][-1].as_py(),
-        )
-    part = Slice(4.2, 5.1, ("force_n_1",))
-    assert table_of(path, part).equals(table_of(tmp_path / "s.parquet", part))
 
 
 # --- damage ---------------------------------------------------------------------------------------

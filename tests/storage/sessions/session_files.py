@@ -13,7 +13,15 @@ from devices.errors import FileFormatError
 from devices.frames import (
     FrameBatch,
 )
-from storage.parquet_hash import FORMAT_WITHOUT_HASH
+from storage.parquet_hash import (
+    FILE_HASH_KEY,
+    FOOTER_HASH_KEY,
+    HASH_PLACEHOLDER,
+    embed_file_hashes,
+)
+from storage.schema import ARRAY_INFO_KEY
+from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, compute_content_hash
+from storage.sessions.footer import NOTES_KEY
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.writer import SealedFileWriter
 from tests.builders.arrays import PERIOD_NS, make_array
@@ -52,15 +60,19 @@ def read(path: Path) -> FrameBatch:
 
 
 def rewritten(path: Path, table: pa.Table, **metadata: bytes | None) -> Path:
-    """The table as an older version wrote it, without hashes, with these metadata changed.
-
-    None takes an entry out.
-    """
-    changed = {"format": FORMAT_WITHOUT_HASH, **metadata}
-    said = {f"foottile.{key}".encode(): value for key, value in changed.items()}
+    """The table with these metadata changed and right hashes; None takes an entry out."""
+    said = {f"foottile.{key}".encode(): value for key, value in metadata.items()}
     merged = {**table.schema.metadata, **said}
     kept = {key: value for key, value in merged.items() if value is not None}
-    pq.write_table(table.replace_schema_metadata(kept), path)
+    info, notes = kept.get(ARRAY_INFO_KEY, b""), kept.get(NOTES_KEY, b"")
+    content_hash = compute_content_hash(info, notes, b"{}")
+    hashes = {CONTENT_KEY: b"{}", CONTENT_HASH_KEY: content_hash.encode()}
+    hashes |= dict.fromkeys((FOOTER_HASH_KEY, FILE_HASH_KEY), HASH_PLACEHOLDER)
+    table = table.replace_schema_metadata(kept)
+    with pq.ParquetWriter(path, table.schema, write_page_checksum=True) as file:
+        file.write_table(table)
+        file.add_key_value_metadata({key.decode(): text.decode() for key, text in hashes.items()})
+    embed_file_hashes(path)
     return path
 
 

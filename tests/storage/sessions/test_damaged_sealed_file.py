@@ -183,14 +183,12 @@ def test_a_file_that_another_program_has_rewritten_is_refused_and_says_what_to_d
     tmp_path: Path,
 ) -> None:
     # Nobody knows what else it has changed.
-    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
-    refused(
-        rewritten(tmp_path / "other.parquet", table, format=b"2"),
-        "another program has rewritten it.*pull it again, or use a copy; export it",
-    )
+    path = write(tmp_path / "s.parquet", frames(5))
+    pq.write_table(pq.read_table(path), path)
+    refused(path, "another program has rewritten it.*pull it again, or use a copy; export it")
 
 
-def test_an_older_file_with_more_columns_than_ours_is_read(tmp_path: Path) -> None:
+def test_columns_that_are_not_ours_are_left_out(tmp_path: Path) -> None:
     batch = frames(5)
     table = pq.read_table(write(tmp_path / "s.parquet", batch))
     table = table.append_column("my_filter_n", pa.array(np.arange(5.0)))

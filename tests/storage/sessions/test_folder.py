@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError, FileFormatError, StorageError, UnknownError
-from storage.checksummed_json import strip_checksum
+from storage.checksummed_json import append_checksum, parse_checksummed_json
 from storage.clock.log import ClockOffset
 from storage.sessions.folder import (
     Ledger,
@@ -234,7 +234,9 @@ def test_what_is_not_a_session_is_refused_with_its_path(
     path = folder.get_path(ID) / "session.json"
     content = path.read_bytes()
     assert old in content
-    path.write_bytes(strip_checksum(content).replace(old, new, 1))
+    path.write_bytes(
+        append_checksum(parse_checksummed_json(content, where="").replace(old, new, 1))
+    )
     with pytest.raises(FileFormatError, match="not a session") as caught:
         folder.load(ID)
     assert caught.value.where == str(path)

@@ -87,8 +87,8 @@ def test_another_table_is_refused(tmp_path: Path) -> None:
     write_hashed_table(path, pa.table({"number": [1]}))
     with pytest.raises(DamagedFileError, match="no table of stances"):
         read_stances(path)
-    pq.write_table(make_stance_table(()), path)  # without a hash
-    with pytest.raises(DamagedFileError, match="no table of stances"):
+    pq.write_table(make_stance_table(()), path)
+    with pytest.raises(DamagedFileError, match="its hash is gone"):
         read_stances(path)
 
 

@@ -12,6 +12,7 @@ import pytest
 from devices.errors import FileFormatError
 from service.sessions.inputs import SessionInputs
 from service.sessions.sealing import seal_session
+from storage.checksummed_json import write_checksummed_json
 from storage.sessions.folder import Part, Session
 from storage.sessions.ledger import compute_ledger
 from storage.verify.data_folder import find_verdict, verify_path
@@ -90,14 +91,15 @@ def test_a_session_that_was_pulled_is_proven_too(tmp_path: Path) -> None:
     pulled = tmp_path / "pulled" / ID
     pulled.mkdir(parents=True)
     shutil.copy(folder / "frames.parquet", pulled)
-    (pulled / "session.json").write_text(json.dumps({**view, "complete": "lossy"}))
+    content = json.dumps({**view, "complete": "lossy"}).encode()
+    write_checksummed_json(pulled / "session.json", content)
     assert kept.ledger is not None
-    (pulled / "ledger.json").write_text(kept.ledger.model_dump_json())
+    write_checksummed_json(pulled / "ledger.json", kept.ledger.model_dump_json().encode())
     report = verify_session(pulled)
     assert report.problems == []
     assert find_verdict(report) == "lossy"
     edited_ledger = kept.ledger.model_copy(update={"lossy": False, "complete": True})
-    (pulled / "ledger.json").write_text(edited_ledger.model_dump_json())
+    write_checksummed_json(pulled / "ledger.json", edited_ledger.model_dump_json().encode())
     assert "ledgers" in problems(pulled)
 
 

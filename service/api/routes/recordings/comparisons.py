@@ -60,7 +60,6 @@ class ComparisonsView(BaseModel):
 class ReportView(ComparisonView):
     """Results of a comparison (docs/compare.md)."""
 
-    is_proven: bool = Field(description="False: written by an older version, without a hash.")
     has_series: bool = Field(description="True: the compared values are there, frame by frame.")
     report: dict[str, Any] = Field(description="Content of `compare.json`.")
 
@@ -144,7 +143,7 @@ def _list_comparisons(session: Session, server: Server) -> list[ComparisonView]:
     found = []
     for name, folder in folders.items():
         try:
-            found.append(_make_view(frames, name, read_comparison_report(folder).content))
+            found.append(_make_view(frames, name, read_comparison_report(folder)))
         except FileFormatError as error:
             found.append(
                 ComparisonView(name=name, problem=str(error), matches_current_data=None, missed=[])
@@ -176,13 +175,12 @@ def _make_view(frames: object, name: str, content: dict[str, Any]) -> Comparison
 
 def _make_report(session: Session, name: str, server: Server) -> ReportView:
     folder = find_comparison_folder(server.sessions.folder.get_path(session.id), name)
-    read = read_comparison_report(folder)
+    content = read_comparison_report(folder)
     return ReportView(
-        **_make_view(_read_frames_hash(session, server), name, read.content).model_dump(),
-        is_proven=read.has_checksum,
+        **_make_view(_read_frames_hash(session, server), name, content).model_dump(),
         has_series=(folder / SERIES_NAME).is_file(),
-        report={key: value for key, value in read.content.items() if key != "session"}
-        | {"reference": Path(str(read.content["reference"])).name},
+        report={key: value for key, value in content.items() if key != "session"}
+        | {"reference": Path(str(content["reference"])).name},
     )
 
 
@@ -193,7 +191,7 @@ def _encode_series(session: Session, name: str, query: SeriesQuery, server: Serv
     if cached is None:
         raise UnknownError(
             f"the comparison with {name!r} has no series",
-            remedy="An older version made it, or it is too long: compare again",
+            remedy="It has too many frames: compare parts of it",
         )
     with server.sessions.open_frames(session.id, only_slices=True) as reader:
         begin_ns, end_ns = reader.read_span_ns()

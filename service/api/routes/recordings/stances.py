@@ -79,7 +79,7 @@ async def get_stances(
 ) -> Response | list[dict[str, Any]]:
     """Return stances as JSON, or as an Arrow stream if `Accept` names its media type.
 
-    For sessions of versions without stances they are computed from the frames.
+    Missing stances are computed from the frames.
     """
     session = _require_sealed(session_id, server)
     folder = server.sessions.folder.get_path(session_id)

@@ -22,14 +22,13 @@ _ONE_AT_A_TIME = CapacityLimiter(1)
 
 
 class VerificationView(Ledger):
-    """Result of `foottile verify --json`: the ledger, and the problems found."""
+    """Result of the verification: the ledger, and the problems found."""
 
     id: str | None
     problems: list[PublicText] = Field(description="Problems found; none: the files are intact.")
     sha256: str | None = Field(
         description="Present hash of the file of frames; null: there is none."
     )
-    unproven: list[str] = Field(description="Facts that these files cannot prove.")
 
 
 @router.get(
@@ -60,4 +59,6 @@ async def verify_session_files(session_id: str, server: ServerState) -> dict[str
         report = await to_thread.run_sync(read, limiter=_ONE_AT_A_TIME)
     except FileFormatError as error:  # it was deleted meanwhile
         raise UnknownError(f"session {session_id}: {error.what}", where=error.where) from error
-    return report.to_json_dict()
+    content = report.to_json_dict()
+    del content["unproven"]  # a server has all of a session's files
+    return content

@@ -154,6 +154,6 @@ def write_result(folder: Path, result: ArrayResult) -> None:
 def read_result(path: Path) -> ArrayResult | None:
     """Read a result file; None if it is missing or damaged."""
     try:
-        return ArrayResult.model_validate_json(read_checksummed_json(path).text)
+        return ArrayResult.model_validate_json(read_checksummed_json(path))
     except (FileNotFoundError, FootTileError, pydantic.ValidationError):
         return None

@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from storage.parquet_hash import FORMAT_KEY, FORMAT_WITHOUT_HASH
 from tests.service.cli.outcome import Run, scene_text, static_only
+from tests.storage.sessions.session_files import rewritten
 
 pytestmark = pytest.mark.slow
 
@@ -50,9 +50,7 @@ def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, be
     column = table.schema.get_field_index("reference_force_n")
     field = table.schema.field(column)
     table = table.set_column(column, field, pa.array(force, field.type))
-    # As of an older version: what another program has rewritten states no hash.
-    older = {**table.schema.metadata, FORMAT_KEY: FORMAT_WITHOUT_HASH}
-    pq.write_table(table.replace_schema_metadata(older), "limited.parquet")
+    rewritten(Path("limited.parquet"), table)
     outcome = run("calibrate", "limited.parquet", "--out", "cal.json", "--json")
     printed = outcome.printed(3)
     assert [tile["serial"] for tile in printed["tiles"]] == ["T01"]

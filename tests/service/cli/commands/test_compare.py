@@ -93,7 +93,7 @@ def test_without_a_folder_it_is_kept_with_the_session(
         *("compare.json", "compare.md", "compare.png"),
         "series.parquet",
     }
-    assert read_checksummed_json(kept / "compare.json").has_checksum
+    read_checksummed_json(kept / "compare.json")
 
 
 def test_a_limit_that_is_missed_is_named_and_code_3_and_all_is_written(

@@ -120,9 +120,8 @@ def test_newtons_that_a_plate_has_measured_are_assumed_no_more() -> None:
         assert (again.is_scale_assumed, flagged) == (assumed, assumed)
 
 
-def test_what_no_plate_has_seen_is_not_written_and_ids_of_older_calibrations_stay() -> None:
+def test_the_mount_calibration_is_part_of_the_id() -> None:
     calibration = make_paper_eq2_preset()
-    assert "mounted" not in calibration.to_json()
     mounted = calibration.model_copy(
         update={
             "mounted": MountCalibration(

@@ -248,12 +248,6 @@ def test_a_foot_that_moves_or_has_a_silent_tile_is_left_alone(bench: Bench) -> N
     assert bench.look(bench.frames(1000.0, [0.0, np.nan]), by_hand()) == FlightTareResult()
 
 
-def test_a_tare_of_unknown_temperature_explains_nothing(bench: Bench) -> None:
-    old = replace(by_hand(), temperature_raw_counts=np.full(TILES, np.nan))
-    assert bench.look(bench.frames(300.0, COUNTS_PER_K, warmer_k=1.0), old).rejection is not None
-    assert bench.look(bench.frames(300.0, 0.5), old).rejection is None
-
-
 # --- the first tare -------------------------------------------------------------------------------
 
 

@@ -110,7 +110,7 @@ def test_what_is_recorded_or_damaged_is_left_out_and_named(data: Path) -> None:
     left_out = {Path(place).name: reason for place, reason in archive.left_out_reasons.items()}
     assert left_out == {
         IDS[0]: "damaged: frames.parquet is missing",
-        IDS[1]: "damaged: session.json was changed: its text does not match its hash",
+        IDS[1]: "damaged: session.json: it was changed: its text does not match its hash",
         IDS[2]: "damaged: frames.parquet is not as long as session.json says",
         IDS[4]: "it is recording, and not sealed yet",
         IDS[5]: f"it is session {IDS[3]} in another session's folder",
@@ -152,7 +152,7 @@ def test_a_damaged_footer_leaves_the_session_out_of_frames_and_sessions(data: Pa
     assert list(archive.left_out_reasons) == [str(data / "sessions" / IDS[0])]
 
 
-def test_stances_that_an_older_session_lacks_are_made_and_kept(data: Path) -> None:
+def test_stances_that_a_session_lacks_are_made_and_kept(data: Path) -> None:
     path = data / "sessions" / IDS[0] / "stances.parquet"
     written, rows = path.read_bytes(), answer(THIRD_IN_MUD, data)
     path.unlink()

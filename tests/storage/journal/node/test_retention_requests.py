@@ -82,13 +82,3 @@ def test_a_flipped_bit_is_noticed_wherever_it_is(tmp_path: Path) -> None:
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :])
         assert RetentionRequests(path).is_unknown
         path.with_name("retention.json.damaged-1").unlink()
-
-
-def test_a_file_of_an_older_version_is_read_and_called_unproven(tmp_path: Path) -> None:
-    path = tmp_path / "retention.json"
-    path.write_text('{"servers":{"laptop":{"streams":{"a":[[0,9]]}}}}')
-    wanted = RetentionRequests(path)
-    assert wanted.required_numbers_of("a") == Intervals([(0, 9)])
-    assert not wanted.has_checksum
-    wanted.save()
-    assert RetentionRequests(path).has_checksum
