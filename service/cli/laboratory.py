@@ -132,7 +132,7 @@ class Laboratory:
             with foottile.connect(self._url, self._token) as server:
                 session = self._started(server, trial.name, node)
                 _wait(trial.seconds, node, trial.name)
-                sealed = session.stop().wait(_SEALED_S).facts
+                sealed = session.stop().wait_until_sealed(_SEALED_S).metadata
                 missed = server.node(trial.name)["missed_slots"]
                 pulled = pull_session(server, session.id, self._folder / "sessions")
         except foottile.FootTileError as error:

@@ -35,7 +35,7 @@ def invite_command(
     import foottile
 
     with foottile.connect(server or SERVER, read_data_token(data), ca=ca) as source:
-        ticket = source.ticket(role="viewer" if read_only else "operator")
+        ticket = source.create_invite(role="viewer" if read_only else "operator")
     if as_json:
         print_json(ticket)
     else:

@@ -347,7 +347,7 @@ def _of_server(url: str, ca: Path | None, choice: SessionFilter) -> list[Mapping
             until=instant(choice.to_t_ns),
             complete=choice.complete,
         )
-        return [session.facts for session in found]
+        return [session.metadata for session in found]
 
 
 def _in_folder(data: Path, choice: SessionFilter) -> list[Mapping[str, Any]]:

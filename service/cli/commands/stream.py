@@ -16,7 +16,7 @@ from service.cli.options import CaOption, remark
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from foottile import Loss
+    from foottile import FrameLoss
 
 FORMATS = ("csv", "jsonl")
 
@@ -103,5 +103,5 @@ class Lines:
         self._sink.flush()
 
 
-def _say_lost(loss: Loss) -> None:
+def _say_lost(loss: FrameLoss) -> None:
     remark(str(loss))
