@@ -22,7 +22,7 @@ from foottile.live_protocol import FrameLoss, LiveRequest, Policy
 from foottile.live_state import LiveStreamState
 from foottile.server import Server
 from foottile.sessions import Marker, Session
-from foottile.websocket import AsyncWebsocketConnection
+from foottile.websocket import AsyncWebsocket
 
 T = TypeVar("T")
 
@@ -91,9 +91,8 @@ class AsyncSession:
         clock: Clock = "node",
     ) -> AsyncSessionData:
         """Return the frames, as `Session.open`."""
-        return AsyncSessionData(
-            self.snapshot.open(columns, start_s=start_s, end_s=end_s, clock=clock)
-        )
+        data = self.snapshot.open(columns, start_s=start_s, end_s=end_s, clock=clock)
+        return AsyncSessionData(data)
 
     async def refresh(self) -> Self:
         """Call `Session.refresh` in a thread."""
@@ -230,11 +229,8 @@ class AsyncLiveStream(LiveStreamState, AsyncCloseable):
     async def _connect(self) -> ClientConnection:
         while self._socket is None:
             try:
-                self._socket = await connect(
-                    self._protocol.make_url(),
-                    create_connection=AsyncWebsocketConnection,
-                    **self._make_connect_options(),
-                )
+                url, options = self._protocol.make_url(), self._get_options()
+                self._socket = await connect(url, create_connection=AsyncWebsocket, **options)
             except (OSError, InvalidHandshake, EOFError) as error:
                 await asyncio.sleep(self._delay_after_failure_s(error))
         return self._socket

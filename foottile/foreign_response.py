@@ -48,12 +48,8 @@ def explain_foreign_response(
 
 
 def _is_same_but_secure(url: str, target: str) -> bool:
-    asked, target_parts = urlsplit(url), urlsplit(target)
-    return (
-        asked.scheme == "http"
-        and target_parts.scheme == "https"
-        and asked.hostname == target_parts.hostname
-    )
+    asked, parts = urlsplit(url), urlsplit(target)
+    return asked.scheme == "http" and parts.scheme == "https" and asked.hostname == parts.hostname
 
 
 def _origin(url: str) -> str:

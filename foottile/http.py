@@ -151,9 +151,8 @@ class HttpClient:
                 yield response
         except httpx.HTTPError as error:
             if has_response:
-                raise ServerUnavailableError(
-                    f"{self.url}: the answer broke off: {error}."
-                ) from error
+                text = f"{self.url}: the answer broke off: {error}."
+                raise ServerUnavailableError(text) from error
             raise self._make_unavailable_error(error) from error
 
     def _request(self, method: str, path: str, attempts: int, **options: Any) -> dict[str, Any]:
@@ -209,13 +208,11 @@ def _parse_json(response: httpx.Response) -> object:
 
 def _encode_query(query: Mapping[str, object] | None) -> dict[str, str | list[str]]:
     return {
-        name: [_encode_value(each) for each in value]
-        if isinstance(value, list)
-        else _encode_value(value)
+        name: [_encode(each) for each in value] if isinstance(value, list) else _encode(value)
         for name, value in (query or {}).items()
         if value is not None
     }
 
 
-def _encode_value(value: object) -> str:
+def _encode(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)

@@ -14,7 +14,7 @@ from websockets.sync.client import ClientConnection, connect
 from foottile.closeable import Closeable
 from foottile.errors import FootTileError
 from foottile.live_state import LiveStreamState
-from foottile.websocket import WebsocketConnection
+from foottile.websocket import Websocket
 
 
 class LiveStream(LiveStreamState, Closeable):
@@ -79,11 +79,8 @@ class LiveStream(LiveStreamState, Closeable):
     def _connect(self) -> ClientConnection:
         while self._socket is None:
             try:
-                connection = connect(
-                    self._protocol.make_url(),
-                    create_connection=WebsocketConnection,
-                    **self._make_connect_options(),
-                )
+                url, options = self._protocol.make_url(), self._get_options()
+                connection = connect(url, create_connection=Websocket, **options)
                 self._socket = self._exit_stack.enter_context(connection)
             except (OSError, InvalidHandshake, EOFError) as error:
                 time.sleep(self._delay_after_failure_s(error))

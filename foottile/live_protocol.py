@@ -137,9 +137,7 @@ class LiveProtocol:
             if self._schema is None:
                 self._schema = pa.ipc.read_schema(pa.py_buffer(message))
                 return None
-            return self._remove_known_frames(
-                pa.ipc.read_record_batch(pa.py_buffer(message), self._schema)
-            )
+            return self._drop_known(pa.ipc.read_record_batch(pa.py_buffer(message), self._schema))
         except (ValueError, KeyError, TypeError, pa.ArrowException) as error:
             raise DamagedError(f"{self._request.url}: not a live message: {error}") from error
 
@@ -171,39 +169,36 @@ class LiveProtocol:
             headers: headers, with names in lower case.
             body: content.
         """
-        problem = explain_foreign_response(self._request.url, status, headers)
-        if problem is None and status == HTTPStatus.OK:  # no websocket server
-            problem = explain_foreign_response(
-                self._request.url, status, headers, expected="a websocket"
-            )
+        url = self._request.url
+        foreign = explain_foreign_response(url, status, headers)
+        if foreign is None and status == HTTPStatus.OK:  # no websocket server
+            foreign = explain_foreign_response(url, status, headers, expected="a websocket")
         if self._has_connected and (
-            problem is not None or status == HTTPStatus.SERVICE_UNAVAILABLE
+            foreign is not None or status == HTTPStatus.SERVICE_UNAVAILABLE
         ):
             return None
-        if problem is not None:
-            return ServerUnavailableError(f"{self._request.url}: {problem}", status=status)
+        if foreign is not None:
+            return ServerUnavailableError(f"{url}: {foreign}", status=status)
         try:
             content: Any = json.loads(body)
         except ValueError:
             content = None
-        return make_error(status, content, self._request.url)
+        return make_error(status, content, url)
 
     def compute_retry_delay_s(
-        self, error: Exception, silence_s: float, reconnect_timeout_s: float | None
+        self, error: Exception, silence_s: float, timeout_s: float | None
     ) -> float:
         """Return the delay before the next attempt, with exponential backoff.
 
         Args:
             error: failure of the last attempt.
             silence_s: time since the last message.
-            reconnect_timeout_s: longest silence; None: unlimited after the first message.
+            timeout_s: longest silence; None: unlimited after the first message.
 
         Raises:
-            ServerUnavailableError: no message yet, or `reconnect_timeout_s` exceeded.
+            ServerUnavailableError: no message yet, or a longer silence.
         """
-        if not self._has_connected or (
-            reconnect_timeout_s is not None and silence_s > reconnect_timeout_s
-        ):
+        if not self._has_connected or (timeout_s is not None and silence_s > timeout_s):
             what = explain_tls(error) or f"no answer: {error}"
             raise ServerUnavailableError(f"{self._request.url}: {what}") from error
         self._failures += 1
@@ -224,7 +219,7 @@ class LiveProtocol:
             self._stream_id, self._next_seq = message["stream_id"], last + 1
             self._add_loss(FrameLoss(message["stream_id"], first, last, str(message["reason"])))
 
-    def _remove_known_frames(self, batch: pa.RecordBatch) -> pa.RecordBatch | None:
+    def _drop_known(self, batch: pa.RecordBatch) -> pa.RecordBatch | None:
         seq = batch.column("seq")
         first, last = seq[0].as_py(), seq[-1].as_py()
         if first is None or last is None or last - first + 1 != batch.num_rows:

@@ -42,7 +42,7 @@ class LiveStreamState:
         """Newest thousand losses that the server reported."""
         return tuple(self._protocol.losses)
 
-    def _make_connect_options(self) -> dict[str, Any]:
+    def _get_options(self) -> dict[str, Any]:
         """Return the websocket options of a connection."""
         return {
             "additional_headers": self._http.headers,

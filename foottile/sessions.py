@@ -151,10 +151,8 @@ class Session:
         Raises:
             FootTileError: no response, or no such session.
         """
-        return [
-            Marker.create(each)
-            for each in self._http.get(f"{self._path}/markers", field="items")["items"]
-        ]
+        found = self._http.get(f"{self._path}/markers", field="items")
+        return [Marker.create(each) for each in found["items"]]
 
     def add_marker(self, label: str, *, t_ns: int | None = None) -> Marker:
         """Add a marker now, or at an instant of the server's UTC; a repeated request adds it once.
@@ -163,9 +161,8 @@ class Session:
             FootTileError: no response, or a problem response.
         """
         body = {"label": label, "t_ns": t_ns, "id": uuid.uuid4().hex[:12]}
-        return Marker.create(
-            self._http.send("POST", f"{self._path}/markers", body, is_idempotent=True)
-        )
+        path = f"{self._path}/markers"
+        return Marker.create(self._http.send("POST", path, body, is_idempotent=True))
 
     def update(
         self,

@@ -32,18 +32,16 @@ def make_context(ca: str | os.PathLike[str] | None = None) -> ssl.SSLContext:
     try:
         if path.is_dir():
             context.load_verify_locations(capath=path)  # read on demand
-            has_certificates = any(each.suffix in (".pem", ".crt", ".0") for each in path.iterdir())
+            has_certs = any(each.suffix in (".pem", ".crt", ".0") for each in path.iterdir())
         else:
             _check_file(path)
             context.load_verify_locations(cafile=path)
-            has_certificates = len(context.get_ca_certs()) > count_before or _is_in_system_trust(
-                path
-            )
+            has_certs = len(context.get_ca_certs()) > count_before or _is_trusted(path)
     except (OSError, ValueError) as error:  # an ssl.SSLError is an OSError
         raise UsageError(
             f"{str(path)!r}: no CA certificates can be read: {error}; expected a file in PEM"
         ) from error
-    if not has_certificates:
+    if not has_certs:
         raise UsageError(f"{str(path)!r}: there is no CA certificate in it; expected a file in PEM")
     return context
 
@@ -55,7 +53,7 @@ def _check_file(path: Path) -> None:
         raise ValueError(f"not a file of at most {_BYTES_MAX >> 20} MiB")
 
 
-def _is_in_system_trust(path: Path) -> bool:
+def _is_trusted(path: Path) -> bool:
     """Return whether the certificates of a file are already in the machine's trust store."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.load_verify_locations(cafile=path)

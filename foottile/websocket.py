@@ -26,7 +26,7 @@ class UpgradeRejection(InvalidHandshake):
         self.body = bytes(response.body or b"")
 
 
-class WebsocketConnection(ClientConnection):
+class Websocket(ClientConnection):
     """Websocket for threads, as `create_connection` of `websockets.sync`."""
 
     def handshake(self, *args: Any, **options: Any) -> None:
@@ -41,7 +41,7 @@ class WebsocketConnection(ClientConnection):
             raise UpgradeRejection(error.response) from error
 
 
-class AsyncWebsocketConnection(AsyncClientConnection):
+class AsyncWebsocket(AsyncClientConnection):
     """Websocket for an event loop, as `create_connection` of `websockets.asyncio`."""
 
     async def handshake(self, *args: Any, **options: Any) -> None:
