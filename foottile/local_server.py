@@ -76,7 +76,7 @@ def publish_local_server(server: LocalServer) -> Iterator[None]:
     if not _is_private(path.parent.lstat()):
         path.parent.chmod(0o700)
     content = {"url": server.url, "token": server.token, "pid": os.getpid()}
-    # Whoever finds the file finds it whole and locked, so it gets its name last.
+    # The rename comes last, so a reader finds the file complete and locked.
     with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX)
