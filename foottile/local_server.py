@@ -146,12 +146,12 @@ def _is_locked(descriptor: int) -> bool:
     return False
 
 
-def _is_same_address(asked: SplitResult, listening: SplitResult) -> bool:
-    if asked.path.strip("/") or not (asked.hostname and listening.hostname):
+def _is_same_address(requested: SplitResult, listening: SplitResult) -> bool:
+    if requested.path.strip("/") or not (requested.hostname and listening.hostname):
         return False
-    if asked.hostname == "localhost":
+    if requested.hostname == "localhost":
         return True
-    return _ip_address(asked.hostname) == _ip_address(listening.hostname)
+    return _ip_address(requested.hostname) == _ip_address(listening.hostname)
 
 
 def _ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:

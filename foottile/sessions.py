@@ -224,11 +224,13 @@ class Session:
             FootTileError: no response, or a problem response.
         """
 
-        def expected() -> str | None:
+        def get_expected_sha256() -> str | None:
             sha256: str | None = self.refresh().metadata["sha256"]
             return sha256 if format == "parquet" else None
 
-        return download(self._http, f"{self._path}/data", {"format": format}, path, expected)
+        return download(
+            self._http, f"{self._path}/data", {"format": format}, path, get_expected_sha256
+        )
 
     @property
     def _path(self) -> str:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 SERVER = "http://127.0.0.1:8000"
 
-_UNLISTED_FIELDS = {"ledger", "markers", "clock", "calibration", "scene_content", "asked"}
+_UNLISTED_FIELDS = {"ledger", "markers", "clock", "calibration", "scene_content", "request"}
 """Fields that a list of sessions omits."""
 
 ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
