@@ -201,7 +201,7 @@ def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touc
     pressed = table["true_force_n_0"].to_numpy() == 110.0
     wrapped = pressed & (table["pressure_raw_0"].to_numpy() > 900)
     assert wrapped.sum() > 100
-    assert (table["status_0"].to_numpy()[wrapped] & 16 == 16).all()
+    assert (table["tile_flags_0"].to_numpy()[wrapped] & 16 == 16).all()
     assert (table["estimate_flags"].to_numpy()[pressed] & 1 == 1).all()
     assert (table["force_n_0"].to_numpy()[pressed] > 15.0).all()  # as creep may have left it
     assert np.isnan(table["force_sigma_n_0"].to_numpy()[pressed]).all()

@@ -314,7 +314,4 @@ def test_one_who_comes_back_in_the_middle_of_a_piece_has_each_frame_once(
     middle = (item.first_seq + item.last_seq) // 2
     following = world.read(world.reader(policy, Position(FIRST, middle)))
     assert (following.first_seq, following.last_seq) == (middle, item.last_seq)
-    assert (
-        following.estimated[0].pressure_raw.tolist()
-        == item.estimated[0].pressure_raw[middle:].tolist()
-    )
+    assert following.batch[0].pressure_raw.tolist() == item.batch[0].pressure_raw[middle:].tolist()
