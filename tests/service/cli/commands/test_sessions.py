@@ -148,7 +148,7 @@ def test_estimate_says_which_models_a_recording_asks_for_and_what_they_are_good_
     assert {"rubber", "hysteresis"} <= set(bare["asks_for"]) <= {"gas", "rubber", "hysteresis"}
     said = run(*few).err
     for name, newtons in bare["asks_for"].items():
-        assert f"model {name!r} is not named, and is good for {newtons:.2f} N" in said
+        assert f"model {name!r} is inactive; it would change the GRF by {newtons:.2f} N" in said
     # Each is expected beside all others, so together they are more than what is gained.
     gained_n = bare["accuracy"]["grf_mae_n"] - whole["accuracy"]["grf_mae_n"]
     assert 0.5 * gained_n < sum(bare["asks_for"].values()) < 4.0 * gained_n
