@@ -48,8 +48,8 @@ def explain_foreign_response(
 
 
 def _is_same_but_secure(url: str, target: str) -> bool:
-    asked, parts = urlsplit(url), urlsplit(target)
-    return asked.scheme == "http" and parts.scheme == "https" and asked.hostname == parts.hostname
+    source, parts = urlsplit(url), urlsplit(target)
+    return source.scheme == "http" and parts.scheme == "https" and source.hostname == parts.hostname
 
 
 def _origin(url: str) -> str:

@@ -71,7 +71,7 @@ def publish_local_server(server: LocalServer) -> Iterator[None]:
 
     path = _record_path(urlsplit(server.url).port or 80)
     if path is None:
-        raise FileNotFoundError(errno.ENOENT, "no home folder is known", f"user {os.getuid()}")
+        raise FileNotFoundError(errno.ENOENT, "no home folder", f"user {os.getuid()}")
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not _is_private(path.parent.lstat()):
         path.parent.chmod(0o700)
@@ -146,12 +146,12 @@ def _is_locked(descriptor: int) -> bool:
     return False
 
 
-def _is_same_address(asked: SplitResult, listening: SplitResult) -> bool:
-    if asked.path.strip("/") or not (asked.hostname and listening.hostname):
+def _is_same_address(requested: SplitResult, listening: SplitResult) -> bool:
+    if requested.path.strip("/") or not (requested.hostname and listening.hostname):
         return False
-    if asked.hostname == "localhost":
+    if requested.hostname == "localhost":
         return True
-    return _ip_address(asked.hostname) == _ip_address(listening.hostname)
+    return _ip_address(requested.hostname) == _ip_address(listening.hostname)
 
 
 def _ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:

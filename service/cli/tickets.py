@@ -88,7 +88,7 @@ def remark_unreachable(urls: list[str], host: str) -> None:
     if any("%25" in url for url in urls):
         remark(
             "an address with %25 is for a node or a Python program on the same cable: replace the "
-            "interface name after it by the name on the other machine"
+            "interface name after it by the other machine's"
         )
 
 
