@@ -259,7 +259,7 @@ class FootOptions:
             )
         if scene.array.bus == EMULATED and scene.ground.kind == "trace" and self.load is None:
             raise UsageError(
-                f"scene {scene.name!r} presses a recorded load, and none was given",
+                f"scene {scene.name!r} needs a recorded load, and none is named",
                 remedy="Add --load FILE",
             )
         offset_m = parse_pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
