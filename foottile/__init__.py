@@ -1,4 +1,4 @@
-"""FootTile from Python: a client of its server. Imports nothing of what servers and nodes run.
+"""Python client of a FootTile server; independent of the code of servers and nodes.
 
     import foottile
 
@@ -6,9 +6,9 @@
         for batch in server.live("left", columns=["grf_n", "cop_x_m"]):
             print(batch["grf_n"][-1])
 
-Sessions are listed, searched, and opened as Arrow, pandas and numpy, cut on the server; nodes are
-tared, recorded and marked. `connect_async` has the same for asyncio. Everything that this package
-raises on purpose is a `FootTileError`.
+It lists, searches and opens sessions as Arrow, pandas and numpy; the server cuts the slices. It
+tares and records nodes, and adds markers. `connect_async` is the same for asyncio. All its errors
+are `FootTileError`s.
 """
 
 from __future__ import annotations
@@ -18,42 +18,42 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import os
 
-    from foottile.data import Data as Data
+    from foottile.asyncio_client import AsyncServer as AsyncServer
+    from foottile.data import SessionData as SessionData
+    from foottile.errors import AccessDeniedError as AccessDeniedError
     from foottile.errors import ConflictError as ConflictError
     from foottile.errors import DamagedError as DamagedError
     from foottile.errors import FootTileError as FootTileError
     from foottile.errors import FramesLostWarning as FramesLostWarning
-    from foottile.errors import NoAnswerError as NoAnswerError
-    from foottile.errors import RefusedError as RefusedError
-    from foottile.errors import UnknownError as UnknownError
+    from foottile.errors import NotFoundError as NotFoundError
+    from foottile.errors import ServerUnavailableError as ServerUnavailableError
     from foottile.errors import UsageError as UsageError
-    from foottile.live import Live as Live
-    from foottile.live_protocol import Loss as Loss
+    from foottile.live import LiveStream as LiveStream
+    from foottile.live_protocol import FrameLoss as FrameLoss
     from foottile.server import Server as Server
     from foottile.sessions import Marker as Marker
     from foottile.sessions import Session as Session
-    from foottile.with_asyncio import AsyncServer as AsyncServer
 
-_PLACES = {
-    "AsyncServer": "with_asyncio",
+_MODULES = {
+    "AccessDeniedError": "errors",
+    "AsyncServer": "asyncio_client",
     "ConflictError": "errors",
     "DamagedError": "errors",
-    "Data": "data",
     "FootTileError": "errors",
+    "FrameLoss": "live_protocol",
     "FramesLostWarning": "errors",
-    "Live": "live",
-    "Loss": "live_protocol",
+    "LiveStream": "live",
     "Marker": "sessions",
-    "NoAnswerError": "errors",
-    "RefusedError": "errors",
+    "NotFoundError": "errors",
     "Server": "server",
+    "ServerUnavailableError": "errors",
     "Session": "sessions",
-    "UnknownError": "errors",
+    "SessionData": "data",
     "UsageError": "errors",
 }
-"""Modules are imported when they are first asked for: Arrow alone takes longer than all of ours."""
+"""Module of each public name; imported at first use, because importing Arrow is slow."""
 
-__all__ = sorted([*_PLACES, "connect", "connect_async"])  # noqa: PLE0605  # names of the table above
+__all__ = sorted([*_MODULES, "connect", "connect_async"])  # noqa: PLE0605  # names of the table above
 
 
 def connect(
@@ -63,18 +63,17 @@ def connect(
     timeout_s: float = 10.0,
     ca: str | os.PathLike[str] | None = None,
 ) -> Server:
-    """A server; use it as a context manager, or `close` it. Nothing is asked yet.
+    """Return a client of a server, without a request yet; a context manager, or `close` it.
 
     Args:
-        url: its address, `http://HOST:PORT`.
-        token: its token; None: FOOTTILE_TOKEN, else that of a server which this user runs on this
-            machine. To read, none is needed unless the server is private.
-        timeout_s: how long an answer may keep one waiting.
-        ca: file or folder of CA certificates in PEM, beside those that this machine trusts, as
-            those of a laboratory.
+        url: address of the server, `http://HOST:PORT`.
+        token: its token; None: FOOTTILE_TOKEN, else the token of a server which this user runs on
+            this machine. Reading needs a token only on a private server.
+        timeout_s: timeout of a request.
+        ca: file or folder of further CA certificates in PEM, for example a laboratory's.
 
     Raises:
-        UsageError: that is no address, token or certificate.
+        UsageError: invalid address, token or certificate.
     """
     from foottile.server import Server
 
@@ -88,19 +87,19 @@ def connect_async(
     timeout_s: float = 10.0,
     ca: str | os.PathLike[str] | None = None,
 ) -> AsyncServer:
-    """The same for asyncio; arguments and errors as of `connect`."""
-    from foottile.with_asyncio import AsyncServer
+    """Return a client for asyncio; arguments and errors as for `connect`."""
+    from foottile.asyncio_client import AsyncServer
 
     return AsyncServer(url, token, timeout_s=timeout_s, ca=ca)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'foottile' has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"foottile.{_PLACES[name]}"), name)
+    return getattr(import_module(f"foottile.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_PLACES]
+    return [*globals(), *_MODULES]

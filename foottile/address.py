@@ -1,4 +1,4 @@
-"""Addresses of servers, as people write them."""
+"""Addresses of servers as users type them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 
 
 def decode_zone(url: str) -> str:
-    """Return an address whose IPv6 zone is written as sockets take it.
+    """Return an address with its IPv6 zone in the notation of sockets.
 
     A URL has `%25` in front of the zone (RFC 6874): `http://[fe80::1%25eth0]:8000`; a socket, `%`.
     """

@@ -1,4 +1,4 @@
-"""Frames of a session: nothing is fetched before it is asked for, and no more than that."""
+"""Lazy access to the frames of a session."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from foottile.errors import DamagedError, FootTileError, UsageError
-from foottile.http import Http
+from foottile.http import HttpClient
 
 if TYPE_CHECKING:
     import httpx
 
 Clock = Literal["node", "server"]
 
-_CHUNK = 1 << 16
-_BEGIN, _END = b"ARROW1\0\0", b"ARROW1"
-"""Of a file in Arrow's IPC format."""
+_CHUNK_BYTES = 1 << 16
+_ARROW_START, _ARROW_END = b"ARROW1\0\0", b"ARROW1"
+"""First and last bytes of an Arrow IPC file."""
 
 
 @dataclass(frozen=True)
-class Data:
-    """Frames of a session, or a slice of them; the server cuts and sends only what is asked for.
+class SessionData:
+    """Frames of a session, or a slice of them; the server sends only the selected part.
 
-    `data["grf_n"]` is a column as numpy, `data[["t_ns", "grf_n"]]` and `data[2.0:3.0]` (seconds
-    from the session's first frame) are less of the same, and fetch nothing.
+    `data["grf_n"]` fetches a column as numpy. `data[["t_ns", "grf_n"]]` and `data[2.0:3.0]`
+    (seconds from the session's first frame) select a part and fetch nothing.
 
     Attributes:
         columns: names, of all tiles (`force_n`) or one (`force_n_0`); empty: all.
-        start_s: from so many seconds after the first frame on; None: from the beginning.
-        end_s: before so many seconds; None: to the end.
-        clock: of `server` there are also `t_server_ns`, each frame's instant in the server's UTC,
-            as markers have it, and its bound `t_server_uncertainty_ns`.
+        start_s: first instant, seconds after the first frame; None: the beginning.
+        end_s: end, exclusive, seconds after the first frame; None: the end.
+        clock: `server` adds `t_server_ns`, each frame's instant in the server's UTC, comparable
+            with markers, and its bound `t_server_uncertainty_ns`.
     """
 
-    _http: Http
+    _http: HttpClient
     session_id: str
     columns: tuple[str, ...] = ()
     start_s: float | None = None
@@ -47,34 +47,34 @@ class Data:
     clock: Clock = "node"
 
     @overload
-    def __getitem__(self, what: str) -> npt.NDArray[Any]: ...
+    def __getitem__(self, key: str) -> npt.NDArray[Any]: ...
     @overload
-    def __getitem__(self, what: slice | list[str] | tuple[str, ...]) -> Data: ...
+    def __getitem__(self, key: slice | list[str] | tuple[str, ...]) -> SessionData: ...
     def __getitem__(
-        self, what: str | slice | list[str] | tuple[str, ...]
-    ) -> Data | npt.NDArray[Any]:
-        """A column as numpy, [n] or [n, tiles]; or less of the same.
+        self, key: str | slice | list[str] | tuple[str, ...]
+    ) -> SessionData | npt.NDArray[Any]:
+        """Return a column as numpy, [n] or [n, tiles]; or a selection of columns or seconds.
 
         Raises:
-            UsageError: a slice with a step, or what is no column's name.
-            FootTileError: as for `batches`.
+            UsageError: a slice with a step, or an invalid column name.
+            FootTileError: as for `iter_batches`.
         """
-        if isinstance(what, str):
-            columns = list(replace(self, columns=(what,)).numpy().values())
+        if isinstance(key, str):
+            columns = list(replace(self, columns=(key,)).to_numpy().values())
             return columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
-        if isinstance(what, slice):
-            return self._between(what)
-        names = tuple(what)
+        if isinstance(key, slice):
+            return self._slice_seconds(key)
+        names = tuple(key)
         if not names or not all(isinstance(name, str) for name in names):
-            raise UsageError(f"{what!r} is no list of columns")
+            raise UsageError(f"{key!r} is no list of columns")
         return replace(self, columns=names)
 
-    def batches(self) -> Iterator[pa.RecordBatch]:
-        """The frames, some thousand at a time, as they come over the network.
+    def iter_batches(self) -> Iterator[pa.RecordBatch]:
+        """Yield the frames in batches of some thousand, as the network delivers them.
 
         Raises:
-            UsageError: there is no such column, or no such time in the session.
-            FootTileError: no answer, no such session, or what came is damaged or broke off.
+            UsageError: no such column, or no such time in the session.
+            FootTileError: no response, no such session, or a damaged or interrupted response.
         """
         query = {
             "format": "arrow",
@@ -83,85 +83,85 @@ class Data:
             "end_s": self.end_s,
             "clock": self.clock,
         }
-        with self._http.stream(f"/sessions/{self.session_id}/data", query) as answer:
-            # Buffered: Arrow takes a read that gives less than it asked for as the end.
-            content = io.BufferedReader(_Reading(answer), _CHUNK)
+        with self._http.stream(f"/sessions/{self.session_id}/data", query) as response:
+            # Buffered: Arrow treats a short read as the end of the file.
+            content = io.BufferedReader(_ResponseFile(response), _CHUNK_BYTES)
             try:
                 yield from _read_batches(content)
-            except FootTileError:  # some are OSErrors, too
+            except FootTileError:  # some are also OSErrors
                 raise
             except (pa.ArrowInvalid, OSError, EOFError) as error:
                 raise DamagedError(
-                    f"session {self.session_id} did not come whole: {error}"
+                    f"session {self.session_id} arrived incomplete or damaged: {error}"
                 ) from error
 
-    def arrow(self) -> pa.Table:
-        """All of it as an Arrow table; units and descriptions are in its fields' metadata.
+    def to_arrow(self) -> pa.Table:
+        """Return an Arrow table; units and descriptions are in the metadata of its fields.
 
         Raises:
-            FootTileError: as for `batches`.
+            FootTileError: as for `iter_batches`, or the slice has no frame.
         """
-        batches = list(self.batches())
+        batches = list(self.iter_batches())
         if not batches:
             raise FootTileError(f"session {self.session_id} has no frame in this slice")
         return pa.Table.from_batches(batches)
 
-    def pandas(self) -> Any:
-        """All of it as a pandas DataFrame; what is not known is NaN.
+    def to_pandas(self) -> Any:
+        """Return a pandas DataFrame; unknown values are NaN.
 
         Raises:
-            FootTileError: as for `batches`, or pandas is not installed.
+            FootTileError: as for `to_arrow`, or pandas is not installed.
         """
         try:
-            return self.arrow().to_pandas()
+            return self.to_arrow().to_pandas()
         except ModuleNotFoundError as error:
             raise FootTileError("this needs pandas: pip install pandas") from error
 
-    def numpy(self) -> dict[str, npt.NDArray[Any]]:
-        """All of it as arrays by name, [n]; what is not known is NaN, also in columns of integers.
+    def to_numpy(self) -> dict[str, npt.NDArray[Any]]:
+        """Return arrays by name, [n]; unknown values are NaN, also in columns of integers.
 
         Raises:
-            FootTileError: as for `batches`.
+            FootTileError: as for `to_arrow`.
         """
-        table = self.arrow()
+        table = self.to_arrow()
         return {name: table[name].to_numpy() for name in table.column_names}
 
-    def _between(self, seconds: slice) -> Data:
+    def _slice_seconds(self, seconds: slice) -> SessionData:
         if seconds.step is not None:
-            raise UsageError("a slice of seconds has no step: every frame is given")
+            raise UsageError("a slice of seconds has no step; expected begin and end only")
         start_s = seconds.start if seconds.start is not None else self.start_s
         end_s = seconds.stop if seconds.stop is not None else self.end_s
         return replace(self, start_s=start_s, end_s=end_s)
 
 
 def _read_batches(content: io.BufferedIOBase) -> Iterator[pa.RecordBatch]:
-    """Read an Arrow file as it comes: behind its first bytes it is a stream.
+    """Yield the batches of an Arrow file while it arrives: after its first bytes it is a stream.
 
     Raises:
-        pa.ArrowInvalid, EOFError: it is damaged, or breaks off.
+        pa.ArrowInvalid, EOFError: the file is damaged or incomplete.
     """
-    if content.read(len(_BEGIN)) != _BEGIN:
-        raise EOFError("it is no Arrow file")
+    if content.read(len(_ARROW_START)) != _ARROW_START:
+        raise EOFError("not an Arrow file")
     with pa.ipc.open_stream(pa.PythonFile(content, mode="r")) as reader:
         yield from reader
-    if not content.read().endswith(_END):
-        raise EOFError("its end is missing")
+    if not content.read().endswith(_ARROW_END):
+        raise EOFError("the end is missing")
 
 
-class _Reading(io.RawIOBase):
-    """An answer as a file that is read once."""
+class _ResponseFile(io.RawIOBase):
+    """Response as a file for one sequential read."""
 
-    def __init__(self, answer: httpx.Response) -> None:
-        self._pieces = answer.iter_bytes(_CHUNK)
-        self._left = memoryview(b"")
+    def __init__(self, response: httpx.Response) -> None:
+        self._chunks = response.iter_bytes(_CHUNK_BYTES)
+        self._rest = memoryview(b"")
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any) -> int:
-        if not self._left:
-            self._left = memoryview(next(self._pieces, b""))
-        n = min(len(buffer), len(self._left))
-        buffer[:n] = self._left[:n]
-        self._left = self._left[n:]
+        if not self._rest:
+            self._rest = memoryview(next(self._chunks, b""))
+        n = min(len(buffer), len(self._rest))
+        buffer[:n] = self._rest[:n]
+        self._rest = self._rest[n:]
         return n

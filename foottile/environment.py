@@ -1,4 +1,4 @@
-"""Environment variables, as env files, service managers and Kubernetes write them."""
+"""Environment variables from env files, service managers and Kubernetes."""
 
 from __future__ import annotations
 

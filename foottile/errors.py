@@ -1,14 +1,14 @@
-"""Every error that this package raises on purpose.
+"""Errors of this package.
 
     FootTileError
-     +-- UsageError     (ValueError)       what was asked for cannot be: no such column, no address
-     +-- UnknownError   (LookupError)      no such node, session, stream
-     +-- RefusedError   (PermissionError)  a token is needed, or this one is not enough
-     +-- ConflictError                     not now: recording already, node away, changed by others
-     +-- NoAnswerError  (ConnectionError)  no server there, or it has gone, or is too slow
-     +-- DamagedError                      what came is not what the server has
+     +-- UsageError              (ValueError)       invalid request: column, address, time, format
+     +-- NotFoundError           (LookupError)      no such node, session or stream
+     +-- AccessDeniedError       (PermissionError)  token missing or insufficient
+     +-- ConflictError                              state forbids it: recording, node away, changed
+     +-- ServerUnavailableError  (ConnectionError)  no server, connection lost, or timeout
+     +-- DamagedError                               response differs from the server's data
 
-What a server answered as a problem (RFC 9457) is in `problem`, with its HTTP status in `status`.
+A problem response of the server (RFC 9457) is in `problem`, with its HTTP status in `status`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class FootTileError(Exception):
     """Base of all errors.
 
     Attributes:
-        problem: what the server answered, as it is; empty if it did not.
-        status: its HTTP status; None if there was no answer.
+        problem: problem response of the server; empty without a response.
+        status: HTTP status; None without a response.
     """
 
     def __init__(
@@ -35,55 +35,55 @@ class FootTileError(Exception):
 
 
 class UsageError(FootTileError, ValueError):
-    """What was asked for cannot be."""
+    """Invalid request: address, column, format, time or range."""
 
 
-class UnknownError(FootTileError, LookupError):
-    """There is no such node, session or stream."""
+class NotFoundError(FootTileError, LookupError):
+    """Unknown node, session or stream."""
 
 
-class RefusedError(FootTileError, PermissionError):
-    """A token is needed, or this one is not enough."""
+class AccessDeniedError(FootTileError, PermissionError):
+    """Missing or insufficient token."""
 
 
 class ConflictError(FootTileError):
-    """Not now: it is being recorded, its node is away, somebody else has changed it."""
+    """Conflict with the present state: session recording, node away, or metadata changed."""
 
 
-class NoAnswerError(FootTileError, ConnectionError):
-    """There is no server, it has gone, or it is too slow."""
+class ServerUnavailableError(FootTileError, ConnectionError):
+    """No usable response: no server, connection lost, timeout, or another program."""
 
 
 class DamagedError(FootTileError):
-    """What came is not what the server has."""
+    """Received data that is damaged or incomplete."""
 
 
 class FramesLostWarning(UserWarning):
-    """Frames of a live stream are missing for good; the text says which, and why."""
+    """Permanent loss of frames of a live stream; the text has their numbers and the reason."""
 
 
 _BY_STATUS: dict[int, type[FootTileError]] = {
     HTTPStatus.BAD_REQUEST: UsageError,
-    HTTPStatus.UNAUTHORIZED: RefusedError,
-    HTTPStatus.FORBIDDEN: RefusedError,
-    HTTPStatus.NOT_FOUND: UnknownError,
+    HTTPStatus.UNAUTHORIZED: AccessDeniedError,
+    HTTPStatus.FORBIDDEN: AccessDeniedError,
+    HTTPStatus.NOT_FOUND: NotFoundError,
     HTTPStatus.CONFLICT: ConflictError,
     HTTPStatus.PRECONDITION_FAILED: ConflictError,
     HTTPStatus.REQUEST_ENTITY_TOO_LARGE: UsageError,
     HTTPStatus.UNPROCESSABLE_ENTITY: UsageError,
-    HTTPStatus.REQUEST_TIMEOUT: NoAnswerError,
-    HTTPStatus.SERVICE_UNAVAILABLE: NoAnswerError,
+    HTTPStatus.REQUEST_TIMEOUT: ServerUnavailableError,
+    HTTPStatus.SERVICE_UNAVAILABLE: ServerUnavailableError,
 }
 
 
-def refused(status: int, content: object, url: str, *, otherwise: str = "") -> FootTileError:
-    """The error for a server's answer that is one.
+def make_error(status: int, content: object, url: str, *, otherwise: str = "") -> FootTileError:
+    """Return the error for an error response.
 
     Args:
-        status: of the answer.
-        content: its JSON, if it is some.
-        url: the server's address, for the text.
-        otherwise: said if the answer has no detail.
+        status: HTTP status.
+        content: JSON content, if any.
+        url: address of the server, for the text.
+        otherwise: text for a response without detail.
     """
     problem = content if isinstance(content, dict) else {}
     detail = problem.get("detail") or otherwise or f"HTTP {status}"

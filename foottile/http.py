@@ -1,4 +1,4 @@
-"""Questions to a server over HTTP, and what is wrong with its answers."""
+"""HTTP client of a server: requests, and errors for its problem responses."""
 
 from __future__ import annotations
 
@@ -12,31 +12,32 @@ from typing import Any
 
 from foottile.address import decode_zone
 from foottile.environment import check_token, read_token
-from foottile.errors import FootTileError, NoAnswerError, UsageError, refused
-from foottile.foreign import explain_foreign
+from foottile.errors import FootTileError, ServerUnavailableError, UsageError, make_error
+from foottile.foreign_response import explain_foreign_response
 from foottile.local_server import find_local_server
 from foottile.tls import explain_tls, make_context
 
 try:
     import httpx
-except ModuleNotFoundError as error:  # a node needs none
+except ModuleNotFoundError as error:  # a node does not need it
     raise UsageError("foottile needs httpx: pip install 'foottile[client]'") from error
 
 API = "/api/v1"
-_TRIES = 2
+_ATTEMPTS_MAX = 2
 
 
-class Http:
-    """One server over HTTP; may be used from several threads.
+class HttpClient:
+    """Thread-safe HTTP client of one server.
 
     Args:
-        url: its address.
-        token: its token; None: FOOTTILE_TOKEN, else that of this user's server on this machine.
-        timeout_s: how long an answer may keep one waiting.
-        ca: file or folder of CA certificates, beside those that the machine trusts.
+        url: address of the server.
+        token: its token; None: FOOTTILE_TOKEN, else the token of this user's server on this
+            machine.
+        timeout_s: timeout of a request.
+        ca: file or folder of further CA certificates, beside the machine's.
 
     Raises:
-        UsageError: that is no address, token or certificate.
+        UsageError: invalid address, token or certificate.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class Http:
         scheme, separator, rest = decode_zone(url.strip().rstrip("/")).partition("://")
         self.url = scheme.lower() + separator + rest
         self.context = make_context(ca) if self.url.startswith("https:") else None
-        """Whom it trusts, if it is asked with TLS."""
+        """Trusted CAs; None without TLS."""
         if ca is not None and self.context is None:
             raise UsageError(f"{self.url}: a CA is for addresses with https://")
         token = check_token(token, "the token") if token else read_token()
@@ -70,26 +71,26 @@ class Http:
             raise UsageError(f"{url!r} is no server address; expected http://HOST:PORT")
 
     def close(self) -> None:
-        """Close its connections."""
+        """Close all connections."""
         self._client.close()
 
     def get(
-        self, path: str, query: Mapping[str, object] | None = None, *, has: str = ""
+        self, path: str, query: Mapping[str, object] | None = None, *, field: str = ""
     ) -> dict[str, Any]:
-        """Ask for JSON.
+        """Return a JSON resource.
 
         Args:
-            path: behind `/api/v1`.
-            query: what is None is left out, and of a list each is asked for.
-            has: a field that the answer of a foottile server has.
+            path: path below `/api/v1`.
+            query: parameters; None values are omitted, a list repeats its name.
+            field: field that every valid response has.
 
         Raises:
-            FootTileError: no answer, or one that is a problem.
+            FootTileError: no response, or a problem response.
         """
-        content = self._asked("GET", path, _TRIES, params=_given(query))
-        if has and has not in content:
-            raise NoAnswerError(
-                f"{self.url}: the answer to {API}{path} has no {has!r}; expected a foottile "
+        content = self._request("GET", path, _ATTEMPTS_MAX, params=_encode_query(query))
+        if field and field not in content:
+            raise ServerUnavailableError(
+                f"{self.url}: the answer to {API}{path} has no {field!r}; expected a foottile "
                 "server's. Another program may have this address"
             )
         return content
@@ -101,23 +102,23 @@ class Http:
         body: Mapping[str, object] | None = None,
         *,
         headers: Mapping[str, str] | None = None,
-        again: bool = False,
+        is_idempotent: bool = False,
     ) -> dict[str, Any]:
-        """Change something.
+        """Send a change and return the JSON response.
 
         Args:
-            method: POST, PATCH or DELETE.
-            path: behind `/api/v1`.
-            body: as JSON; what is None is left out.
-            headers: further ones.
-            again: may it be sent twice, if there was no answer the first time?
+            method: POST, PUT, PATCH or DELETE.
+            path: path below `/api/v1`.
+            body: JSON content; None values are omitted.
+            headers: further headers.
+            is_idempotent: send it again if the first response is lost.
 
         Raises:
-            FootTileError: no answer, or one that is a problem.
+            FootTileError: no response, or a problem response.
         """
-        given = None if body is None else {k: v for k, v in body.items() if v is not None}
-        tries = _TRIES if again else 1
-        return self._asked(method, path, tries, json=given, headers=dict(headers or {}))
+        content = None if body is None else {k: v for k, v in body.items() if v is not None}
+        attempts = _ATTEMPTS_MAX if is_idempotent else 1
+        return self._request(method, path, attempts, json=content, headers=dict(headers or {}))
 
     @contextmanager
     def stream(
@@ -127,89 +128,91 @@ class Http:
         *,
         headers: Mapping[str, str] | None = None,
     ) -> Iterator[httpx.Response]:
-        """An answer whose content is read in pieces.
+        """Yield a response whose content is read in chunks.
 
         Args:
-            path: behind `/api/v1`.
-            query: as of `get`.
-            headers: further ones.
+            path: path below `/api/v1`.
+            query: as for `get`.
+            headers: further headers.
 
         Raises:
-            FootTileError: no answer, one that is a problem, or one that broke off.
+            FootTileError: no response, a problem response, or an interrupted one.
         """
-        has_begun = False
+        has_response = False
         try:
             with self._client.stream(
-                "GET", path, params=_given(query), headers=dict(headers or {})
-            ) as answer:
-                has_begun = True
-                self._check_ours(answer)
-                if answer.is_error:
-                    answer.read()
-                    raise self._problem(answer)
-                yield answer
+                "GET", path, params=_encode_query(query), headers=dict(headers or {})
+            ) as response:
+                has_response = True
+                self._check_origin(response)
+                if response.is_error:
+                    response.read()
+                    raise self._make_error(response)
+                yield response
         except httpx.HTTPError as error:
-            if has_begun:
-                raise NoAnswerError(f"{self.url}: the answer broke off: {error}.") from error
-            raise self._no_answer(error) from error
+            if has_response:
+                text = f"{self.url}: the answer broke off: {error}."
+                raise ServerUnavailableError(text) from error
+            raise self._make_unavailable_error(error) from error
 
-    def _asked(self, method: str, path: str, tries: int, **how: Any) -> dict[str, Any]:
+    def _request(self, method: str, path: str, attempts: int, **options: Any) -> dict[str, Any]:
         if self._client.is_closed:
             raise UsageError(f"{self.url}: this connection was closed; make a new one")
         while True:
-            tries -= 1
+            attempts -= 1
             try:
-                answer = self._client.request(method, path, **how)
+                response = self._client.request(method, path, **options)
                 break
             except httpx.TransportError as error:
-                if tries <= 0 or isinstance(error, httpx.TimeoutException):
-                    raise self._no_answer(error) from error
+                if attempts <= 0 or isinstance(error, httpx.TimeoutException):
+                    raise self._make_unavailable_error(error) from error
             except httpx.HTTPError as error:
-                raise self._no_answer(error) from error
-        self._check_ours(answer)
-        if answer.is_error:
-            raise self._problem(answer)
-        if answer.status_code == HTTPStatus.NO_CONTENT:
+                raise self._make_unavailable_error(error) from error
+        self._check_origin(response)
+        if response.is_error:
+            raise self._make_error(response)
+        if response.status_code == HTTPStatus.NO_CONTENT:
             return {}
-        content = _json(answer)
+        content = _parse_json(response)
         if not isinstance(content, dict):
-            self._check_ours(answer, expected="JSON")
-        assert isinstance(content, dict)  # noqa: S101  # else the line above has raised
+            self._check_origin(response, expected="JSON")
+        assert isinstance(content, dict)  # noqa: S101  # `_check_origin` raises otherwise
         return content
 
-    def _check_ours(self, answer: httpx.Response, *, expected: str = "") -> None:
-        """Refuse an answer that is another program's."""
-        status, headers = answer.status_code, dict(answer.headers)
-        foreign = explain_foreign(str(answer.url), status, headers, expected=expected)
-        if foreign is not None:
-            raise NoAnswerError(f"{self.url}: {foreign}", status=status)
+    def _check_origin(self, response: httpx.Response, *, expected: str = "") -> None:
+        """Reject a response of another program."""
+        status, headers = response.status_code, dict(response.headers)
+        problem = explain_foreign_response(str(response.url), status, headers, expected=expected)
+        if problem is not None:
+            raise ServerUnavailableError(f"{self.url}: {problem}", status=status)
 
-    def _problem(self, answer: httpx.Response) -> FootTileError:
-        reason = f"{answer.reason_phrase} (HTTP {answer.status_code})"
-        return refused(answer.status_code, _json(answer), self.url, otherwise=reason)
+    def _make_error(self, response: httpx.Response) -> FootTileError:
+        reason = f"{response.reason_phrase} (HTTP {response.status_code})"
+        return make_error(response.status_code, _parse_json(response), self.url, otherwise=reason)
 
-    def _no_answer(self, error: Exception) -> NoAnswerError:
-        if (of_tls := explain_tls(error)) is not None:
-            return NoAnswerError(f"{self.url}: {of_tls}")
-        said = str(error) or type(error).__name__
-        return NoAnswerError(f"{self.url}: no answer: {said}. Is `foottile serve` running there?")
+    def _make_unavailable_error(self, error: Exception) -> ServerUnavailableError:
+        if (tls_problem := explain_tls(error)) is not None:
+            return ServerUnavailableError(f"{self.url}: {tls_problem}")
+        reason = str(error) or type(error).__name__
+        text = f"{self.url}: no answer: {reason}. Is `foottile serve` running there?"
+        return ServerUnavailableError(text)
 
 
-def _json(answer: httpx.Response) -> object:
+def _parse_json(response: httpx.Response) -> object:
     try:
-        content: object = json.loads(answer.content)
+        content: object = json.loads(response.content)
     except ValueError:
         return None
     return content
 
 
-def _given(query: Mapping[str, object] | None) -> dict[str, str | list[str]]:
+def _encode_query(query: Mapping[str, object] | None) -> dict[str, str | list[str]]:
     return {
-        name: [_text(each) for each in value] if isinstance(value, list) else _text(value)
+        name: [_encode(each) for each in value] if isinstance(value, list) else _encode(value)
         for name, value in (query or {}).items()
         if value is not None
     }
 
 
-def _text(value: object) -> str:
+def _encode(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,4 +1,4 @@
-"""A live stream: an iterator of Arrow batches that goes on by itself when its connection breaks."""
+"""Live stream for threads: an iterator of Arrow batches that reconnects by itself."""
 
 from __future__ import annotations
 
@@ -11,50 +11,50 @@ import pyarrow as pa
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
-from foottile.closing import Closing
+from foottile.closeable import Closeable
 from foottile.errors import FootTileError
-from foottile.live_state import LiveState
-from foottile.websocket import Connection
+from foottile.live_state import LiveStreamState
+from foottile.websocket import Websocket
 
 
-class Live(LiveState, Closing):
-    """Made by `Server.live`. It connects when the first batch is asked for; `close` ends it.
+class LiveStream(LiveStreamState, Closeable):
+    """Iterator of live batches, created by `Server.live`; connects at the first batch.
 
-    Each batch has consecutive frames of one stream, with `seq`, `t_ns`, the columns asked for, and
-    `is_recomputed`. The array is described in `batch.schema.metadata[b"foottile.array_info"]`.
+    Each batch has consecutive frames of one stream, with `seq`, `t_ns`, the requested columns, and
+    `recomputed`. `batch.schema.metadata[b"foottile.array_info"]` describes the array.
     """
 
-    def __init__(self, *asked: Any, **how: Any) -> None:
-        self._closing = ExitStack()
+    def __init__(self, *request: Any, **options: Any) -> None:
+        self._exit_stack = ExitStack()
         self._socket: ClientConnection | None = None
-        super().__init__(*asked, **how)
+        super().__init__(*request, **options)
 
     def __del__(self) -> None:
-        # A `for` loop that is left has nobody else who would close it.
+        # Nothing else closes the stream of a `for` loop that ends early.
         self.close()
 
     def __iter__(self) -> Iterator[pa.RecordBatch]:
         return self
 
     def __next__(self) -> pa.RecordBatch:
-        """The next frames; waits for them.
+        """Wait for the next frames and return them.
 
         Raises:
-            UsageError: what was asked for is not there.
-            NoAnswerError: there is no server, at first, or not for `give_up_s`.
-            FootTileError: it refuses, or is no foottile server.
-            StopIteration: it was closed.
+            UsageError: no such node, column or stream.
+            ServerUnavailableError: no server at first, or not for `reconnect_timeout_s`.
+            FootTileError: the server rejects the request, or is no foottile server.
+            StopIteration: the stream was closed.
         """
-        while not self._is_over:
+        while not self._is_closed:
             try:
-                message = self._connected().recv()
+                message = self._connect().recv()
             except ConnectionClosed as end:
-                self._drop()
-                time.sleep(self._closed_s(end))
+                self._disconnect()
+                time.sleep(self._delay_after_close_s(end))
                 continue
-            self._heard_s = time.monotonic()
+            self._last_message_s = time.monotonic()
             try:
-                batch = self._protocol.take(message)
+                batch = self._protocol.parse_message(message)
             except FootTileError:
                 self.close()
                 raise
@@ -64,25 +64,24 @@ class Live(LiveState, Closing):
 
     @property
     def is_connected(self) -> bool:
-        """Is there a connection now?"""
+        """State of the connection."""
         return self._socket is not None
 
     def close(self) -> None:
-        """End it; who waits for a batch, in another thread, gets none any more."""
-        self._is_over = True
-        self._drop()
+        """End the stream, also for a thread that waits for a batch."""
+        self._is_closed = True
+        self._disconnect()
 
-    def _drop(self) -> None:
+    def _disconnect(self) -> None:
         self._socket = None
-        self._closing.close()
+        self._exit_stack.close()
 
-    def _connected(self) -> ClientConnection:
+    def _connect(self) -> ClientConnection:
         while self._socket is None:
             try:
-                connection = connect(
-                    self._protocol.address(), create_connection=Connection, **self._options()
-                )
-                self._socket = self._closing.enter_context(connection)
+                url, options = self._protocol.make_url(), self._get_options()
+                connection = connect(url, create_connection=Websocket, **options)
+                self._socket = self._exit_stack.enter_context(connection)
             except (OSError, InvalidHandshake, EOFError) as error:
-                time.sleep(self._failed_s(error))
+                time.sleep(self._delay_after_failure_s(error))
         return self._socket

@@ -1,4 +1,4 @@
-"""What is said on a live websocket, and when to go on after it broke: no socket, no clock here."""
+"""Protocol of a live websocket without socket and clock: messages, positions and retry delays."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from foottile.errors import (
     DamagedError,
     FootTileError,
     FramesLostWarning,
-    NoAnswerError,
+    ServerUnavailableError,
     UsageError,
-    refused,
+    make_error,
 )
-from foottile.foreign import explain_foreign
+from foottile.foreign_response import explain_foreign_response
 from foottile.tls import explain_tls
 
 Policy = Literal["lossless", "drop_oldest", "latest"]
@@ -30,20 +30,20 @@ POLICIES: tuple[Policy, ...] = get_args(Policy)
 MESSAGE_BYTES_MAX = 1 << 24
 _POLICY, _NO_STREAM, _UNREADABLE = 1008, 4011, 4012
 _LOSSES_MAX = 1000
-_AGAIN_S = (0.1, 5.0)
+_RETRY_DELAYS_S = (0.1, 5.0)
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is asked for.
+class LiveRequest:
+    """Request for a live stream.
 
     Attributes:
-        url: the server's address.
-        node: the node; None: the only one.
-        columns: names; none: all.
-        policy: what is left out, if anything.
-        stream_id: stream to begin in; None: the present one.
-        from_seq: frame to begin with; None: the next that comes.
+        url: address of the server.
+        node: name of the node; None: the only one.
+        columns: names; empty: all.
+        policy: rule for dropping frames of a slow reader.
+        stream_id: stream of the first frame; None: the present one.
+        from_seq: number of the first frame; None: the next frame.
     """
 
     url: str
@@ -54,24 +54,24 @@ class Asked:
     from_seq: int | None = None
 
     @classmethod
-    def of(
+    def create(
         cls, url: str, node: str | None, columns: str | Sequence[str], policy: Policy, *begin: Any
-    ) -> Asked:
-        """The same, where a name alone may stand for columns."""
+    ) -> LiveRequest:
+        """Return a request; `columns` may be a single name."""
         return cls(
             url, node, (columns,) if isinstance(columns, str) else (*columns,), policy, *begin
         )
 
 
 @dataclass(frozen=True)
-class Loss:
-    """Frames that are left out of a live stream, ends included.
+class FrameLoss:
+    """Interval of frames that a live stream lacks, ends included.
 
     Attributes:
-        stream_id: the stream.
-        from_seq: the first of them.
-        to_seq: the last of them; None: not known.
-        reason: why; as docs/api.md says.
+        stream_id: id of the stream.
+        from_seq: first missing frame.
+        to_seq: last missing frame; None: unknown.
+        reason: reason as in docs/api.md.
     """
 
     stream_id: str
@@ -86,153 +86,160 @@ class Loss:
 
 
 class LiveProtocol:
-    """A live stream over as many connections as it takes.
+    """State of a live stream across connections.
 
     Args:
-        asked: what for.
-        on_loss: told of frames that are left out; None: warned of, for `lossless`.
+        request: node, columns, policy and position.
+        on_loss: receives each loss; None: a loss is a warning, for `lossless`.
     """
 
-    def __init__(self, asked: Asked, on_loss: Callable[[Loss], None] | None = None) -> None:
-        self.losses: deque[Loss] = deque(maxlen=_LOSSES_MAX)
-        """What was left out, as far as it was said; the newest thousand."""
-        self._asked = asked
+    def __init__(
+        self, request: LiveRequest, on_loss: Callable[[FrameLoss], None] | None = None
+    ) -> None:
+        self.losses: deque[FrameLoss] = deque(maxlen=_LOSSES_MAX)
+        """Newest thousand losses that the server reported."""
+        self._request = request
         self._on_loss = on_loss
-        self._stream_id, self._next_seq = asked.stream_id, asked.from_seq
+        self._stream_id, self._next_seq = request.stream_id, request.from_seq
         self._schema: pa.Schema | None = None
         self._failures = 0
-        self._has_begun = False
+        self._has_connected = False
 
     @property
     def position(self) -> tuple[str, int] | None:
-        """Stream and number of the frame that is wanted next; None before the first."""
+        """Stream and number of the next frame; None before the first."""
         if self._stream_id is None or self._next_seq is None:
             return None
         return self._stream_id, self._next_seq
 
-    def address(self) -> str:
-        """Where to connect to, to begin or to go on."""
-        asked = self._asked
-        query = {"format": "arrow", "policy": asked.policy}
-        given = {"node": asked.node, "columns": ",".join(asked.columns) or None}
+    def make_url(self) -> str:
+        """Return the websocket address that begins or resumes the stream."""
+        request = self._request
+        query = {"format": "arrow", "policy": request.policy}
+        given = {"node": request.node, "columns": ",".join(request.columns) or None}
         given |= {"stream_id": self._stream_id}
         given |= {"from_seq": None if self._next_seq is None else str(self._next_seq)}
         query |= {name: value for name, value in given.items() if value is not None}
         self._schema = None
-        return f"ws{asked.url.removeprefix('http')}/api/v1/live?{urlencode(query)}"
+        return f"ws{request.url.removeprefix('http')}/api/v1/live?{urlencode(query)}"
 
-    def take(self, message: str | bytes) -> pa.RecordBatch | None:
-        """A message; its frames, if it has some.
+    def parse_message(self, message: str | bytes) -> pa.RecordBatch | None:
+        """Return the new frames of a message; None without frames.
 
         Raises:
-            DamagedError: it is not one of a foottile server.
+            DamagedError: not a valid message of a foottile server.
         """
-        self._has_begun = True
+        self._has_connected = True
         try:
             if isinstance(message, str):
-                self._said(json.loads(message))
+                self._parse_text(json.loads(message))
                 return None
             if self._schema is None:
                 self._schema = pa.ipc.read_schema(pa.py_buffer(message))
                 return None
-            return self._news(pa.ipc.read_record_batch(pa.py_buffer(message), self._schema))
+            return self._drop_known(pa.ipc.read_record_batch(pa.py_buffer(message), self._schema))
         except (ValueError, KeyError, TypeError, pa.ArrowException) as error:
-            raise DamagedError(f"{self._asked.url}: not a live message: {error}") from error
+            raise DamagedError(f"{self._request.url}: not a live message: {error}") from error
 
-    def closed(self, code: int, reason: str) -> None:
-        """The connection has ended; it is to be opened again, unless this raises.
+    def check_close(self, code: int, reason: str) -> None:
+        """Handle the close code of a connection; returning means: reconnect.
 
         Raises:
-            UsageError: what was asked for is not there.
-            DamagedError: the server cannot read the frame that is wanted next.
+            UsageError: no such node, column or stream.
+            DamagedError: the server cannot read the next frame.
         """
         if code == _POLICY:
-            raise UsageError(f"{self._asked.url}: {reason}")
+            raise UsageError(f"{self._request.url}: {reason}")
         if code == _UNREADABLE:
-            raise DamagedError(f"{self._asked.url}: {reason}")
+            raise DamagedError(f"{self._request.url}: {reason}")
         if code == _NO_STREAM:
-            if not self._has_begun or self._stream_id is None:
-                raise UsageError(f"{self._asked.url}: {reason}")
-            loss = Loss(self._stream_id, self._next_seq or 0, None, "no_stream")
-            self._stream_id, self._next_seq = None, 0  # all that there is of the present one
-            self._lose(loss)
+            if not self._has_connected or self._stream_id is None:
+                raise UsageError(f"{self._request.url}: {reason}")
+            loss = FrameLoss(self._stream_id, self._next_seq or 0, None, "no_stream")
+            self._stream_id, self._next_seq = None, 0  # all stored frames of the present one
+            self._add_loss(loss)
 
-    def refused(self, status: int, headers: Mapping[str, str], body: bytes) -> FootTileError | None:
-        """The server has answered with HTTP; None: it may be asked again.
+    def explain_rejection(
+        self, status: int, headers: Mapping[str, str], body: bytes
+    ) -> FootTileError | None:
+        """Return the error for an HTTP response in place of a websocket; None: retry.
 
         Args:
-            status: of the answer.
-            headers: of the answer, their names in small letters.
-            body: its content.
+            status: HTTP status.
+            headers: headers, with names in lower case.
+            body: content.
         """
-        foreign = explain_foreign(self._asked.url, status, headers)
-        if foreign is None and status == HTTPStatus.OK:  # it has not understood
-            foreign = explain_foreign(self._asked.url, status, headers, expected="a websocket")
-        if self._has_begun and (foreign is not None or status == HTTPStatus.SERVICE_UNAVAILABLE):
+        url = self._request.url
+        foreign = explain_foreign_response(url, status, headers)
+        if foreign is None and status == HTTPStatus.OK:  # no websocket server
+            foreign = explain_foreign_response(url, status, headers, expected="a websocket")
+        if self._has_connected and (
+            foreign is not None or status == HTTPStatus.SERVICE_UNAVAILABLE
+        ):
             return None
         if foreign is not None:
-            return NoAnswerError(f"{self._asked.url}: {foreign}", status=status)
+            return ServerUnavailableError(f"{url}: {foreign}", status=status)
         try:
             content: Any = json.loads(body)
         except ValueError:
             content = None
-        return refused(status, content, self._asked.url)
+        return make_error(status, content, url)
 
-    def again_s(self, error: Exception, silent_s: float, give_up_s: float | None) -> float:
-        """How long to wait before it is tried again.
+    def compute_retry_delay_s(
+        self, error: Exception, silence_s: float, timeout_s: float | None
+    ) -> float:
+        """Return the delay before the next attempt, with exponential backoff.
 
         Args:
-            error: what went wrong.
-            silent_s: since something was heard.
-            give_up_s: how long that may be; None: without end, once it has begun.
+            error: failure of the last attempt.
+            silence_s: time since the last message.
+            timeout_s: longest silence; None: unlimited after the first message.
 
         Raises:
-            NoAnswerError: it is not to be tried again.
+            ServerUnavailableError: no message yet, or a longer silence.
         """
-        if not self._has_begun or (give_up_s is not None and silent_s > give_up_s):
+        if not self._has_connected or (timeout_s is not None and silence_s > timeout_s):
             what = explain_tls(error) or f"no answer: {error}"
-            raise NoAnswerError(f"{self._asked.url}: {what}") from error
+            raise ServerUnavailableError(f"{self._request.url}: {what}") from error
         self._failures += 1
-        least, most = _AGAIN_S
+        least, most = _RETRY_DELAYS_S
         return float(min(most, least * 2 ** min(self._failures - 1, 10)))
 
-    def _said(self, said: dict[str, Any]) -> None:
-        kind = said["type"]
+    def _parse_text(self, message: dict[str, Any]) -> None:
+        kind = message["type"]
         if not isinstance(kind, str):
             raise TypeError("a message without a type")
         if kind == "stream":
-            if said["stream_id"] != self._stream_id or self._next_seq is None:
-                self._stream_id, self._next_seq = said["stream_id"], int(said["from_seq"])
+            if message["stream_id"] != self._stream_id or self._next_seq is None:
+                self._stream_id, self._next_seq = message["stream_id"], int(message["from_seq"])
             self._schema = None
         elif kind in ("lost", "dropped"):
-            self._check_next(int(said["from_seq"]))
-            self._stream_id, self._next_seq = said["stream_id"], int(said["to_seq"]) + 1
-            reason = str(said["reason"])
-            self._lose(Loss(said["stream_id"], int(said["from_seq"]), int(said["to_seq"]), reason))
+            first, last = int(message["from_seq"]), int(message["to_seq"])
+            self._check_no_gap(first)
+            self._stream_id, self._next_seq = message["stream_id"], last + 1
+            self._add_loss(FrameLoss(message["stream_id"], first, last, str(message["reason"])))
 
-    def _news(self, batch: pa.RecordBatch) -> pa.RecordBatch | None:
+    def _drop_known(self, batch: pa.RecordBatch) -> pa.RecordBatch | None:
         seq = batch.column("seq")
         first, last = seq[0].as_py(), seq[-1].as_py()
         if first is None or last is None or last - first + 1 != batch.num_rows:
-            raise ValueError("frames whose numbers do not follow one another")
-        self._check_next(first)
+            raise ValueError("the frame numbers are not consecutive")
+        self._check_no_gap(first)
         self._failures = 0
-        if self._next_seq is not None and first < self._next_seq:  # it was here already
+        if self._next_seq is not None and first < self._next_seq:  # already received
             batch = batch.slice(self._next_seq - first)
         self._next_seq = max(last + 1, self._next_seq or 0)
         return batch if batch.num_rows else None
 
-    def _check_next(self, seq: int) -> None:
-        """No frame is missing of which nothing was said."""
+    def _check_no_gap(self, seq: int) -> None:
+        """Reject a gap that the server did not report as a loss."""
         if self._next_seq is not None and seq > self._next_seq:
-            raise ValueError(
-                f"frame {seq} after {self._next_seq - 1}, and no word of those between"
-            )
+            raise ValueError(f"frame {seq} follows {self._next_seq - 1} without a reported loss")
 
-    def _lose(self, loss: Loss) -> None:
+    def _add_loss(self, loss: FrameLoss) -> None:
         self._failures = 0
         self.losses.append(loss)
         if self._on_loss is not None:
             self._on_loss(loss)
-        elif self._asked.policy == "lossless":
+        elif self._request.policy == "lossless":
             warnings.warn(str(loss), FramesLostWarning, stacklevel=5)

@@ -1,4 +1,4 @@
-"""What a live stream is apart from its socket: its protocol, its clock, how it is connected."""
+"""State of a live stream without its socket: protocol, clock and connection options."""
 
 from __future__ import annotations
 
@@ -8,42 +8,42 @@ from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 
-from foottile.http import Http
-from foottile.live_protocol import MESSAGE_BYTES_MAX, Asked, LiveProtocol, Loss
-from foottile.websocket import UpgradeRefused
+from foottile.http import HttpClient
+from foottile.live_protocol import MESSAGE_BYTES_MAX, FrameLoss, LiveProtocol, LiveRequest
+from foottile.websocket import UpgradeRejection
 
 _NO_CLOSE_FRAME = 1006
 
 
-class LiveState:
-    """Base of live streams, with threads and with asyncio."""
+class LiveStreamState:
+    """Base class of live streams for threads and for asyncio."""
 
     def __init__(
         self,
-        asked: Asked,
-        http: Http,
+        request: LiveRequest,
+        http: HttpClient,
         *,
-        on_loss: Callable[[Loss], None] | None = None,
-        give_up_s: float | None = None,
+        on_loss: Callable[[FrameLoss], None] | None = None,
+        reconnect_timeout_s: float | None = None,
     ) -> None:
-        self._protocol = LiveProtocol(asked, on_loss)
+        self._protocol = LiveProtocol(request, on_loss)
         self._http = http
-        self._give_up_s = give_up_s
-        self._heard_s = time.monotonic()
-        self._is_over = False
+        self._reconnect_timeout_s = reconnect_timeout_s
+        self._last_message_s = time.monotonic()
+        self._is_closed = False
 
     @property
     def position(self) -> tuple[str, int] | None:
-        """`stream_id` and `first_seq` of the frame that is wanted next; None before the first."""
+        """`stream_id` and `from_seq` of the next frame; None before the first."""
         return self._protocol.position
 
     @property
-    def losses(self) -> Sequence[Loss]:
-        """What was left out, as far as it was said; the newest thousand."""
+    def losses(self) -> Sequence[FrameLoss]:
+        """Newest thousand losses that the server reported."""
         return tuple(self._protocol.losses)
 
-    def _options(self) -> dict[str, Any]:
-        """How a connection is made."""
+    def _get_options(self) -> dict[str, Any]:
+        """Return the websocket options of a connection."""
         return {
             "additional_headers": self._http.headers,
             "ssl": self._http.context,
@@ -53,32 +53,32 @@ class LiveState:
             "proxy": None,
         }
 
-    def _closed_s(self, end: ConnectionClosed) -> float:
-        """How long to wait after a connection has ended.
+    def _delay_after_close_s(self, end: ConnectionClosed) -> float:
+        """Return the delay before reconnecting after a closed connection.
 
         Raises:
-            FootTileError: it is not to be opened again.
+            FootTileError: reconnecting is useless.
         """
-        if self._is_over:
+        if self._is_closed:
             return 0.0
         code, reason = _NO_CLOSE_FRAME, ""
         if end.rcvd is not None:
             code, reason = end.rcvd.code, end.rcvd.reason
-        self._protocol.closed(int(code), reason)
-        return self._again_s(end)
+        self._protocol.check_close(int(code), reason)
+        return self._retry_delay_s(end)
 
-    def _failed_s(self, error: Exception) -> float:
-        """How long to wait after none could be made.
+    def _delay_after_failure_s(self, error: Exception) -> float:
+        """Return the delay before reconnecting after a failed attempt.
 
         Raises:
-            FootTileError: it is not to be tried again.
+            FootTileError: another attempt is useless.
         """
-        if isinstance(error, UpgradeRefused):
-            problem = self._protocol.refused(error.status, error.headers, error.body)
+        if isinstance(error, UpgradeRejection):
+            problem = self._protocol.explain_rejection(error.status, error.headers, error.body)
             if problem is not None:
                 raise problem from error
-        return self._again_s(error)
+        return self._retry_delay_s(error)
 
-    def _again_s(self, error: Exception) -> float:
-        silent_s = time.monotonic() - self._heard_s
-        return self._protocol.again_s(error, silent_s, self._give_up_s)
+    def _retry_delay_s(self, error: Exception) -> float:
+        silence_s = time.monotonic() - self._last_message_s
+        return self._protocol.compute_retry_delay_s(error, silence_s, self._reconnect_timeout_s)

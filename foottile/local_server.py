@@ -76,7 +76,7 @@ def publish_local_server(server: LocalServer) -> Iterator[None]:
     if not _is_private(path.parent.lstat()):
         path.parent.chmod(0o700)
     content = {"url": server.url, "token": server.token, "pid": os.getpid()}
-    # Whoever finds the file finds it whole and locked, so it gets its name last.
+    # The rename comes last, so a reader finds the file complete and locked.
     with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -146,12 +146,12 @@ def _is_locked(descriptor: int) -> bool:
     return False
 
 
-def _is_same_address(asked: SplitResult, listening: SplitResult) -> bool:
-    if asked.path.strip("/") or not (asked.hostname and listening.hostname):
+def _is_same_address(requested: SplitResult, listening: SplitResult) -> bool:
+    if requested.path.strip("/") or not (requested.hostname and listening.hostname):
         return False
-    if asked.hostname == "localhost":
+    if requested.hostname == "localhost":
         return True
-    return _ip_address(asked.hostname) == _ip_address(listening.hostname)
+    return _ip_address(requested.hostname) == _ip_address(listening.hostname)
 
 
 def _ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:

@@ -1,4 +1,4 @@
-"""A server: its nodes and sessions, and what is live."""
+"""Client of one server: nodes, sessions, recording and live streams."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from foottile.closing import Closing
+from foottile.closeable import Closeable
 from foottile.files import download
-from foottile.http import Http
-from foottile.live import Live
-from foottile.live_protocol import Asked, Loss, Policy
+from foottile.http import HttpClient
+from foottile.live import LiveStream
+from foottile.live_protocol import FrameLoss, LiveRequest, Policy
 from foottile.sessions import Session
 
 _PAGE = 500
 
 
-class Server(Closing):
-    """One server; made by `foottile.connect`. May be used from several threads.
+class Server(Closeable):
+    """Thread-safe client of one server, created by `foottile.connect`.
 
-    Every method raises a `FootTileError` if there is no answer, or one that is a problem.
+    Every method raises a `FootTileError` without a response, or for a problem response.
     """
 
     def __init__(
@@ -34,30 +34,30 @@ class Server(Closing):
         timeout_s: float = 10.0,
         ca: str | os.PathLike[str] | None = None,
     ) -> None:
-        self.http = Http(url, token, timeout_s, ca)
-        """Asks it what has no method here: `server.http.get("/calibrations")`."""
+        self.http = HttpClient(url, token, timeout_s, ca)
+        """HTTP client for routes without a method here: `server.http.get("/calibrations")`."""
 
     def close(self) -> None:
-        """Close its connections."""
+        """Close all connections."""
         self.http.close()
 
     @property
     def url(self) -> str:
-        """Its address."""
+        """Address of the server."""
         return self.http.url
 
     @property
     def headers(self) -> dict[str, str]:
-        """What is shown with every question: the token, if there is one."""
+        """Headers of every request: the token, if any."""
         return dict(self.http.headers)
 
     def nodes(self) -> list[dict[str, Any]]:
-        """All nodes that it knows, as the API describes them: `node`, `connected`, `tiles`, ..."""
-        items: list[dict[str, Any]] = self.http.get("/nodes", has="items")["items"]
+        """Return all nodes, with the fields of the API: `node`, `connected`, `tiles`, ..."""
+        items: list[dict[str, Any]] = self.http.get("/nodes", field="items")["items"]
         return items
 
     def node(self, name: str) -> dict[str, Any]:
-        """One node."""
+        """Return one node."""
         return self.http.get(f"/nodes/{quote(name, safe='')}")
 
     def sessions(
@@ -71,39 +71,39 @@ class Server(Closing):
         until: datetime | str | None = None,
         complete: bool | str | None = None,
     ) -> Iterator[Session]:
-        """Sessions, the newest first, page after page as they are taken.
+        """Yield sessions, newest first; pages are fetched on demand.
 
         Args:
             search: text in name, subject, notes, tags or node.
-            node: of this node only, or of one of these.
-            tag: with this tag only, or with each of these.
-            take: of this take only.
-            since: recorded at this instant or later; one without a zone is of this machine's zone.
-            until: recorded before this instant.
+            node: filter by node; several: any of these.
+            tag: filter by tag; several: all of these.
+            take: filter by take.
+            since: earliest start; an instant without a zone is local time.
+            until: end of the starts, exclusive.
             complete: True, False or "lossy".
         """
         query: dict[str, object] = {
             "q": search,
-            "node": _all_of(node),
-            "tag": _all_of(tag),
+            "node": _as_list(node),
+            "tag": _as_list(tag),
             "take": take,
-            "from": _instant(since),
-            "to": _instant(until),
+            "from": _format_instant(since),
+            "to": _format_instant(until),
             "complete": complete,
             "limit": _PAGE,
         }
         while True:
-            page = self.http.get("/sessions", query, has="next_cursor")
-            for facts in page["items"]:
-                yield Session(self.http, facts)
+            page = self.http.get("/sessions", query, field="next_cursor")
+            for metadata in page["items"]:
+                yield Session(self.http, metadata)
             if page["next_cursor"] is None:
                 return
             query["cursor"] = page["next_cursor"]
 
     def session(self, session_id: str) -> Session:
-        """One session."""
+        """Return one session."""
         return Session(
-            self.http, self.http.get(f"/sessions/{quote(session_id, safe='')}", has="id")
+            self.http, self.http.get(f"/sessions/{quote(session_id, safe='')}", field="id")
         )
 
     def download_take(
@@ -115,18 +115,18 @@ class Server(Closing):
         start_s: float | None = None,
         end_s: float | None = None,
     ) -> Path:
-        """All sessions of a take as one file, on the server's axis of time.
+        """Download all sessions of a take as one file, on the server's time axis.
 
         Args:
-            take: `Session.take`.
-            path: of the file, which appears whole or not at all.
-            format: one that holds several: `c3d`, `opensim`, `mcap`, `mat`, `xdf`.
-            start_s: from so many seconds after each session's first frame on; None: all.
-            end_s: before so many seconds; None: to the end.
+            take: id of the take, `Session.take`.
+            path: file to write, atomically.
+            format: format for several sessions: `c3d`, `opensim`, `mcap`, `mat`, `xdf`.
+            start_s: first instant, seconds after each session's first frame; None: the beginning.
+            end_s: end, exclusive; None: the end.
 
         Raises:
-            ConflictError: one of them is not sealed.
-            UsageError: the format holds one session only, or one cannot be in it.
+            ConflictError: a session is not sealed.
+            UsageError: the format holds one session only, or cannot hold one of these.
             OSError: the file cannot be written.
         """
         query = {"format": format, "start_s": start_s, "end_s": end_s}
@@ -142,19 +142,19 @@ class Server(Closing):
         notes: str = "",
         tags: Sequence[str] = (),
     ) -> Session:
-        """Begin to record a node, or so many seconds earlier. Sent twice, it is begun once.
+        """Start recording a node, `pre_roll_s` in the past; a repeated request starts it once.
 
-        Use the session as a context manager to have it stopped.
+        As a context manager the session stops at the end of the block.
         """
         body: dict[str, object] = {"node": node, "name": name, "pre_roll_s": float(pre_roll_s)}
         body |= {"subject": subject, "notes": notes, "tags": list(tags)}
         key = {"Idempotency-Key": uuid.uuid4().hex}
         return Session(
-            self.http, self.http.send("POST", "/sessions", body, headers=key, again=True)
+            self.http, self.http.send("POST", "/sessions", body, headers=key, is_idempotent=True)
         )
 
     def tare(self, node: str, reason: str = "") -> dict[str, Any]:
-        """Take the newest unloaded quarter of a second of the last ten seconds as the baseline.
+        """Tare with the newest unloaded quarter of a second of the last ten seconds.
 
         Raises:
             ConflictError: the foot is loaded or moves, or the node is away.
@@ -162,13 +162,13 @@ class Server(Closing):
         return self.http.send("POST", f"/nodes/{quote(node, safe='')}/tare", {"reason": reason})
 
     def tares(self, node: str) -> list[dict[str, Any]]:
-        """The tares of a node, the newest first."""
+        """Return the tares of a node, newest first."""
         path = f"/nodes/{quote(node, safe='')}/tares"
-        items: list[dict[str, Any]] = self.http.get(path, has="items")["items"]
+        items: list[dict[str, Any]] = self.http.get(path, field="items")["items"]
         return items
 
-    def ticket(self, *, role: str = "operator") -> dict[str, Any]:
-        """Return an invite for an `operator` or a `viewer`; this needs the server's token."""
+    def create_invite(self, *, role: str = "operator") -> dict[str, Any]:
+        """Create a login link for an `operator` or a `viewer`; this needs the server's token."""
         return self.http.send("POST", "/tickets", {"role": role})
 
     def live(
@@ -179,32 +179,34 @@ class Server(Closing):
         policy: Policy = "lossless",
         stream_id: str | None = None,
         from_seq: int | None = None,
-        on_loss: Callable[[Loss], None] | None = None,
-        give_up_s: float | None = None,
-    ) -> Live:
-        """Every frame of a node with its estimates, as Arrow batches, from now or from a frame on.
+        on_loss: Callable[[FrameLoss], None] | None = None,
+        reconnect_timeout_s: float | None = None,
+    ) -> LiveStream:
+        """Stream frames of a node with estimates, as Arrow batches, from now or from a position.
 
         Args:
-            node: its name; None: the only one there is.
-            columns: of all tiles (`force_n`) or one (`force_n_0`); none: all.
-            policy: `lossless`: every frame once, over broken links and restarts of the server;
-                `drop_oldest`: what you are 2 s late for is left out; `latest`: the newest only.
-            stream_id: with `first_seq`, the stream to begin in, as in `Live.position`.
-            from_seq: the frame to begin with.
-            on_loss: told of frames that are left out; None: for `lossless` a `FramesLostWarning`,
-                and all are in `Live.losses`.
-            give_up_s: raise `NoAnswerError` if the server does not answer for so long; None: never,
-                once it has answered.
+            node: name of the node; None: the only one.
+            columns: names, of all tiles (`force_n`) or one (`force_n_0`); empty: all.
+            policy: `lossless`: every frame once, across broken links and restarts of the server;
+                `drop_oldest`: drops frames that wait for 2 s; `latest`: the newest frames only.
+            stream_id: stream of the first frame, as in `LiveStream.position`.
+            from_seq: number of the first frame.
+            on_loss: receives each loss; None: a `FramesLostWarning` for `lossless`. All losses are
+                in `LiveStream.losses`.
+            reconnect_timeout_s: longest silence of the server before a `ServerUnavailableError`;
+                None: unlimited after the first message.
         """
-        asked = Asked.of(self.http.url, node, columns, policy, stream_id, from_seq)
-        return Live(asked, self.http, on_loss=on_loss, give_up_s=give_up_s)
+        request = LiveRequest.create(self.http.url, node, columns, policy, stream_id, from_seq)
+        return LiveStream(
+            request, self.http, on_loss=on_loss, reconnect_timeout_s=reconnect_timeout_s
+        )
 
 
-def _all_of(given: str | Sequence[str] | None) -> list[str]:
-    return [given] if isinstance(given, str) else list(given or ())
+def _as_list(value: str | Sequence[str] | None) -> list[str]:
+    return [value] if isinstance(value, str) else list(value or ())
 
 
-def _instant(given: datetime | str | None) -> str | None:
-    if isinstance(given, datetime):
-        return given.astimezone().isoformat()
-    return given
+def _format_instant(value: datetime | str | None) -> str | None:
+    if isinstance(value, datetime):
+        return value.astimezone().isoformat()
+    return value

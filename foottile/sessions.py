@@ -1,4 +1,4 @@
-"""Sessions: what is known of one, its frames and markers, and how it is ended."""
+"""Sessions: metadata, frames, markers, stop and download."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from types import TracebackType
 from typing import Any, Self
 from urllib.parse import quote
 
-from foottile.data import Clock, Data
+from foottile.data import Clock, SessionData
 from foottile.errors import ConflictError, FootTileError
 from foottile.files import download
-from foottile.http import Http
+from foottile.http import HttpClient
 
-_LOOK_EVERY_S = 0.2
+_POLL_S = 0.2
 
 
 @dataclass(frozen=True)
 class Marker:
-    """Something that was marked.
+    """Labelled instant of a session.
 
     Attributes:
-        id: its own, within the session.
-        label: what was written.
-        t_ns: when, in the server's UTC, nanoseconds since 1970.
+        id: unique id within the session.
+        label: text.
+        t_ns: instant in the server's UTC, nanoseconds since 1970.
     """
 
     id: str
@@ -35,20 +35,20 @@ class Marker:
     t_ns: int
 
     @classmethod
-    def of(cls, facts: Mapping[str, Any]) -> Marker:
-        """As the server says it."""
-        return cls(facts["id"], facts["label"], facts["t_ns"])
+    def create(cls, metadata: Mapping[str, Any]) -> Marker:
+        """Return a marker from the server's JSON."""
+        return cls(metadata["id"], metadata["label"], metadata["t_ns"])
 
 
 class Session:
-    """A session, as the server described it last (`facts`, with every field of the API).
+    """Session with its `metadata` at the last response, with every field of the API.
 
-    As a context manager it is stopped at the end of the block, if it is still being recorded.
+    As a context manager it stops a running recording at the end of the block.
     """
 
-    def __init__(self, http: Http, facts: Mapping[str, Any]) -> None:
+    def __init__(self, http: HttpClient, metadata: Mapping[str, Any]) -> None:
         self._http = http
-        self.facts: Mapping[str, Any] = facts
+        self.metadata: Mapping[str, Any] = metadata
 
     def __repr__(self) -> str:
         what = f"{self.name!r} of {self.node}, {self.duration_s:.1f} s, {self.state}"
@@ -67,63 +67,63 @@ class Session:
             if self.refresh().state == "recording":
                 self.stop()
         except FootTileError:
-            if error is None:  # else that is what has to be told
+            if error is None:  # else the error of the block matters more
                 raise
 
     @property
     def id(self) -> str:
-        """Its name for machines."""
-        return str(self.facts["id"])
+        """Unique id."""
+        return str(self.metadata["id"])
 
     @property
     def name(self) -> str:
-        """Its name for people."""
-        return str(self.facts["name"])
+        """Name for people."""
+        return str(self.metadata["name"])
 
     @property
     def node(self) -> str:
-        """Whose frames they are."""
-        return str(self.facts["node"])
+        """Name of the recorded node."""
+        return str(self.metadata["node"])
 
     @property
     def state(self) -> str:
         """`recording`, `pending` (frames are still to come), `sealing` or `sealed`."""
-        return str(self.facts["state"])
+        return str(self.metadata["state"])
 
     @property
     def complete(self) -> bool | str:
-        """Is every frame there? False: not yet known; "lossy": some are lost for good."""
-        complete: bool | str = self.facts["complete"]
+        """Completeness. True: all frames stored; False: undecided; "lossy": frames are lost."""
+        complete: bool | str = self.metadata["complete"]
         return complete
 
     @property
-    def frames(self) -> int:
-        """How many it has."""
-        return int(self.facts["frames"])
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return int(self.metadata["frames"])
 
     @property
     def duration_s(self) -> float:
-        """From its first frame to its last."""
-        return float(self.facts["duration_s"])
+        """Time from the first frame to the last, s."""
+        return float(self.metadata["duration_s"])
 
     @property
     def tags(self) -> tuple[str, ...]:
-        """What people wrote to find it again."""
-        return tuple(self.facts["tags"])
+        """Tags."""
+        return tuple(self.metadata["tags"])
 
     @property
     def take(self) -> str | None:
-        """The take that it is of: its id, None of a session that was recorded by itself."""
-        found: str | None = self.facts["take"]
+        """Id of the take; None for a session of a single node."""
+        found: str | None = self.metadata["take"]
         return found
 
     def refresh(self) -> Self:
-        """Ask what is known of it now.
+        """Fetch the present metadata.
 
         Raises:
-            FootTileError: no answer, or it is gone.
+            FootTileError: no response, or no such session.
         """
-        self.facts = self._http.get(self._path)
+        self.metadata = self._http.get(self._path)
         return self
 
     def open(
@@ -133,39 +133,38 @@ class Session:
         start_s: float | None = None,
         end_s: float | None = None,
         clock: Clock = "node",
-    ) -> Data:
-        """Its frames, or some columns and seconds of them; nothing is fetched yet.
+    ) -> SessionData:
+        """Return the frames, or a slice of them, without fetching anything yet.
 
         Args:
-            columns: names, of all tiles (`force_n`) or one (`force_n_0`); none: all.
-            start_s: from so many seconds after the first frame on.
-            end_s: before so many seconds.
-            clock: of `server` there are also `t_server_ns`, to compare with markers, and its bound.
+            columns: names, of all tiles (`force_n`) or one (`force_n_0`); empty: all.
+            start_s: first instant, seconds after the first frame.
+            end_s: end, exclusive.
+            clock: `server` adds `t_server_ns`, comparable with markers, and its bound.
         """
         names = (columns,) if isinstance(columns, str) else tuple(columns)
-        return Data(self._http, self.id, names, start_s, end_s, clock)
+        return SessionData(self._http, self.id, names, start_s, end_s, clock)
 
     def markers(self) -> list[Marker]:
-        """What was marked in it, in order of time.
+        """Return the markers, in order of time.
 
         Raises:
-            FootTileError: no answer, or it is gone.
+            FootTileError: no response, or no such session.
         """
-        return [
-            Marker.of(each)
-            for each in self._http.get(f"{self._path}/markers", has="items")["items"]
-        ]
+        found = self._http.get(f"{self._path}/markers", field="items")
+        return [Marker.create(each) for each in found["items"]]
 
     def add_marker(self, label: str, *, t_ns: int | None = None) -> Marker:
-        """Marker this moment, or another one of the server's UTC; sent twice, it is marked once.
+        """Add a marker now, or at an instant of the server's UTC; a repeated request adds it once.
 
         Raises:
-            FootTileError: no answer, or it is refused.
+            FootTileError: no response, or a problem response.
         """
         body = {"label": label, "t_ns": t_ns, "id": uuid.uuid4().hex[:12]}
-        return Marker.of(self._http.send("POST", f"{self._path}/markers", body, again=True))
+        path = f"{self._path}/markers"
+        return Marker.create(self._http.send("POST", path, body, is_idempotent=True))
 
-    def describe(
+    def update(
         self,
         *,
         name: str | None = None,
@@ -173,72 +172,76 @@ class Session:
         notes: str | None = None,
         tags: Sequence[str] | None = None,
     ) -> Self:
-        """Change what people say of it; what is left out stays.
+        """Change the given metadata.
 
         Raises:
-            ConflictError: somebody else has changed it since it was asked for; `refresh` it.
-            FootTileError: no answer, or it is refused.
+            ConflictError: the metadata changed since the last response; `refresh` it.
+            FootTileError: no response, or a problem response.
         """
         body = {"name": name, "subject": subject, "notes": notes}
         changes: dict[str, object] = {**body, "tags": None if tags is None else list(tags)}
-        headers = {"If-Match": f'"{self.facts["revision"]}"'}
-        self.facts = self._http.send("PATCH", self._path, changes, headers=headers)
+        headers = {"If-Match": f'"{self.metadata["revision"]}"'}
+        self.metadata = self._http.send("PATCH", self._path, changes, headers=headers)
         return self
 
     def stop(self) -> Self:
-        """End the recording. Answers when it is sealed, or after some seconds.
+        """Stop the recording; return when it is sealed, or after some seconds.
 
         Raises:
-            FootTileError: no answer, or it is gone.
+            FootTileError: no response, or no such session.
         """
-        self.facts = self._http.send("POST", f"{self._path}/stop", again=True)
+        self.metadata = self._http.send("POST", f"{self._path}/stop", is_idempotent=True)
         return self
 
-    def wait(self, timeout_s: float = 60.0) -> Self:
-        """Wait until it is sealed.
+    def wait_until_sealed(self, timeout_s: float = 60.0) -> Self:
+        """Wait until the session is sealed.
 
         Args:
-            timeout_s: not longer than that; to seal an hour takes some tens of seconds, and the
-                first session of a new machine waits until models are compiled.
+            timeout_s: longest wait. Sealing an hour takes some tens of seconds; the first session
+                on a new machine also waits for the compilation of models.
 
         Raises:
-            ConflictError: it is not by then, and says what it waits for; it may be asked again.
-            FootTileError: no answer.
+            ConflictError: not sealed at the timeout; the text has the reason. Retry.
+            FootTileError: no response.
         """
         end_s = time.monotonic() + timeout_s
         while self.refresh().state != "sealed":
             if time.monotonic() > end_s:
+                reason = _explain_not_sealed(self.metadata)
                 raise ConflictError(
-                    f"session {self.id} is not sealed after {timeout_s:g} s: {_why_not(self.facts)}"
+                    f"session {self.id} is not sealed after {timeout_s:g} s: {reason}"
                 )
-            time.sleep(_LOOK_EVERY_S)
+            time.sleep(_POLL_S)
         return self
 
     def download(self, path: str | os.PathLike[str], *, format: str = "parquet") -> Path:  # noqa: A002  # the API's name
-        """All of it as a file, which appears whole or not at all; Parquet is checked by its hash.
+        """Download the session as a file, atomically; the hash of Parquet is verified.
 
         Raises:
-            ConflictError: it is not sealed, for Parquet.
-            DamagedError: what came has not the hash that the server states.
+            ConflictError: the session is not sealed, for Parquet.
+            DamagedError: the hash differs from the server's.
             OSError: the file cannot be written.
-            FootTileError: no answer, or it is refused.
+            FootTileError: no response, or a problem response.
         """
 
-        def expected() -> str | None:
-            sha256: str | None = self.refresh().facts["sha256"]
+        def get_expected_sha256() -> str | None:
+            sha256: str | None = self.refresh().metadata["sha256"]
             return sha256 if format == "parquet" else None
 
-        return download(self._http, f"{self._path}/data", {"format": format}, path, expected)
+        return download(
+            self._http, f"{self._path}/data", {"format": format}, path, get_expected_sha256
+        )
 
     @property
     def _path(self) -> str:
         return f"/sessions/{quote(self.id, safe='')}"
 
 
-def _why_not(facts: Mapping[str, Any]) -> str:
-    if facts["problem"]:
-        return str(facts["problem"])
+def _explain_not_sealed(metadata: Mapping[str, Any]) -> str:
+    if metadata["problem"]:
+        return str(metadata["problem"])
+    reason = metadata["pending_reason"] or "frames"
     return {
-        "recording": "it is still being recorded, and waits for its stop",
-        "pending": f"it is stopped, and waits for its node's {facts['pending_reason'] or 'frames'}",
-    }.get(facts["state"], "the server is writing it; wait again")
+        "recording": "it is still recording; stop it",
+        "pending": f"it is stopped, and waits for its node's {reason}",
+    }.get(metadata["state"], "the server is writing it; retry")

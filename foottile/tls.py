@@ -1,4 +1,4 @@
-"""Whose certificates are trusted, and what is wrong with one that is not."""
+"""TLS contexts with trusted CAs, and explanations of TLS errors."""
 
 from __future__ import annotations
 
@@ -10,61 +10,61 @@ from pathlib import Path
 from foottile.errors import UsageError
 
 _BYTES_MAX = 16 << 20
-"""Of a file of CAs: 70 times as many as Debian trusts."""
+"""Size limit of a file of CAs: 70 times Debian's."""
 
 
 def make_context(ca: str | os.PathLike[str] | None = None) -> ssl.SSLContext:
-    """Return a context that trusts the CAs of this machine, and those of a file.
+    """Return a context that trusts the CAs of this machine and of a file.
 
-    The machine's are those of OpenSSL, or of the variables SSL_CERT_FILE and SSL_CERT_DIR.
+    The machine's CAs are OpenSSL's, or those of the variables SSL_CERT_FILE and SSL_CERT_DIR.
 
     Args:
-        ca: certificates in PEM, or a folder of them as `openssl rehash` leaves it.
+        ca: certificates in PEM, or a folder prepared by `openssl rehash`.
 
     Raises:
-        UsageError: there are no certificates in it.
+        UsageError: no readable certificate.
     """
     context = ssl.create_default_context()
     if ca is None:
         return context
     path = Path(ca)
-    before = len(context.get_ca_certs())
+    count_before = len(context.get_ca_certs())
     try:
         if path.is_dir():
-            context.load_verify_locations(capath=path)  # they are read when one is needed
-            has_some = any(each.suffix in (".pem", ".crt", ".0") for each in path.iterdir())
+            context.load_verify_locations(capath=path)  # read on demand
+            has_certs = any(each.suffix in (".pem", ".crt", ".0") for each in path.iterdir())
         else:
             _check_file(path)
             context.load_verify_locations(cafile=path)
-            has_some = len(context.get_ca_certs()) > before or _is_known(path)
+            has_certs = len(context.get_ca_certs()) > count_before or _is_trusted(path)
     except (OSError, ValueError) as error:  # an ssl.SSLError is an OSError
         raise UsageError(
             f"{str(path)!r}: no CA certificates can be read: {error}; expected a file in PEM"
         ) from error
-    if not has_some:
+    if not has_certs:
         raise UsageError(f"{str(path)!r}: there is no CA certificate in it; expected a file in PEM")
     return context
 
 
 def _check_file(path: Path) -> None:
-    """Refuse what OpenSSL would wait for, as a pipe, or read for hours."""
+    """Reject a pipe, on which OpenSSL would block, and a huge file."""
     found = path.stat()
     if not stat.S_ISREG(found.st_mode) or found.st_size > _BYTES_MAX:
-        raise ValueError(f"it is no file of at most {_BYTES_MAX >> 20} MiB")
+        raise ValueError(f"not a file of at most {_BYTES_MAX >> 20} MiB")
 
 
-def _is_known(path: Path) -> bool:
-    """Return whether a file has certificates that the machine trusts without it, too."""
-    alone = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    alone.load_verify_locations(cafile=path)
-    return bool(alone.get_ca_certs())
+def _is_trusted(path: Path) -> bool:
+    """Return whether the certificates of a file are already in the machine's trust store."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.load_verify_locations(cafile=path)
+    return bool(context.get_ca_certs())
 
 
 def explain_tls(error: BaseException | None) -> str | None:
-    """Return what is wrong with TLS and what to do; None if that is not what failed.
+    """Return problem and remedy of a TLS failure; None for other errors.
 
     Args:
-        error: perhaps caused by another one.
+        error: exception, perhaps with a TLS error as its cause.
     """
     while error is not None and not isinstance(error, ssl.SSLError):
         error = error.__cause__ or error.__context__

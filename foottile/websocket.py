@@ -1,4 +1,4 @@
-"""Websockets of a client that follows no redirect: it would show its token to whoever sends one."""
+"""Websocket clients that follow no redirect: a redirect could steal the token."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from websockets.http11 import Response
 from websockets.sync.client import ClientConnection
 
 
-class UpgradeRefused(InvalidHandshake):
-    """An HTTP answer came in place of a websocket.
+class UpgradeRejection(InvalidHandshake):
+    """HTTP response in place of a websocket.
 
     Attributes:
-        status: of the answer.
-        headers: of the answer, their names in small letters.
-        body: what came with it.
+        status: HTTP status.
+        headers: headers, with names in lower case.
+        body: content.
     """
 
     def __init__(self, response: Response) -> None:
@@ -26,31 +26,31 @@ class UpgradeRefused(InvalidHandshake):
         self.body = bytes(response.body or b"")
 
 
-class Connection(ClientConnection):
-    """A websocket read by a thread; for `create_connection` of `websockets.sync`."""
+class Websocket(ClientConnection):
+    """Websocket for threads, as `create_connection` of `websockets.sync`."""
 
-    def handshake(self, *given: Any, **options: Any) -> None:
-        """Ask for the websocket.
-
-        Raises:
-            UpgradeRefused: an HTTP answer came.
-        """
-        try:
-            super().handshake(*given, **options)
-        except InvalidStatus as error:
-            raise UpgradeRefused(error.response) from error
-
-
-class AsyncConnection(AsyncClientConnection):
-    """A websocket of an event loop; for `create_connection` of `websockets.asyncio`."""
-
-    async def handshake(self, *given: Any, **options: Any) -> None:
-        """Ask for the websocket.
+    def handshake(self, *args: Any, **options: Any) -> None:
+        """Perform the websocket handshake.
 
         Raises:
-            UpgradeRefused: an HTTP answer came.
+            UpgradeRejection: the server sent an HTTP response.
         """
         try:
-            await super().handshake(*given, **options)
+            super().handshake(*args, **options)
         except InvalidStatus as error:
-            raise UpgradeRefused(error.response) from error
+            raise UpgradeRejection(error.response) from error
+
+
+class AsyncWebsocket(AsyncClientConnection):
+    """Websocket for an event loop, as `create_connection` of `websockets.asyncio`."""
+
+    async def handshake(self, *args: Any, **options: Any) -> None:
+        """Perform the websocket handshake.
+
+        Raises:
+            UpgradeRejection: the server sent an HTTP response.
+        """
+        try:
+            await super().handshake(*args, **options)
+        except InvalidStatus as error:
+            raise UpgradeRejection(error.response) from error

@@ -67,7 +67,7 @@ interface Tile {
 interface Frame {
   node?: string; seq: number; frame_flags: number; estimate_flags: number | null; contact: boolean | null;
   grf_n: number | null; grf_sigma_n: number | null; grf_lower_bound_n: number | null;
-  force_n: (number | null)[]; force_sigma_n: (number | null)[]; gauge_kpa: (number | null)[]; status: (number | null)[];
+  force_n: (number | null)[]; force_sigma_n: (number | null)[]; gauge_kpa: (number | null)[]; tile_flags: (number | null)[];
   saturated: boolean[];
   /** On a session's page: seconds after its first frame. */
   timeS?: number;

@@ -226,7 +226,7 @@ def _get_session_metadata(server: foottile.Server, session_id: str) -> Mapping[s
         raise UsageError(
             f"{session_id!r} is not a session id", remedy="List them with `foottile sessions`"
         )
-    return server.session(session_id).facts
+    return server.session(session_id).metadata
 
 
 def _download_frames(server: foottile.Server, session: Mapping[str, Any], path: Path) -> int:
@@ -277,15 +277,15 @@ def _write_response(response: httpx.Response, file: IO[bytes]) -> None:
 def _append_retry_remedy(remedy: str) -> Iterator[None]:
     try:
         yield
-    except foottile.NoAnswerError as error:
-        raise foottile.NoAnswerError(f"{error} {remedy}") from error
+    except foottile.ServerUnavailableError as error:
+        raise foottile.ServerUnavailableError(f"{error} {remedy}") from error
 
 
 def _pull_table(server: foottile.Server, url: str, path: Path) -> None:
     try:
         with server.http.stream(url, {"format": "parquet"}) as answer:
             content = answer.read()
-    except foottile.UnknownError:
+    except foottile.NotFoundError:
         return  # a rebuilt session may lack its clock
     try:
         parse_hashed_table(content, where=path.name)

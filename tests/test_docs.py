@@ -39,7 +39,7 @@ from devices.scene.scene_file import Scene, list_builtin_scenes, load_scene
 from service.api.app import make_app
 from service.api.logins import Logins
 from service.api.settings import Settings
-from service.cli.table import SUMMARIES, loaded
+from service.cli.command_table import SUMMARIES, load_command
 from service.estimation.calibration import TileCalibration
 from service.estimation.estimates import EstimateFlag
 from service.protocol import LinkCloseCode
@@ -134,7 +134,7 @@ def test_every_estimate_status_bit_is_documented() -> None:
 
 
 def commands() -> dict[str, Any]:
-    return {name: loaded(name) for name in SUMMARIES}
+    return {name: load_command(name) for name in SUMMARIES}
 
 
 def test_every_command_is_documented_and_says_what_its_options_do() -> None:

@@ -10,6 +10,7 @@
 // messages to it. Panels do not import each other. No build step, no file from another host.
 
 import { Link } from "./common/link.js";
+import { LOSSES_HELP } from "./common/losses.js";
 import { look } from "./common/login.js";
 import { quietly } from "./common/notices.js";
 import { ReplacementWarning } from "./common/replacement.js";
@@ -70,7 +71,7 @@ const pause = new Pause(() => {
   redraw();
 });
 pause.latest = () => state.frame;
-helpWithKeys();
+helpWithKeys(LOSSES_HELP);
 const notes = new Notes();
 const replacement = new ReplacementWarning();
 byId("replacement-box").append(replacement.element);

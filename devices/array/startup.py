@@ -204,27 +204,27 @@ def choose_scene_schedule(
     Raises:
         SceneError: the schedule does not suit a reference sensor.
     """
-    asked = schedule or scene.array.schedule
+    requested = schedule or scene.array.schedule
     if has_reference:
-        return _choose_with_reference(asked)
-    if asked == "auto":
+        return _choose_with_reference(requested)
+    if requested == "auto":
         return choose_schedule(
             timing,
             requested_rate_hz=requested_rate_hz or scene.rate_hz,
             channels_max=scene.array.broadcast_channels,
         )
-    return ScheduleChoice(asked, "as the scene says" if schedule is None else "as asked for")
+    return ScheduleChoice(requested, "as the scene says" if schedule is None else "as requested")
 
 
-def _choose_with_reference(asked: AnySchedule) -> ScheduleChoice:
-    if asked in ("auto", "simultaneous"):
+def _choose_with_reference(requested: AnySchedule) -> ScheduleChoice:
+    if requested in ("auto", "simultaneous"):
         return ScheduleChoice(
             "simultaneous", "the reference force is read while all tiles convert at once"
         )
-    if asked == "sequential":
-        return ScheduleChoice(asked, "as the scene says")
+    if requested == "sequential":
+        return ScheduleChoice(requested, "as the scene says")
     raise SceneError(
-        f"schedule {asked!r} beside a reference sensor: its tiles are sampled one after another",
+        f"schedule {requested!r} beside a reference sensor: its tiles are sampled in turn",
         where="array.schedule",
         expected='"simultaneous" or "sequential", in which the reference is read with the tiles',
     )

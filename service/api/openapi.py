@@ -45,13 +45,13 @@ def add_security_scheme(app: FastAPI) -> None:
     """Add the token to the app's OpenAPI document as an optional security scheme."""
     made = app.openapi
 
-    def described() -> dict[str, Any]:
+    def make_schema() -> dict[str, Any]:
         schema = made()
         schema["components"]["securitySchemes"] = {"token": _TOKEN}
         schema["security"] = [{}, {"token": []}]
         return schema
 
-    app.openapi = described  # type: ignore[method-assign]  # as FastAPI documents
+    app.openapi = make_schema  # type: ignore[method-assign]  # as FastAPI documents
 
 
 def list_operations(schema: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:

@@ -1,4 +1,4 @@
-"""A calibration as tables for people and as JSON for programs."""
+"""Calibrations as tables for people and as JSON for programs."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from service.estimation.fitting.confidence import compute_student_t_95
 from service.estimation.models.hysteresis import WIDTHS_N
 
 
-def calibration_tables(calibration: Calibration) -> list[Table]:
-    """Quality of every tile's curve, where it ends, and what else is known of it."""
-    weighed = [
-        _weights(calibration, tile) for tile in calibration.tiles if tile.weights is not None
-    ]
+def make_calibration_tables(calibration: Calibration) -> list[Table]:
+    """Return tables of the tiles' curves, ranges, effects and dead weights."""
+    tiles = [tile for tile in calibration.tiles if tile.weights is not None]
+    weighed = [_tabulate_weights(calibration, tile) for tile in tiles]
     if len(weighed) == len(calibration.tiles):
         return weighed
-    return [_curves(calibration), _ranges(calibration), _effects(calibration), *weighed]
+    rig_tables = (_tabulate_curves, _tabulate_ranges, _tabulate_effects)
+    return [*(tabulate(calibration) for tabulate in rig_tables), *weighed]
 
 
-def _weights(calibration: Calibration, tile: TileCalibration) -> Table:
-    """Every weight on a tile, what was left of it, and the interval of a force like it."""
+def _tabulate_weights(calibration: Calibration, tile: TileCalibration) -> Table:
+    """Return a table of the weights on a tile, with residual and interval of each."""
     facts = tile.weights
-    assert facts is not None  # noqa: S101  # the caller has looked
-    table = _table(
+    assert facts is not None  # noqa: S101  # checked by the caller
+    table = _make_table(
         f"Tile {tile.serial}, {len(facts.steps)} weights",
         [
             "pressure: above the rest before it;",
@@ -48,9 +48,9 @@ def _weights(calibration: Calibration, tile: TileCalibration) -> Table:
     for step in sorted(facts.steps, key=lambda step: step.force_n):
         table.add_row(
             escape(step.weight),
-            _number(step.force_n, 2),
-            _number(step.gauge_kpa, 2),
-            _number(step.noise_kpa, 2),
+            _format_number(step.force_n, 2),
+            _format_number(step.gauge_kpa, 2),
+            _format_number(step.noise_kpa, 2),
             f"{step.settle_kpa:+.2f}",
             f"{step.residual_n:+.2f}",
             f"±{facts.interpolate_half_width_n(step.gauge_kpa):.2f}",
@@ -58,7 +58,7 @@ def _weights(calibration: Calibration, tile: TileCalibration) -> Table:
     return table
 
 
-def _table(title: str, notes: Sequence[str], *headings: str) -> Table:
+def _make_table(title: str, notes: Sequence[str], *headings: str) -> Table:
     table = Table(
         title=escape(title),
         caption=escape("\n".join(notes)),
@@ -75,9 +75,9 @@ def _table(title: str, notes: Sequence[str], *headings: str) -> Table:
     return table
 
 
-def _curves(calibration: Calibration) -> Table:
+def _tabulate_curves(calibration: Calibration) -> Table:
     assumed = any(tile.absolute_scale == "assumed" for tile in calibration.tiles)
-    table = _table(
+    table = _make_table(
         f"Calibration {calibration.name} ({calibration.id})",
         [
             "of mean: R2 of the mean of all repeats; left out: error on a repeat the",
@@ -95,56 +95,56 @@ def _curves(calibration: Calibration) -> Table:
         files = f" in {facts.recordings}" if facts is not None and facts.recordings > 1 else ""
         table.add_row(
             tile.serial,
-            _number(tile.r2, 4),
-            _number(None if facts is None else facts.r2_of_mean, 5),
-            _number(tile.rmse_n, 2),
-            _number(tile.cv_rmse_n, 2),
-            _number(None if last is None else last.mean_n, 2),
-            _number(None if last is None else last.new_loading_n, 2),
-            _number(tile.hysteresis_n, 2),
+            _format_number(tile.r2, 4),
+            _format_number(None if facts is None else facts.r2_of_mean, 5),
+            _format_number(tile.rmse_n, 2),
+            _format_number(tile.cv_rmse_n, 2),
+            _format_number(None if last is None else last.mean_n, 2),
+            _format_number(None if last is None else last.new_loading_n, 2),
+            _format_number(tile.hysteresis_n, 2),
             "yes" if tile.monotonic else "NO",
             f"{tile.repeats}{files}",
         )
     return table
 
 
-def _ranges(calibration: Calibration) -> Table:
-    table = _table(
+def _tabulate_ranges(calibration: Calibration) -> Table:
+    table = _make_table(
         "Range",
         [
             "end: where the range ends, above the baseline, absolute, and as a force;",
             "ended by: the load, which went no further, or the chip, whose reading did not",
         ],
         *("tile", "end\nkPa", "absolute\nkPa", "left to 115\nkPa", "force\nN", "ended by"),
-        *("drift\nkPa", "temperature_raw\ncounts", "about\ndegC"),
+        *("drift\nkPa", "temp.\ncounts", "about\ndegC"),
     )
     for tile in calibration.tiles:
         facts = tile.bench
         if facts is None:
-            table.add_row(tile.serial, _number(tile.range_kpa[1], 2), *["-"] * 7)
+            table.add_row(tile.serial, _format_number(tile.range_kpa[1], 2), *["-"] * 7)
             continue
         table.add_row(
             tile.serial,
-            _number(tile.range_kpa[1], 2),
-            _number(facts.end_absolute_kpa, 2),
-            _number(facts.spare_kpa, 2),
-            _number(facts.end_n, 1),
+            _format_number(tile.range_kpa[1], 2),
+            _format_number(facts.end_absolute_kpa, 2),
+            _format_number(facts.spare_kpa, 2),
+            _format_number(facts.end_n, 1),
             facts.ended_by,
-            _number(facts.baseline_drift_kpa, 2),
-            _number(facts.temperature_raw_counts, 0),
-            _number(facts.degc, 0),
+            _format_number(facts.baseline_drift_kpa, 2),
+            _format_number(facts.temperature_raw_counts, 0),
+            _format_number(facts.degc, 0),
         )
     return table
 
 
-def _effects(calibration: Calibration) -> Table:
-    table = _table(
+def _tabulate_effects(calibration: Calibration) -> Table:
+    table = _make_table(
         "Beside the curve",
         [
             "each with half its 95 % interval; creep: parts of the force, and their times;",
             "gas lag: behind its chip, negative where the chip is behind",
             *(
-                f"{tile.serial}: sampled {_interval(late_s, 0, 1e6)} us later than assumed"
+                f"{tile.serial}: sampled {_format_interval(late_s, 0, 1e6)} us later than assumed"
                 for tile in calibration.tiles
                 if (late_s := tile.effects.late_s) is not None
             ),
@@ -167,22 +167,22 @@ def _effects(calibration: Calibration) -> Table:
         gas, rubber, warm = effects.gas, effects.rubber, effects.temperature
         table.add_row(
             tile.serial,
-            _interval(gas.gamma, 2) if gas else "-",
-            _interval(gas.tau_s, 1, 1e3) if gas else "-",
-            "\n".join(_interval(part, 1, 100.0) for part in rubber.part) if rubber else "-",
-            "\n".join(_interval(tau, 2) for tau in rubber.tau_s) if rubber else "-",
-            _interval(loop, 2) if (loop := loop_half_width_n(effects)) else "-",
-            _interval(warm.kpa_per_k, 3) if warm else "-",
-            _interval(warm.lag_s, 1) if warm else "-",
+            _format_interval(gas.gamma, 2) if gas else "-",
+            _format_interval(gas.tau_s, 1, 1e3) if gas else "-",
+            "\n".join(_format_interval(part, 1, 100.0) for part in rubber.part) if rubber else "-",
+            "\n".join(_format_interval(tau, 2) for tau in rubber.tau_s) if rubber else "-",
+            _format_interval(loop, 2) if (loop := compute_loop_half_width_n(effects)) else "-",
+            _format_interval(warm.kpa_per_k, 3) if warm else "-",
+            _format_interval(warm.lag_s, 1) if warm else "-",
         )
     return table
 
 
-def loop_half_width_n(effects: Effects) -> Parameter | None:
-    """Half width of a hysteresis loop that is wide open, in a slow stroke.
+def compute_loop_half_width_n(effects: Effects) -> Parameter | None:
+    """Return the half width of a fully open hysteresis loop, in a slow stroke.
 
-    The plays' parts times their half widths, and what the branch that flows bears. Its uncertainty
-    takes these as independent, which errs on the wide side: they trade with one another.
+    It is the sum of the plays' parts times their half widths, and the stress of the flowing branch.
+    Its uncertainty assumes independent terms, which is conservative: they are anticorrelated.
     """
     if effects.hysteresis is None:
         return None
@@ -195,61 +195,63 @@ def loop_half_width_n(effects: Effects) -> Parameter | None:
     )
 
 
-def calibration_json(calibration: Calibration) -> dict[str, object]:
-    """A calibration's quality for programs."""
+def calibration_to_json(calibration: Calibration) -> dict[str, object]:
+    """Return the quality of a calibration for programs."""
     return {
         "id": calibration.id,
         "name": calibration.name,
         "reference": calibration.reference,
         "date": calibration.date,
-        "tiles": [_tile_json(tile) for tile in calibration.tiles],
+        "tiles": [_make_tile_json(tile) for tile in calibration.tiles],
         "refused": calibration.refused,
     }
 
 
-_OF_A_TILE = {
+_TILE_FIELDS = {
     *("serial", "r2", "rmse_n", "cv_rmse_n", "hysteresis_n", "range_kpa", "monotonic"),
     *("coefficients", "absolute_scale", "repeats", "covariance", "baseline_kpa", "noise_kpa"),
     *("bench", "weights"),
 }
 
 
-def _tile_json(tile: TileCalibration) -> dict[str, object]:
+def _make_tile_json(tile: TileCalibration) -> dict[str, object]:
     effects = tile.effects
     gas, rubber, warm = effects.gas, effects.rubber, effects.temperature
     gamma, tau = (gas.gamma, gas.tau_s) if gas else (None, None)
     kpa_per_k, lag = (warm.kpa_per_k, warm.lag_s) if warm else (None, None)
     return {
-        **tile.model_dump(mode="json", include=_OF_A_TILE),
+        **tile.model_dump(mode="json", include=_TILE_FIELDS),
         "student_t_95": compute_student_t_95(tile.repeats) if tile.repeats > 1 else None,
         "effects": {
-            "late_us": _parameter(effects.late_s, 1e6),
+            "late_us": _parameter_to_json(effects.late_s, 1e6),
             "late_common_sigma_us": 1e6 * effects.late_common_s,
             "reference_late_us": 1e6 * effects.reference_late_s,
-            "gamma": _parameter(gamma),
-            "gas_tau_ms": _parameter(tau, 1e3),
-            "creep_part": [_parameter(part) for part in rubber.part] if rubber else None,
-            "creep_time_s": [_parameter(tau) for tau in rubber.tau_s] if rubber else None,
-            "loop_half_width_n": _parameter(loop_half_width_n(effects)),
-            "kpa_per_k": _parameter(kpa_per_k),
-            "gas_lag_s": _parameter(lag),
+            "gamma": _parameter_to_json(gamma),
+            "gas_tau_ms": _parameter_to_json(tau, 1e3),
+            "creep_part": [_parameter_to_json(part) for part in rubber.part] if rubber else None,
+            "creep_time_s": [_parameter_to_json(tau) for tau in rubber.tau_s] if rubber else None,
+            "loop_half_width_n": _parameter_to_json(compute_loop_half_width_n(effects)),
+            "kpa_per_k": _parameter_to_json(kpa_per_k),
+            "gas_lag_s": _parameter_to_json(lag),
             "at_bound": list(effects.at_bound),
             "refused": dict(effects.refused),
         },
     }
 
 
-def _parameter(parameter: Parameter | None, factor: float = 1.0) -> dict[str, object] | None:
+def _parameter_to_json(
+    parameter: Parameter | None, factor: float = 1.0
+) -> dict[str, object] | None:
     if parameter is None:
         return None
     low, high = parameter.interval_95
     return {"value": factor * parameter.value, "interval_95": [factor * low, factor * high]}
 
 
-def _interval(parameter: Parameter, digits: int, factor: float = 1.0) -> str:
+def _format_interval(parameter: Parameter, digits: int, factor: float = 1.0) -> str:
     half = SIGMAS_95 * factor * parameter.sigma
     return f"{factor * parameter.value:.{digits}f}±{half:.{digits}f}"
 
 
-def _number(value: float | None, digits: int) -> str:
+def _format_number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"

@@ -1,7 +1,7 @@
-"""A laboratory for emulated feet: a server, nodes with plates under them, and what they recorded.
+"""Laboratory for emulated feet: a server, nodes on plates, and their recordings.
 
-Server and nodes are processes of their own, started as a user starts them, on loopback. What they
-say goes to files beside the sessions.
+Server and nodes are processes on loopback, started by their commands; their output goes to log
+files beside the sessions.
 """
 
 from __future__ import annotations
@@ -24,48 +24,48 @@ from devices.errors import FootTileError, LinkError
 from service.pull import pull_session
 from storage.sessions.folder import FRAMES_NAME
 
-_SERVER_S = 120.0
-"""On a new machine its models are compiled first."""
-_NODE_S = 60.0
-_SEALED_S = 60.0
-_END_S = 15.0
-"""A node writes what its plates have seen before it ends."""
-_LOOK_S = 0.05
+_SERVER_START_TIMEOUT_S = 120.0
+"""Timeout of the server's start, which compiles models on a new machine."""
+_NODE_START_TIMEOUT_S = 60.0
+_SEAL_TIMEOUT_S = 60.0
+_STOP_TIMEOUT_S = 15.0
+"""Timeout of a node's end, at which it writes the files of its plates."""
+_POLL_S = 0.05
 PRE_ROLL_S = 5.0
-"""A recording begins so much earlier, if the node has run that long: with the lead, the tare."""
-_AT = "FootTile is at "
-_CODE = (
+"""Longest pre-roll, which includes the lead and thus the tare."""
+_ADDRESS_PREFIX = "FootTile is at "
+_PYTHON_CODE = (
     "from devices.realtime import terminate_with_parent; terminate_with_parent(); "
     "from service.cli.main import main; main()"
 )
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One recording of an emulated foot.
+class RecordingJob:
+    """Recording to make of an emulated foot.
 
     Attributes:
-        name: of node and session.
-        arguments: of `foottile node`: its scene, seeds, plates.
-        seconds: recorded after the node has appeared.
-        writes: files that it leaves behind.
+        name: name of node and session.
+        arguments: arguments of `foottile node`: scene, seeds, plates.
+        seconds: recorded time after the node has connected.
+        expected_files: files that the node writes.
     """
 
     name: str
     arguments: Sequence[str]
     seconds: float
-    writes: Sequence[Path]
+    expected_files: Sequence[Path]
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """A trial's session, downloaded.
+class RecordedTrial:
+    """Downloaded session of a trial.
 
     Attributes:
-        path: of its frames.
-        session: what the server says of it.
-        lost_frames: that no file has.
-        missed_slots: in which no frame was taken.
+        path: file of its frames.
+        session: metadata of the server.
+        lost_frames: number of lost frames.
+        missed_slots: number of slots without a frame.
     """
 
     path: Path
@@ -75,10 +75,10 @@ class Recorded:
 
 
 class Laboratory:
-    """A running server, and a folder for everything. Use as a context manager.
+    """Running server with a folder for all files; a context manager.
 
     Args:
-        folder: for data, journals, downloads and logs; is there.
+        folder: existing folder for data, journals, downloads and logs.
 
     Raises:
         FootTileError: the server does not start.
@@ -90,63 +90,63 @@ class Laboratory:
         self._url = ""
         self._token = secrets.token_urlsafe(18)
         self._nodes: list[subprocess.Popen[bytes]] = []
-        self._is_over = False
+        self._is_closed = False
         self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
         try:
             arguments = ("serve", "--host=127.0.0.1", "--port=0", f"--data={self._folder / 'data'}")
             server = self._start("server", arguments)
-            self._url = self._address(server)
+            self._url = self._wait_for_address(server)
         except BaseException:
             self._stack.close()
             raise
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.end_nodes()
+        self.stop_nodes()
         self._stack.close()
 
-    def end_nodes(self) -> None:
-        """End all nodes and start no other: whoever waits for a trial need not wait any longer."""
+    def stop_nodes(self) -> None:
+        """Stop all nodes and start no more; this ends pending `record` calls."""
         with self._lock:
-            self._is_over = True
+            self._is_closed = True
             for node in self._nodes:
-                _end(node)
+                _stop_process(node)
 
-    def record(self, trial: Trial) -> Recorded:
-        """Run a node, record it, and download what was sealed; several may run at the same time.
+    def record(self, trial: RecordingJob) -> RecordedTrial:
+        """Run a node, record it and download the sealed session; calls may run in parallel.
 
         Raises:
-            FootTileError: the node ends by itself, nothing is sealed, or a file is missing.
+            FootTileError: the node ends early, the session is not sealed, or a file is missing.
         """
         own = (f"--server={self._url}", f"--name={trial.name}", "--end-with-parent")
         journal = self._folder / "nodes" / trial.name
         with self._lock:
-            if self._is_over:
-                raise FootTileError(f"trial {trial.name} was not begun: the laboratory is closed")
+            if self._is_closed:
+                raise FootTileError(f"trial {trial.name} was not started: the laboratory is closed")
             arguments = ("node", *own, f"--journal={journal}", *trial.arguments)
             node = self._start(trial.name, arguments)
             self._nodes.append(node)
         try:
             with foottile.connect(self._url, self._token) as server:
-                session = self._started(server, trial.name, node)
-                _wait(trial.seconds, node, trial.name)
-                sealed = session.stop().wait(_SEALED_S).facts
+                session = self._start_recording(server, trial.name, node)
+                _check_keeps_running(trial.seconds, node, trial.name)
+                sealed = session.stop().wait_until_sealed(_SEAL_TIMEOUT_S).metadata
                 missed = server.node(trial.name)["missed_slots"]
                 pulled = pull_session(server, session.id, self._folder / "sessions")
         except foottile.FootTileError as error:
             raise LinkError(f"trial {trial.name}: {error}") from error
         finally:
-            code = _end(node)
-        absent = [path for path in trial.writes if not path.is_file()]
-        if code != 0 or absent:
+            code = _stop_process(node)
+        missing_files = [path for path in trial.expected_files if not path.is_file()]
+        if code != 0 or missing_files:
             raise FootTileError(
                 f"node {trial.name} ended with code {code}"
-                + "".join(f", and without {path.name}" for path in absent),
-                where=str(self._log(trial.name)),
+                + "".join(f", and without {path.name}" for path in missing_files),
+                where=str(self._log_path(trial.name)),
             )
-        return Recorded(
+        return RecordedTrial(
             path=self._folder / "sessions" / session.id / FRAMES_NAME,
             session=pulled,
             lost_frames=sum(sealed["lost"].values()),
@@ -154,48 +154,52 @@ class Laboratory:
         )
 
     def _start(self, name: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-        log = self._log(name)
+        log = self._log_path(name)
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as file:
-            process = subprocess.Popen(  # noqa: S603  # ourselves, with arguments of our own
-                [sys.executable, "-c", _CODE, *arguments],
+            process = subprocess.Popen(  # noqa: S603  # our own program and arguments
+                [sys.executable, "-c", _PYTHON_CODE, *arguments],
                 env={**os.environ, "PYTHONUNBUFFERED": "1", "FOOTTILE_TOKEN": self._token},
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C is for us, who end it
+                start_new_session=True,  # Ctrl-C reaches this process, which stops the node
             )
-        self._stack.callback(_end, process)
+        self._stack.callback(_stop_process, process)
         return process
 
-    def _log(self, name: str) -> Path:
+    def _log_path(self, name: str) -> Path:
         return self._folder / "logs" / f"{name}.log"
 
-    def _address(self, server: subprocess.Popen[bytes]) -> str:
-        until_s = time.monotonic() + _SERVER_S
-        while time.monotonic() < until_s and server.poll() is None:
-            for line in self._log("server").read_text(errors="replace").splitlines():
-                if line.startswith(_AT):
-                    return line.removeprefix(_AT).strip().rstrip("/")
-            time.sleep(_LOOK_S)
-        raise FootTileError("the server does not start", where=str(self._log("server")))
+    def _wait_for_address(self, server: subprocess.Popen[bytes]) -> str:
+        deadline_s = time.monotonic() + _SERVER_START_TIMEOUT_S
+        while time.monotonic() < deadline_s and server.poll() is None:
+            for line in self._log_path("server").read_text(errors="replace").splitlines():
+                if line.startswith(_ADDRESS_PREFIX):
+                    return line.removeprefix(_ADDRESS_PREFIX).strip().rstrip("/")
+            time.sleep(_POLL_S)
+        raise FootTileError("the server does not start", where=str(self._log_path("server")))
 
-    def _started(
+    def _start_recording(
         self, server: foottile.Server, name: str, process: subprocess.Popen[bytes]
     ) -> foottile.Session:
-        """The session that is recorded, as soon as the node is there."""
-        until_s, why = time.monotonic() + _NODE_S, ""
-        while time.monotonic() < until_s and process.poll() is None:
+        """Start recording as soon as the node is connected."""
+        deadline_s, reason = time.monotonic() + _NODE_START_TIMEOUT_S, ""
+        while time.monotonic() < deadline_s and process.poll() is None:
             try:
                 return server.record(name, name, pre_roll_s=PRE_ROLL_S)
-            except foottile.FootTileError as error:  # the server does not know it yet
-                why = str(error)
-                time.sleep(_LOOK_S)
-        raise FootTileError(f"node {name} does not come: {why}", where=str(self._log(name)))
+            except foottile.FootTileError as error:  # not connected yet
+                reason = str(error)
+                time.sleep(_POLL_S)
+        raise FootTileError(f"node {name} does not come: {reason}", where=str(self._log_path(name)))
 
 
-def _wait(seconds: float, process: subprocess.Popen[bytes], name: str) -> None:
-    """Let a node run; it is not to end meanwhile."""
+def _check_keeps_running(seconds: float, process: subprocess.Popen[bytes], name: str) -> None:
+    """Wait while a node runs; fail if it ends.
+
+    Raises:
+        FootTileError: the node ended.
+    """
     try:
         code = process.wait(seconds)
     except subprocess.TimeoutExpired:
@@ -203,13 +207,13 @@ def _wait(seconds: float, process: subprocess.Popen[bytes], name: str) -> None:
     raise FootTileError(f"node {name} has ended by itself, with code {code}")
 
 
-def _end(process: subprocess.Popen[bytes]) -> int:
-    """End a process, if it has not ended; its exit code."""
+def _stop_process(process: subprocess.Popen[bytes]) -> int:
+    """Stop a process and return its exit code."""
     if process.poll() is None:
         with suppress(ProcessLookupError):
             process.send_signal(signal.SIGTERM)
         try:
-            process.wait(_END_S)
+            process.wait(_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
     return process.wait()

@@ -1,6 +1,6 @@
-"""What several commands share: options that are pairs, output paths, progress, and JSON.
+"""Shared parts of commands: option types, output paths, progress, printing, stop signals.
 
-With them the options of an emulated foot, and how a command is told to stop.
+Also the options of an emulated foot.
 """
 
 from __future__ import annotations
@@ -29,27 +29,25 @@ from devices.scene.scene_file import Scene, load_scene
 from devices.text import escape_control_chars
 from foottile.environment import read_variable
 from service.cli.reference_options import (
-    ColumnsOfReference,
-    Decimal,
-    Encoding,
-    RateOfReference,
-    SignOfReference,
-    SkipRows,
-    UnitsOfReference,
-    UnitsRow,
-    named_values,
-    text_stated,
+    DecimalOption,
+    EncodingOption,
+    ReferenceColumnsOption,
+    ReferenceRateOption,
+    ReferenceSignOption,
+    ReferenceUnitsOption,
+    SkipRowsOption,
+    UnitsRowOption,
+    make_reference_options,
 )
 from service.json_output import to_json_text
 
 if TYPE_CHECKING:
     from service.rig.emulated_foot import EmulatedFoot
     from service.rig.plate_files import PlateFiles
-    from storage.formats.reference import ReferenceOptions
 
 SEED_MAX = 2**63 - 1
 SECONDS_MAX = NUMBER_MAX = 1e9
-"""Thirty years; and more than any metre, newton or factor can be."""
+"""Upper bounds of options: thirty years, and more than any plausible length, force or factor."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 ExactOption = Annotated[
@@ -60,45 +58,45 @@ CaOption = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="CA certificates in PEM that an https server's may be of, beside the machine's own.",
+        help="Further trusted CA certificates in PEM, for an https server.",
     ),
 ]
 StartOption = Annotated[
-    float | None, typer.Option(help="From so many seconds after the first frame.")
+    float | None, typer.Option(help="First instant, seconds after the first frame.")
 ]
-EndOption = Annotated[float | None, typer.Option(help="Before so many seconds.")]
+EndOption = Annotated[float | None, typer.Option(help="End, exclusive, in the same seconds.")]
 
 
-class _Screen(Console):
-    """A console that shows control characters of any text or cell of a table, and obeys none."""
+class _SafeConsole(Console):
+    """Console that escapes control characters in texts and table cells."""
 
     def render_str(self, text: str, **how: Any) -> Text:
         return super().render_str(escape_control_chars(text, keep_line_breaks=True), **how)
 
 
-class _Output(_Screen):
+class _StdoutConsole(_SafeConsole):
     def on_broken_pipe(self) -> None:
-        # The reader has seen enough, as with `| head -1`: that is no failure.
+        # The reader has ended, as with `| head -1`: no failure.
         self.quiet = True
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0)
 
 
-def _width() -> int | None:
-    # A pipe or a file has no edge at which a line or a cell would have to be broken.
+def _choose_width() -> int | None:
+    # A pipe or a file needs no line breaks.
     return None if sys.stdout.isatty() or read_variable("COLUMNS") else 500
 
 
 # Data goes to stdout; progress and remarks to stderr, progress only on a terminal.
-stdout = _Output(width=_width())
-stderr = _Screen(stderr=True)
+stdout = _StdoutConsole(width=_choose_width())
+stderr = _SafeConsole(stderr=True)
 
 
-def pair(text: str | None, option: str) -> tuple[float, float] | None:
-    """Two numbers with a comma between them.
+def parse_pair(text: str | None, option: str) -> tuple[float, float] | None:
+    """Return two comma-separated numbers.
 
     Raises:
-        UsageError: anything else.
+        UsageError: not a pair, or a number out of range.
     """
     if text is None:
         return None
@@ -111,59 +109,60 @@ def pair(text: str | None, option: str) -> tuple[float, float] | None:
     return first, second
 
 
-def data_folder(given: Path | None) -> Path:
+def resolve_data_folder(values: Path | None) -> Path:
     """Return the data folder that `--data` names, or the user's."""
     from service.user_folders import resolve_user_folder
 
-    return resolve_user_folder("data", given, "--data")
+    return resolve_user_folder("data", values, "--data")
 
 
-def output_path(path: Path, *inputs: Path) -> Path:
-    """Where to write, links resolved, after a look whether it can be, before anything takes time.
+def resolve_output_path(path: Path, *inputs: Path) -> Path:
+    """Return the file to write, links resolved, and check early that it can be written.
 
     Raises:
-        UsageError: its folder is missing or not writable, it is no regular file, or one of the
-            inputs, which would be lost.
+        UsageError: the folder is missing or not writable, the path is not a regular file, or it
+            is an input, which would be lost.
     """
-    target = _resolved(path)
+    target = _resolve_links(path)
     folder = target.parent
     if not folder.is_dir():
         raise UsageError(f"no folder {str(folder)!r} to write {path.name} in", remedy="Make it")
-    is_file = target.is_file() or not os.path.lexists(target)  # a link in a circle is there, too
+    is_file = target.is_file() or not os.path.lexists(target)  # a circular link also exists
     if not (is_file and os.access(folder, os.W_OK)):
         raise UsageError(f"{str(path)!r} cannot be written")
-    if any(target == _resolved(given) for given in inputs):
+    if any(target == _resolve_links(values) for values in inputs):
         raise UsageError(
             f"{str(path)!r} is an input and would be lost", remedy="Write to another file"
         )
     return target
 
 
-def _resolved(path: Path) -> Path:
-    return Path(os.path.realpath(path))  # unlike Path.resolve, whatever links there are
+def _resolve_links(path: Path) -> Path:
+    return Path(os.path.realpath(path))  # Path.resolve fails on circular links
 
 
 def print_json(value: object) -> None:
-    """One JSON document on stdout."""
+    """Print one JSON document on stdout."""
     sys.stdout.write(to_json_text(value))
 
 
 @contextmanager
-def progress(message: str) -> Iterator[Callable[[str], None]]:
-    """Say what takes time, on a terminal only.
+def show_progress(message: str) -> Iterator[Callable[[str], None]]:
+    """Show a running task on a terminal.
 
-    What it gives says how far it is: in the same line on a terminal, else a line each on stderr.
+    The yielded function shows its progress: in the same line on a terminal, else as a line each
+    on stderr.
     """
     if not stderr.is_terminal:
         yield remark
         return
-    # The usual spinner is of Braille, which not every terminal's encoding has.
-    spinner = "dots" if is_shown("⠋") else "line"
+    # The default spinner uses Braille, which some encodings lack.
+    spinner = "dots" if is_encodable("⠋") else "line"
     with stderr.status(escape(escape_control_chars(message)), spinner=spinner) as status:
         yield lambda text: status.update(escape(escape_control_chars(text)))
 
 
-def is_shown(text: str) -> bool:
+def is_encodable(text: str) -> bool:
     """Return whether the encodings of both streams have all characters of a text."""
     try:
         for stream in (sys.stdout, sys.stderr):
@@ -173,19 +172,19 @@ def is_shown(text: str) -> bool:
     return True
 
 
-def say(message: str) -> None:
-    """Print one line of the result on stdout; what is in it cannot make a second one."""
+def echo(message: str) -> None:
+    """Print one line of the result on stdout, with line breaks escaped."""
     indent = " " * (len(message) - len(message.lstrip(" ")))
-    say_lines(indent + escape_control_chars(message))
+    echo_lines(indent + escape_control_chars(message))
 
 
-def say_lines(text: str) -> None:
-    """Print a report of several lines on stdout; names in it must be escaped already."""
+def echo_lines(text: str) -> None:
+    """Print several lines on stdout; names must already be escaped."""
     stdout.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def remark(message: str) -> None:
-    """Print one line on stderr that a user should see, wherever it goes."""
+    """Print one line on stderr, also without a terminal."""
     stderr.print(
         escape_control_chars(message), style="dim", highlight=False, markup=False, soft_wrap=True
     )
@@ -193,32 +192,34 @@ def remark(message: str) -> None:
 
 @dataclass(frozen=True)
 class FootOptions:
-    """An emulated foot, as options of a command that is decorated by `with_foot_options`."""
+    """Options of an emulated foot, for commands decorated by `add_foot_options`."""
 
     load: Annotated[
-        Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
+        Path | None, typer.Option(help="Recorded load in place of the scene's ground.")
     ] = None
-    map_: ColumnsOfReference = None
-    units: UnitsOfReference = None
-    sign: SignOfReference = None
-    rate_hz: RateOfReference = None
-    skip_rows: SkipRows = None
-    units_row: UnitsRow = None
-    decimal: Decimal = None
-    encoding: Encoding = None
+    map_: ReferenceColumnsOption = None
+    units: ReferenceUnitsOption = None
+    sign: ReferenceSignOption = None
+    rate_hz: ReferenceRateOption = None
+    skip_rows: SkipRowsOption = None
+    units_row: UnitsRowOption = None
+    decimal: DecimalOption = None
+    encoding: EncodingOption = None
     load_scale: Annotated[float, typer.Option(help="Factor on every force of the load.")] = 1.0
     cop_scale: Annotated[float, typer.Option(help="Factor on the load's COP about its mean.")] = 1.0
     cop_offset_m: Annotated[
-        str, typer.Option(metavar="X,Y", help="Where the load's mean COP comes to lie.")
+        str, typer.Option(metavar="X,Y", help="Position of the load's mean COP, m.")
     ] = "0,0"
     cop_axes: Annotated[
         str, typer.Option(help="Axes of the load that become x and y: xy, yx, -yx, ...")
     ] = "xy"
-    lead_s: Annotated[float, typer.Option(help="Seconds without load first: the tare.")] = 1.0
+    lead_s: Annotated[float, typer.Option(help="Unloaded seconds at the start, for the tare.")] = (
+        1.0
+    )
     seed: Annotated[
-        int, typer.Option(min=0, max=SEED_MAX, help="Draws noise and ground, not the parts.")
+        int, typer.Option(min=0, max=SEED_MAX, help="Random seed of noise and ground.")
     ] = 0
-    parts_seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Draws other parts.")] = 0
+    parts_seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Random seed of parts.")] = 0
     force_plate: Annotated[
         Path | None,
         typer.Option(help="CSV of an emulated force plate under the foot, written at the end."),
@@ -228,11 +229,11 @@ class FootOptions:
         typer.Option(help="Frames (.npz) of an emulated pressure plate, written at the end."),
     ] = None
 
-    def foot(self, scene: Scene) -> EmulatedFoot:
-        """What they ask for, in a scene.
+    def make_foot(self, scene: Scene) -> EmulatedFoot:
+        """Return the emulated foot for a scene.
 
         Raises:
-            UsageError: options that do not fit, or a number that cannot be meant.
+            UsageError: conflicting options, or an implausible number.
             LoadTraceError: the load is not readable.
         """
         from devices.emulation.ground.load_trace import CopTransform
@@ -249,11 +250,11 @@ class FootOptions:
                 raise UsageError(f"{option} {value:g}", expected="a sensible positive number")
         if self.load is not None and scene.array.bus != EMULATED:
             raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
-        plates = self._plates(scene)
-        stated = self._stated()
+        plates = self._make_plate_files(scene)
+        stated = make_reference_options({**vars(self), "map": self.map_}, self.rate_hz)
         if self.load is None and stated != ReferenceOptions():
             raise UsageError(
-                "what a table does not state itself is stated, and none is named",
+                "the options of a table go with --load",
                 remedy="Add --load FILE",
             )
         if scene.array.bus == EMULATED and scene.ground.kind == "trace" and self.load is None:
@@ -261,7 +262,7 @@ class FootOptions:
                 f"scene {scene.name!r} presses a recorded load, and none was given",
                 remedy="Add --load FILE",
             )
-        offset_m = pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
+        offset_m = parse_pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
         return EmulatedFoot(
             load=read_load_trace(self.load, stated) if self.load is not None else None,
             load_scale=self.load_scale,
@@ -272,24 +273,7 @@ class FootOptions:
             plates=plates,
         )
 
-    def _stated(self) -> ReferenceOptions:
-        from storage.formats.reference import ReferenceOptions
-
-        of_text: dict[str, str | float | None] = {
-            "skip_rows": self.skip_rows,
-            "units_row": self.units_row,
-            "decimal": self.decimal,
-            "encoding": self.encoding,
-        }
-        return ReferenceOptions(
-            named_values(self.map_, "--map"),
-            named_values(self.units, "--units"),
-            self.sign,
-            self.rate_hz,
-            text_stated(of_text),
-        )
-
-    def _plates(self, scene: Scene) -> PlateFiles:
+    def _make_plate_files(self, scene: Scene) -> PlateFiles:
         from devices.emulation.plates.plate_load import check_plate_usable
         from service.rig.plate_files import PlateFiles
 
@@ -306,49 +290,58 @@ class FootOptions:
                 raise UsageError(
                     f"{option} {str(path)!r}", expected=f"a file that ends in {ending}"
                 )
-            output_path(path)
+            resolve_output_path(path)
             check_plate_usable(name, scene)
         return PlateFiles(self.force_plate, self.pressure_plate)
 
-    def as_arguments(self) -> list[str]:
-        """The same options for another command."""
+    def to_arguments(self) -> list[str]:
+        """Return these options as arguments of another command."""
         values = {f.name.replace("_", "-"): getattr(self, f.name) for f in fields(self)}
         return [f"--{name}={value}" for name, value in values.items() if value is not None]
 
 
-def with_foot_options(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose parameter `options`, a `FootOptions`, is an option for each of its fields."""
+def add_foot_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Replace the parameter `options` of a command by an option for each field of `FootOptions`."""
+    parameters = inspect.signature(FootOptions, eval_str=True).parameters.values()
+    return expand_options(command, [*parameters], lambda values: FootOptions(**values))
+
+
+def expand_options(
+    command: Callable[..., None],
+    parameters: list[inspect.Parameter],
+    make_options: Callable[[dict[str, Any]], Any],
+) -> Callable[..., None]:
+    """Replace the parameter `options` of a command by these, from which `options` is made."""
     own = inspect.signature(command, eval_str=True)
-    of_foot = inspect.signature(FootOptions, eval_str=True).parameters
 
     @wraps(command)
-    def run(**given: Any) -> None:
-        options = FootOptions(**{name: given.pop(name) for name in of_foot})
-        command(**given, options=options)
+    def run(**values: Any) -> None:
+        options = make_options({each.name: values.pop(each.name) for each in parameters})
+        command(**values, options=options)
 
-    parameters = [p for p in own.parameters.values() if p.name != "options"] + [*of_foot.values()]
-    run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # for typer
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    expanded = [p for p in own.parameters.values() if p.name != "options"] + parameters
+    run.__signature__ = own.replace(parameters=expanded)  # type: ignore[attr-defined]  # for typer
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in expanded}
     return run
 
 
-def with_finite_numbers(command: Callable[..., None]) -> Callable[..., None]:
-    """A command that refuses NaN and infinity in any of its options: no option means them."""
+def require_finite_numbers(command: Callable[..., None]) -> Callable[..., None]:
+    """Wrap a command to reject NaN and infinity in its options."""
 
     @wraps(command)
-    def run(**given: Any) -> None:
-        for name, value in given.items():
+    def run(**values: Any) -> None:
+        for name, value in values.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise UsageError(
                     f"--{name.replace('_', '-')} {value:g}", expected="a finite number"
                 )
-        command(**given)
+        command(**values)
 
     return run
 
 
 def check_emulated(scene: Scene) -> None:
-    """Refuse a scene of real hardware in a command that only emulates.
+    """Reject a scene of real hardware, for commands that only emulate.
 
     Raises:
         UsageError: its bus or its servo is real.
@@ -366,12 +359,12 @@ def check_emulated(scene: Scene) -> None:
         )
 
 
-def scene_with(name: str, *, bus: str | None, servo: str | None) -> Scene:
-    """A scene, on another bus or with its servo elsewhere if that is asked for.
+def load_adapted_scene(name: str, *, bus: str | None, servo: str | None) -> Scene:
+    """Load a scene and replace its bus, or the port of its servo.
 
     Raises:
         SceneError: no such scene.
-        UsageError: a servo's port for a scene without servo.
+        UsageError: the scene has no servo.
     """
     scene = load_scene(name)
     if bus is not None:
@@ -388,8 +381,8 @@ def scene_with(name: str, *, bus: str | None, servo: str | None) -> Scene:
     return scene
 
 
-def stop_on_signals() -> asyncio.Event:
-    """An event that Ctrl-C or SIGTERM sets, in the running loop."""
+def create_stop_event() -> asyncio.Event:
+    """Return an event of the running loop that Ctrl-C and SIGTERM set."""
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):

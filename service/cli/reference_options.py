@@ -1,4 +1,4 @@
-"""How a user states what a reference's file does not say itself: columns, units, sign, lag."""
+"""Options for facts that a reference's file lacks: columns, units, sign, rate, lag."""
 
 from __future__ import annotations
 
@@ -10,109 +10,110 @@ import typer
 from devices.errors import UsageError
 
 if TYPE_CHECKING:
-    from storage.formats.readers.text_options import TextOptions
+    from storage.formats.reference import ReferenceOptions
 
 SOLE_MAX_M = 1.0
 
-ColumnsOfReference = Annotated[
+ReferenceColumnsOption = Annotated[
     str | None,
     typer.Option(
         "--map",
         metavar="NAME=COLUMN,...",
-        help="Which columns are time_s, grf_n, cop_x_m, cop_y_m; - before a column turns it, + "
-        "between two adds them up.",
+        help="Columns of time_s, grf_n, cop_x_m, cop_y_m; - before a column inverts its sign, + "
+        "adds two columns.",
     ),
 ]
-UnitsOfReference = Annotated[
+ReferenceUnitsOption = Annotated[
     str | None,
     typer.Option(
         "--units",
         metavar="NAME=UNIT,...",
-        help="Of grf (N, kN, mN), cop (m, cm, mm) and time (s, ms, us, ns), unless the file or "
-        "our names state them.",
+        help="Units of grf (N, kN, mN), cop (m, cm, mm) and time (s, ms, us, ns), unless the file "
+        "states them.",
     ),
 ]
-SignOfReference = Annotated[
+ReferenceSignOption = Annotated[
     str | None,
     typer.Option(
         "--sign",
-        help="Of the reference's force under load: + or -; force platforms of C3D show it.",
+        help="Sign of the reference's force under load: + or -; C3D force platforms state it.",
     ),
 ]
-RateOfReference = Annotated[
+ReferenceRateOption = Annotated[
     float | None,
-    typer.Option(
-        "--rate-hz", help="Samples a second, of a reference with sample numbers or without times."
-    ),
+    typer.Option("--rate-hz", help="Sample rate of a reference without times."),
 ]
-SkipRows = Annotated[
+SkipRowsOption = Annotated[
     int | None,
     typer.Option(
         "--skip-rows",
         metavar="N",
-        help="Lines above the line of names, of a table in text; above the numbers, without names.",
+        help="Lines of a text table above its header, or above its numbers without a header.",
     ),
 ]
-UnitsRow = Annotated[
+UnitsRowOption = Annotated[
     int | None,
-    typer.Option("--units-row", metavar="N", help="Number of the line of units, from 1 on."),
+    typer.Option("--units-row", metavar="N", help="Line of the units, from 1."),
 ]
-Decimal = Annotated[
+DecimalOption = Annotated[
     str | None,
-    typer.Option("--decimal", metavar=",|.", help="Mark of decimals of a table in text."),
+    typer.Option("--decimal", metavar=",|.", help="Decimal mark of a text table."),
 ]
-Encoding = Annotated[
+EncodingOption = Annotated[
     str | None,
-    typer.Option("--encoding", metavar="NAME", help="Of a table in text, as cp1252 or cp932."),
+    typer.Option("--encoding", metavar="NAME", help="Encoding of a text table: cp1252, cp932."),
 ]
-SoleOfReference = Annotated[
+SoleSizeOption = Annotated[
     str | None,
     typer.Option(
         "--sole-m",
         metavar="LENGTH[,WIDTH]",
-        help="Size of the insole, where the reference's centre of pressure is a part of it.",
+        help="Size of the insole, for a COP as a fraction of it.",
     ),
 ]
-LagRange = Annotated[
+LagRangeOption = Annotated[
     str | None,
-    typer.Option(
-        "--lag-range-s", metavar="A,B", help="Least and greatest lag, where several would fit."
-    ),
+    typer.Option("--lag-range-s", metavar="A,B", help="Range of the lag, where several fit."),
 ]
 
 
-def text_stated(said: Mapping[str, str | float | None]) -> TextOptions:
-    """Return how a text is laid out, by options or cells of these names.
+def make_reference_options(stated: Mapping[str, object], rate_hz: float | None) -> ReferenceOptions:
+    """Return how to read a reference, from options or cells by name.
 
     Raises:
-        UsageError: one of them cannot be meant.
+        UsageError: an invalid value.
     """
     from storage.formats.readers.text_options import TextOptions
+    from storage.formats.reference import ReferenceOptions
 
-    def text(name: str) -> str | None:
-        value = said.get(name)
-        return None if value is None else str(value)
-
-    return TextOptions(
-        _whole_number(text("skip_rows"), "--skip-rows"),
-        _whole_number(text("units_row"), "--units-row"),
-        text("decimal"),
-        text("encoding"),
+    text = {name: None if value is None else str(value) for name, value in stated.items()}
+    return ReferenceOptions(
+        parse_named_values(text.get("map"), "--map"),
+        parse_named_values(text.get("units"), "--units"),
+        text.get("sign"),
+        rate_hz,
+        TextOptions(
+            _parse_int(text.get("skip_rows"), "--skip-rows"),
+            _parse_int(text.get("units_row"), "--units-row"),
+            text.get("decimal"),
+            text.get("encoding"),
+        ),
+        _parse_sole_size(text.get("sole_m")),
     )
 
 
-def _whole_number(text: str | None, option: str) -> int | None:
+def _parse_int(text: str | None, option: str) -> int | None:
     try:
         return None if text is None else int(text)
     except ValueError:
         raise UsageError(f"{option} {text!r}", expected="a whole number") from None
 
 
-def sole_size(text: str | None) -> tuple[float, ...]:
-    """Return length, and width if it is stated, of an insole in m.
+def _parse_sole_size(text: str | None) -> tuple[float, ...]:
+    """Return length, and width if stated, of an insole in m.
 
     Raises:
-        UsageError: they are no sizes of an insole.
+        UsageError: not a size of an insole.
     """
     if text is None:
         return ()
@@ -122,17 +123,17 @@ def sole_size(text: str | None) -> tuple[float, ...]:
         size_m = ()
     if len(size_m) not in (1, 2) or not all(0.0 < one < SOLE_MAX_M for one in size_m):
         raise UsageError(
-            f"--sole-m {text!r} is no size of an insole",
+            f"--sole-m {text!r} is not a size of an insole",
             expected=f"LENGTH or LENGTH,WIDTH, in metres, below {SOLE_MAX_M:g}",
         )
     return size_m
 
 
-def named_values(text: str | None, option: str) -> dict[str, str]:
-    """Names with what is said of them.
+def parse_named_values(text: str | None, option: str) -> dict[str, str]:
+    """Return values by name.
 
     Raises:
-        UsageError: no name, nothing said, or a name twice.
+        UsageError: a missing name or value, or a repeated name.
     """
     found: dict[str, str] = {}
     for part in (text or "").split(","):

@@ -1,4 +1,4 @@
-"""Results as tables for people."""
+"""Results as tables and lines of text."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from statistics import median
 
 from rich.table import Table
 
-from service.cli.options import remark, say, stdout
+from service.cli.options import echo, remark, stdout
 from service.estimation.stances import Stance
 from service.offline.accuracy import MIN_COP_GRF_N, MIN_GRF_N, Accuracy
 from service.offline.estimate_summary import EstimateSummary
@@ -20,12 +20,12 @@ PHASES = {
     "unloading": "while unloading",
 }
 ASSUMED_SCALE = "The scale of this calibration is assumed: do not trust the newtons."
-PULL_LONG_S = 0.25
+PULL_MIN_S = 0.25
 EMULATED = "Errors of an emulated foot; the paper's 1 N and 4 mm are a real one's."
 
 
-def accuracy_table(a: Accuracy) -> Table:
-    """Errors against the truth of an emulated scene."""
+def make_accuracy_table(a: Accuracy) -> Table:
+    """Return a table of errors against the truth of an emulated scene."""
     table = Table(title="Error against the truth", caption=EMULATED, title_justify="left")
     table.add_column("quantity")
     table.add_column("value", justify="right")
@@ -61,8 +61,8 @@ def accuracy_table(a: Accuracy) -> Table:
     )
     table.add_row("saturated", str(a.saturated_frames), f"{a.frames} frames")
     if a.bounds.frames:
-        held = f"{100 * a.bounds.share:.2f} % hold"
-        table.add_row("lower bounds of the GRF", held, f"{a.bounds.frames} frames without a GRF")
+        text = f"{100 * a.bounds.share:.2f} % hold"
+        table.add_row("lower bounds of the GRF", text, f"{a.bounds.frames} frames without a GRF")
     after = a.after_saturation
     if after.frames:
         table.add_row(
@@ -73,24 +73,24 @@ def accuracy_table(a: Accuracy) -> Table:
     return table
 
 
-def tell_findings(findings: EstimateSummary) -> None:
-    """Print what the estimates of a session come to."""
+def print_findings(findings: EstimateSummary) -> None:
+    """Print a summary of a session's estimates."""
     if findings.assumed_scale:
-        say(ASSUMED_SCALE)
+        echo(ASSUMED_SCALE)
     if findings.stances:
-        say(stances_line(findings.stances))
-    if findings.pull.duration_s > PULL_LONG_S:
+        echo(format_stances(findings.stances))
+    if findings.pull.duration_s > PULL_MIN_S:
         remark(
             f"The GRF is below zero for {findings.pull.duration_s:.2f} s, by up to "
             f"{findings.pull.greatest_n:.1f} N: the foot was probably loaded during the tare. "
             "Name an unloaded interval with --tare-s BEGIN,END."
         )
     if findings.accuracy is not None:
-        stdout.print(accuracy_table(findings.accuracy))
+        stdout.print(make_accuracy_table(findings.accuracy))
 
 
-def findings_json(findings: EstimateSummary) -> dict[str, object]:
-    """The same for programs."""
+def make_findings_json(findings: EstimateSummary) -> dict[str, object]:
+    """Return the summary for programs."""
     scale = {None: None, True: "assumed", False: "measured"}[findings.assumed_scale]
     return {
         "absolute_scale": scale,
@@ -100,19 +100,19 @@ def findings_json(findings: EstimateSummary) -> dict[str, object]:
     }
 
 
-def stances_line(stances: Sequence[Stance]) -> str:
-    """How often the foot stood, and how hard."""
+def format_stances(stances: Sequence[Stance]) -> str:
+    """Return number, median peak, impulse and duration of the stances."""
     hidden = [s for s in stances if not math.isfinite(s.peak_grf_n)]
     whole = [s for s in stances if s.is_whole]
-    said = f"{len(stances)} stance{'s' if len(stances) != 1 else ''}"
+    text = f"{len(stances)} stance{'s' if len(stances) != 1 else ''}"
     if hidden:
-        said += f", {len(hidden)} with a peak that is not known"
+        text += f", {len(hidden)} with an unknown peak"
     if len(whole) + len(hidden) < len(stances):
-        said += f", {len(whole)} of them seen from beginning to end"
+        text += f", {len(whole)} of them complete"
     if not whole:
-        return said
+        return text
     return (
-        f"{said}: median peak {median(s.peak_grf_n for s in whole):.2f} N, impulse "
+        f"{text}: median peak {median(s.peak_grf_n for s in whole):.2f} N, impulse "
         f"{median(s.impulse_n_s for s in whole):.2f} N s, duration "
         f"{median(s.duration_s for s in whole):.2f} s"
     )

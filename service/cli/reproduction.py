@@ -1,6 +1,6 @@
-"""Runs a reproduction: tiles on the mill in processes, trials in the laboratory, all judged.
+"""Reproduction of the paper's experiments: tiles under the indenter, trials in the laboratory.
 
-One part that fails fails alone: what was not measured is said by name.
+A failed part is reported by name and does not stop the others.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 from devices.errors import FootTileError
 from devices.scene.scene_file import load_scene
-from service.cli.laboratory import Laboratory, Trial
+from service.cli.laboratory import Laboratory, RecordingJob
 from service.estimation.calibration import Calibration
 from service.estimation.domes import DOMES, PAPER_DOME, Dome
 from service.offline.calibration_lookup import EMULATED_RIG, find_calibration, make_rig_scene
@@ -45,16 +45,15 @@ from service.sessions.calibration_file import write_calibration
 from service.version import SOFTWARE_VERSION
 from storage.durable_files import make_synced_folder, write_atomically
 
-Tell = Callable[[str], None]
+ReportStep = Callable[[str], None]
 QUICK_TRIALS = 1
 REPEATED_MAX = 4
-"""So many trials may be spoiled, by a machine that stood still, and are repeated. If there are
-more, something else is wrong."""
+"""Most failed trials that are repeated: a busy machine spoils a few; more have another cause."""
 
 
 @dataclass(frozen=True)
 class ReproduceOptions:
-    """How much; see `foottile reproduce --help`."""
+    """Options of `foottile reproduce`."""
 
     seed: int = 0
     parts_seed: int = 0
@@ -64,54 +63,54 @@ class ReproduceOptions:
 
     @property
     def domes(self) -> tuple[Dome, ...]:
-        """That are pressed."""
+        """Domes under the indenter."""
         return (PAPER_DOME,) if self.quick else DOMES
 
     @property
     def setups(self) -> tuple[ExperimentSetup, ...]:
-        """That are recorded."""
+        """Experiments to record."""
         return (ROLLING,) if self.quick else SETUPS
 
 
 @dataclass
 class _Run:
-    """A run as far as it is."""
+    """State of a running reproduction."""
 
     options: ReproduceOptions
     folder: Path
-    tell: Tell
+    report_step: ReportStep
     failures: dict[str, str] = field(default_factory=dict)
     repeated: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def timed(self, what: str) -> Iterator[None]:
+    def measure_time(self, what: str) -> Iterator[None]:
         begin_s = time.monotonic()
         yield
         self.seconds[what] = time.monotonic() - begin_s
 
-    def failed(self, what: str, error: Exception) -> None:
+    def add_failure(self, what: str, error: Exception) -> None:
         self.failures[what] = str(error) or type(error).__name__
 
 
-def reproduce(options: ReproduceOptions, folder: Path, tell: Tell) -> Reproduction:
-    """Press, record, download and compare.
+def run_reproduction(options: ReproduceOptions, folder: Path, report: ReportStep) -> Reproduction:
+    """Load tiles, record trials, download and compare.
 
     Args:
-        options: how much.
-        folder: for everything that is recorded; is there.
-        tell: told how far it is.
+        options: extent of the reproduction.
+        folder: existing folder for all recordings.
+        report: receives progress messages.
 
     Raises:
-        FootTileError: the server does not start, or the disk takes nothing.
+        FootTileError: the server does not start, or the disk is not writable.
     """
-    run = _Run(options, folder, tell)
-    with run.timed("mill"):
-        domes, calibration = _mill(run)
+    run = _Run(options, folder, report)
+    with run.measure_time("mill"):
+        domes, calibration = _indent_tiles(run)
     experiments: tuple[ExperimentResult, ...] = ()
     if calibration is not None:
-        with run.timed("trials"):
-            experiments = _experiments(run, calibration)
+        with run.measure_time("trials"):
+            experiments = _run_experiments(run, calibration)
     return Reproduction(
         software=SOFTWARE_VERSION,
         run_at=datetime.now(UTC).strftime("%Y-%m-%d"),
@@ -120,72 +119,71 @@ def reproduce(options: ReproduceOptions, folder: Path, tell: Tell) -> Reproducti
         domes=domes,
         calibration=calibration,
         experiments=experiments,
-        not_borne_n=_not_borne_n(run, experiments),
+        not_borne_n=_compute_not_borne_n(run, experiments),
         failures=run.failures,
         seconds=run.seconds,
-        notes=_notes(run),
+        notes=_make_notes(run),
     )
 
 
-def _notes(run: _Run) -> list[str]:
+def _make_notes(run: _Run) -> list[str]:
     options = run.options
     how = (
-        "the foot's calibration is that of the emulated bench, kept from before if it was there"
+        "the foot has the calibration of the emulated rig, cached if available"
         if options.quick
-        else "the foot's four tiles were pressed on it, too, and calibrated"
+        else "it also loaded and calibrated the foot's four tiles"
     )
     return [
-        f"The mill runs in virtual time; {how}.",
-        "Trials run in real time: a server and, for each trial, a node as processes of their own, "
-        f"{options.jobs} of them at a time on {os.cpu_count()} cores, over loopback; the real "
-        "driver reads emulated chips. Sessions were sealed by the server, downloaded and compared.",
-        "Domes differ by 3 % between loadings, as the paper's.",
-        *(f"Trial {name} was repeated, alone: {why}." for name, why in run.repeated.items()),
+        f"The indenter runs in virtual time; {how}.",
+        "Trials run in real time: a server and a node for each trial, in processes over loopback, "
+        f"{options.jobs} at a time on {os.cpu_count()} cores; the real driver reads emulated "
+        "chips. The server sealed the sessions; they were downloaded and compared.",
+        "Domes differ by 3 % between loadings, as in the paper.",
+        *(f"Trial {name} was repeated, alone: {reason}." for name, reason in run.repeated.items()),
     ]
 
 
-def _mill(run: _Run) -> tuple[tuple[DomeResult, ...], Calibration | None]:
+def _indent_tiles(run: _Run) -> tuple[tuple[DomeResult, ...], Calibration | None]:
     options = run.options
-    pressed: dict[str, DomeResult] = {}
-    calibrated: dict[str, Calibration] = {}
-    serials = () if options.quick else _serials()
+    dome_results: dict[str, DomeResult] = {}
+    calibrations: dict[str, Calibration] = {}
+    serials = () if options.quick else _list_serials()
     tasks: list[Dome | str] = [*options.domes, *serials]
-    work = partial(_pressed, seed=options.seed, parts_seed=options.parts_seed)
+    work = partial(_indent, seed=options.seed, parts_seed=options.parts_seed)
     results: Iterator[tuple[Dome | str, DomeResult | Calibration | Exception]]
     results = map_in_processes(work, tasks, min(options.jobs, len(tasks)))
     for number, (task, found) in enumerate(results, 1):
         name = task if isinstance(task, str) else task.name
-        run.tell(f"mill: {number} of {len(tasks)} tiles pressed, the last one {name}")
+        run.report_step(f"indenter: {number} of {len(tasks)} tiles, last {name}")
         if isinstance(found, Exception):
-            run.failed(f"mill: {name}", found)
+            run.add_failure(f"indenter: {name}", found)
         elif isinstance(found, DomeResult):
-            pressed[name] = found
+            dome_results[name] = found
         else:
-            calibrated[name] = found
-    domes = tuple(pressed[dome.name] for dome in options.domes if dome.name in pressed)
+            calibrations[name] = found
+    domes = tuple(dome_results[dome.name] for dome in options.domes if dome.name in dome_results)
     calibration = None
     try:
         if options.quick:
+            seed, report_step = options.parts_seed, run.report_step
             calibration = find_calibration(
-                EMULATED_RIG, _serials(), parts_seed=options.parts_seed, on_progress=run.tell
+                EMULATED_RIG, _list_serials(), parts_seed=seed, on_progress=report_step
             )
-        elif set(calibrated) == set(serials):
-            calibration = merge_calibrations(
-                [calibrated[serial] for serial in serials], "reproduce"
-            )
+        elif set(calibrations) == set(serials):
+            calibration = merge_calibrations([calibrations[each] for each in serials], "reproduce")
     except FootTileError as error:
-        run.failed("mill: the foot", error)
+        run.add_failure("indenter: the foot", error)
     return domes, calibration
 
 
-def _serials() -> tuple[str, ...]:
+def _list_serials() -> tuple[str, ...]:
     return tuple(tile.serial for tile in load_scene(ROLLING.scene).tile)
 
 
-def _pressed(
+def _indent(
     task: Dome | str, *, seed: int, parts_seed: int
 ) -> DomeResult | Calibration | FootTileError:
-    """Press a dome of Table I, or calibrate a tile of the foot."""
+    """Evaluate a dome of Table I, or calibrate a tile of the foot."""
     try:
         if isinstance(task, str):
             return calibrate_tile(make_rig_scene(task), seed=seed, parts_seed=parts_seed)
@@ -196,27 +194,25 @@ def _pressed(
         return error
 
 
-def _experiments(run: _Run, calibration: Calibration) -> tuple[ExperimentResult, ...]:
+def _run_experiments(run: _Run, calibration: Calibration) -> tuple[ExperimentResult, ...]:
     options = run.options
     _write_scenes(run, calibration)
     planned = plan_trials(options.setups, options.trials, options.seed, run.folder / "references")
-    run.tell("trials: starting the server")
+    run.report_step("trials: starting the server")
     with Laboratory(run.folder) as laboratory:
-        judged, spoiled = _recorded(run, laboratory, planned, options.jobs)
-        if len(spoiled) <= REPEATED_MAX:
-            # One at a time: a machine that was too busy for two may have room for one.
-            again = [plan.make_repetition() for plan in spoiled]
-            run.repeated |= {plan.trial_name: str(error) for plan, error in spoiled.items()}
-            better, spoiled = _recorded(run, laboratory, again, 1)
-            judged |= better
-    for plan, error in spoiled.items():
-        run.failed(plan.trial_name, error)
+        results, failures = _record_trials(run, laboratory, planned, options.jobs)
+        if len(failures) <= REPEATED_MAX:
+            # One at a time: a machine too busy for two trials may manage one.
+            again = [plan.make_repetition() for plan in failures]
+            run.repeated |= {plan.trial_name: str(error) for plan, error in failures.items()}
+            better, failures = _record_trials(run, laboratory, again, 1)
+            results |= better
+    for plan, error in failures.items():
+        run.add_failure(plan.trial_name, error)
+    done = [plan for plan in planned if plan.trial_name in results]
     grouped = (
         ExperimentResult(
-            setup,
-            tuple(
-                judged[p.trial_name] for p in planned if p.setup is setup and p.trial_name in judged
-            ),
+            setup, tuple(results[plan.trial_name] for plan in done if plan.setup is setup)
         )
         for setup in options.setups
     )
@@ -226,45 +222,43 @@ def _experiments(run: _Run, calibration: Calibration) -> tuple[ExperimentResult,
 def _write_scenes(run: _Run, calibration: Calibration) -> None:
     for name in ("scenes", "references"):
         make_synced_folder(run.folder / name)
-    kept = run.folder / "calibration.json"
-    write_calibration(kept, calibration)
+    path = run.folder / "calibration.json"
+    write_calibration(path, calibration)
     for setup in run.options.setups:
-        write_atomically(_scene(run, setup), compose_scene_toml(setup, kept).encode())
+        write_atomically(_get_scene_path(run, setup), compose_scene_toml(setup, path).encode())
 
 
-def _scene(run: _Run, setup: ExperimentSetup) -> Path:
+def _get_scene_path(run: _Run, setup: ExperimentSetup) -> Path:
     return run.folder / "scenes" / f"{setup.name}.toml"
 
 
-def _recorded(
+def _record_trials(
     run: _Run, laboratory: Laboratory, planned: Sequence[TrialPlan], jobs: int
 ) -> tuple[dict[str, TrialResult], dict[TrialPlan, FootTileError]]:
-    """Trials that were recorded and judged, by name, and those that were not."""
-    judged: dict[str, TrialResult] = {}
-    spoiled: dict[TrialPlan, FootTileError] = {}
+    """Return the results of evaluated trials by name, and the errors of failed ones."""
+    results: dict[str, TrialResult] = {}
+    failures: dict[TrialPlan, FootTileError] = {}
     with ThreadPoolExecutor(jobs) as pool:
-        futures = {pool.submit(_trial, run, laboratory, plan): plan for plan in planned}
+        futures = {pool.submit(_run_trial, run, laboratory, plan): plan for plan in planned}
         try:
             for number, future in enumerate(as_completed(futures), 1):
                 plan = futures[future]
                 try:
-                    judged[plan.trial_name] = future.result()
+                    results[plan.trial_name] = future.result()
                 except FootTileError as error:
-                    spoiled[plan] = error
-                run.tell(
-                    f"trials: {number} of {len(planned)} done, the last one {plan.session_name}"
-                )
+                    failures[plan] = error
+                run.report_step(f"trials: {number} of {len(planned)}, last {plan.session_name}")
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            laboratory.end_nodes()
+            laboratory.stop_nodes()
             raise
-    return judged, spoiled
+    return results, failures
 
 
-def _trial(run: _Run, laboratory: Laboratory, plan: TrialPlan) -> TrialResult:
-    arguments = plan.make_node_arguments(_scene(run, plan.setup), run.options.parts_seed)
+def _run_trial(run: _Run, laboratory: Laboratory, plan: TrialPlan) -> TrialResult:
+    arguments = plan.make_node_arguments(_get_scene_path(run, plan.setup), run.options.parts_seed)
     recorded = laboratory.record(
-        Trial(plan.session_name, arguments, plan.recording_seconds, (plan.reference_path,))
+        RecordingJob(plan.session_name, arguments, plan.recording_seconds, (plan.reference_path,))
     )
     return evaluate_trial(
         plan.setup,
@@ -276,10 +270,10 @@ def _trial(run: _Run, laboratory: Laboratory, plan: TrialPlan) -> TrialResult:
     )
 
 
-def _not_borne_n(run: _Run, experiments: tuple[ExperimentResult, ...]) -> dict[str, float]:
+def _compute_not_borne_n(run: _Run, experiments: tuple[ExperimentResult, ...]) -> dict[str, float]:
     found = {}
     for one in experiments:
-        scene = load_scene(str(_scene(run, one.setup)))
+        scene = load_scene(str(_get_scene_path(run, one.setup)))
         each = [
             compute_not_borne_n(scene, run.options.seed + number, one.setup.trial_seconds)
             for number in range(1, run.options.trials + 1)

@@ -1,4 +1,4 @@
-"""A folder for results that a command makes, and that is gone again if nothing came of it."""
+"""Folder for results, removed again after a failure."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from devices.errors import UsageError
 
 
 @contextmanager
-def result_folder(out: Path) -> Iterator[Path]:
-    """The folder to write in, made if it is missing, and gone again if nothing came of it.
+def open_result_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder, created if missing and removed again after an error if empty.
 
     Raises:
-        UsageError: it cannot be made, or not be written in.
+        UsageError: the folder cannot be created or written.
     """
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
-        _make(out)
+        _make_folder(out)
         yield out.resolve()
     except BaseException:
         for folder in missing:
-            with suppress(OSError):  # not empty, or not made yet
+            with suppress(OSError):  # not empty, or not created yet
                 folder.rmdir()
         raise
 
 
-def _make(out: Path) -> None:
+def _make_folder(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"no folder {str(out)!r} can be made: {error}") from error
+        raise UsageError(f"folder {str(out)!r} cannot be created: {error}") from error
     if not os.access(out, os.W_OK):
-        raise UsageError(f"{str(out)!r} cannot be written in")
+        raise UsageError(f"folder {str(out)!r} is not writable")

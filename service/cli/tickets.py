@@ -1,4 +1,4 @@
-"""Tickets and tokens on the command line: addresses, QR codes, and the token of a data folder."""
+"""Tickets and tokens on the command line: addresses, QR codes, token of a data folder."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from urllib.parse import urlsplit
 import typer
 
 from devices.errors import UsageError
-from service.cli.options import data_folder, is_shown, remark, say
+from service.cli.options import echo, is_encodable, remark, resolve_data_folder
 
 AdvertiseOption = Annotated[
     str | None,
     typer.Option(
         metavar="HOST",
-        help="Address or name to show to people, as behind a reverse proxy or in a container; "
-        "default: those of all interfaces.",
+        help="Address or name to print, for a server behind a reverse proxy or in a container; "
+        "default: all interfaces.",
     ),
 ]
 TokenFolderOption = Annotated[
@@ -29,22 +29,22 @@ TokenFolderOption = Annotated[
 ]
 _BORDER = 2
 _BLACK_ON_WHITE = "\x1b[38;5;231;48;5;16m"
-"""Light blocks on a dark ground, whatever colours the terminal has: few phones read it inverted."""
+"""Light blocks on a dark ground in any colour scheme: few phones read an inverted code."""
 _WHITE_ON_WHITE = "\x1b[38;5;231;48;5;231m"
-_USUAL = "\x1b[0m"
+_RESET = "\x1b[0m"
 
 
 def read_data_token(folder: Path | None) -> str | None:
-    """Return the token that a server keeps in its data folder; None without a folder.
+    """Return the token in a server's data folder; None without a folder.
 
     Raises:
-        UsageError: no token is there.
+        UsageError: the folder has no token.
     """
     from service.api.address import TOKEN_NAME, read_token
 
     if folder is None:
         return None
-    folder = data_folder(folder)
+    folder = resolve_data_folder(folder)
     try:
         return read_token(folder)
     except FileNotFoundError as error:
@@ -55,49 +55,49 @@ def read_data_token(folder: Path | None) -> str | None:
         ) from error
 
 
-def host_of(url: str) -> str:
+def get_host(url: str) -> str:
     """Return the name or the address of a server, without port and brackets."""
     return urlsplit(url).hostname or ""
 
 
-def reaches_others(url: str) -> bool:
-    """Is this an address that a phone could open?"""
+def is_reachable(url: str) -> bool:
+    """Return whether other devices can reach the address."""
     from foottile.local_server import is_loopback
 
-    return not is_loopback(host_of(url))
+    return not is_loopback(get_host(url))
 
 
-def remark_reach(urls: list[str], host: str) -> None:
-    """Remark what keeps others from a server's addresses.
+def remark_unreachable(urls: list[str], host: str) -> None:
+    """Print why other devices cannot reach a server's addresses.
 
     Args:
-        urls: its addresses.
-        host: what it was told to listen on.
+        urls: addresses of the server.
+        host: address on which it listens.
     """
     from service.api.address import is_wildcard
     from service.api.interfaces import list_addresses
 
-    if is_wildcard(host) and not any(reaches_others(url) for url in urls):
+    if is_wildcard(host) and not any(is_reachable(url) for url in urls):
         if list_addresses(include_ipv6=True):
-            remark("this machine has addresses of IPv6 only: start the server with --host ::")
+            remark("this machine has IPv6 addresses only: start the server with --host ::")
         else:
             remark(
-                "this machine is in no network, so no phone reaches it: start a hotspot or join a "
+                "this machine has no network, so no phone reaches it: start a hotspot or join a "
                 "network; `foottile invite` then shows its address"
             )
     if any("%25" in url for url in urls):
         remark(
-            "an address with %25 is for a node or a Python program at the same cable: behind it "
-            "stands this machine's name of the interface; write there the other machine's"
+            "an address with %25 is for a node or a Python program on the same cable: replace the "
+            "interface name after it by the other machine's"
         )
 
 
-def qr_lines(text: str, *, is_ascii: bool = False) -> list[str]:
-    """Return a QR code as lines of text in which the light modules are drawn.
+def make_qr_lines(text: str, *, is_ascii: bool = False) -> list[str]:
+    """Return a QR code as lines of text that draw its light modules.
 
     Args:
-        text: its content.
-        is_ascii: draw `##` for a module, and not half blocks, two rows a line.
+        text: content of the code.
+        is_ascii: draw `##` for a module instead of half blocks with two rows a line.
     """
     import segno
 
@@ -110,31 +110,31 @@ def qr_lines(text: str, *, is_ascii: bool = False) -> list[str]:
     return drawn.getvalue().splitlines()
 
 
-def show_code(address: str, *, viewer: bool = False) -> None:
-    """Show the code of an address that has a ticket; on a terminal only, which no log is."""
+def show_qr_code(address: str, *, viewer: bool = False) -> None:
+    """Print the QR code of a login link, only on a terminal, not to a log."""
     if not sys.stdout.isatty():
         return
-    lines = qr_lines(address, is_ascii=not is_shown("█▀▄"))
+    lines = make_qr_lines(address, is_ascii=not is_encodable("█▀▄"))
     columns = shutil.get_terminal_size().columns
     if len(lines[0]) > columns:
         remark(f"the QR code needs {len(lines[0])} columns, and this terminal has {columns}")
         return
     for line in lines:
         solid = re.sub("#+", rf"{_WHITE_ON_WHITE}\g<0>{_BLACK_ON_WHITE}", line)
-        sys.stdout.write(f"{_BLACK_ON_WHITE}{solid}{_USUAL}\n")
+        sys.stdout.write(f"{_BLACK_ON_WHITE}{solid}{_RESET}\n")
     sys.stdout.flush()
-    may = "look" if viewer else "tare, record and change"
-    remark(f"for a phone: it may {may}; good once, for five minutes; more with `foottile invite`")
+    permissions = "look" if viewer else "tare, record and change"
+    remark(f"for a phone: it may {permissions}; once, for five minutes; more: `foottile invite`")
 
 
-def say_ticket(urls: list[str], *, viewer: bool) -> None:
-    """Say under which addresses a ticket is good, and show the code of the first one."""
+def print_ticket(urls: list[str], *, viewer: bool) -> None:
+    """Print the login links of a ticket, and the QR code of the first."""
     for url in urls:
-        say(url)
-    if reaches_others(urls[0]):
-        show_code(urls[0], viewer=viewer)
+        echo(url)
+    if is_reachable(urls[0]):
+        show_qr_code(urls[0], viewer=viewer)
     else:
         remark(
-            "a phone does not reach this address: start the server with --host 0.0.0.0; if that is "
-            "done, its machine is in no network: start a hotspot or join one, and ask again"
+            "a phone does not reach this address: start the server with --host 0.0.0.0. If it "
+            "runs so, its machine has no network: start a hotspot or join one, and retry"
         )

@@ -82,8 +82,8 @@ class OmittedModelEffect:
         if not self._frames:
             return {}
         newtons = {name: total / _NANONEWTONS / self._frames for name, total in self._sums.items()}
-        asked = [(n, name) for name, n in newtons.items() if n >= EFFECT_MIN_N]
-        return {name: n for n, name in sorted(asked, reverse=True)}
+        requested = [(n, name) for name, n in newtons.items() if n >= EFFECT_MIN_N]
+        return {name: n for n, name in sorted(requested, reverse=True)}
 
     def _start_tare(self, tare: Tare) -> None:
         self._tare = tare

@@ -156,24 +156,24 @@ class FrameSender:
         while True:
             oldest_s = next(iter(self._pending_pings.values()), None)
             if oldest_s is not None and time.monotonic() - oldest_s > _PING_TIMEOUT_S:
-                raise LinkError(f"the server has not answered for {_PING_TIMEOUT_S:g} s")
+                raise LinkError(f"the server has not on_pong for {_PING_TIMEOUT_S:g} s")
             await self.send_ping()
             await asyncio.sleep(_PING_INTERVAL_S)
 
     async def send_ping(self) -> None:
         """Send a ping; its answer shows that all frames sent before were read."""
         number, flow = next(self._ping_numbers), self._window
-        asked = self._pending_pings
-        asked[number] = time.monotonic()
+        requested = self._pending_pings
+        requested[number] = time.monotonic()
         flow.record_ping(number)
 
-        def answered(answer: asyncio.Future[float]) -> None:
-            asked.pop(number, None)
+        def on_pong(answer: asyncio.Future[float]) -> None:
+            requested.pop(number, None)
             if not answer.cancelled() and answer.exception() is None:
                 flow.record_ping_answer(number, time.monotonic())
                 self._link.wake_sender.set()
 
-        asyncio.ensure_future(await self._link.socket.ping()).add_done_callback(answered)
+        asyncio.ensure_future(await self._link.socket.ping()).add_done_callback(on_pong)
 
     def _read_next_chunk(self) -> list[tuple[str, EncodedBatch]]:
         """Read the next batches of the backlog, from memory or disk."""
@@ -184,7 +184,7 @@ class FrameSender:
         stream_id, first, last = wanted
         stream = self._link.callbacks.get_streams().get(stream_id)
         found: list[EncodedBatch] = []
-        done = asked = Intervals([(first, last)])
+        done = requested = Intervals([(first, last)])
         if stream is not None:
             has_failed, damaged = False, Intervals()
             try:
@@ -197,13 +197,15 @@ class FrameSender:
             # Frames not held were evicted meanwhile, and counted; held ones may be on the way from
             # memory to disk, and are read again. Whole batches are sent, which may exceed the
             # requested range.
-            done = union(batch.numbers for batch in found) | damaged | (asked - stream.available)
-            if not asked & done:
+            done = (
+                union(batch.numbers for batch in found) | damaged | (requested - stream.available)
+            )
+            if not requested & done:
                 time.sleep(_REREAD_DELAY_S)
                 if (
                     not has_failed and wanted == self._last_missing_range
                 ):  # its index may be damaged
-                    done = asked
+                    done = requested
                 self._last_missing_range = wanted
         for numbers in done:
             backlog.remove_frames(stream_id, *numbers)

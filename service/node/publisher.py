@@ -18,7 +18,7 @@ from websockets.frames import CloseCode
 from devices.errors import LinkError
 from foottile.local_server import find_local_server
 from foottile.tls import make_context
-from foottile.websocket import AsyncConnection
+from foottile.websocket import AsyncWebsocket
 from service.node.frame_sender import EstablishedLink, NodeCallbacks
 from service.node.server_connection import ServerConnection, parse_server_message
 from service.node.tcp_connect import (
@@ -124,7 +124,7 @@ class Publisher:
             self._url,
             sock=tcp,
             ssl=self._context,
-            create_connection=AsyncConnection,
+            create_connection=AsyncWebsocket,
             subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
             compression=None,  # costs three times the CPU, saves little (performance.md)
             max_size=MESSAGE_BYTES_MAX,

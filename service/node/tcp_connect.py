@@ -18,9 +18,9 @@ from websockets.exceptions import ConnectionClosed
 
 from devices.errors import UsageError
 from foottile.address import decode_zone
-from foottile.foreign import explain_foreign
+from foottile.foreign_response import explain_foreign_response
 from foottile.tls import explain_tls
-from foottile.websocket import UpgradeRefused
+from foottile.websocket import UpgradeRejection
 from service.protocol import INGEST_PATH, LinkCloseCode
 
 ATTEMPT_INTERVAL_S = 0.5
@@ -149,22 +149,22 @@ def _is_refusal(error: BaseException) -> bool:
         # A restarting server will be back, and damaged messages are sent again.
         soon = (LinkCloseCode.RESTART, LinkCloseCode.MALFORMED)
         return error.rcvd is not None and error.rcvd.code not in soon
-    return isinstance(error, UpgradeRefused)
+    return isinstance(error, UpgradeRejection)
 
 
 def explain_connection_error(error: Exception, url: str = "") -> str:
     """Explain in words why the connection to an address failed."""
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         return error.rcvd.reason or f"closed with code {error.rcvd.code}"
-    if isinstance(error, UpgradeRefused):
+    if isinstance(error, UpgradeRejection):
         return _explain_refusal(error, url)
     return explain_tls(error) or str(error) or type(error).__name__
 
 
-def _explain_refusal(error: UpgradeRefused, url: str) -> str:
-    foreign = explain_foreign(url, error.status, error.headers)
-    if foreign is not None:
-        return foreign
+def _explain_refusal(error: UpgradeRejection, url: str) -> str:
+    foreign_response = explain_foreign_response(url, error.status, error.headers)
+    if foreign_response is not None:
+        return foreign_response
     if error.status == HTTPStatus.UNAUTHORIZED:
         is_wrong = b"is not the server's token" in error.body
         what = (

@@ -182,10 +182,10 @@ def make_rig_scene(
 ) -> Scene:
     """Build the indenter scene with one tile."""
     scene = replace_tiles(load_scene("indentation"), [serial])
-    asked: dict[str, object] = {"family": family}
+    requested: dict[str, object] = {"family": family}
     if repeatability is not None:
-        asked["repeatability"] = repeatability
-    return scene.model_copy(update={"emulation": scene.emulation.model_copy(update=asked)})
+        requested["repeatability"] = repeatability
+    return scene.model_copy(update={"emulation": scene.emulation.model_copy(update=requested)})
 
 
 def replace_tiles(scene: Scene, serials: Sequence[str]) -> Scene:

@@ -130,8 +130,8 @@ def diagnose_bus(
             finding, conversion_ms=conversion_ms, problem=problem
         )
     findings = tuple(measured.get((f.mux, f.channel), f) for f in findings)
-    asked = tuple(measured.values())
-    timing = compute_bus_timing(array, wires, [f.mux for f in asked], conversions_ns)
+    requested = tuple(measured.values())
+    timing = compute_bus_timing(array, wires, [f.mux for f in requested], conversions_ns)
     rates: dict[ScheduleName, float | None] = {
         name: rate
         if count_broadcast_channels(name, timing.muxes) <= array.broadcast_channels
@@ -151,7 +151,7 @@ def diagnose_bus(
     advice = _make_advice(findings, timing, rates, array, requested_hz, choice.schedule, schedule)
     hints = (
         *advice.hints,
-        _describe_slowest_tile(asked, timing, schedule, rates[schedule]),
+        _describe_slowest_tile(requested, timing, schedule, rates[schedule]),
         _describe_disturbance(bus.retried_transfers),
     )
     return BusDiagnosis(
@@ -226,7 +226,7 @@ def _make_advice(
     timing: BusTiming,
     rates: Mapping[ScheduleName, float | None],
     array: ArraySection,
-    asked_hz: float,
+    requested_hz: float,
     best: ScheduleName,
     chosen: ScheduleName,
 ) -> _Advice:
@@ -241,12 +241,12 @@ def _make_advice(
         slow = f"The bus runs at {timing.scl_hz / 1e3:.0f} kHz where {array.scl_hz / 1e3:.0f} are"
         if abs(part - _PI_CLOCK_RATIO) < _PI_CLOCK_TOLERANCE:
             slow += (
-                " asked for: this Raspberry Pi derives it from a core that idles at 250 MHz. Fix "
+                " requested: this Raspberry Pi derives it from a core that idles at 250 MHz. Fix "
                 "the core's clock in config.txt (core_freq and core_freq_min alike, or "
                 "enable_uart=1)."
             )
         else:
-            slow += " asked for: check dtparam=i2c_arm_baudrate in config.txt."
+            slow += " requested: check dtparam=i2c_arm_baudrate in config.txt."
         hints.append(slow)
     rate = rates[chosen]
     best_hz = rates[best] or 0.0
@@ -260,27 +260,27 @@ def _make_advice(
         summary = f"{tiles} on {mux_count} mux{'es' * (mux_count > 1)}."
         return _Advice(summary, tuple(wrong), tuple(hints))
     summary = f"{tiles}: {chosen} gives {rate:.0f} frames/s."
-    if asked_hz and rate < asked_hz:
+    if requested_hz and rate < requested_hz:
         change = f"ask for {_RATE_MARGIN * best_hz:.0f} or less"
-        if best_hz >= asked_hz:
+        if best_hz >= requested_hz:
             change = f"use schedule {best}"
-        wrong.append(f"The {asked_hz:g} frames/s asked for will not hold: {change}.")
-    elif asked_hz:
-        summary += f" The {asked_hz:g} frames/s asked for will hold."
+        wrong.append(f"The {requested_hz:g} frames/s requested will not hold: {change}.")
+    elif requested_hz:
+        summary += f" The {requested_hz:g} frames/s requested will hold."
     elif chosen != best:
         hints.append(f"Schedule {best} would give {best_hz:.0f}.")
     return _Advice(summary, tuple(wrong), tuple(hints))
 
 
 def _describe_slowest_tile(
-    asked: tuple[TileFinding, ...],
+    requested: tuple[TileFinding, ...],
     timing: BusTiming,
     schedule: ScheduleName,
     rate_hz: float | None,
 ) -> str:
-    """Describe the tile that limits the rate, if one does; `asked` are the tiles of `timing`."""
+    """Describe the tile that limits the rate, if one does; `requested`: tiles of `timing`."""
     slowest_s = max(timing.conversions_s)
-    slow = asked[timing.conversions_s.index(slowest_s)]
+    slow = requested[timing.conversions_s.index(slowest_s)]
     if rate_hz is None or slow.conversion_ms is None:
         return ""
     usual_s = sorted(timing.conversions_s)[len(timing.conversions_s) // 2]

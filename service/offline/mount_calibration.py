@@ -60,12 +60,12 @@ def calibrate_mount(
         ComparisonError: the two cannot be compared.
         CalibrationError: the load does not determine the requested parameters.
     """
-    asked = CompareOptions(
+    requested = CompareOptions(
         stated=options.stated, lag_range_s=options.lag_range_s, remove_offset=True
     )
     with SealedFileReader(path) as session:
         info, calibration = session.info, _read_calibration(session)
-    comparison = compare_session(path, reference_path, asked)
+    comparison = compare_session(path, reference_path, requested)
     if far := describe_implausible_alignment(comparison.alignment):
         raise CalibrationError(
             far[0],

@@ -44,12 +44,12 @@ class RefusedMachine:
     Attributes:
         secret: becomes the node's secret if a person accepts the machine.
         address: peer address of the machine.
-        asked_t_ns: time of its last attempt, server's UTC.
+        requested_t_ns: time of its last attempt, server's UTC.
     """
 
     secret: str
     address: str
-    asked_t_ns: int
+    requested_t_ns: int
 
     @property
     def fingerprint(self) -> str:

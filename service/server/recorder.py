@@ -106,7 +106,7 @@ class Recorder:
             notes=notes,
             tags=tags,
             take=take,
-            asked=request,
+            request=request,
             missed_slots_at_start=node.present_stream.missed_slots,
             clock=session_parts.clock_offsets_at_start(node, part),
         )
@@ -198,13 +198,13 @@ class Recorder:
         whose server time is far from the present time is dropped, as is one that is far from the
         node's clock as hello stated it.
         """
-        said_t_ns = row.t_mono_ns + node.info.utc_offset_ns + row.server_minus_node_ns
-        if abs(said_t_ns - now_t_ns) > CLOCK_ERROR_MAX_NS + row.uncertainty_ns:
+        stated_t_ns = row.t_mono_ns + node.info.utc_offset_ns + row.server_minus_node_ns
+        if abs(stated_t_ns - now_t_ns) > CLOCK_ERROR_MAX_NS + row.uncertainty_ns:
             log.warning(
                 "node %s: a measurement of its clock is not kept: it has this server's clock "
                 "%.0f s off. Was that set just now?",
                 node.name,
-                (said_t_ns - now_t_ns) * 1e-9,
+                (stated_t_ns - now_t_ns) * 1e-9,
             )
             return
         limit = node.present_stream.limit

@@ -306,8 +306,8 @@ class Server:
         try:
             yield
         except Exception as error:
-            before, said_s = self._failures.get(step, ("", 0.0))
-            if str(error) != before or time.monotonic() - said_s > _LOG_AGAIN_S:
+            before, logged_s = self._failures.get(step, ("", 0.0))
+            if str(error) != before or time.monotonic() - logged_s > _LOG_AGAIN_S:
                 self._failures[step] = (str(error), time.monotonic())
                 if isinstance(error, FootTileError | OSError):
                     log.warning("%s: %s", step, error)

@@ -220,10 +220,10 @@ class SessionStore:
         found = [
             session
             for session in (*self.iterate_newest_first(), *self.trash.list_sessions())
-            if session.asked is not None and session.asked.key == request.key
+            if session.request is not None and session.request.key == request.key
         ]
         for session in found:
-            if session.asked != request:
+            if session.request != request:
                 raise UsageError(
                     "this Idempotency-Key was used by another request, which started session "
                     f"{session.id}",

@@ -144,7 +144,7 @@ class TakeRecorder:
                 self._recorder.stop_session(session.id)
             except FootTileError as error:
                 take.errors_by_node[session.node] = str(error)
-        return self._succeeded(take, take.sessions)
+        return self._require_success(take, take.sessions)
 
     def add_marker(
         self, take_id: str, label: str, t_ns: int | None, marker_id: str | None = None
@@ -169,9 +169,9 @@ class TakeRecorder:
                 self._store.add_marker(session.id, label, t_ns, marker_id)
             except FootTileError as error:
                 take.errors_by_node[session.node] = str(error)
-        return self._succeeded(take, running)
+        return self._require_success(take, running)
 
-    def _succeeded(self, take: Take, tried: Iterable[Session]) -> Take:
+    def _require_success(self, take: Take, tried: Iterable[Session]) -> Take:
         done = [
             self._store.get_session(one.id) for one in tried if one.node not in take.errors_by_node
         ]

@@ -142,7 +142,7 @@ class EstimateStream:
         Raises:
             TareError: no tare can be found.
         """
-        for frames, columns in self._estimated(iter(batches), ends=is_final):
+        for frames, columns in self._estimate(iter(batches), ends=is_final):
             yield frames, self.rounding.quantize(columns)
 
     def state_dict(self) -> Columns:
@@ -177,7 +177,7 @@ class EstimateStream:
         """
         return self._find_tare([frames for frames, _ in self._read_until_tare(iter(batches))])
 
-    def _estimated(
+    def _estimate(
         self, pieces: Iterator[tuple[FrameBatch, Extra]], *, ends: bool
     ) -> Iterator[tuple[FrameBatch, Columns]]:
         run = self._run

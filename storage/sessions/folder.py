@@ -154,7 +154,7 @@ class Session(_Record):
     """True: a person has given up the pending frames."""
     take: str | None = None
     """Id of the take that it was recorded in together with other nodes."""
-    asked: IdempotencyRecord | None = None
+    request: IdempotencyRecord | None = None
     """Record of the request that started it, if that had an `Idempotency-Key`."""
     continues: str | None = None
     """Id of the session that this one continues, with other tiles."""

@@ -36,7 +36,7 @@ def recorded(server: foottile.Server, tared: FakeNode, name: str = "trial") -> f
         tared.send(10, now=True)
         session.stop()
         tared.send(10, now=True)
-        return session.wait()
+        return session.wait_until_sealed()
 
 
 def test_to_import_it_imports_nothing_heavy() -> None:
@@ -62,20 +62,22 @@ def test_a_session_is_recorded_marked_found_and_read(
     assert [each.id for each in found] == [session.id]
     assert not list(server.sessions(since=now + timedelta(1)))
     data = session.open(["t_ns", "grf_n", "force_n"])
-    table = data.arrow()
+    table = data.to_arrow()
     assert table.column_names[:2] == ["t_ns", "grf_n"]
-    assert len(table) == session.frames
-    assert data["force_n"].shape == (session.frames, 2)
+    assert len(table) == session.frame_count
+    assert data["force_n"].shape == (session.frame_count, 2)
     assert np.nanmedian(data["grf_n"]) == pytest.approx(80.0, abs=1.0)
     part = data[0.5:0.7]
-    assert isinstance(part, foottile.Data)
+    assert isinstance(part, foottile.SessionData)
     t_ns = part["t_ns"]
-    assert 0 < len(t_ns) < session.frames
+    assert 0 < len(t_ns) < session.frame_count
     assert 0.5e9 <= t_ns[0] - data["t_ns"][0] < 0.6e9
-    assert part.numpy().keys() == {"t_ns", "grf_n", "force_n_0", "force_n_1"}
-    assert sum(batch.num_rows for batch in session.open("seq").batches()) == session.frames
+    assert part.to_numpy().keys() == {"t_ns", "grf_n", "force_n_0", "force_n_1"}
+    assert (
+        sum(batch.num_rows for batch in session.open("seq").iter_batches()) == session.frame_count
+    )
     path = session.download(tmp_path / "trial.parquet")
-    assert path.stat().st_size == session.facts["bytes"]
+    assert path.stat().st_size == session.metadata["bytes"]
     assert [*tmp_path.glob("*trial*")] == [path]
 
 
@@ -85,8 +87,8 @@ def test_frames_are_read_however_small_the_pieces_are_that_they_come_in(
     session = recorded(server, tared)
     whole = pq.read_table(session.download(tmp_path / "trial.parquet"))
     monkeypatch.setattr(foottile.data, "_CHUNK_BYTES", 100)
-    table = session.open(whole.column_names).arrow()
-    assert table.num_rows == session.frames
+    table = session.open(whole.column_names).to_arrow()
+    assert table.num_rows == session.frame_count
     assert table["seq"].equals(whole["seq"])
 
 
@@ -100,8 +102,8 @@ def test_an_answer_that_breaks_off_is_said_to_be_damaged(
         yield b"".join(given(answer, size))[:-500]
 
     monkeypatch.setattr(httpx.Response, "iter_bytes", short)
-    with pytest.raises(foottile.DamagedError, match="did not come whole"):
-        session.open("seq").arrow()
+    with pytest.raises(foottile.DamagedError, match="arrived incomplete or damaged"):
+        session.open("seq").to_arrow()
 
 
 def test_a_frames_instant_in_the_servers_utc_is_beside_its_columns_on_request(
@@ -109,17 +111,17 @@ def test_a_frames_instant_in_the_servers_utc_is_beside_its_columns_on_request(
 ) -> None:
     session = recorded(server, tared)
     data = session.open(["t_server_ns", "grf_n"], clock="server")
-    assert data.arrow().column_names == ["t_server_ns", "grf_n"]
+    assert data.to_arrow().column_names == ["t_server_ns", "grf_n"]
     assert data["t_server_ns"].shape == data["grf_n"].shape
-    assert "t_server_uncertainty_ns" in session.open(clock="server").arrow().column_names
+    assert "t_server_uncertainty_ns" in session.open(clock="server").to_arrow().column_names
     with pytest.raises(foottile.UsageError, match="no column 't_server_ns'"):
-        session.open("t_server_ns").arrow()
+        session.open("t_server_ns").to_arrow()
 
 
 def test_sessions_are_found_of_several_nodes_and_with_several_tags(
     server: foottile.Server, tared: FakeNode
 ) -> None:
-    session = recorded(server, tared).describe(tags=["mud", "wet"])
+    session = recorded(server, tared).update(tags=["mud", "wet"])
     assert [each.id for each in server.sessions(node=["left", "bench"])] == [session.id]
     assert [each.id for each in server.sessions(tag=("mud", "wet"))] == [session.id]
     assert not list(server.sessions(node=["left", "right"]))
@@ -137,28 +139,28 @@ def test_what_somebody_else_has_changed_is_not_overwritten(
 ) -> None:
     with server.record("bench", "one") as mine:
         theirs = server.session(mine.id)
-        theirs.describe(notes="wet")
+        theirs.update(notes="wet")
         with pytest.raises(foottile.ConflictError) as raised:
-            mine.describe(name="two")
+            mine.update(name="two")
         assert raised.value.status == 412
-        assert mine.refresh().describe(name="two").facts["notes"] == "wet"
+        assert mine.refresh().update(name="two").metadata["notes"] == "wet"
 
 
 def test_an_error_carries_what_the_server_said(server: foottile.Server, tared: FakeNode) -> None:
-    with pytest.raises(foottile.UnknownError, match="no node 'nobody'") as raised:
+    with pytest.raises(foottile.NotFoundError, match="no node 'nobody'") as raised:
         server.node("nobody")
     assert raised.value.status == 404
     assert raised.value.problem["title"]
-    with pytest.raises(foottile.UnknownError):
+    with pytest.raises(foottile.NotFoundError):
         server.session("../nodes")
     session = server.record("bench", "x")
     tared.deliver(20)
     with pytest.raises(foottile.UsageError, match="no column 'colour'"):
-        session.open(["colour"]).arrow()
+        session.open(["colour"]).to_arrow()
     with pytest.raises(foottile.UsageError, match="no step"):
         _ = session.open()[0:1:2]
-    with pytest.raises(foottile.ConflictError, match="waits for"):
-        session.wait(timeout_s=0.0)
+    with pytest.raises(foottile.ConflictError, match="still recording"):
+        session.wait_until_sealed(timeout_s=0.0)
     tared.send(60, 20.0)
     with pytest.raises(foottile.ConflictError, match=r"loaded|moves|unloaded"):
         server.tare("bench")
@@ -171,12 +173,12 @@ def test_a_token_is_shown_and_its_lack_is_told(
     monkeypatch.delenv("FOOTTILE_TOKEN", raising=False)
     with (
         foottile.connect(running.url) as server,
-        pytest.raises(foottile.RefusedError, match="token"),
+        pytest.raises(foottile.AccessDeniedError, match="token"),
     ):
         server.nodes()
     with (
         foottile.connect(running.url) as server,
-        pytest.raises(foottile.RefusedError, match="token"),
+        pytest.raises(foottile.AccessDeniedError, match="token"),
     ):
         next(server.live())
     monkeypatch.setenv("FOOTTILE_TOKEN", TOKEN)
@@ -188,7 +190,7 @@ def test_a_token_is_shown_and_its_lack_is_told(
     "url", ["", "laptop", "ftp://laptop", "http://", "http://[::1", "http://a b"]
 )
 def test_what_is_no_address_is_said(url: str) -> None:
-    with pytest.raises((foottile.UsageError, foottile.NoAnswerError)):
+    with pytest.raises((foottile.UsageError, foottile.ServerUnavailableError)):
         foottile.connect(url).nodes()
 
 
@@ -202,9 +204,9 @@ def test_what_was_closed_is_not_asked_any_more(running: Running) -> None:
 def test_where_no_server_is_that_is_said(running: Running) -> None:
     running.stop()
     with foottile.connect(running.url) as server:
-        with pytest.raises(foottile.NoAnswerError, match="foottile serve"):
+        with pytest.raises(foottile.ServerUnavailableError, match="foottile serve"):
             server.nodes()
-        with pytest.raises(foottile.NoAnswerError):
+        with pytest.raises(foottile.ServerUnavailableError):
             next(server.live("bench"))
 
 
@@ -217,11 +219,13 @@ def test_all_of_it_is_there_for_asyncio(running: Running, tared: FakeNode, tmp_p
                 await session.add_marker("now")
                 await session.stop()
                 await asyncio.to_thread(tared.send, 10, now=True)
-                await session.wait()
-            assert [each.now.id async for each in server.sessions("async")] == [session.now.id]
-            table = await session.open(["grf_n"])[0.0:0.5].arrow()
-            assert 0 < len(table) <= session.now.frames
-            assert [len(b) async for b in session.open("seq").batches()]
+                await session.wait_until_sealed()
+            assert [each.snapshot.id async for each in server.sessions("async")] == [
+                session.snapshot.id
+            ]
+            table = await session.open(["grf_n"])[0.0:0.5].to_arrow()
+            assert 0 < len(table) <= session.snapshot.frame_count
+            assert [len(b) async for b in session.open("seq").iter_batches()]
             async with server.live("bench", ["grf_n"]) as live:
                 first = asyncio.ensure_future(anext(live))
                 while not first.done():

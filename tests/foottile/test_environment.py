@@ -89,8 +89,8 @@ def test_no_other_place_reads_a_variable_of_ours() -> None:
         ROOT / "service" / "cli" / "commands" / "demo.py",
         ROOT / "service" / "cli" / "laboratory.py",
         # Read or set for a library.
-        ROOT / "devices" / "compiled.py",
-        ROOT / "service" / "freed.py",
+        ROOT / "devices" / "jit.py",
+        ROOT / "service" / "memory.py",
         # It refuses paths that are not UTF-8, those in variables too.
         ROOT / "service" / "cli" / "main.py",
     }

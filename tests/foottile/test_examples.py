@@ -48,13 +48,13 @@ def test_every_python_example_runs(
     names: dict[str, Any] = {}
     lacking = [name for name in ("pandas", "matplotlib") if find_spec(name) is None]
     for block in blocks("python"):
-        if "pandas()" in block and lacking:
+        if "to_pandas()" in block and lacking:
             continue
         exec(compile(block.replace(URL, running.url), str(PAGE), "exec"), names)  # noqa: S102  # our own page
     names["server"].close()
-    assert len(names["grf_n"]) == len(names["force_n"]) == names["session"].frames
-    assert names["session"].facts["notes"] == "wetter than the second"
-    assert Path("trial.parquet").stat().st_size == names["session"].facts["bytes"]
+    assert len(names["grf_n"]) == len(names["force_n"]) == names["session"].frame_count
+    assert names["session"].metadata["notes"] == "wetter than the second"
+    assert Path("trial.parquet").stat().st_size == names["session"].metadata["bytes"]
     if lacking:
         pytest.skip(f"all but the notebook's: {', '.join(lacking)} is not installed")
     assert Path("trial.png").stat().st_size > 1000
@@ -73,8 +73,8 @@ def test_the_readme_plots_what_was_pulled_over_seconds(
     monkeypatch.setenv("MPLBACKEND", "agg")
     with client.connect(running.url) as server:
         with server.record("left", "a trial") as session:
-            until(lambda: session.refresh().frames > 100)
-        session.wait()
+            until(lambda: session.refresh().frame_count > 100)
+        session.wait_until_sealed()
     pulled = foottile("pull", session.id, "--out", tmp_path / "here", "--server", running.url)
     assert pulled.ended(PATIENCE_S) == 0, pulled.err
     (block,) = re.findall(r"```python\n(import pandas.*?)```", README.read_text(), re.DOTALL)
@@ -82,7 +82,7 @@ def test_the_readme_plots_what_was_pulled_over_seconds(
     exec(compile(block.replace("SESSION", session.id), str(README), "exec"), names)  # noqa: S102  # our own page
     (line,) = names["axes"].lines
     time_s, grf_n = line.get_data()
-    assert len(time_s) == session.frames
+    assert len(time_s) == session.frame_count
     assert time_s[0] == 0.0
     assert time_s[-1] == pytest.approx(session.duration_s, abs=0.1)
     assert max(grf_n) > 10.0
@@ -113,7 +113,7 @@ def test_the_matlab_example_runs_in_octave(
     (block,) = blocks("matlab")
     block = "function websave(file, url), urlwrite(url, file); end\n" + block
     with client.connect(running.url) as server:
-        server.session(session.id).wait()
+        server.session(session.id).wait_until_sealed()
     done = subprocess.run(
         [octave, "--no-init-file", "--eval", block.replace(URL, running.url)],
         cwd=tmp_path,

@@ -11,13 +11,13 @@ import pyarrow as pa
 import pytest
 
 import foottile
-from foottile.live_protocol import Asked, LiveProtocol
+from foottile.live_protocol import LiveProtocol, LiveRequest
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import Running
 from tests.waiting import until
 
 
-def taken(live: foottile.Live, last: int) -> list[int]:
+def taken(live: foottile.LiveStream, last: int) -> list[int]:
     """Numbers of frames until this one has come."""
     seqs: list[int] = []
     while not seqs or seqs[-1] < last:
@@ -96,8 +96,8 @@ def test_frames_that_are_lost_are_told(running: Running, tared: FakeNode) -> Non
     tared.frames(30)
     tared.say_lost(disk_full=[[first, tared.seq - 1]])
     tared.deliver(50, 20.0)
-    told: list[foottile.Loss] = []
-    loss = foottile.Loss(tared.stream_id, first, first + 29, "disk_full")
+    told: list[foottile.FrameLoss] = []
+    loss = foottile.FrameLoss(tared.stream_id, first, first + 29, "disk_full")
     with foottile.connect(running.url) as server:
         with server.live("bench", from_seq=0, on_loss=told.append) as live:
             taken(live, tared.seq - 10)
@@ -133,11 +133,11 @@ def test_what_is_not_there_is_said_and_not_tried_again(
 def test_it_gives_up_if_that_is_wanted(running: Running, played: FakeNode) -> None:
     with (
         foottile.connect(running.url) as server,
-        server.live("bench", give_up_s=0.0) as live,
+        server.live("bench", reconnect_timeout_s=0.0) as live,
     ):
         next(live)
         running.stop()
-        with pytest.raises(foottile.NoAnswerError):
+        with pytest.raises(foottile.ServerUnavailableError):
             list(live)
 
 
@@ -165,25 +165,25 @@ def protocol(**asked: object) -> LiveProtocol:
         "columns": (),
         "policy": "lossless",
     }
-    return LiveProtocol(Asked(**(content | asked)))  # type: ignore[arg-type]  # of several types
+    return LiveProtocol(LiveRequest(**(content | asked)))  # type: ignore[arg-type]  # of several types
 
 
 def test_a_stream_that_is_gone_is_a_loss_and_the_next_one_is_begun() -> None:
     live = protocol()
-    live.take(json.dumps({"type": "stream", "stream_id": "a" * 32, "from_seq": 5}))
-    assert f"stream_id={'a' * 32}&from_seq=5" in live.address()
+    live.parse_message(json.dumps({"type": "stream", "stream_id": "a" * 32, "from_seq": 5}))
+    assert f"stream_id={'a' * 32}&from_seq=5" in live.make_url()
     with pytest.warns(foottile.FramesLostWarning, match="from 5 on"):
-        live.closed(4011, "no stream")
-    assert "stream_id" not in live.address()
-    assert "from_seq=0" in live.address()  # nothing of the next one is left out
+        live.check_close(4011, "no stream")
+    assert "stream_id" not in live.make_url()
+    assert "from_seq=0" in live.make_url()  # nothing of the next one is left out
     assert live.losses[0].reason == "no_stream"
 
 
 def begun(seq: int, policy: str = "lossless") -> LiveProtocol:
     """A live stream whose next frame is this one."""
     live = protocol(policy=policy)
-    live.take(json.dumps({"type": "stream", "stream_id": "a" * 32, "from_seq": seq}))
-    live.take(SCHEMA.serialize().to_pybytes())
+    live.parse_message(json.dumps({"type": "stream", "stream_id": "a" * 32, "from_seq": seq}))
+    live.parse_message(SCHEMA.serialize().to_pybytes())
     return live
 
 
@@ -208,35 +208,35 @@ def frames(*seqs: int) -> bytes:
 )
 def test_a_frame_of_which_nothing_was_said_is_missed(message: str | bytes) -> None:
     with pytest.raises(foottile.DamagedError):
-        begun(5).take(message)
+        begun(5).parse_message(message)
 
 
 def test_frames_that_were_here_already_are_left_out() -> None:
     live = begun(5)
-    assert live.take(frames(5, 6)) is not None
-    rows = live.take(frames(5, 6, 7))
+    assert live.parse_message(frames(5, 6)) is not None
+    rows = live.parse_message(frames(5, 6, 7))
     assert rows is not None
     assert rows["seq"].to_pylist() == [7]
-    assert live.take(frames(6, 7)) is None
+    assert live.parse_message(frames(6, 7)) is None
 
 
 def test_a_frame_that_the_server_cannot_read_is_an_error_and_is_not_tried_again() -> None:
     with pytest.raises(foottile.DamagedError, match="from_seq=5"):
-        begun(5).closed(4012, "resume with from_seq=5")
+        begun(5).check_close(4012, "resume with from_seq=5")
 
 
 def test_one_who_gets_nowhere_waits_longer_each_time_until_frames_come() -> None:
     live, waits = begun(5), []
     for _ in range(9):
-        live.closed(1013, "try later")
-        waits.append(live.again_s(OSError(), 0.0, None))
-        live.address()
-        live.take(json.dumps({"type": "hello"}))
+        live.check_close(1013, "try later")
+        waits.append(live.compute_retry_delay_s(OSError(), 0.0, None))
+        live.make_url()
+        live.parse_message(json.dumps({"type": "hello"}))
     assert waits == sorted(waits)
     assert waits[0] < waits[-1] == 5.0
-    live.take(SCHEMA.serialize().to_pybytes())
-    live.take(frames(5))
-    assert live.again_s(OSError(), 0.0, None) == waits[0]
+    live.parse_message(SCHEMA.serialize().to_pybytes())
+    live.parse_message(frames(5))
+    assert live.compute_retry_delay_s(OSError(), 0.0, None) == waits[0]
 
 
 @pytest.mark.parametrize(
@@ -245,4 +245,4 @@ def test_one_who_gets_nowhere_waits_longer_each_time_until_frames_come() -> None
 def test_what_no_foottile_server_says_is_damage(message: str | bytes) -> None:
     live = protocol()
     with warnings.catch_warnings(), pytest.raises(foottile.DamagedError):
-        live.take(message)
+        live.parse_message(message)

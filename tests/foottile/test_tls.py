@@ -26,9 +26,11 @@ def secure(running: Running, tmp_path: Path) -> Iterator[str]:
 
 def test_a_certificate_of_an_unknown_ca_is_refused_with_what_to_do(secure: str) -> None:
     with foottile.connect(secure) as server:
-        with pytest.raises(foottile.NoAnswerError, match=r"not trusted.*--ca.*SSL_CERT_FILE"):
+        with pytest.raises(
+            foottile.ServerUnavailableError, match=r"not trusted.*--ca.*SSL_CERT_FILE"
+        ):
             server.nodes()
-        with pytest.raises(foottile.NoAnswerError, match=r"not trusted.*--ca"):
+        with pytest.raises(foottile.ServerUnavailableError, match=r"not trusted.*--ca"):
             next(server.live())
 
 
@@ -58,7 +60,7 @@ async def test_asyncio_trusts_it_too(secure: str, tmp_path: Path) -> None:
         with pytest.raises(foottile.UsageError, match="nobody"):
             await anext(server.live("nobody"))
     async with foottile.connect_async(secure) as server:
-        with pytest.raises(foottile.NoAnswerError, match="not trusted"):
+        with pytest.raises(foottile.ServerUnavailableError, match="not trusted"):
             await anext(server.live("nobody"))
 
 
@@ -96,12 +98,12 @@ def test_what_is_no_ca_is_said(content: bytes | None, tmp_path: Path) -> None:
 def test_plain_http_and_tls_are_not_taken_for_each_other(running: Running, secure: str) -> None:
     with (
         foottile.connect(running.url.replace("http:", "https:")) as server,
-        pytest.raises(foottile.NoAnswerError, match="use http://"),
+        pytest.raises(foottile.ServerUnavailableError, match="use http://"),
     ):
         server.nodes()
     with (
         foottile.connect(secure.replace("https:", "http:")) as server,
-        pytest.raises(foottile.NoAnswerError),
+        pytest.raises(foottile.ServerUnavailableError),
     ):
         server.nodes()
     with pytest.raises(foottile.UsageError, match="https"):

@@ -120,7 +120,8 @@ def test_a_failed_calibration_shows_its_reason_and_can_be_repeated(
         page.fill("#weights", "200 g, 500 g, 1 kg, 2 kg")
         page.click("#start")
         expect(page.locator("#notices")).to_contain_text("4 weights on the tile")
-        page.fill("#weights", "200 g, 500 g, 1 kg, 1.5 kg, 2 kg")
+        page.fill("#weights", "200 g, 500 g, 1 kg, 1.5 kg, 2.2 kg")
+        page.fill("#within", "2.5")
         monkeypatch.setattr(weighings, "IDLE_S", 5.0)
         page.click("#start")
         expect(page.locator("#progress")).to_have_text("T02, weight 1 of 5, tile 1 of 2")
@@ -130,9 +131,13 @@ def test_a_failed_calibration_shows_its_reason_and_can_be_repeated(
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
         page.click("#restart")
         expect(page.locator("#guide")).to_be_visible()
+        page.reload()
         expect(page.locator("#problem")).to_contain_text("no step was completed")
         page.click("#save")
         expect(page.locator("#setup")).to_be_visible()
+        expect(page.locator("[data-order=T02]")).to_have_text("1.")
+        expect(page.locator("#weights")).to_have_value("200 g, 500 g, 1 kg, 1.5 kg, 2.2 kg")
+        expect(page.locator("#within")).to_have_value("2.5")
         until(lambda: not scripted.running.node()["recording"])
 
 

@@ -239,8 +239,16 @@ def test_eight_tiles_are_on_one_screen_of_a_laptop(scripted: Scripted, open_page
         page.select_option("#node-select", "eight")
         expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#bars .tile")).to_have_count(8)
-        for part in ("#grf-card", "#foot-card", "#bars-card", "#trace-card", "#actions"):
+        for part in (
+            "#grf-card",
+            "#foot-card",
+            "#bars-card",
+            "#trace-card",
+            "#actions",
+            "#calibration",
+        ):
             assert bottom_of(page, part) <= 800, part
+        assert bottom_of(page, "#calibration") <= 800  # without unfolding anything
         cut = page.evaluate(
             """() => [...document.querySelectorAll("#live .card, #bars .tile")]
               .filter((one) => one.scrollHeight > one.clientHeight + 1)

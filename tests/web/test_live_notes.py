@@ -80,6 +80,6 @@ def tell(scripted: Scripted, *warnings: str) -> None:
         server: Any = scripted.running.server
         node = server.nodes.get("bench")
         node.warnings = warnings
-        server.tell_node(node)
+        server.notify_node_changed(node)
 
     scripted.running.call(change)

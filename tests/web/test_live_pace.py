@@ -19,8 +19,8 @@ WRITTEN = """async () => {
   const { TextPace } = await import("/static/live/pace.js");
   const pace = new TextPace();
   const node = {};
-  const of = (status, force_n) =>
-    ({ status, force_n, saturated: [false], frame_flags: 0, estimate_flags: 0 });
+  const of = (tile_flags, force_n) =>
+    ({ tile_flags, force_n, saturated: [false], frame_flags: 0, estimate_flags: 0 });
   const steady = of([0], [1]);
   return {
     first: pace.isDue(node, steady, 1000),

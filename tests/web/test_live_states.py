@@ -9,6 +9,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 import service.api.routes.sockets.ingest
+from service.estimation.compilation import mark_compiling
 from service.protocol import LINK_TIMEOUT_S
 from tests.service.fake_node import Play
 from tests.service.recording import Recording
@@ -171,3 +172,14 @@ def test_a_session_whose_node_never_comes_back_is_sealed_with_what_is_here(
     expect(row.locator(".state")).to_have_text("lossy")
     expect(row).to_contain_text("at the end may be lost")
     assert session.now()["frames"] == 50
+
+
+def test_while_models_are_compiled_the_page_says_so_and_shows_pressures(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with mark_compiling(), Play(scripted.node, 5.0):
+        page = open_page(scripted.url)
+        expect(page.locator("#grf-sigma")).to_contain_text("models are being compiled")
+        expect(page.locator("#bars .tile").first).to_have_attribute("data-unit", "kPa")
+        expect(page.locator("#unit-kpa")).to_have_attribute("aria-pressed", "true")
+        expect(page.locator("#unit-n")).to_have_attribute("aria-pressed", "false")

@@ -22,7 +22,8 @@ PLACES = """() => Object.fromEntries(
     .map((id) => [id, document.getElementById(id).getBoundingClientRect().toJSON()]))"""
 COVERED = """() => {
   const at = document.querySelector("#notices .notice:last-child").getBoundingClientRect();
-  const parts = "#pause #foot #grf #trace #bars #record #stop #marker #tare".split(" ");
+  const parts =
+    "#pause #foot #grf #trace #bars #record #stop #marker #tare #recording-state".split(" ");
   return parts.filter((name) => {
     const { left, right, top, bottom } = document.querySelector(name).getBoundingClientRect();
     return left < at.right && right > at.left && top < at.bottom && bottom > at.top;

@@ -163,7 +163,7 @@ COLOURS = """async () => {
   const tiles = [0, 1, 2, 3].map((i) => (
     { serial: `T${i}`, x_m: 0.014 * i, y_m: 0, z_m: -0.15, full_scale_n: 29 }));
   const node = { node: "n", tiles, tare: {}, calibration: {}, servo: null };
-  foot.draw(node, { status: [0, 0, 0, 0], force_n: [0, 10, 17, 21], saturated: [] });
+  foot.draw(node, { tile_flags: [0, 0, 0, 0], force_n: [0, 10, 17, 21], saturated: [] });
   const ratio = canvas.width / canvas.clientWidth;
   const copy = new OffscreenCanvas(canvas.width, canvas.height)
     .getContext("2d", { willReadFrequently: true });

@@ -9,6 +9,7 @@ from urllib.parse import urlencode
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import scipy.stats
 from playwright.sync_api import Browser, Page, expect
 
 from tests.service.fake_node import FakeNode
@@ -169,6 +170,34 @@ def test_another_session_is_laid_over_by_start_contact_or_marker_and_says_how_fa
     again.keyboard.press("+")
     expect(again).to_have_url(re.compile(f"with={other.id}.*from="))
     beside(again)
+
+
+def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
+    compared: Recording, other: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(compared, **{"with": other.id}))
+    expect(page.locator("#beside-summary")).to_contain_text("each session from its own first frame")
+    expect(page.locator("#beside-summary")).to_contain_text(re.compile(r"\(recorded \d+ s later\)"))
+    expect(page.locator("#differences-rows tr")).to_have_count(4)
+    values = ([9.6, 9.9, 9.1, 9.4], [10.2, 10.9, 9.8])
+    found = page.evaluate(
+        """([own, other]) => import("/static/session/differences.js").then((module) => {
+          const stances = (values) => values.map((n) => ({ is_whole: true, peak_grf_n: n }));
+          module.drawDifferences(stances(own), stances(other), "other");
+          const { textContent } = document.querySelector("[data-figure=peak]");
+          module.drawDifferences(stances(own), stances(other.slice(1)), "other");
+          const cell = document.querySelector("[data-figure=peak] td:last-child").textContent;
+          const moments = (values) => module.momentsOf(stances(values), "peak_grf_n");
+          const { mean, half } = module.differenceOf(moments(own), moments(other));
+          return { textContent, cell, mean, half };
+        })""",
+        values,
+    )
+    welch = scipy.stats.ttest_ind(values[1], values[0], equal_var=False).confidence_interval(0.95)
+    assert found["mean"] == pytest.approx((welch.low + welch.high) / 2)
+    assert found["half"] == pytest.approx((welch.high - welch.low) / 2, rel=0.03)
+    assert f"0.8 ± {found['half']:.1f}" in found["textContent"]
+    assert not re.search(r"[0-9]", found["cell"])  # two stances do not bound their scatter
 
 
 def test_another_session_is_told_by_its_node_and_has_its_stances_and_tiles(

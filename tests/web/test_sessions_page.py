@@ -87,8 +87,11 @@ def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is
     page.locator("#trash-card summary").click()
     trashed = page.locator(f'#trash [data-session-id="{session.id}"]')
     expect(trashed).to_contain_text("walk")
+    said = page.locator("#notices .notice", has_text="is in the trash")
+    expect(said).to_have_count(1)
     trashed.get_by_role("button", name="Restore").click()
     expect(trashed).to_have_count(0)
+    expect(said).to_have_count(0)  # it no longer holds
     expect(row).to_have_count(1)
     choose(page, row, "Delete")
     expect(trashed).to_have_count(1)
@@ -114,6 +117,32 @@ def test_a_pending_session_says_what_it_waits_for_and_can_be_sealed_without_it(
     expect(row.locator(".state")).to_have_text("lossy")
     expect(row).to_contain_text("100 frames: abandoned")
     expect(open_menu(page, row).get_by_role("menuitem", name="Abandon")).to_have_count(0)
+
+
+def test_a_complete_session_says_how_much_was_not_sampled(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    node = scripted.node
+    with Play(node):
+        session = node.record(name="walk")
+        time.sleep(0.5)
+        node.socket.send(json.dumps({"type": "status", "missed_slots": 1000, "warnings": []}))
+        wait_until(lambda: scripted.running.node()["missed_slots"] == 1000, "the missed slots")
+        session.stop()
+        sealed = session.sealed()
+    assert sealed["complete"] is True
+    share = f"complete, {100 * 1000 / (1000 + sealed['frames']):.0f}\u00a0% not sampled"
+    counts = "0 lost, 1,000 not sampled"
+    page = open_page(f"{scripted.url}/sessions")
+    expect(row_of(page, session).locator(".state")).to_have_text(share)
+    expect(row_of(page, session).locator(".c-state")).to_contain_text(counts)
+    page.goto(scripted.url)
+    expect(page.locator("#last-session")).to_contain_text(share)
+    page.goto(f"{scripted.url}/sessions/{session.id}")
+    expect(page.locator("#state")).to_have_text(share)
+    expect(page.locator("#state-why")).to_contain_text(counts)
+    page.click("#help")
+    expect(page.locator("#help-dialog")).to_contain_text("Not sampled: the node")
 
 
 def test_losses_troubles_and_what_is_behind_are_said_in_words(
@@ -184,7 +213,7 @@ def test_a_session_shows_how_many_markers_it_has_and_its_downloads_have_them(
         with page.expect_download() as download:
             open_menu(page, row_of(page, session)).locator(f'[data-part="{kind}"]').click()
         content = Path(download.value.path()).read_bytes()
-        assert content == session.data(format=kind, marks="true").content
+        assert content == session.data(format=kind, markers="true").content
         assert b"a stone" in content
 
 

@@ -36,7 +36,7 @@ export class Guide {
     setData(byId("instruction"), "step", isFitting ? "fitting" : weighing.step);
     setText(byId("progress"), isFitting ? weighing.name : `${weighing.tile}, weight ${weightNumber} of ${weighing.weights.length}`
       + (weighing.tiles.length > 1 ? `, tile ${at + 1} of ${weighing.tiles.length}` : ""));
-    setText(byId("prompt-text"), isFitting ? "Fitting. Unload the tile" : weighing.prompt);
+    setText(byId("prompt-text"), isFitting ? "Fitting, readings pause. Unload the tile" : weighing.prompt);
     setText(byId("remaining"), weighing.left_s === null || isFitting ? "" : `: ${Math.ceil(weighing.left_s)} s`);
     this.drawBar(weighing, isFitting);
     setText(byId("warning"), isConnected ? (weighing.warning ? `Step repeated: ${weighing.warning}` : "") : "Node offline: waiting for it");

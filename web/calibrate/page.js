@@ -119,6 +119,7 @@ function show(next) {
   const isRunning = next !== null && ["weighing", "fitting"].includes(next.state);
   byId("no-node").hidden = Boolean(node) || !link.open;
   byId("setup").hidden = !node || next !== null;
+  if (node && next) setup.fill(next);
   guide.draw(isRunning ? next : null, node?.connected ?? true);
   result.draw(next !== null && !isRunning ? next : null, selected());
 }

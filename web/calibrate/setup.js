@@ -1,6 +1,7 @@
 // Form of a calibration: tiles, reference, weights, tolerance.
 
 import { byId, el, setText } from "../common/text.js";
+import { plainWeight } from "./guide.js";
 
 const METHODS = {
   weights: {
@@ -28,6 +29,7 @@ export class Setup {
     /** @type {string[]} */
     this.order = []; // selected tiles
     this.shown = "";
+    this.filled = ""; // session of the calibration that the form shows
     this.method = "weights";
     this.useMethod();
     this.form.addEventListener("submit", (event) => {
@@ -51,6 +53,20 @@ export class Setup {
     this.shown = key;
     this.order = serials;
     byId("tiles").replaceChildren(...serials.map((serial) => this.tileBox(serial)));
+    this.drawTexts();
+  }
+
+  /** Fill in tiles, method, weights and tolerance of a calibration: this page may be younger than it. @param {Weighing} weighing */
+  fill({ session_id: id, tiles, weights, method }) {
+    if (id === this.filled) return;
+    this.filled = id;
+    this.order = tiles.map(({ serial }) => serial);
+    for (const box of byId("tiles").querySelectorAll("input")) box.checked = this.order.includes(box.value);
+    for (const radio of /** @type {NodeListOf<HTMLInputElement>} */ (this.form.querySelectorAll("[name=method]"))) radio.checked = radio.value === method;
+    this.method = method;
+    this.useMethod();
+    this.weights.value = weights.map(plainWeight).join(", ");
+    this.within.value = /\+-([\d.]+) ?%/.exec(weights[0])?.[1] ?? this.within.value;
     this.drawTexts();
   }
 

@@ -1,10 +1,11 @@
 // Help dialog of a page: opened by `?` or its button.
 
-import { byId, isInside } from "./text.js";
+import { byId, el, isInside } from "./text.js";
 
-/** Bind key and button of the help. */
-export function helpWithKeys() {
+/** Bind key and button of the help. @param {string} [text] last paragraph, shared by several pages */
+export function helpWithKeys(text) {
   const dialog = byId("help-dialog", HTMLDialogElement);
+  if (text) dialog.querySelector(".row").before(el("p", { text }));
   const open = () => { if (!dialog.open) dialog.showModal(); };
   byId("help").addEventListener("click", open);
   document.addEventListener("keydown", (event) => {

@@ -1,4 +1,4 @@
-// Texts of the ledger's reasons for lost frames.
+// Texts of lost frames and of slots that were not sampled.
 
 const REASONS = {
   disk_full: "node disk full",
@@ -24,5 +24,20 @@ export function lossTexts(lost) {
     .sort((a, b) => b[1] - a[1])
     .map(([reason, count]) => [reason, `${many(count)}: ${REASONS[reason] ?? reason.replaceAll("_", " ")}`]);
 }
+
+/** Return the share of a session's slots that were not sampled, 0 to 1. @param {Session} session */
+export function missedShare({ frames: recorded, lost, missed_slots: missed }) {
+  const slots = recorded + countLost(lost) + missed;
+  return slots ? missed / slots : 0;
+}
+
+/** Return the number of lost frames. @param {Record<string, number>} [lost] by reason */
+export const countLost = (lost) => Object.values(lost ?? {}).reduce((sum, count) => sum + count, 0);
+
+/** Return both counts, such as "0 lost, 2,187 not sampled". @param {number} lost @param {number} missed */
+export const lossCounts = (lost, missed) => `${lost.toLocaleString("en-GB")} lost, ${missed.toLocaleString("en-GB")} not sampled`;
+
+export const LOSSES_HELP = "“0 lost, 12 not sampled”: lost frames were sampled, but did not arrive. Not sampled: the node’s computer was late and left "
+  + "these slots out; all other frames are correct. “Complete”: nothing is lost. If many slots are not sampled, reduce other load on that computer.";
 
 export { many as frames };

@@ -10,12 +10,12 @@ const NOTICES_MAX = 2;
 /**
  * Show a notice. `press`: label and action of a button on it.
  * @param {string} text
- * @param {{bad?: boolean, press?: [string, () => unknown] | null, stays?: boolean}} [how]
+ * @param {{bad?: boolean, press?: [string, () => unknown] | null, stays?: boolean, about?: string[]}} [how] `about`: ids, for `withdraw`
  */
-export function notice(text, { bad = false, press = null, stays = bad } = {}) {
+export function notice(text, { bad = false, press = null, stays = bad, about = [] } = {}) {
   const box = byId("notices");
   const close = el("button", { type: "button", cls: "close", text: "×", "aria-label": "Dismiss" });
-  const item = el("p", { cls: bad ? "notice bad" : "notice" }, el("span", { text: bad ? `Not done: ${text}` : text }));
+  const item = el("p", { cls: bad ? "notice bad" : "notice", "data-about": about.join(" ") }, el("span", { text: bad ? `Not done: ${text}` : text }));
   if (press) {
     const button = el("button", { type: "button", cls: "small", text: press[0] });
     button.addEventListener("click", () => { item.remove(); press[1](); });
@@ -28,6 +28,11 @@ export function notice(text, { bad = false, press = null, stays = bad } = {}) {
   box.append(item);
   while (box.children.length > NOTICES_MAX) box.firstElementChild.remove();
   if (!stays) setTimeout(() => item.remove(), press ? WITH_BUTTON_MS : SHOWN_MS);
+}
+
+/** Remove notices about an id that no longer hold. @param {string} id */
+export function withdraw(id) {
+  byId("notices").querySelector(`[data-about~="${CSS.escape(id)}"]`)?.remove();
 }
 
 /** Show a refusal; rethrow any other error, for guard.js. @param {unknown} error */

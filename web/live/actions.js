@@ -1,6 +1,7 @@
 // Action bar: Tare, Record, Stop, Marker; fields, shortcuts and running recordings.
 
 import * as api from "../common/api.js";
+import { countLost } from "../common/losses.js";
 import { isOperator } from "../common/login.js";
 import { notice, showRefusal } from "../common/notices.js";
 import { byId, duration, el, isInside, localTime, setData, setText } from "../common/text.js";
@@ -30,7 +31,6 @@ export class Actions {
       const open = bar.dataset.fields !== "true";
       bar.dataset.fields = String(open);
       byId("fields").setAttribute("aria-expanded", String(open));
-      if (open) byId("session-name", HTMLInputElement).focus();
     });
     new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
   }
@@ -180,7 +180,7 @@ export class Actions {
     if (shown.length !== box.children.length || shown.some((row, i) => row !== box.children[i])) box.replaceChildren(...shown);
     for (const session of running) {
       const elapsedS = Math.max(0, (this.state.serverNowMs() - session.started_t_ns / 1e6) / 1000);
-      const lost = Object.values(session.lost ?? {}).reduce((sum, count) => sum + count, 0);
+      const lost = countLost(session.lost);
       const row = rows.get(session.id);
       setText(row.querySelector(".recording-name"), `“${session.name}”`);
       setText(row.querySelector(".recording-time"), duration(elapsedS));

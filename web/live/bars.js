@@ -26,10 +26,9 @@ export class Bars {
     let stored = null;
     try { stored = localStorage.getItem(UNIT_KEY); } catch { /* private window */ }
     this.unit = stored === "kPa" ? "kPa" : "N";
-    this.shown = this.unit;
     byId("unit-kpa").addEventListener("click", () => this.choose("kPa"));
     byId("unit-n").addEventListener("click", () => this.choose("N"));
-    this.showUnit();
+    this.showUnit(this.unit);
     new ResizeObserver(() => this.arrange()).observe(this.list);
   }
 
@@ -38,13 +37,15 @@ export class Bars {
     try { localStorage.setItem(UNIT_KEY, unit); } catch { /* private window */ }
     this.key = ""; // full scales change: rebuild
     this.tiles = null;
-    this.showUnit();
+    this.showUnit(unit);
     this.onUnit();
   }
 
-  showUnit() {
-    byId("unit-kpa").setAttribute("aria-pressed", String(this.unit === "kPa"));
-    byId("unit-n").setAttribute("aria-pressed", String(this.unit === "N"));
+  /** Highlight the unit on display: kPa while there are no forces. */
+  showUnit(unit) {
+    this.shown = unit;
+    byId("unit-kpa").setAttribute("aria-pressed", String(unit === "kPa"));
+    byId("unit-n").setAttribute("aria-pressed", String(unit === "N"));
   }
 
   /** Build the cells of the node's tiles, if these have changed. */
@@ -79,7 +80,8 @@ export class Bars {
 
   /** Draw the bars; `writesText`: write the numbers, too. */
   draw(node, frame, nowMs, writesText = true) {
-    this.shown = hasPressuresOnly(frame) ? "kPa" : this.unit;
+    const unit = hasPressuresOnly(frame) ? "kPa" : this.unit;
+    if (unit !== this.shown) this.showUnit(unit);
     this.fit(node);
     this.range.update(node, frame, nowMs);
     this.tracks.draw(this.cells.map((cell, i) => {

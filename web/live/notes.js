@@ -11,14 +11,14 @@ const FIRST_MS = 3000; // a warning this soon after opening may be older
 /** @typedef {{key: string, id: string, text: string}} Note `key`: reason and help; `id`: same note, other text */
 
 // A chip has an outlier now and then: this flag counts only if it stays.
-const BELOW_RANGE = "Below the calibrated range: suction or an old tare.";
+const BELOW_RANGE = "A tile is below its calibrated range: lift the foot, press Tare.";
 const SETTLE_MESSAGES = 15;
 /** @type {[bit: number, key: string, text: string][]} */
 const FROM_ESTIMATE = [
   [ESTIMATE.TILE_MISSING, "tile_missing", "Tile missing: force is a lower bound, no COP."],
   [ESTIMATE.STUCK, "stuck", "A tile repeats one reading: its force is unknown. Unplug and replug it."],
   [ESTIMATE.BASELINE_LOST, "baseline_lost", "Zero of a tile has dropped: force is less certain. Lift the foot, press Tare; if it recurs, the dome may leak."],
-  [ESTIMATE.AFTER_SATURATION, "after_saturation", "Force is less certain after saturation."],
+  [ESTIMATE.AFTER_SATURATION, "after_saturation", "Force is less certain: a tile was saturated or not read just before."],
   [ESTIMATE.OVER_RATED, "over_rated", "Above the rated 115 kPa, within the calibration."],
 ];
 /** @type {[bit: number, key: string, text: string][]} */

@@ -1,5 +1,6 @@
 // Status line: rate, losses, latency, age of the last frame; live or frozen.
 
+import { lossCounts } from "../common/losses.js";
 import { byId, number, perSecond, roughly, setData, setText } from "../common/text.js";
 
 const FROZEN_AFTER_MS = 600; // with a tick of 100 ms well within the promised second
@@ -82,7 +83,7 @@ export class Status {
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const backlog = beat.backlog_frames ?? node.backlog_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;
-    write("lost", `${lost.toLocaleString("en-GB")} lost, ${missed.toLocaleString("en-GB")} not sampled`, lost > 0 || slow);
+    write("lost", lossCounts(lost, missed), lost > 0 || slow);
     byId("backlog-box").hidden = backlog < SHOWN_BACKLOG_S * (nominalHz || 400);
     write("backlog", `${backlog.toLocaleString("en-GB")} frames`, false);
     write("latency", this.delayMs === null ? "unknown" : `${number(this.delayMs, 0)} ms`, this.delayMs > 250);

@@ -11,7 +11,7 @@ const WARNINGS = {
   baseline_lost: { section: "a-force-in-the-air",
     why: "The unloaded pressure is below that of the last tare. The dome leaks or the tile's temperature has changed, so forces are off by a few newtons." },
   after_saturation: { section: "too-low",
-    why: "The rubber remembers a load that the saturated chip could not measure. The effect is unknown, so the 95 % interval is wider until it has faded." },
+    why: "The rubber remembers each load, and a saturated tile or frames not sampled hid one: the 95 % interval is wider until that fades. If it recurs, reduce the load on the foot or on the node's computer." },
   over_rated: { section: "too-low",
     why: "The data sheet specifies accuracy up to 115 kPa only. The calibration covers this pressure, so the force is known, but the chip is overloaded." },
   below_range: { section: "a-force-in-the-air",

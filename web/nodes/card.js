@@ -1,5 +1,6 @@
 // Card of a node: live state, force, link quality, recording, warnings.
 
+import { lossCounts } from "../common/losses.js";
 import { quietly } from "../common/notices.js";
 import { ReplacementWarning } from "../common/replacement.js";
 import { loadModule } from "../common/request.js";
@@ -146,7 +147,7 @@ export class Card {
     fact("Frames/s", `${perSecond(rateHz ?? NaN)}${of}`, slow);
     const lost = heartbeat.lost_frames ?? node.lost_frames ?? 0;
     const missed = heartbeat.missed_slots ?? node.missed_slots ?? 0;
-    fact("Losses", `${lost.toLocaleString("en-GB")} lost, ${missed.toLocaleString("en-GB")} not sampled`, lost > 0 || slow);
+    fact("Losses", lossCounts(lost, missed), lost > 0 || slow);
     const backlog = heartbeat.backlog_frames ?? node.backlog_frames ?? 0;
     this.facts.Backlog.row.hidden = backlog < SHOWN_BACKLOG_S * (node.nominal_rate_hz || 400);
     fact("Backlog", `${backlog.toLocaleString("en-GB")} frames`, false);

@@ -2,6 +2,7 @@
 
 import { helpWithKeys } from "../common/help.js";
 import { Link } from "../common/link.js";
+import { LOSSES_HELP } from "../common/losses.js";
 import { look } from "../common/login.js";
 import { inSunlight } from "../common/sunlight.js";
 import { byId, setText } from "../common/text.js";
@@ -111,7 +112,7 @@ function recolour() {
 document.addEventListener("foottile-colours", recolour);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
 inSunlight();
-helpWithKeys();
+helpWithKeys(LOSSES_HELP);
 setInterval(write, EVERY_MS);
 write();
 draw();

@@ -2,6 +2,7 @@
 
 import * as api from "../common/api.js";
 import { isOperator } from "../common/login.js";
+import { countLost } from "../common/losses.js";
 import { notice, quietly, showRefusal } from "../common/notices.js";
 import { byId, duration, isInside, localTime, setData, setText } from "../common/text.js";
 import { MarkerQueue } from "../live/markers.js";
@@ -152,7 +153,7 @@ export class Takes {
     byId("take-text").hidden = !take;
     if (take) {
       const longest = Math.max(...take.sessions.map((session) => session.duration_s));
-      const lost = take.sessions.flatMap((session) => Object.values(session.lost ?? {})).reduce((sum, count) => sum + count, 0);
+      const lost = take.sessions.reduce((sum, session) => sum + countLost(session.lost), 0);
       setText(byId("take-running"), `“${take.name}” on ${nodes(take.sessions.length)}, ${duration(Math.floor(longest))}, ${lost.toLocaleString("en-GB")} frames lost`);
     }
     setText(byId("take-why"), take ? "" : reason ? `Cannot record: ${reason[0].toLowerCase()}${reason.slice(1)}` : "Not recording");

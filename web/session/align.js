@@ -11,7 +11,7 @@ import { offsetAt } from "./clock.js";
  * @returns {{key: string, label: string, meaning: string, shiftS: number}[]}
  */
 export function alignments(own, other) {
-  const found = [{ key: "start", label: "start", meaning: "same start", shiftS: 0 }];
+  const found = [{ key: "start", label: "start", meaning: "each session from its own first frame", shiftS: 0 }];
   const mine = own.stances.find((stance) => stance.begun);
   const theirs = other.stances.find((stance) => stance.begun);
   if (mine && theirs) {

@@ -3,9 +3,10 @@
 import * as api from "../common/api.js";
 import { notice, quietly, showRefusal } from "../common/notices.js";
 import { unlessRefused } from "../common/request.js";
-import { byId, el, localTime, number, setText } from "../common/text.js";
+import { byId, el, localTime, number, roughly, setText } from "../common/text.js";
 import { Beside } from "./beside.js";
 import { alignments } from "./align.js";
+import { drawDifferences } from "./differences.js";
 import { drawReport } from "./report.js";
 import { moveClock, moveStances } from "./time_axis.js";
 
@@ -27,7 +28,7 @@ function nameOf(other, session) {
 /** Controls of the overlay. */
 export class Compare {
   /**
-   * @param {{id: string}} session
+   * @param {Session} session
    * @param {import("./plotted.js").Plotted} page
    * @param {(tNs: number, ofServer: boolean) => number | null} offset of this session's node
    * @param {{name: string}[]} references of earlier comparisons
@@ -67,7 +68,7 @@ export class Compare {
     this.wanted = wanted;
     this.show(null);
     this.page.setOverlay(null);
-    byId("report-card").hidden = true;
+    byId("report-card").hidden = byId("differences-card").hidden = true;
     byId("align-choice").hidden = true;
     this.showText("");
     this.updateUrl();
@@ -115,6 +116,8 @@ export class Compare {
     this.align.replaceChildren(...this.ways.map((way) => el("option", { value: way.key, text: way.label })));
     byId("align-choice").hidden = false;
     this.drawn = beside;
+    this.apartS = (other.started_t_ns - this.session.started_t_ns) * 1e-9;
+    drawDifferences(plots.stances, stances ?? [], beside.name);
     this.page.setOverlay({ id, name: beside.name });
     this.moveTo(this.ways.some((way) => way.key === align) ? align : this.ways[0].key);
     this.show(beside);
@@ -131,8 +134,9 @@ export class Compare {
     const way = this.ways.find((one) => one.key === key);
     this.align.value = key;
     this.drawn.move(way.shiftS);
-    const shift = way.shiftS === 0 ? "not shifted" : `shifted by ${number(way.shiftS, 3)} s`;
-    this.showText(`${this.drawn.name}: ${shift} (${way.meaning}).`, way.shiftS);
+    const shift = way.shiftS === 0 ? "" : `shifted by ${number(way.shiftS, 3)} s, `;
+    const apart = `recorded ${roughly(Math.abs(this.apartS))} ${this.apartS < 0 ? "earlier" : "later"}`;
+    this.showText(`${this.drawn.name} (${apart}): ${shift}${way.meaning}.`, way.shiftS);
     this.page.redraw();
   }
 

@@ -54,10 +54,10 @@ const ESTIMATE_TEXTS = [
   [ESTIMATE.TILE_MISSING, "tile missing"],
   [ESTIMATE.STUCK, "tile stuck"],
   [ESTIMATE.TARE_LOST, "tare lost"],
-  [ESTIMATE.EXTRAPOLATED, "below the calibrated range"],
+  [ESTIMATE.EXTRAPOLATED, "a tile below its calibrated range (suction or old tare)"],
   [ESTIMATE.TARE_OLD, "tare in doubt"],
   [ESTIMATE.BASELINE_LOST, "zero of a tile has dropped"],
-  [ESTIMATE.AFTER_SATURATION, "less certain after saturation"],
+  [ESTIMATE.AFTER_SATURATION, "less certain: a tile saturated or not read just before"],
   [ESTIMATE.OVER_RATED, "above the rated pressure"],
   [ESTIMATE.OUTLIER_REPLACED, "outlier replaced"],
   [ESTIMATE.ASSUMED_SCALE, "scale assumed"],
@@ -65,7 +65,7 @@ const ESTIMATE_TEXTS = [
 /** @type {[bit: number, text: string][]} */
 const FRAME_TEXTS = [
   [FRAME.BUS_FAULT, "bus fault"],
-  [FRAME.OVERRUN, "slots before it not sampled"],
+  [FRAME.OVERRUN, "node late: no frames sampled just before"],
   [FRAME.SERVO_STALE, "servo angle stale"],
   [FRAME.SERVO_TURN_UNKNOWN, "servo turn unknown"],
   [FRAME.LEAD, "unloaded lead-in"],

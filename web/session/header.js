@@ -4,15 +4,13 @@ import { byId, duration, el, localTime, perSecond, setText } from "../common/tex
 import { stateText } from "../sessions/state.js";
 
 /**
- * Return the achieved rate, such as "434 of 449 frames/s, 292 slots not sampled".
- * @param {Session} session @param {import("./bins.js").Bins | null} whole @param {number | null} nominalHz
+ * Return the achieved rate, such as "434 of 449 frames/s".
+ * @param {import("./bins.js").Bins | null} whole @param {number | null} nominalHz
  */
-export function rateText(session, whole, nominalHz) {
+export function rateText(whole, nominalHz) {
   const hz = whole?.rateHz ?? null;
   if (hz === null || nominalHz === null) return "";
-  const missed = session.missed_slots;
-  const slots = missed ? `, ${missed.toLocaleString("en-GB")} slot${missed === 1 ? "" : "s"} not sampled` : "";
-  return `${perSecond(hz)} of ${perSecond(nominalHz)} frames/s${slots}`;
+  return `${perSecond(hz)} of ${perSecond(nominalHz)} frames/s`;
 }
 
 /**
@@ -33,7 +31,7 @@ export function drawHeader(session, whole = null, nominalHz = null) {
     ["Started", localTime(new Date(session.started_t_ns / 1e6))],
     ["Duration", duration(session.duration_s)],
     ["Frames", session.frames.toLocaleString("en-GB")],
-    ["Rate", rateText(session, whole, nominalHz)],
+    ["Rate", rateText(whole, nominalHz)],
     ["Parts", session.parts.length > 1 ? String(session.parts.length) : ""],
     ["Scene", session.scene],
     ["Scale", session.absolute_scale === "assumed" ? "assumed: newtons are approximate" : ""],

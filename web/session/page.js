@@ -3,6 +3,7 @@
 import * as api from "../common/api.js";
 import { edit } from "../common/dialogs.js";
 import { helpWithKeys } from "../common/help.js";
+import { LOSSES_HELP } from "../common/losses.js";
 import { logInFromUrl } from "../common/login.js";
 import { notice, quietly } from "../common/notices.js";
 import { unlessRefused } from "../common/request.js";
@@ -100,5 +101,5 @@ const STATE_TEXTS = {
 };
 
 inSunlight();
-helpWithKeys();
+helpWithKeys(LOSSES_HELP);
 logInFromUrl().then(() => quietly(refresh));

@@ -11,12 +11,12 @@ const RETRY_MS = 2000;
 const UNSETTLED_S = 1; // end of a running recording: look-ahead changes its estimates
 const APART_S = 0.1; // a frame further away does not belong to an instant
 
-const BY_TILE = ["status", "force_n", "force_sigma_n", "gauge_kpa"];
+const BY_TILE = ["tile_flags", "force_n", "force_sigma_n", "gauge_kpa"];
 const BY_FRAME = [
   "seq", "frame_flags", "estimate_flags", "contact", "grf_n", "grf_sigma_n", "grf_lower_bound_n",
   "cop_x_m", "cop_y_m", "cop_sigma_x_m", "cop_sigma_y_m", "angle_rad",
 ];
-const RAW = ["seq", "frame_flags", "status"];
+const RAW = ["seq", "frame_flags", "tile_flags"];
 
 /**
  * Parse the columns of CSV; unknown values are NaN.

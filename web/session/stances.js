@@ -22,6 +22,7 @@ function flagsOf(stance) {
   const texts = estimateTexts(stance.estimate_flags & ORDINARY);
   if (!stance.begun) texts.push("start not recorded");
   if (!stance.ended) texts.push("end not recorded");
+  if (stance.begun && stance.ended && stance.duration_sigma_s === null) texts.push("touchdown or lift-off not sampled: contact time has no interval");
   if (stance.missing_frames) texts.push(`${stance.missing_frames} frames missing`);
   if (stance.unknown_frames) texts.push(`${stance.unknown_frames} frames without a GRF`);
   return texts.join(", ");
@@ -43,7 +44,7 @@ export function neighbour(stances, by, cursorS, view) {
 const Z95 = 1.96;
 
 /** Figures of a stance: label, value and sigma field, factor to the unit, decimals. */
-const FIGURES = [
+export const FIGURES = [
   { key: "peak", label: "Peak force", value: "peak_grf_n", sigma: "peak_sigma_n", unit: "N", factor: 1, decimals: 1 },
   { key: "duration", label: "Contact time", value: "duration_s", sigma: "duration_sigma_s", unit: "ms", factor: 1e3, decimals: 0 },
   { key: "impulse", label: "Impulse", value: "impulse_n_s", sigma: "impulse_sigma_n_s", unit: "N\u00a0s", factor: 1, decimals: 2 },

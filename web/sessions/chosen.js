@@ -110,7 +110,7 @@ export class Chosen {
       }
     } finally {
       this.draw();
-      if (gone.length) notice(`${many(gone.length)} moved to the trash.`, { press: ["Undo", () => quietly(() => this.restore(gone))] });
+      if (gone.length) notice(`${many(gone.length)} moved to the trash.`, { about: gone, press: ["Undo", () => quietly(() => this.restore(gone))] });
     }
     return null;
   }

@@ -2,6 +2,7 @@
 
 import { helpWithKeys } from "../common/help.js";
 import { Link } from "../common/link.js";
+import { LOSSES_HELP } from "../common/losses.js";
 import { look } from "../common/login.js";
 import { inSunlight } from "../common/sunlight.js";
 import { byId, setText } from "../common/text.js";
@@ -40,4 +41,4 @@ const link = new Link({
 });
 
 inSunlight();
-helpWithKeys();
+helpWithKeys(LOSSES_HELP);

@@ -1,6 +1,6 @@
 // Rows of the list: sessions and takes.
 
-import { frames } from "../common/losses.js";
+import { countLost, frames } from "../common/losses.js";
 import { bytes, duration, el, localTime } from "../common/text.js";
 import { stateText } from "./state.js";
 
@@ -63,7 +63,7 @@ export function makeTakeRow(sessions, pick) {
 
 /** Return the texts that change during a recording, by class. @param {Session} session */
 export function counts(session) {
-  const lost = Object.values(session.lost ?? {}).reduce((sum, count) => sum + count, 0);
+  const lost = countLost(session.lost);
   return {
     "c-duration": duration(session.duration_s),
     taken: Number.isFinite(session.frames) ? session.frames.toLocaleString("en-GB") : "–",

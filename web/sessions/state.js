@@ -1,6 +1,8 @@
 // State of a session as text.
 
-import { frames, lossTexts } from "../common/losses.js";
+import { countLost, frames, lossCounts, lossTexts, missedShare } from "../common/losses.js";
+
+const MISSED_SHARE_MAX = 0.01; // more is a warning
 
 const WAITS = {
   frames: (session) => `${frames(session.pending_frames)} still on the node; sealed once they arrive.`,
@@ -13,6 +15,9 @@ export function stateText(session) {
   const losses = lossTexts(session.lost).map(([, text]) => `${text}.`);
   if (session.max_lost_tail_frames) losses.push(`Up to ${frames(session.max_lost_tail_frames)} at the end may be lost (power failure).`);
   const missing = losses.length ? ` Missing: ${losses.join(" ")}` : "";
+  const percent = 100 * missedShare(session);
+  const share = percent ? `, ${percent < 1 ? "<1" : Math.round(percent)}\u00a0% not sampled` : "";
+  const missed = percent ? `${lossCounts(countLost(session.lost), session.missed_slots)} (node late).` : "";
   switch (session.state) {
     case "recording": return ["recording", missing.trim(), "run"];
     case "pending": {
@@ -20,8 +25,8 @@ export function stateText(session) {
     }
     case "sealing": return ["sealing", `Writing files.${missing}${why}`, "run"];
     case "sealed":
-      if (session.complete === true) return ["complete", why.trim(), "good"];
-      if (session.complete === "lossy") return ["lossy", `${missing.trim() || "Frames are lost."}${why}`, "warn"];
+      if (session.complete === true) return [`complete${share}`, `${missed}${why}`.trim(), missedShare(session) > MISSED_SHARE_MAX ? "warn" : "good"];
+      if (session.complete === "lossy") return [`lossy${share}`, `${missing.trim() || "Frames are lost."}${missed && ` ${missed}`}${why}`, "warn"];
       return ["incomplete", why.trim() || "Not all frames have arrived.", "warn"];
     default: return [String(session.state), why.trim(), "warn"];
   }

@@ -268,11 +268,11 @@ class DynamixelServo:
         try:
             # Packets have no number: discard a late answer to an older request.
             port.reset_input_buffer()
-            asked_ns = self._clock.now_ns()
+            requested_ns = self._clock.now_ns()
             sent = port.write(request)
             if sent is not None and sent != len(request):
                 raise OSError(errno.EIO, f"{sent} of {len(request)} bytes sent")
-            status, done_ns = self._read_answer(port, request, asked_ns + self._timeout_ns)
+            status, done_ns = self._read_answer(port, request, requested_ns + self._timeout_ns)
         except ServoError:  # a ServoTimeoutError is an OSError too
             raise
         except SEND_TIMEOUT_ERROR as error:
@@ -282,7 +282,7 @@ class DynamixelServo:
             self._lost = self._make_port_error(str(error))
             raise self._lost from error
         self._check_answer(status, n_data)
-        return _TimedAnswer(status, asked_ns, done_ns)
+        return _TimedAnswer(status, requested_ns, done_ns)
 
     def _make_port_error(self, why: str) -> ServoLostError:
         return ServoLostError(

@@ -1,4 +1,4 @@
-"""`foottile accept-node`: accepts another machine under the name of a node."""
+"""`foottile accept-node`: acceptance of another machine under the name of a node."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from devices.errors import StateError, require_extra
 from service.cli.commands.sessions import SERVER, ServerOption
-from service.cli.options import CaOption, say
+from service.cli.options import CaOption, echo
 from service.cli.tickets import TokenFolderOption, read_data_token
 
 
@@ -18,7 +18,7 @@ def accept_node_command(
     node: Annotated[str, typer.Argument(help="Name of the node.")],
     fingerprint: Annotated[
         str | None,
-        typer.Option(help="Only the machine with this one; default: the one that asked last."),
+        typer.Option(help="Fingerprint of the machine; default: the last one that connected."),
     ] = None,
     server: ServerOption = None,
     ca: CaOption = None,
@@ -26,20 +26,20 @@ def accept_node_command(
 ) -> None:
     """Accept another machine under the name of a node.
 
-    A server refuses a machine that lacks the node's secret, as after its storage was replaced. Once
-    accepted, the machine is the node; the one before is disconnected and refused. Compare the
-    fingerprint with the one that the machine prints. Run it on the server's own computer.
+    A server rejects a machine without the node's secret, for example after a change of its storage.
+    The accepted machine becomes the node; the previous one is disconnected and rejected. Compare
+    the fingerprint with the machine's output first. Run this on the server's computer.
     """
     import foottile
 
     path = f"/nodes/{quote(node, safe='')}"
     with foottile.connect(server or SERVER, read_data_token(data), ca=ca) as source:
-        asking = source.http.get(path)["replacement"]
-        if asking is None:
+        replacement = source.http.get(path)["replacement"]
+        if replacement is None:
             raise StateError(
                 f"no other machine asks to connect as {node!r}",
-                remedy="Start it; it asks again by itself every few seconds",
+                remedy="Start the machine; it retries every few seconds",
             )
-        chosen = fingerprint or asking["fingerprint"]
+        chosen = fingerprint or replacement["fingerprint"]
         source.http.send("POST", f"{path}/accept-replacement", {"fingerprint": chosen})
-    say(f"{node} is the machine {chosen} from now on")
+    echo(f"{node} is now the machine {chosen}")

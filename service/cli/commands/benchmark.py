@@ -1,4 +1,4 @@
-"""`foottile benchmark`: speed against error of the model ladder."""
+"""`foottile benchmark`: time and error of model sets."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from service.cli.commands.benchmark_broad import ARRAYS, QUICK_ARRAYS, benchmark
 from service.cli.options import (
     JsonOption,
     check_emulated,
+    echo,
+    echo_lines,
     print_json,
-    progress,
     remark,
-    say,
-    say_lines,
+    show_progress,
 )
-from service.cli.result_folder import result_folder
+from service.cli.result_folder import open_result_folder
 from service.json_output import to_json_text
 
 SCENES = ("rolling", "poppy", "mud")
@@ -28,7 +28,7 @@ DRAWS, QUICK_DRAWS = 20, 3
 FRAMES, QUICK_FRAMES = 1_000_000, 100_000
 LIVE_FRAMES, QUICK_LIVE_FRAMES = 10_000, 2_000
 SECONDS_MAX = 1000.0
-"""A draw is held in memory: at 500 frames/s and four tiles this is about 100 MB."""
+"""Longest draw in memory: about 100 MB at 500 frames/s and four tiles."""
 FRAMES_MAX = 10_000_000
 DRAWS_MAX = 100_000
 JOBS_MAX = 1024
@@ -40,18 +40,16 @@ def benchmark_command(
     out: Annotated[
         Path,
         typer.Option(
-            help="Folder for bench.json, bench.md and bench.png (broad.*); made if absent."
+            help="Folder for bench.json, bench.md and bench.png (broad.*); created if missing."
         ),
     ],
     scene: Annotated[
         list[str] | None,
-        typer.Option(help=f"Scene, can be given again; default: {', '.join(SCENES)}."),
+        typer.Option(help=f"Scene, repeatable; default: {', '.join(SCENES)}."),
     ] = None,
     quick: Annotated[
         bool,
-        typer.Option(
-            "--quick", help=f"{QUICK_DRAWS} draws and fewer timed frames, for a first look."
-        ),
+        typer.Option("--quick", help=f"Quick run: {QUICK_DRAWS} draws and fewer timed frames."),
     ] = False,
     draws: Annotated[
         int | None,
@@ -69,17 +67,18 @@ def benchmark_command(
     ] = None,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, max=JOBS_MAX, help="Draws at the same time; default: one per core."),
+        typer.Option(min=1, max=JOBS_MAX, help="Parallel draws; default: one per core."),
     ] = None,
-    whole_only: Annotated[
-        bool, typer.Option("--full-only", help="Only the scenes' whole ladders, for many draws.")
+    full_only: Annotated[
+        bool,
+        typer.Option("--full-only", help="Full model sets of the scenes only, for many draws."),
     ] = False,
     repeatability: Annotated[
         float | None,
         typer.Option(
             min=0.0,
             max=0.2,
-            help="Of the emulated domes, instead of the scene's; the paper's: 0.03.",
+            help="Override the domes' repeatability (paper: 0.03).",
         ),
     ] = None,
     correlated_ms: Annotated[
@@ -87,22 +86,22 @@ def benchmark_command(
         typer.Option(
             min=0.0,
             max=1000.0,
-            help="Correlation time of the emulated noise, instead of the scene's.",
+            help="Override the correlation time of the noise.",
         ),
     ] = None,
     family: Annotated[
         str,
         typer.Option(
-            help="Of emulated parts: default; or broad: arrays of domes nobody has seen, each "
-            f"with its own bench, {ARRAYS} unless --draws says otherwise. A run that was broken "
-            "off goes on, if its folder is the same."
+            help="Family of emulated parts: default; or broad: arrays of unseen domes, each with "
+            f"its own rig, {ARRAYS} of them without --draws. In the same folder an interrupted run "
+            "continues."
         ),
     ] = "default",
     seeds: Annotated[
         str,
         typer.Option(
-            help="Of the broad family's arrays: development; or judgement, from which no constant "
-            "of the estimator may be set."
+            help="Seeds of the broad family: development; or judgement, which must not be used to "
+            "set constants of the estimator."
         ),
     ] = "development",
     check_goals: Annotated[
@@ -112,10 +111,10 @@ def benchmark_command(
 ) -> None:
     """Measure time and error of every model set.
 
-    Each draw has other tiles, calibrated on the emulated bench as a user would, and other noise.
-    Rungs are built up model by model to the scene's whole ladder, and the whole is tried without
-    each of its models. Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but something could
-    not be measured (or, with --check-goals, a goal is not met).
+    Each draw has other noise and other tiles, calibrated on the emulated rig. Model sets grow model
+    by model to the scene's full set, which is also tried without each of its models. Exit codes: 0
+    success, 1 failure, 2 wrong usage, 3 written, but with missing results (or, with --check-goals,
+    a missed goal).
     """
     if is_broad(
         family,
@@ -124,10 +123,10 @@ def benchmark_command(
             "--seconds": seconds,
             "--frames": frames,
             "--correlated-ms": correlated_ms,
-            "--full-only": whole_only or None,
+            "--full-only": full_only or None,
         },
     ):
-        with result_folder(out) as folder:
+        with open_result_folder(out) as folder:
             benchmark_broad(
                 folder,
                 arrays=draws or (QUICK_ARRAYS if quick else ARRAYS),
@@ -152,7 +151,7 @@ def benchmark_command(
         check_emulated(the_scene)
     if seconds is not None and not 0.0 < seconds <= SECONDS_MAX:
         raise UsageError(f"--seconds {seconds:g}", expected=f"0 to {SECONDS_MAX:g}")
-    create_figure(1.0, 1.0)  # says what is missing before anything takes time
+    create_figure(1.0, 1.0)  # reports a missing package early
     options = BenchmarkOptions(
         scenes=scenes,
         draws=draws or (QUICK_DRAWS if quick else DRAWS),
@@ -161,13 +160,13 @@ def benchmark_command(
         offline_frames=frames or (QUICK_FRAMES if quick else FRAMES),
         live_frames=QUICK_LIVE_FRAMES if quick else LIVE_FRAMES,
         repetitions=QUICK_REPETITIONS if quick else REPETITIONS,
-        full_only=whole_only,
+        full_only=full_only,
         repeatability=repeatability,
         correlated_ms=correlated_ms,
     )
-    with result_folder(out) as folder:
-        with progress("starting") as tell:
-            bench = run_benchmark(options, tell)
+    with open_result_folder(out) as folder:
+        with show_progress("starting") as report_step:
+            bench = run_benchmark(options, report_step)
             text, png = format_benchmark_report(bench), plot_benchmark(bench.scenes)
         content = to_json_text(bench.as_dict())
         write_atomically(folder / "bench.json", content.encode())
@@ -176,8 +175,8 @@ def benchmark_command(
     if as_json:
         print_json(bench.as_dict())
     else:
-        say_lines(text)
-        say(f"{folder}: bench.json, bench.md, bench.png")
+        echo_lines(text)
+        echo(f"{folder}: bench.json, bench.md, bench.png")
     for name, failure in bench.failures:
         remark(f"not measured: {name}, {failure.what}: {failure.why}")
     missed = [

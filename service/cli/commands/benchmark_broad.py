@@ -1,4 +1,4 @@
-"""`foottile benchmark --family broad`: arrays of domes nobody has seen, and quantiles of errors."""
+"""`foottile benchmark --family broad`: quantiles of errors over arrays of unseen domes."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import typer
 
 from devices.errors import UsageError
 from devices.scene.emulation_sections import PartFamily
-from service.cli.options import print_json, remark, say, say_lines
+from service.cli.options import echo, echo_lines, print_json, remark
 from service.json_output import to_json_text
 
 ARRAYS, QUICK_ARRAYS = 200, 3
 
 
-def is_broad(family: str, given: Mapping[str, object]) -> bool:
-    """Whether the broad family is asked for.
+def is_broad(family: str, options: Mapping[str, object]) -> bool:
+    """Return whether the broad family is selected.
 
     Args:
-        family: its name.
-        given: options that go with the default family only; None where not given.
+        family: name of the family.
+        options: options of the default family only; None if absent.
 
     Raises:
-        UsageError: there is no such family, or an option does not go with it.
+        UsageError: no such family, or an option of the other family.
     """
-    known = get_args(PartFamily)
-    if family not in known:
-        raise UsageError(f"--family {family}", expected=" or ".join(known))
-    asked = [option for option, value in given.items() if value is not None]
-    if family == "broad" and asked:
-        raise UsageError(f"{', '.join(asked)} and --family broad", expected="one or the other")
+    choices = get_args(PartFamily)
+    if family not in choices:
+        raise UsageError(f"--family {family}", expected=" or ".join(choices))
+    excluded = [option for option, value in options.items() if value is not None]
+    if family == "broad" and excluded:
+        raise UsageError(f"{', '.join(excluded)} and --family broad", expected="one or the other")
     return family == "broad"
 
 
@@ -45,11 +45,11 @@ def benchmark_broad(
     check_goals: bool,
     as_json: bool,
 ) -> None:
-    """Run the arrays that have no result in the folder yet, and write broad.json, .md and .png.
+    """Run the arrays without a result in the folder, and write broad.json, .md and .png.
 
     Raises:
-        UsageError: there are no such seeds.
-        Exit: 3, if something gave no result, or with `check_goals` a goal is not met.
+        UsageError: no such seeds.
+        Exit: 3, for a missing result, or with `check_goals` a missed goal.
     """
     from service.offline.benchmark.broad.figures import (
         compare_with_goals,
@@ -63,12 +63,12 @@ def benchmark_broad(
     from service.offline.figure_output import create_figure
     from storage.durable_files import write_atomically
 
-    known: dict[str, Seeds] = {name: name for name in get_args(Seeds)}
-    if seeds not in known:
-        raise UsageError(f"--seeds {seeds}", expected=" or ".join(known))
-    create_figure(1.0, 1.0)  # says what is missing before anything takes time
+    choices: dict[str, Seeds] = {name: name for name in get_args(Seeds)}
+    if seeds not in choices:
+        raise UsageError(f"--seeds {seeds}", expected=" or ".join(choices))
+    create_figure(1.0, 1.0)  # reports a missing package early
     bench = run_broad_benchmark(
-        BroadOptions(arrays, known[seeds], jobs, folder, repeatability), remark
+        BroadOptions(arrays, choices[seeds], jobs, folder, repeatability), remark
     )
     text = format_broad_report(bench)
     goals = compare_with_goals(bench.results)
@@ -91,8 +91,8 @@ def benchmark_broad(
     if as_json:
         print_json(content)
     else:
-        say_lines(text)
-        say(f"{folder}: broad.json, broad.md, broad.png")
+        echo_lines(text)
+        echo(f"{folder}: broad.json, broad.md, broad.png")
     refused = [(f"array {r.number}, {f.what}", f.why) for r in bench.results for f in r.refusals]
     for what, why in [*refused, *((f.what, f.why) for f in bench.lost_arrays)]:
         remark(f"no result: {what}: {why}")

@@ -1,6 +1,6 @@
-"""`foottile calibrate --live`: dead weights on a tile of a node that is running.
+"""`foottile calibrate --live`: dead weights on a tile of a running node.
 
-The server guides, records and fits, as for the page `/calibrate`; here its prompts are printed.
+The server guides, records and fits, as for the page `/calibrate`; this module prints its prompts.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from urllib.parse import quote
 import typer
 
 from devices.errors import CalibrationError, UsageError
-from service.cli.options import print_json, progress, remark, stderr, stdout
+from service.cli.options import print_json, remark, show_progress, stderr, stdout
 
 if TYPE_CHECKING:
     from foottile.server import Server
     from service.estimation.calibration import Calibration
 
-_LOOK_S = 0.3
-_NOT_ACCEPTED = 3
+_POLL_S = 0.3
+_EXIT_NOT_ACCEPTED = 3
 
 
 @dataclass(frozen=True)
-class LiveWeights:
-    """What to put on which tile; see `foottile calibrate --help`."""
+class WeighingRequest:
+    """Tiles, weights and options of a weighing; see `foottile calibrate --help`."""
 
     tiles: tuple[str, ...]
     weights: str
@@ -40,30 +40,30 @@ class LiveWeights:
 
 
 def calibrate_live(
-    out: Path, asked: LiveWeights, server: str, ca: Path | None, *, as_json: bool
+    out: Path, request: WeighingRequest, server: str, ca: Path | None, *, as_json: bool
 ) -> None:
-    """Guide through the weights, fit, show, and write the calibration if it is accepted.
+    """Guide through the weights, fit, show, and write the calibration if accepted.
 
     Raises:
-        UsageError: no such node or tile, or a weight that is none.
-        CalibrationError: the weights show no curve.
+        UsageError: no such node or tile, or an invalid weight.
+        CalibrationError: the weights give no curve.
     """
     import foottile
-    from service.cli.calibration_report import calibration_json, calibration_tables
+    from service.cli.calibration_report import calibration_to_json, make_calibration_tables
     from service.estimation.dead_weights import make_weight_labels
     from service.sessions.calibration_file import parse_calibration
     from storage.durable_files import write_atomically
 
-    weights = make_weight_labels(asked.weights.split(","), asked.within_percent)
+    weights = make_weight_labels(request.weights.split(","), request.within_percent)
     with foottile.connect(server, ca=ca) as source:
-        node = _node_of(source, asked.node)
-        _check_assignable(node, asked)
+        node = _select_node(source, request.node)
+        _check_assignable(node, request)
         path = f"/nodes/{quote(node['node'], safe='')}/weighing"
         body = {
-            "tiles": list(asked.tiles),
+            "tiles": list(request.tiles),
             "weights": list(weights),
-            "reference": asked.reference,
-            "name": asked.name,
+            "reference": request.reference,
+            "name": request.name,
         }
         while True:
             weighing = _weigh(source, path, body)
@@ -72,25 +72,27 @@ def calibrate_live(
                 content = file.read()
             calibration = parse_calibration(content, where=f"calibration {found}")
             if not as_json:
-                for table in calibration_tables(calibration):
+                for table in make_calibration_tables(calibration):
                     stdout.print(table)
-            answer = "y" if asked.yes else _ask()
+            answer = "y" if request.yes else _ask_to_accept()
             if answer == "y":
                 break
             source.http.send("DELETE", f"/calibrations/{found}")
             if answer == "n":
                 remark(f"not accepted; its recording is session {weighing['session_id']}")
-                raise typer.Exit(_NOT_ACCEPTED)
+                raise typer.Exit(_EXIT_NOT_ACCEPTED)
         write_atomically(out, content)
-        if asked.assign:
+        if request.assign:
             _assign(source, node, calibration)
     if as_json:
-        print_json({**calibration_json(calibration), "session": weighing["session_id"], "out": out})
+        print_json(
+            {**calibration_to_json(calibration), "session": weighing["session_id"], "out": out}
+        )
     else:
         remark(f"written: {out}; its recording is session {weighing['session_id']}")
 
 
-def _node_of(source: Server, name: str | None) -> dict[str, Any]:
+def _select_node(source: Server, name: str | None) -> dict[str, Any]:
     if name is not None:
         return source.node(name)
     nodes = [node for node in source.nodes() if node["connected"]]
@@ -101,33 +103,33 @@ def _node_of(source: Server, name: str | None) -> dict[str, Any]:
     return nodes[0]
 
 
-def _check_assignable(node: dict[str, Any], asked: LiveWeights) -> None:
-    """Refuse what would fail after all the weights.
+def _check_assignable(node: dict[str, Any], request: WeighingRequest) -> None:
+    """Reject early a calibration that the node could not use.
 
     Raises:
-        UsageError: the node cannot use what comes out.
+        UsageError: tiles of the node are missing.
     """
-    bearing = [tile["serial"] for tile in node["tiles"] if not tile["reference"]]
-    if asked.assign and (left := [serial for serial in bearing if serial not in asked.tiles]):
+    needed = [tile["serial"] for tile in node["tiles"] if not tile["reference"]]
+    if request.assign and (missing := [each for each in needed if each not in request.tiles]):
         raise UsageError(
-            f"--assign without tile {', '.join(left)}: a node needs a curve of each of its tiles",
-            remedy=f"Calibrate all: --tile {','.join(bearing)}; or put the recordings of single "
+            f"--assign without tile {', '.join(missing)}: a node needs a curve of every tile",
+            remedy=f"Calibrate all: --tile {','.join(needed)}; or put the recordings of single "
             "tiles together with foottile calibrate SESSION...",
         )
 
 
 def _weigh(source: Server, path: str, body: dict[str, Any]) -> dict[str, Any]:
-    """Have the server guide through the weights, and say what it says; the weighing once done.
+    """Run a guided weighing on the server, print its prompts and return it when done.
 
     Raises:
-        CalibrationError: it ended without a calibration.
+        CalibrationError: the weighing ended without a calibration.
     """
     import foottile
 
     weighing = source.http.send("POST", path, body)
     try:
-        weighing = _follow(source, path, weighing)
-    finally:  # cancelled if it is under way; else nobody has to close it on the page
+        weighing = _show_until_done(source, path, weighing)
+    finally:  # cancels a running weighing, or closes it on the page
         with suppress(foottile.FootTileError):
             source.http.send("DELETE", path, headers={"If-Match": weighing["session_id"]})
     if weighing["state"] == "failed":
@@ -137,62 +139,62 @@ def _weigh(source: Server, path: str, body: dict[str, Any]) -> dict[str, Any]:
     return weighing
 
 
-def _follow(source: Server, path: str, weighing: dict[str, Any]) -> dict[str, Any]:
-    """Show how far it is until it ends.
+def _show_until_done(source: Server, path: str, weighing: dict[str, Any]) -> dict[str, Any]:
+    """Show the progress of a weighing until its end.
 
     Raises:
-        CalibrationError: somebody has cancelled it.
+        CalibrationError: a user cancelled the weighing.
     """
-    shown, warned, held = "", None, 0
-    with progress(weighing["prompt"]) as say:
+    shown, warned, printed_count = "", None, 0
+    with show_progress(weighing["prompt"]) as show_status:
         while weighing["state"] in ("weighing", "fitting"):
             if weighing["warning"] not in (None, warned):
-                remark(f"once more: {weighing['warning']}")
+                remark(f"repeat: {weighing['warning']}")
             warned = weighing["warning"]
-            texts = _held(weighing)
-            for text in texts[held:]:
+            texts = _format_done_weights(weighing)
+            for text in texts[printed_count:]:
                 remark(text)
-            held = len(texts)
-            text = _status(weighing)
+            printed_count = len(texts)
+            text = _format_status(weighing)
             if text != shown:
                 shown = text
-                say(text)
-            time.sleep(_LOOK_S)
+                show_status(text)
+            time.sleep(_POLL_S)
             found = source.http.get(path)["weighing"]
             if found is None or found["session_id"] != weighing["session_id"]:
-                raise CalibrationError("somebody has cancelled it on the server")
+                raise CalibrationError("the weighing was cancelled on the server")
             weighing = found
     return weighing
 
 
-def _held(weighing: dict[str, Any]) -> list[str]:
-    """Return a line for each weight that is done."""
+def _format_done_weights(weighing: dict[str, Any]) -> list[str]:
+    """Return a line for each finished weight."""
     return [
-        f"{tile['serial']} {weight}: {_in_words(seen)}"
+        f"{tile['serial']} {weight}: {_format_reading(reading)}"
         for tile in weighing["tiles"]
-        for weight, seen in zip(weighing["weights"], tile["held"], strict=False)
+        for weight, reading in zip(weighing["weights"], tile["held"], strict=False)
     ]
 
 
-def _in_words(seen: dict[str, float]) -> str:
+def _format_reading(reading: dict[str, float]) -> str:
     return (
-        f"{seen['mean_kpa']:.2f} kPa, spread {seen['spread_kpa']:.3f}, "
-        f"settled by {seen['settle_kpa']:+.3f}"
+        f"{reading['mean_kpa']:.2f} kPa, spread {reading['spread_kpa']:.3f}, "
+        f"settled by {reading['settle_kpa']:+.3f}"
     )
 
 
-def _status(weighing: dict[str, Any]) -> str:
+def _format_status(weighing: dict[str, Any]) -> str:
     if weighing["state"] == "fitting":
         return "fitting"
     if weighing["left_s"] is None or not stderr.is_terminal:
         return str(weighing["prompt"])
-    seen = weighing["repeatability"]
-    live = "" if seen is None else f"; {_in_words(seen)}"
+    reading = weighing["repeatability"]
+    live = "" if reading is None else f"; {_format_reading(reading)}"
     return f"{weighing['prompt']}: {weighing['left_s']:.0f} s{live}"
 
 
-def _ask() -> str:
-    """Return y, r or n; n where nobody answers."""
+def _ask_to_accept() -> str:
+    """Prompt and return y, r or n; n without an input."""
     try:
         answer = typer.prompt("Accept it? y: yes, r: repeat, n: no", err=True).strip().lower()
     except typer.Abort:
@@ -203,4 +205,4 @@ def _ask() -> str:
 def _assign(source: Server, node: dict[str, Any], calibration: Calibration) -> None:
     path = f"/nodes/{quote(node['node'], safe='')}/calibration"
     source.http.send("PUT", path, {"id": calibration.id})
-    remark(f"node {node['node']} uses it from now on")
+    remark(f"node {node['node']} now uses it")

@@ -1,4 +1,4 @@
-"""`foottile compare`: a session against a force plate, an insole, or another session."""
+"""`foottile compare`: comparison of a session with a reference."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from typing import Annotated
 import typer
 
 from devices.errors import UsageError, require_extra
-from service.cli.commands.sessions import sealed_file
-from service.cli.compare_many import MISSED, compare_many, options_of
-from service.cli.many import NOT_ALL, JobsOption, ManifestOption, SchedulerOption
-from service.cli.options import JsonOption, print_json, progress, remark, say, say_lines
+from service.cli.commands.sessions import find_sealed_file
+from service.cli.manifest_comparison import LIMIT_MISSED, compare_manifest, make_compare_options
+from service.cli.multi_session import EXIT_INCOMPLETE, JobsOption, ManifestOption, SchedulerOption
+from service.cli.options import JsonOption, echo, echo_lines, print_json, remark, show_progress
 from service.cli.reference_options import (
-    ColumnsOfReference,
-    Decimal,
-    Encoding,
-    LagRange,
-    RateOfReference,
-    SignOfReference,
-    SkipRows,
-    SoleOfReference,
-    UnitsOfReference,
-    UnitsRow,
-    named_values,
+    DecimalOption,
+    EncodingOption,
+    LagRangeOption,
+    ReferenceColumnsOption,
+    ReferenceRateOption,
+    ReferenceSignOption,
+    ReferenceUnitsOption,
+    SkipRowsOption,
+    SoleSizeOption,
+    UnitsRowOption,
+    parse_named_values,
 )
-from service.cli.result_folder import result_folder
+from service.cli.result_folder import open_result_folder
 
 
 @require_extra("server", "`foottile compare`")
@@ -38,55 +38,55 @@ def compare_command(
     reference: Annotated[
         Path | None,
         typer.Option(
-            help="What to compare with: .c3d, .csv, .txt, .parquet (or a session), .mot, .sto, "
-            ".asf, .bag, .mcap, .db3 or a bag's folder, or .npz of a pressure plate."
+            help="Reference: .c3d, .csv, .txt, .parquet (or a session), .mot, .sto, .asf, .bag, "
+            ".mcap, .db3 or a bag's folder, or .npz of a pressure plate."
         ),
     ] = None,
     out: Annotated[
         str | None,
         typer.Option(
             help="Folder for compare.json, compare.md, compare.png and series.parquet; default: "
-            "with the session, in comparisons/ and the reference's name. Of many sessions each has "
+            "with the session, in comparisons/ and the reference's name. Each of many sessions has "
             "a folder in it."
         ),
     ] = None,
-    columns: ColumnsOfReference = None,
-    units: UnitsOfReference = None,
-    sign: SignOfReference = None,
-    rate_hz: RateOfReference = None,
-    skip_rows: SkipRows = None,
-    units_row: UnitsRow = None,
-    decimal: Decimal = None,
-    encoding: Encoding = None,
-    sole_m: SoleOfReference = None,
+    columns: ReferenceColumnsOption = None,
+    units: ReferenceUnitsOption = None,
+    sign: ReferenceSignOption = None,
+    rate_hz: ReferenceRateOption = None,
+    skip_rows: SkipRowsOption = None,
+    units_row: UnitsRowOption = None,
+    decimal: DecimalOption = None,
+    encoding: EncodingOption = None,
+    sole_m: SoleSizeOption = None,
     reference_sigma_n: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Standard uncertainty of the reference; tells coverage."),
+        typer.Option(min=0.0, help="Reference force uncertainty (1 sigma, N), for coverage."),
     ] = None,
     reference_cop_sigma_m: Annotated[
         float | None,
-        typer.Option(min=0.0, help="The same of each coordinate of its centre of pressure."),
+        typer.Option(min=0.0, help="Reference COP uncertainty (1 sigma, m)."),
     ] = None,
     remove_offset: Annotated[
-        bool, typer.Option("--remove-offset", help="Take off what the reference reads in flight.")
+        bool, typer.Option("--remove-offset", help="Subtract the reference's mean in flight.")
     ] = False,
-    lag_range_s: LagRange = None,
+    lag_range_s: LagRangeOption = None,
     contact_n: Annotated[
         float | None,
         typer.Option(
-            min=0.0, help="From when on the reference bears load; default: 5 sigma of its noise."
+            min=0.0, help="Contact threshold of the reference; default: 5 sigma of its noise."
         ),
     ] = None,
     cop_offset_m: Annotated[
         str | None,
-        typer.Option(metavar="X,Y", help="Added to the reference's centre of pressure."),
+        typer.Option(metavar="X,Y", help="Offset added to the reference's COP."),
     ] = None,
     limits: Annotated[
         str | None,
         typer.Option(
             metavar="FIGURE=LIMIT,...",
-            help="Exit code 3 if the mean of a figure is more, as grf_mae_n=1,cop_p95_m=0.004; of "
-            "coverage, R² and counts, if it is less.",
+            help="Limits of mean figures: grf_mae_n=1,cop_p95_m=0.004; a missed one is exit code "
+            "3. They are lower limits for coverage, R² and counts, upper limits else.",
         ),
     ] = None,
     data: Annotated[
@@ -99,23 +99,23 @@ def compare_command(
 ) -> None:
     """Compare a session with a reference: a force plate, an insole, another session.
 
-    Clocks are aligned first: lag and drift, offset and scale come with intervals, and none of them
-    but lag and drift is applied unless asked for. Without --out all is kept with the session, in
-    its folder. Many sessions are named by --manifest, with columns session and reference; what
-    differs by row is a column, too: map, units, sign, name of the result and the like.
+    Clocks are aligned first. Lag, drift, offset and scale have intervals; only lag and drift are
+    applied by default. Without --out the results are stored with the session. --manifest names many
+    sessions, with columns session and reference; options that differ by row are further columns:
+    map, units, sign, name of the result and so on.
 
-    Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but a limit is missed, or some of many
-    sessions failed.
+    Exit codes: 0 success, 1 failure, 2 wrong usage, 3 written, but a limit is missed, or some of
+    many sessions failed.
     """
     from service.offline.compare.report import FIGURE_TITLES
     from service.offline.comparison_output import write_comparison
     from service.offline.figure_output import create_figure
 
-    asked = {
-        name: _limit(name, text, FIGURE_TITLES)
-        for name, text in named_values(limits, "--limits").items()
+    parsed_limits = {
+        name: _parse_limit(name, text, FIGURE_TITLES)
+        for name, text in parse_named_values(limits, "--limits").items()
     }
-    said: dict[str, str | float | None] = {
+    stated: dict[str, str | float | None] = {
         "map": columns,
         "units": units,
         "sign": sign,
@@ -131,67 +131,69 @@ def compare_command(
         "reference_sigma_n": reference_sigma_n,
         "reference_cop_sigma_m": reference_cop_sigma_m,
     }
-    create_figure(1.0, 1.0)  # says what is missing before anything takes time
+    create_figure(1.0, 1.0)  # reports a missing package early
     if manifest is not None or session is None or reference is None:
         if manifest is None or session is not None or reference is not None or out is None:
             raise UsageError(
-                "which session is compared with what is not said, or twice",
+                "session and reference are not named, or twice",
                 expected="SESSION and --reference; or for many --manifest and --out",
             )
-        summary = compare_many(
+        summary = compare_manifest(
             manifest,
-            said,
-            asked,
+            stated,
+            parsed_limits,
             remove_offset=remove_offset,
             out=out,
             jobs=jobs,
             scheduler=scheduler,
             as_json=as_json,
         )
-        if summary.states["failed"] or summary.verdicts[MISSED]:
-            raise typer.Exit(NOT_ALL)
+        if summary.states["failed"] or summary.verdicts[LIMIT_MISSED]:
+            raise typer.Exit(EXIT_INCOMPLETE)
         return
-    options = options_of(said, remove_offset=remove_offset)
-    source = sealed_file(session, data)
+    options = make_compare_options(stated, remove_offset=remove_offset)
+    source = find_sealed_file(session, data)
     title = f"{Path(session).name} against {reference.name}"
     with (
-        result_folder(Path(out) if out is not None else kept_with(source, reference)) as folder,
-        progress(f"comparing {title}"),
+        open_result_folder(
+            Path(out) if out is not None else get_comparison_folder(source, reference)
+        ) as folder,
+        show_progress(f"comparing {title}"),
     ):
-        done = write_comparison(source, reference, options, asked, folder, title)
+        done = write_comparison(source, reference, options, parsed_limits, folder, title)
     if as_json:
         print_json(done.content)
     else:
-        say_lines(done.report_text)
-        say(f"{folder}: compare.json, compare.md, compare.png, series.parquet")
+        echo_lines(done.report_text)
+        echo(f"{folder}: compare.json, compare.md, compare.png, series.parquet")
     for line in done.missed_limits:
         remark(f"limit missed: {line}")
     if done.missed_limits:
         raise typer.Exit(3)
 
 
-def kept_with(source: Path, reference: Path) -> Path:
-    """Where a comparison lies with its session.
+def get_comparison_folder(source: Path, reference: Path) -> Path:
+    """Return the folder of a comparison within its session.
 
     Raises:
-        UsageError: the session is a file by itself.
+        UsageError: the session is a single file.
     """
     from storage.sessions.comparisons import COMPARISONS_FOLDER
     from storage.sessions.metadata import SESSION_NAME
 
     if not (source.parent / SESSION_NAME).is_file():
         raise UsageError(
-            f"{source.name} is a file by itself, with which nothing is kept",
+            f"{source.name} is a single file, without a folder for results",
             remedy="Add --out FOLDER, or name a session's folder or id",
         )
     return source.parent / COMPARISONS_FOLDER / reference.stem
 
 
-def _limit(name: str, text: str, known: Collection[str]) -> float:
+def _parse_limit(name: str, text: str, figures: Collection[str]) -> float:
     try:
         limit = float(text)
     except ValueError:
         limit = math.nan
-    if name not in known or not limit >= 0.0:
-        raise UsageError(f"--limits {name}={text}", expected=f"a limit of {', '.join(known)}")
+    if name not in figures or not limit >= 0.0:
+        raise UsageError(f"--limits {name}={text}", expected=f"a limit of {', '.join(figures)}")
     return limit

@@ -1,4 +1,4 @@
-"""`foottile demo`: a server and an emulated node, to try everything without hardware."""
+"""`foottile demo`: a server with an emulated node, without hardware."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import FootTileError, require_extra
-from service.cli.commands.node import calibration_of
-from service.cli.commands.serve import announce
+from service.cli.commands.node import find_scene_calibration
+from service.cli.commands.serve import print_addresses
 from service.cli.options import (
     SECONDS_MAX,
     FootOptions,
+    add_foot_options,
     check_emulated,
-    data_folder,
+    create_stop_event,
+    load_adapted_scene,
     remark,
-    scene_with,
-    stop_on_signals,
-    with_foot_options,
+    resolve_data_folder,
 )
-from service.cli.tickets import AdvertiseOption, host_of, remark_reach
+from service.cli.tickets import AdvertiseOption, get_host, remark_unreachable
 
 if TYPE_CHECKING:
     import socket
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from service.server.server import Server
 
 NODE = "demo"
-_SEAL_S = 20.0
-_END_S = 8.0
+_SEAL_TIMEOUT_S = 20.0
+_STOP_TIMEOUT_S = 8.0
 
 
 @require_extra("server", "`foottile demo`")
-@with_foot_options
+@add_foot_options
 def demo_command(
     options: FootOptions,
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
@@ -48,17 +48,17 @@ def demo_command(
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
     advertise: AdvertiseOption = None,
     data: Annotated[
-        Path | None, typer.Option(help="Folder for sessions; default: one for demos.")
+        Path | None, typer.Option(help="Folder for sessions; default: the user's demo folder.")
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.0, max=SECONDS_MAX, help="End after so long; default: at Ctrl-C."),
+        typer.Option(min=0.0, max=SECONDS_MAX, help="Run time; default: until Ctrl-C."),
     ] = None,
 ) -> None:
     """Run a server and an emulated node, and print a link to the live page.
 
-    The scene never ends; a recorded load is pressed over and over again. Ctrl-C stops what is
-    being recorded, seals it, and ends both.
+    The scene never ends; a recorded load repeats. Ctrl-C stops and seals running recordings, and
+    ends both.
     """
     import uvloop
 
@@ -66,19 +66,19 @@ def demo_command(
     from service.rig.options import RigOptions
 
     raise_open_files_limit()
-    the_scene = scene_with(scene, bus=None, servo=None)
+    the_scene = load_adapted_scene(scene, bus=None, servo=None)
     check_emulated(the_scene)
-    # The node finds it in the cache.
-    calibration_of(RigOptions(the_scene, NODE, options.foot(the_scene)))
-    arguments = [f"--scene={scene}", *options.as_arguments()]
-    folder = data_folder(data)
+    # Fills the cache for the node.
+    find_scene_calibration(RigOptions(the_scene, NODE, options.make_foot(the_scene)))
+    arguments = [f"--scene={scene}", *options.to_arguments()]
+    folder = resolve_data_folder(data)
     if data is None:
         folder /= "demo"
     arguments.append(f"--journal={folder / 'node'}")
-    uvloop.run(_demo(host, port, advertise, folder, seconds, arguments))
+    uvloop.run(_run_demo(host, port, advertise, folder, seconds, arguments))
 
 
-async def _demo(
+async def _run_demo(
     host: str,
     port: int,
     advertise: str | None,
@@ -96,22 +96,22 @@ async def _demo(
     from service.api.logins import Logins
     from storage.permissions import restrict_to_owner
 
-    stop = stop_on_signals()
+    stop = create_stop_event()
     restrict_to_owner(data)
     with open_listening_socket(host, port) as listening, ExitStack() as stack:
-        given = read_token()
-        token = load_or_create_token(given, data)
+        given_token = read_token()
+        token = load_or_create_token(given_token, data)
         stack.enter_context(publish_token(listening, token))
         logins = Logins(token)
         find_urls = partial(list_urls, listening, host, advertise)
         urls = find_urls()
-        # First: while the server is imported and prepared, the tiles are found and measured.
+        # First: the node finds and measures its tiles while the server starts.
         node = await _start_node(urls[-1], token, node_arguments)
         try:
-            async with _server(listening, data, logins, find_urls) as server:
-                announce(urls, data, logins, is_kept=not given, is_demo=True)
-                remark_reach(urls, host)
-                remark(f"what was recorded: foottile sessions --server {urls[-1]}")
+            async with _run_server(listening, data, logins, find_urls) as server:
+                print_addresses(urls, data, logins, is_stored=not given_token, is_demo=True)
+                remark_unreachable(urls, host)
+                remark(f"list recordings: foottile sessions --server {urls[-1]}")
                 ended = asyncio.create_task(node.wait())
                 stopped = asyncio.create_task(stop.wait())
                 done, _ = await asyncio.wait(
@@ -121,21 +121,21 @@ async def _demo(
                 if ended in done:
                     raise FootTileError(
                         f"the node ended with code {node.returncode}",
-                        remedy="What it said stands above",
+                        remedy="See its output above",
                     )
                 await _stop_recording(server)
-                await _end(node)  # before its server, which it would miss
+                await _stop_node(node)  # before its server, else it would try to reconnect
                 if not stop.is_set():
                     remark(f"ended after {seconds:g} s; data in {data}")
         finally:
-            await _end(node)
+            await _stop_node(node)
 
 
 @asynccontextmanager
-async def _server(
+async def _run_server(
     listening: socket.socket, data: Path, logins: Logins, find_urls: Callable[[], list[str]]
 ) -> AsyncIterator[Server]:
-    """A server that answers, while the block runs."""
+    """Run a server while the block runs."""
     from devices.realtime import freeze_garbage_collector
     from service.api.address import list_own_names
     from service.api.app import make_app
@@ -143,7 +143,7 @@ async def _server(
     from service.server.server import Server
 
     server = Server(data)
-    hosts = (*list_own_names(), host_of(find_urls()[0]))
+    hosts = (*list_own_names(), get_host(find_urls()[0]))
     app = make_app(server, hosts=hosts, logins=logins, find_urls=find_urls)
     async with serve_app(app, listening):
         freeze_garbage_collector()
@@ -159,25 +159,25 @@ async def _start_node(url: str, token: str, arguments: list[str]) -> asyncio.sub
         *arguments,
         env=environment,
         stdin=asyncio.subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C is for us, who end it when the recording is stopped
+        start_new_session=True,  # Ctrl-C reaches this process, which stops the recording first
     )
 
 
 async def _stop_recording(server: Server) -> None:
     for session in server.recorder.list_recording(NODE):
         server.recorder.stop_session(session.id)
-        sealed = await server.sealer.wait_until_sealed(session.id, _SEAL_S)
+        sealed = await server.sealer.wait_until_sealed(session.id, _SEAL_TIMEOUT_S)
         remark(f"session {sealed.id} ({sealed.name}) is {sealed.state}")
 
 
-async def _end(node: asyncio.subprocess.Process) -> None:
-    """End the node, if it has not ended."""
+async def _stop_node(node: asyncio.subprocess.Process) -> None:
+    """Stop the node, if it still runs."""
     if node.returncode is not None:
         return
     with suppress(ProcessLookupError):
         node.terminate()
     try:
-        await asyncio.wait_for(node.wait(), _END_S)
+        await asyncio.wait_for(node.wait(), _STOP_TIMEOUT_S)
     except TimeoutError:
         with suppress(ProcessLookupError):
             node.kill()

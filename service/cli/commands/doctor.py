@@ -1,4 +1,4 @@
-"""`foottile doctor`: find the tiles of a bus, measure it, and say what rate it will hold."""
+"""`foottile doctor`: tiles, timing and frame rate of a bus."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from devices.clock import Clock, SystemClock, VirtualClock
 from devices.errors import UsageError, require_extra
 from devices.scene.hardware_sections import EMULATED, ServoSection
 from devices.scene.scene_file import Scene, load_scene
-from service.cli.options import JsonOption, print_json, progress, say, stdout
+from service.cli.options import JsonOption, echo, print_json, show_progress, stdout
 
 if TYPE_CHECKING:
     from service.offline.doctor import BusDiagnosis
@@ -28,13 +28,13 @@ _EMULATED_SCENE = "standing"
 def doctor_command(
     scene: Annotated[
         str | None,
-        typer.Option(help="Scene that says what should be there; default: whatever is."),
+        typer.Option(help="Scene with the expected tiles; default: accept any."),
     ] = None,
     bus: Annotated[
         str | None, typer.Option(help="I2C bus, /dev/i2c-1 or emulated; default: the scene's.")
     ] = None,
     rate_hz: Annotated[
-        float, typer.Option(min=0.0, help="Frames a second wanted; 0: the scene's, or the most.")
+        float, typer.Option(min=0.0, help="Required frame rate; 0: the scene's, or the highest.")
     ] = 0.0,
     servo: Annotated[
         str | None,
@@ -44,11 +44,10 @@ def doctor_command(
 ) -> None:
     """Find the tiles of a bus, measure it, and predict its frame rate.
 
-    Looks behind every multiplexer, reads each tile's coefficients three times, measures the bus
-    clock and every part's conversion time, and predicts the frame rate of every schedule. With a
-    servo, asks for it in both protocols at the usual baud rates. An emulated bus is examined in
-    virtual time. Exit codes: 0 all is well, 1 nothing works, 2 wrong usage, 3 something has to be
-    changed.
+    It scans every multiplexer, reads each tile's coefficients three times, measures the bus clock
+    and every part's conversion time, and predicts the frame rate of every schedule. It searches a
+    servo with both protocols at the usual baud rates. An emulated bus is examined in virtual time.
+    Exit codes: 0 ready, 1 no working bus, 2 wrong usage, 3 something has to be changed.
     """
     from service.offline.doctor import diagnose_bus
     from service.offline.servo_doctor import diagnose_servo
@@ -61,25 +60,25 @@ def doctor_command(
         )
     if name == EMULATED and the_scene is None:
         the_scene = load_scene(_EMULATED_SCENE)
-    with ExitStack() as stack, progress(f"examining {name}"):
-        opened, clock = _open(name, the_scene)
+    with ExitStack() as stack, show_progress(f"examining {name}"):
+        opened, clock = _open_bus(name, the_scene)
         stack.callback(opened.close)
         diagnosis = diagnose_bus(opened, clock, the_scene, requested_hz=rate_hz)
     wanted = the_scene.servo if the_scene is not None else None
     port = servo or (wanted.port if wanted is not None else "none")
     found = None
     if port != "none":
-        with ExitStack() as stack, progress(f"asking for a servo at {port}"):
+        with ExitStack() as stack, show_progress(f"asking for a servo at {port}"):
             opened_port = port
             if port == EMULATED:
-                opened_port = stack.enter_context(_emulated_servo(the_scene, wanted))
+                opened_port = stack.enter_context(_open_servo(the_scene, wanted))
             found = diagnose_servo(opened_port, SystemClock(), wanted)
     if as_json:
-        print_json(_as_json(name, diagnosis, port, found))
+        print_json(_make_json(name, diagnosis, port, found))
     else:
-        _print(name, diagnosis, the_scene)
+        _print_diagnosis(name, diagnosis, the_scene)
         if found is not None:
-            say(f"Servo at {port}: {found.verdict}")
+            echo(f"Servo at {port}: {found.verdict}")
     if diagnosis.scl_hz is None:
         raise typer.Exit(1)
     if not diagnosis.is_rate_reached or (found is not None and not found.is_well):
@@ -87,10 +86,10 @@ def doctor_command(
 
 
 @contextmanager
-def _emulated_servo(scene: Scene | None, wanted: ServoSection | None) -> Iterator[str]:
+def _open_servo(scene: Scene | None, wanted: ServoSection | None) -> Iterator[str]:
     if scene is None or wanted is None:
         raise UsageError(
-            "an emulated servo for a scene without servo", remedy="Add --scene rolling"
+            "the scene of the emulated servo has no servo", remedy="Add --scene rolling"
         )
     from devices.emulation.world import World
 
@@ -99,7 +98,7 @@ def _emulated_servo(scene: Scene | None, wanted: ServoSection | None) -> Iterato
         yield emulated.port
 
 
-def _open(name: str, scene: Scene | None) -> tuple[I2cBus, Clock]:
+def _open_bus(name: str, scene: Scene | None) -> tuple[I2cBus, Clock]:
     if name != EMULATED or scene is None:
         return open_bus(name), SystemClock()
     from devices.emulation.world import World
@@ -111,7 +110,7 @@ def _open(name: str, scene: Scene | None) -> tuple[I2cBus, Clock]:
     return open_bus(name, world.i2c_adapter), clock
 
 
-def _as_json(
+def _make_json(
     name: str, diagnosis: BusDiagnosis, port: str, servo: ServoDiagnosis | None
 ) -> dict[str, object]:
     return {
@@ -128,11 +127,11 @@ def _as_json(
     }
 
 
-def _print(name: str, diagnosis: BusDiagnosis, scene: Scene | None) -> None:
+def _print_diagnosis(name: str, diagnosis: BusDiagnosis, scene: Scene | None) -> None:
     where = f"{name}, scene {scene.name}" if scene is not None else name
     if name == EMULATED:
         where += ", in virtual time"
-    say(f"Bus {where}")
+    echo(f"Bus {where}")
     tiles = Table("tile", "mux", "channel", "a0 b1 b2 c12", "conversion", "problem")
     for tile in diagnosis.tiles:
         words = tile.coefficient_words
@@ -146,7 +145,7 @@ def _print(name: str, diagnosis: BusDiagnosis, scene: Scene | None) -> None:
         )
     stdout.print(tiles)
     if diagnosis.scl_hz is not None:
-        say(
+        echo(
             f"SCL {diagnosis.scl_hz / 1e3:.1f} kHz measured, "
             f"{diagnosis.configured_scl_hz / 1e3:.0f} asked for; "
             f"{diagnosis.transaction_overhead_s * 1e6:.0f} us per transaction beyond its bits"
@@ -159,4 +158,4 @@ def _print(name: str, diagnosis: BusDiagnosis, scene: Scene | None) -> None:
                 "best" if schedule == diagnosis.fastest_schedule else "",
             )
         stdout.print(rates)
-    say(diagnosis.verdict)
+    echo(diagnosis.verdict)

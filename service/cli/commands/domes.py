@@ -1,4 +1,4 @@
-"""`foottile domes`: which of the paper's domes for which load."""
+"""`foottile domes`: load ranges of the paper's domes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from devices.errors import UsageError
-from service.cli.options import JsonOption, print_json, say, stdout
+from service.cli.options import JsonOption, echo, print_json, stdout
 from service.estimation.domes import (
     SaturationLoad,
     compute_ambient_transmission,
@@ -21,18 +21,18 @@ from service.estimation.domes import (
 
 def domes_command(
     load_n: Annotated[
-        float | None, typer.Option(help="Greatest load on one tile in newtons: which dome for it.")
+        float | None, typer.Option(help="Greatest load on one tile, N: select a dome.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the domes of the paper's Table I and their load ranges.
 
     The paper states a range for one dome only, 11 mm of Vytaflex 60; the others are scaled by
-    modulus and area, which is an estimate. Exit codes: 0 good, 2 wrong usage, 3 every dome
+    modulus and area, which is an estimate. Exit codes: 0 success, 2 wrong usage, 3 every dome
     saturates.
     """
     if load_n is not None and not 0.0 < load_n < float("inf"):
-        raise UsageError(f"--load-n {load_n} is no load", expected="newtons above 0")
+        raise UsageError(f"--load-n {load_n} is not a load", expected="newtons above 0")
     chosen = None if load_n is None else select_dome_for_load(load_n)
     if as_json:
         print_json(
@@ -80,21 +80,21 @@ def domes_command(
                 *([] if load_n is None else [found.judge_load(load_n)]),
             )
         stdout.print(table)
-        say(_NOTES.format(fast=100 * compute_fast_load_ratio()))
+        echo(_NOTES.format(fast=100 * compute_fast_load_ratio()))
         if load_n is not None:
-            say(f"For {load_n:g} N: {_answer(chosen, load_n)}")
+            echo(f"For {load_n:g} N: {_format_choice(chosen, load_n)}")
     if load_n is not None and chosen is None:
         raise typer.Exit(3)
 
 
 _NOTES = """\
-Full scale: a slow load that takes the chip to its 115 kPa. The paper states it for
-v60-11; the others are scaled by modulus and area: press one before you rely on it.
-A load that comes within milliseconds reaches full scale at about {fast:.0f} % of it.
+Full scale: slow load at which the chip reaches its 115 kPa. The paper states it for
+v60-11; the others are scaled by modulus and area: test a dome before you rely on it.
+A load within milliseconds reaches full scale at about {fast:.0f} % of it.
 Outside: estimated part of a change of air or water pressure that a tile reads."""
 
 
-def _answer(chosen: SaturationLoad | None, load_n: float) -> str:
+def _format_choice(chosen: SaturationLoad | None, load_n: float) -> str:
     if chosen is None:
         return "none of them; share the load between tiles."
     if chosen.judge_load(load_n) == "covers":

@@ -1,4 +1,4 @@
-"""`foottile estimate`: forces, GRF and COP of a recorded session."""
+"""`foottile estimate`: new estimates of a recorded session."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import require_extra
-from service.cli.many import (
-    NOT_ALL,
+from service.cli.multi_session import (
+    EXIT_INCOMPLETE,
     JobsOption,
     ManifestOption,
     SchedulerOption,
-    is_one,
-    run_many,
+    is_single_session,
+    run_task,
 )
 from service.cli.options import (
     EndOption,
     ExactOption,
     JsonOption,
     StartOption,
-    output_path,
-    pair,
+    echo,
+    parse_pair,
     print_json,
-    progress,
     remark,
-    say,
+    resolve_output_path,
+    show_progress,
 )
 from service.estimation import OFFLINE_LAG_MS
 from storage.sessions.folder import FRAMES_NAME
@@ -43,8 +43,8 @@ def estimate_command(
     out: Annotated[
         str,
         typer.Option(
-            help="Session to write, with the new estimates; .parquet is added to a name without "
-            "an ending; for many, a folder or URI."
+            help="Session to write, .parquet is added to a name without a suffix; for many "
+            "sessions, a folder or URI."
         ),
     ],
     sessions: Annotated[
@@ -61,14 +61,14 @@ def estimate_command(
         ),
     ] = None,
     models: Annotated[
-        str | None, typer.Option(help="Comma-separated; default: those of the scene.")
+        str | None, typer.Option(help="Comma-separated models; default: the scene's.")
     ] = None,
     lag_ms: Annotated[
         float, typer.Option(help="Look-ahead of smoothing and contact.")
     ] = OFFLINE_LAG_MS,
     scene: Annotated[
         str | None,
-        typer.Option(help="Scene whose models, calibration and tile positions to use."),
+        typer.Option(help="Scene for models, calibration and tile positions."),
     ] = None,
     tare_s: Annotated[
         str | None,
@@ -85,16 +85,16 @@ def estimate_command(
     """Estimate a recorded session again and write it with the new estimates.
 
     The tare comes from --tare-s, else from frames flagged as lead, else from the first interval
-    that can be recognised as unloaded. Of some seconds no more is read than they need: models begin
-    some time before them, and do not remember what was before that.
+    recognised as unloaded. For a slice the models start some time before it, in their initial
+    state, and only that part is read.
 
-    Many sessions are estimated in processes of their own, each into a folder of its id in --out;
-    given again, the command goes on where it was broken off.
+    Many sessions are estimated in parallel processes, each into a folder of its id in --out; a
+    repeated command resumes.
 
-    Exit codes: 0 good, 1 failed, 2 wrong usage, 3 some of many sessions failed.
+    Exit codes: 0 success, 1 failure, 2 wrong usage, 3 some of many sessions failed.
     """
     from devices.scene.scene_file import load_scene
-    from service.cli.report import findings_json, tell_findings
+    from service.cli.report import make_findings_json, print_findings
     from service.estimation.model_sensitivity import REASONS_BY_MODEL
     from service.offline.archive.locations import is_remote
     from service.offline.archive.tasks import EstimateTask
@@ -110,25 +110,25 @@ def estimate_command(
         models=None if models is None else tuple(models.split(",")),
         lag_ms=lag_ms,
         scene=None if scene is None else load_scene(scene),
-        tare_s=pair(tare_s, "--tare-s"),
+        tare_s=parse_pair(tare_s, "--tare-s"),
         part=Slice(start_s, end_s),
         exact=exact,
     )
-    if not is_one(sessions, manifest) or is_remote(out):
-        task = replace(task, calibration=_for_workers(calibration))
-        summary = run_many(
+    if not is_single_session(sessions, manifest) or is_remote(out):
+        task = replace(task, calibration=_embed_calibration(calibration))
+        summary = run_task(
             task, sessions, manifest, out=out, jobs=jobs, scheduler=scheduler, as_json=as_json
         )
         if summary.states["failed"]:
-            raise typer.Exit(NOT_ALL)
+            raise typer.Exit(EXIT_INCOMPLETE)
         return
     (session,) = map(Path, sessions or ())
-    # The session itself may be the output: it is replaced whole, and nothing raw is lost.
-    path = output_path(
-        _with_ending(Path(out)), *(Path(name) for name in (calibration, scene) if name is not None)
+    # The output may be the input: it is replaced atomically, and keeps all raw data.
+    path = resolve_output_path(
+        _add_suffix(Path(out)), *(Path(name) for name in (calibration, scene) if name is not None)
     )
     source = session / FRAMES_NAME if session.is_dir() else session
-    with progress(f"estimating {session}"):
+    with show_progress(f"estimating {session}"):
         before = read_stored_estimates(source)
         result = estimate_session(source, path, task, on_remark=remark)
         after = None if before is None else read_stored_estimates(path)
@@ -149,30 +149,30 @@ def estimate_command(
                     "end_s": result.tare_s[1],
                 },
                 "asks_for": result.omitted_effects_n,
-                **findings_json(result.findings),
+                **make_findings_json(result.findings),
             }
         )
         return
-    say(
+    echo(
         f"{path}: {result.frame_count} frames, calibration {plan.calibration.name} "
         f"({plan.calibration.id}), models {', '.join(plan.models)}, tare {plan.tare.source} "
         f"{result.tare_s[0]:.2f} to {result.tare_s[1]:.2f} s"
     )
-    say(f"look-ahead {lag_ms:g} ms{_describe(change)}")
-    tell_findings(result.findings)
+    echo(f"look-ahead {lag_ms:g} ms{_format_change(change)}")
+    print_findings(result.findings)
     for name, newtons in result.omitted_effects_n.items():
         remark(
-            f"{REASONS_BY_MODEL[name]}: model {name!r} is not named, and is good for "
-            f"{newtons:.2f} N of the GRF here; the calibration offers it"
+            f"{REASONS_BY_MODEL[name]}: model {name!r} is inactive; it would change the GRF by "
+            f"{newtons:.2f} N here, and the calibration has it"
         )
 
 
-def _with_ending(out: Path) -> Path:
-    """Return where a session is written: programs tell a file's format by its ending."""
+def _add_suffix(out: Path) -> Path:
+    """Return the path with a suffix, from which programs recognise the format."""
     return out if out.suffix or os.path.lexists(out) else out.with_name(f"{out.name}.parquet")
 
 
-def _describe(change: EstimateChange | None) -> str:
+def _format_change(change: EstimateChange | None) -> str:
     if change is None:
         return ""
     before = f" (before: {change.lag_before_ms:g} ms)"
@@ -185,10 +185,10 @@ def _describe(change: EstimateChange | None) -> str:
     )
 
 
-def _for_workers(named: str | None) -> Calibration | str | None:
-    """A calibration's content, where a file is named: a worker elsewhere does not have it."""
+def _embed_calibration(calibration: str | None) -> Calibration | str | None:
+    """Replace the name of a calibration file by its content, for workers on other machines."""
     from service.offline.calibration_lookup import read_calibration
 
-    if named is None or not Path(named).is_file():
-        return named
-    return read_calibration(Path(named))
+    if calibration is None or not Path(calibration).is_file():
+        return calibration
+    return read_calibration(Path(calibration))

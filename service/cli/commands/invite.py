@@ -8,12 +8,8 @@ import typer
 
 from devices.errors import require_extra
 from service.cli.commands.sessions import SERVER, ServerOption
-from service.cli.options import (
-    CaOption,
-    JsonOption,
-    print_json,
-)
-from service.cli.tickets import TokenFolderOption, read_data_token, say_ticket
+from service.cli.options import CaOption, JsonOption, print_json
+from service.cli.tickets import TokenFolderOption, print_ticket, read_data_token
 
 
 @require_extra("server", "`foottile invite`")
@@ -29,14 +25,14 @@ def invite_command(
     """Create a one-time login link, and on a terminal its QR code.
 
     The first browser that opens it within five minutes is logged in for twelve hours. Run it on the
-    server's computer. Token: the one in the folder of --data, else FOOTTILE_TOKEN, else that of a
-    server of this user.
+    server's computer. The token comes from the folder of --data, else from FOOTTILE_TOKEN, else
+    from a server of this user.
     """
     import foottile
 
     with foottile.connect(server or SERVER, read_data_token(data), ca=ca) as source:
-        ticket = source.ticket(role="viewer" if read_only else "operator")
+        ticket = source.create_invite(role="viewer" if read_only else "operator")
     if as_json:
         print_json(ticket)
     else:
-        say_ticket(ticket["urls"], viewer=read_only)
+        print_ticket(ticket["urls"], viewer=read_only)

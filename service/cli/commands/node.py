@@ -1,4 +1,4 @@
-"""`foottile node`: acquisition on the robot."""
+"""`foottile node`: acquisition on a robot."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from devices.types import check_user_name
 from service.cli.options import (
     CaOption,
     FootOptions,
+    add_foot_options,
+    create_stop_event,
+    echo,
+    load_adapted_scene,
     remark,
-    say,
-    scene_with,
-    stop_on_signals,
-    with_foot_options,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 SERVER = "http://127.0.0.1:8000"
 
 
-@with_foot_options
+@add_foot_options
 def node_command(
     options: FootOptions,
     scene: Annotated[str, typer.Option(help="Scene file, or a built-in scene.")],
@@ -53,26 +53,26 @@ def node_command(
     ] = None,
     journal: Annotated[
         Path | None,
-        typer.Option(help="Folder for the journal and for sessions recorded here."),
+        typer.Option(help="Folder for the journal and for local sessions."),
     ] = None,
     record: Annotated[
         str | None,
-        typer.Option(help="Record a session of this name here; no server is needed for it."),
+        typer.Option(help="Record a local session of this name, without a server."),
     ] = None,
     ca: CaOption = None,
     end_with_parent: Annotated[
-        bool, typer.Option("--end-with-parent", hidden=True, help="End when its parent dies.")
+        bool, typer.Option("--end-with-parent", hidden=True, help="End with the parent process.")
     ] = False,
 ) -> None:
     """Read an array, keep its frames on disk and send them to a server.
 
-    Every frame is journaled: what sessions need stays until the server has it on its disk, the rest
-    for ten minutes. It keeps trying: when the server is away, or this node was switched off, frames
-    follow when both are back. With --record it needs no server: at Ctrl-C the session is sealed in
-    the folder of --journal. The server's token is FOOTTILE_TOKEN; that of a server which this user
-    runs on this machine is found. Options from --load on are for emulated tiles.
+    Every frame is journaled. Frames of sessions stay until the server has stored them, others for
+    ten minutes. It reconnects by itself: frames follow after an interrupted link or a restart.
+    With --record it needs no server: at Ctrl-C the session is sealed in the folder of --journal.
+    The server's token is FOOTTILE_TOKEN, or that of a server of this user on this machine. Options
+    from --load on are for emulated tiles.
 
-    Exit code 3: frames of a session are lost, or wait on this disk for their server.
+    Exit code 3: frames of a session are lost, or still wait on this disk for their server.
     """
     from foottile.environment import read_token
     from foottile.tls import make_context
@@ -104,13 +104,13 @@ def node_command(
             check_user_name(record)
         except ValueError as error:
             raise UsageError(f"--record {record!r} {error}", expected="one line of text") from error
-    the_scene = scene_with(scene, bus=bus, servo=servo)
-    rig = RigOptions(the_scene, _name(name), options.foot(the_scene))
-    calibration, problem = calibration_of(rig)
-    with suppress(StorageError):  # a card that takes nothing is said later, and stops nothing
+    the_scene = load_adapted_scene(scene, bus=bus, servo=servo)
+    rig = RigOptions(the_scene, _choose_name(name), options.make_foot(the_scene))
+    calibration, problem = find_scene_calibration(rig)
+    with suppress(StorageError):  # an unwritable card is reported later
         restrict_to_owner(folder)
     outcome = asyncio.run(
-        _run(
+        _run_node(
             NodeOptions(
                 rig_options=rig,
                 node_folder=folder,
@@ -124,7 +124,7 @@ def node_command(
         )
     )
     if outcome.recorded_session_id is not None:
-        say(
+        echo(
             f"session {outcome.recorded_session_id}"
             + (" is lossy" if outcome.is_lossy else " is complete")
         )
@@ -139,25 +139,25 @@ def node_command(
         raise typer.Exit(3)
 
 
-async def _run(options: NodeOptions) -> NodeOutcome:
+async def _run_node(options: NodeOptions) -> NodeOutcome:
     from devices.realtime import freeze_garbage_collector
     from service.node.running_node import run_node
 
     freeze_garbage_collector()
-    return await run_node(options, stop=stop_on_signals(), report=remark)
+    return await run_node(options, stop=create_stop_event(), report=remark)
 
 
-def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]:
-    """The calibration that the scene names, or why there is none: raw frames are worth having."""
+def find_scene_calibration(options: RigOptions) -> tuple[Calibration | None, str | None]:
+    """Return the scene's calibration, or the reason for its absence: raw frames need none."""
     from service.offline.calibration_lookup import EMULATED_RIG, find_calibration
 
     scene = options.scene
     if scene.calibration == "none":
         return None, "the scene names no calibration"
     if scene.calibration == EMULATED_RIG and not options.is_emulated:
-        # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
+        # The emulated rig would calibrate an emulated tile of the same serial: plausible and wrong.
         problem = (
-            "the emulated bench knows emulated tiles only: press the tiles on a real bench, run "
+            "the emulated rig is for emulated tiles only: load the tiles on a real rig, run "
             "`foottile calibrate`, and name its file in the scene"
         )
         remark(f"no calibration, so no forces: {problem}")
@@ -176,8 +176,8 @@ def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]
     return calibration, None
 
 
-def _name(given: str | None) -> str:
-    name = given if given is not None else re.sub(r"[^A-Za-z0-9._-]", "-", socket.gethostname())
+def _choose_name(name: str | None) -> str:
+    name = name if name is not None else re.sub(r"[^A-Za-z0-9._-]", "-", socket.gethostname())
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}", name):
         raise UsageError(
             f"--name {name!r}", expected="1 to 64 letters, digits, '.', '_' or '-', no '.' first"

@@ -1,4 +1,4 @@
-"""`foottile recover`: after a crash, journals to sessions."""
+"""`foottile recover`: repair of journals and sessions after a crash."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
-from service.cli.options import JsonOption, print_json, progress, remark, say
+from service.cli.options import JsonOption, echo, print_json, remark, show_progress
 
 if TYPE_CHECKING:
     from service.sessions.recovery import RecoveredSession, RecoveryReport
 
-_FAILED, _NOT_ALL = 1, 3
+_EXIT_FAILED, _EXIT_INCOMPLETE = 1, 3
 
 
 def recover_command(
     folder: Annotated[Path, typer.Argument(help="Data folder of a server, or journal of a node.")],
     streams: Annotated[
         bool,
-        typer.Option("--streams", help="Make sessions of frames that belong to none, too."),
+        typer.Option("--streams", help="Also make sessions of frames that belong to none."),
     ] = False,
     give_up: Annotated[
         bool,
         typer.Option(
             "--give-up",
-            help="On a server: count what nodes have not brought as lost, and do not wait.",
+            help="On a server: count the missing frames of nodes as lost.",
         ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Repair journals and seal sessions after a crash, without a server.
 
-    A server does this by itself when it is started; this is for a folder that has none, and for a
-    node alone. It can be run again at any time. Exit codes: 0 good, 1 something could not be
-    recovered, 2 wrong usage, 3 done, but a session is lossy, or waits for its node.
+    A server does this at its start; this command is for a folder without a server, and for a node.
+    It can be repeated. Exit codes: 0 success, 1 something was not recovered, 2 wrong usage, 3 done,
+    but a session is lossy or waits for its node.
     """
     from service.sessions.recovery import recover_folder
     from storage.durable_files import lock_folder
@@ -47,21 +47,21 @@ def recover_command(
             expected="a folder with `journal` and `sessions`, of a server or a node",
         )
     restrict_to_owner(folder)
-    with lock_folder(folder), progress("opening journals") as tell:
+    with lock_folder(folder), show_progress("opening journals") as report_step:
         recovery = recover_folder(
-            folder, make_sessions=streams, abandon_missing=give_up, report_step=tell
+            folder, make_sessions=streams, abandon_missing=give_up, report_step=report_step
         )
     if as_json:
-        print_json(_as_dict(recovery))
+        print_json(_to_json(recovery))
     else:
-        _tell(recovery)
+        _print_report(recovery)
     if recovery.problems or any(found.outcome == "failed" for found in recovery.sessions):
-        raise typer.Exit(_FAILED)
+        raise typer.Exit(_EXIT_FAILED)
     if any(found.ledger is None or not found.ledger.complete for found in recovery.sessions):
-        raise typer.Exit(_NOT_ALL)
+        raise typer.Exit(_EXIT_INCOMPLETE)
 
 
-def _as_dict(recovery: RecoveryReport) -> dict[str, Any]:
+def _to_json(recovery: RecoveryReport) -> dict[str, Any]:
     return {
         "sessions": [
             {
@@ -82,32 +82,32 @@ def _as_dict(recovery: RecoveryReport) -> dict[str, Any]:
     }
 
 
-def _tell(recovery: RecoveryReport) -> None:
+def _print_report(recovery: RecoveryReport) -> None:
     for name, cut_bytes in recovery.cut_bytes.items():
-        say(f"journal {name}: {cut_bytes} bytes behind the last whole batch were set aside")
+        echo(f"journal {name}: {cut_bytes} bytes after the last complete batch were set aside")
     if recovery.removed_temporaries:
-        say(f"{len(recovery.removed_temporaries)} half-written files were removed")
+        echo(f"{len(recovery.removed_temporaries)} incomplete files were removed")
     for session_id in recovery.rewritten_markers:
-        say(f"session {session_id}: markers.parquet was written again")
+        echo(f"session {session_id}: markers.parquet was written again")
     for session_id in recovery.rebuilt_sessions:
-        say(f"session {session_id}: session.json was made again from the files beside it")
+        echo(f"session {session_id}: session.json was rebuilt from the files beside it")
     for found in recovery.sessions:
-        say(f"session {found.session.id} ({found.session.name}): {_outcome(found)}")
+        echo(f"session {found.session.id} ({found.session.name}): {_format_outcome(found)}")
         if found.problem:
-            say(f"  {found.problem}")
+            echo(f"  {found.problem}")
     for problem in recovery.problems:
-        say(f"not recovered: {problem}")
+        echo(f"not recovered: {problem}")
     if recovery.is_empty:
-        say("nothing to recover")
+        echo("nothing to recover")
     if any(found.outcome == "waiting" for found in recovery.sessions):
-        remark("what waits for its node is completed by the server, or sealed with --give-up")
+        remark("the server completes the waiting sessions; --give-up seals them now")
 
 
-def _outcome(found: RecoveredSession) -> str:
+def _format_outcome(found: RecoveredSession) -> str:
     ledger = found.ledger
     if found.outcome != "sealed" or ledger is None:
         return {"waiting": "waits for its node"}.get(found.outcome, "NOT recovered")
     lost = sum(ledger.lost.values())
-    text = f"sealed and proven, {ledger.recorded} frames" + (f", {lost} lost" if lost else "")
+    text = f"sealed and verified, {ledger.recorded} frames" + (f", {lost} lost" if lost else "")
     tail = ledger.max_lost_tail_frames
-    return text + (f", at most {tail} more when it broke off" if tail else "")
+    return text + (f", at most {tail} more at its end" if tail else "")

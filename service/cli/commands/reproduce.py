@@ -1,4 +1,4 @@
-"""`foottile reproduce`: the paper's experiments, end to end, on emulated hardware."""
+"""`foottile reproduce`: the paper's experiments on emulated hardware."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from devices.errors import require_extra
 from service.cli.options import (
     SEED_MAX,
     JsonOption,
+    echo,
+    echo_lines,
     print_json,
-    progress,
     remark,
-    say,
-    say_lines,
+    show_progress,
 )
-from service.cli.result_folder import result_folder
+from service.cli.result_folder import open_result_folder
 from service.json_output import to_json_text
 
 TRIALS_MAX, JOBS_MAX = 100, 64
@@ -32,36 +32,36 @@ def reproduce_command(
     ],
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="One dome and one trial of rolling, for a first look."),
+        typer.Option("--quick", help="Quick run: one dome and one trial of rolling."),
     ] = False,
     trials: Annotated[
         int | None,
-        typer.Option(min=1, max=TRIALS_MAX, help="Of each experiment; default 4, quick 1."),
+        typer.Option(min=1, max=TRIALS_MAX, help="Trials of each experiment; default 4, quick 1."),
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, max=SEED_MAX - TRIALS_MAX, help="Draws noise, ground, plates.")
+        int, typer.Option(min=0, max=SEED_MAX - TRIALS_MAX, help="Random seed of noise and ground.")
     ] = 0,
-    parts_seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Draws other parts.")] = 0,
+    parts_seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Random seed of parts.")] = 0,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, max=JOBS_MAX, help="At the same time; default: one per core, up to 2."),
+        typer.Option(min=1, max=JOBS_MAX, help="Parallel trials; default: one per core, up to 2."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Repeat the paper's experiments on emulated hardware.
 
-    Six domes are pressed, a foot is calibrated, rolls over a pressure plate and hops on a force
-    plate; node and server are processes of their own, over loopback and in real time. Exit codes: 0
-    good, 1 failed, 2 wrong usage, 3 written, but something could not be measured.
+    An indenter loads six domes; a foot is calibrated, rolls over a pressure plate and hops on a
+    force plate. Node and server are processes, over loopback and in real time. Exit codes: 0
+    success, 1 failure, 2 wrong usage, 3 written, but with missing results.
     """
-    from service.cli.reproduction import QUICK_TRIALS, ReproduceOptions, reproduce
+    from service.cli.reproduction import QUICK_TRIALS, ReproduceOptions, run_reproduction
     from service.offline.figure_output import create_figure
     from service.offline.reproduce.figures import draw_figures
     from service.offline.reproduce.report import format_reproduction_report
     from service.offline.reproduce.setups import TRIALS
     from storage.durable_files import write_atomically
 
-    create_figure(1.0, 1.0)  # says what is missing before anything takes time
+    create_figure(1.0, 1.0)  # reports a missing package early
     options = ReproduceOptions(
         seed=seed,
         parts_seed=parts_seed,
@@ -69,9 +69,9 @@ def reproduce_command(
         jobs=jobs or min(2, os.cpu_count() or 1),
         quick=quick,
     )
-    with result_folder(out) as folder:
-        with progress("starting") as tell:
-            result = reproduce(options, folder, tell)
+    with open_result_folder(out) as folder:
+        with show_progress("starting") as report_step:
+            result = run_reproduction(options, folder, report_step)
             text, figures = format_reproduction_report(result), draw_figures(result)
         content = to_json_text(result)
         write_atomically(folder / "reproduce.json", content.encode())
@@ -81,8 +81,8 @@ def reproduce_command(
     if as_json:
         print_json(result)
     else:
-        say_lines(text)
-        say(f"{folder}: reproduce.json, reproduce.md, {', '.join(figures)}")
+        echo_lines(text)
+        echo(f"{folder}: reproduce.json, reproduce.md, {', '.join(figures)}")
     for name, why in result.failures.items():
         remark(f"not measured: {name}: {why}")
     if result.failures:

@@ -1,4 +1,4 @@
-"""`foottile serve`: the server."""
+"""`foottile serve`: server."""
 
 from __future__ import annotations
 
@@ -11,16 +11,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import require_extra
-from service.cli.options import remark, say, stop_on_signals
-from service.cli.tickets import AdvertiseOption, host_of, reaches_others, remark_reach, show_code
+from service.cli.options import create_stop_event, echo, remark
+from service.cli.tickets import (
+    AdvertiseOption,
+    get_host,
+    is_reachable,
+    remark_unreachable,
+    show_qr_code,
+)
 
 if TYPE_CHECKING:
     from service.api.logins import Logins
     from service.api.settings import Settings
 
 
-def _bound(text: str) -> Any:
-    return typer.Option(help=text, rich_help_panel="Bounds for those without a key")
+def _make_limit(text: str) -> Any:
+    return typer.Option(help=text, rich_help_panel="Limits for unauthenticated clients")
 
 
 @require_extra("server", "`foottile serve`")
@@ -33,14 +39,12 @@ def serve_command(
     config: Annotated[Path | None, typer.Option(help="TOML file with settings.")] = None,
     allow_host: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Further name under which the server is reached; may be given several times."
-        ),
+        typer.Option(help="Further host name of the server (repeatable)."),
     ] = None,
     advertise: AdvertiseOption = None,
     private: Annotated[
         bool | None,
-        typer.Option("--private", help="Ask for a login to look, too; default: only to change."),
+        typer.Option("--private", help="Require a login for reading; default: for changes only."),
     ] = None,
     no_quantize: Annotated[
         bool | None,
@@ -53,31 +57,27 @@ def serve_command(
         list[str] | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Reverse proxy whose X-Forwarded-For and X-Forwarded-Proto count; may be given "
-            "several times; default: none.",
+            help="Reverse proxy with trusted X-Forwarded-For and X-Forwarded-Proto (repeatable); "
+            "default: none.",
         ),
     ] = None,
-    max_connections: Annotated[int | None, _bound("Requests and screens at once; 512.")] = None,
+    max_connections: Annotated[int | None, _make_limit("Open connections; 512.")] = None,
     max_connections_per_address: Annotated[
-        int | None, _bound("The same from one address, as all phones of a hotspot are; 256.")
+        int | None,
+        _make_limit("Open connections per address; 256."),
     ] = None,
-    max_nodes: Annotated[int | None, _bound("Nodes at once; 32.")] = None,
-    max_header_bytes: Annotated[int | None, _bound("Longest headers of a request; 32768.")] = None,
-    header_timeout_s: Annotated[
-        float | None, _bound("A request's headers have to come within; 10.")
-    ] = None,
-    body_timeout_s: Annotated[float | None, _bound("Its body has to come within; 20.")] = None,
-    idle_timeout_s: Annotated[
-        float | None, _bound("A connection may wait so long for its next request; 30.")
-    ] = None,
+    max_nodes: Annotated[int | None, _make_limit("Connected nodes; 32.")] = None,
+    max_header_bytes: Annotated[int | None, _make_limit("Headers of a request; 32768.")] = None,
+    header_timeout_s: Annotated[float | None, _make_limit("Timeout of headers; 10.")] = None,
+    body_timeout_s: Annotated[float | None, _make_limit("Timeout of a body; 20.")] = None,
+    idle_timeout_s: Annotated[float | None, _make_limit("Timeout between requests; 30.")] = None,
 ) -> None:
     """Run the server: live view, recording, REST API.
 
-    Settings come from options, else from FOOTTILE_HOST and the like, else from --config. Changes
-    need a token: FOOTTILE_TOKEN, or one that is made and kept in the data folder. On a terminal a
-    link is printed that logs a browser in; `foottile invite` prints others. Commands of this user
-    on this machine find the token by themselves. Ctrl-C ends it; what is being recorded goes on
-    when it runs again.
+    Settings come from options, else from variables like FOOTTILE_HOST, else from --config. Changes
+    need a token: FOOTTILE_TOKEN, or a generated one in the data folder. On a terminal it prints a
+    login link; `foottile invite` creates others. Commands of this user on this machine find the
+    token by themselves. Ctrl-C ends it; running recordings continue at the next start.
     """
     import uvloop
 
@@ -103,10 +103,10 @@ def serve_command(
         idle_timeout_s=idle_timeout_s,
     )
     raise_open_files_limit()
-    uvloop.run(_serve(settings))
+    uvloop.run(_run_server(settings))
 
 
-async def _serve(settings: Settings) -> None:
+async def _run_server(settings: Settings) -> None:
     from devices.realtime import freeze_garbage_collector
     from service.api.address import (
         list_own_names,
@@ -121,7 +121,7 @@ async def _serve(settings: Settings) -> None:
     from service.server.server import Server
     from storage.permissions import restrict_to_owner
 
-    stop = stop_on_signals()
+    stop = create_stop_event()
     restrict_to_owner(settings.data)
     with open_listening_socket(settings.host, settings.port) as listening:
         server = Server(settings.data, exact=settings.no_quantize)
@@ -129,30 +129,30 @@ async def _serve(settings: Settings) -> None:
         logins = Logins(token, is_private=settings.private)
         find_urls = partial(list_urls, listening, settings.host, settings.advertise)
         urls = find_urls()
-        hosts = (*settings.allow_host, *list_own_names(), host_of(urls[0]))
+        hosts = (*settings.allow_host, *list_own_names(), get_host(urls[0]))
         app = make_app(server, logins=logins, hosts=hosts, find_urls=find_urls)
         with publish_token(listening, token):
             async with serve_app(app, listening, settings):
                 freeze_garbage_collector()
-                announce(urls, settings.data, logins, is_kept=not settings.token)
-                remark_reach(urls, settings.host)
+                print_addresses(urls, settings.data, logins, is_stored=not settings.token)
+                remark_unreachable(urls, settings.host)
                 await stop.wait()
 
 
-def announce(
-    urls: list[str], data: Path, logins: Logins, *, is_kept: bool, is_demo: bool = False
+def print_addresses(
+    urls: list[str], data: Path, logins: Logins, *, is_stored: bool, is_demo: bool = False
 ) -> None:
-    """Print where the page is, how a phone gets in, and how a node gets there.
+    """Print the address of the page, a login for phones, and the command of a node.
 
-    The token is shown on a terminal only: what is not one is often a log, which others may read. A
-    demo prints a ticket there, which is good once and soon ends.
+    The token is printed only on a terminal, as others may read a log. In a log a demo prints a
+    ticket, which is good once and expires soon.
 
     Args:
         urls: addresses of the server.
-        data: its data folder.
+        data: data folder.
         logins: token and tickets of the server.
-        is_kept: is its token the one that is kept in the data folder?
-        is_demo: has every link to log a browser in?
+        is_stored: whether the token is in the data folder.
+        is_demo: print login links without a terminal, too.
     """
     from service.api.address import TOKEN_NAME
     from service.api.logins import Role
@@ -165,15 +165,15 @@ def announce(
             link = f"{url}/#token={token}"
         else:
             link = add_ticket(url, logins.tickets.create(Role.OPERATOR)) if is_demo else f"{url}/"
-        say(f"FootTile is at {link}")
-    if has_screen and reaches_others(urls[0]):
-        show_code(add_ticket(urls[0], logins.tickets.create(Role.OPERATOR)))
+        echo(f"FootTile is at {link}")
+    if has_screen and is_reachable(urls[0]):
+        show_qr_code(add_ticket(urls[0], logins.tickets.create(Role.OPERATOR)))
     remark(f"data in {data}; Ctrl-C ends it")
     if is_compiling():
         remark(COMPILING_NOTE)
-    where = f"$(cat {shlex.quote(str(data / TOKEN_NAME))})" if is_kept else '"$FOOTTILE_TOKEN"'
+    where = f"$(cat {shlex.quote(str(data / TOKEN_NAME))})" if is_stored else '"$FOOTTILE_TOKEN"'
     if not has_screen:
-        place = f"in {data / TOKEN_NAME}" if is_kept else "the one that was given"
-        remark(f"its token is {place}; `foottile invite` prints a link that logs a browser in")
+        place = f"in {data / TOKEN_NAME}" if is_stored else "FOOTTILE_TOKEN"
+        remark(f"its token is {place}; `foottile invite` prints a login link")
     shown = token if sys.stderr.isatty() else where
     remark(f"a node: FOOTTILE_TOKEN={shown} foottile node --scene FILE --server {urls[0]}")

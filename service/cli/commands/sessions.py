@@ -1,4 +1,4 @@
-"""`foottile sessions`, `pull` and `export`: what was recorded, and how to get it."""
+"""`foottile sessions`, `pull` and `export`: list, download and convert sessions."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import typer
 
 from devices.errors import UsageError
 from devices.text import escape_control_chars
-from service.cli.format_options import FormatOption, with_format_options
-from service.cli.many import (
-    NOT_ALL,
+from service.cli.format_options import FormatOption, add_format_options
+from service.cli.multi_session import (
+    EXIT_INCOMPLETE,
     JobsOption,
     ManifestOption,
     SchedulerOption,
-    is_one,
-    run_many,
+    is_single_session,
+    run_task,
 )
 from service.cli.options import (
     CaOption,
     EndOption,
     JsonOption,
     StartOption,
-    data_folder,
-    output_path,
+    echo,
     print_json,
-    progress,
     remark,
-    say,
+    resolve_data_folder,
+    resolve_output_path,
+    show_progress,
     stdout,
 )
 from storage.formats.options import FormatOptions
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
 
 SERVER = "http://127.0.0.1:8000"
 
-_LONG = {"ledger", "markers", "clock", "calibration", "scene_content", "asked"}
-"""What a list of sessions leaves out."""
+_UNLISTED_FIELDS = {"ledger", "markers", "clock", "calibration", "scene_content", "request"}
+"""Fields that a list of sessions omits."""
 
 ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
 ColumnsOption = Annotated[
-    str | None, typer.Option(help="Names with commas between: t_ns,grf_n,force_n_0.")
+    str | None, typer.Option(help="Comma-separated names: t_ns,grf_n,force_n_0.")
 ]
 
 ClockOption = Annotated[
@@ -59,42 +59,39 @@ def sessions_command(
     server: ServerOption = None,
     ca: CaOption = None,
     data: Annotated[
-        Path | None, typer.Option(help="Data folder to look into, without any server.")
+        Path | None, typer.Option(help="Data folder to list, without a server.")
     ] = None,
     node: Annotated[
-        list[str] | None, typer.Option(help="Only those of this node; again for others.")
+        list[str] | None, typer.Option(help="Filter by node (repeat for several).")
     ] = None,
     tag: Annotated[
-        list[str] | None, typer.Option(help="Only those with this tag; again: and that one.")
+        list[str] | None, typer.Option(help="Filter by tag (repeat to require several).")
     ] = None,
     search: Annotated[
-        str | None, typer.Option(help="Only those with this in name, subject, notes, tag or node.")
+        str | None, typer.Option(help="Filter by text in name, subject, notes, tag or node.")
     ] = None,
-    take: Annotated[str | None, typer.Option(help="Only those of this take.")] = None,
+    take: Annotated[str | None, typer.Option(help="Filter by take.")] = None,
     since: Annotated[
         str | None,
-        typer.Option(
-            "--from", help="Only those started then or later: 2026-11-24 or 2026-11-24T08:00, UTC."
-        ),
+        typer.Option("--from", help="Earliest start, UTC: 2026-11-24 or 2026-11-24T08:00."),
     ] = None,
-    until: Annotated[
-        str | None, typer.Option("--to", help="Only those started before that.")
-    ] = None,
+    until: Annotated[str | None, typer.Option("--to", help="End of the starts, exclusive.")] = None,
     complete: Annotated[
-        str | None, typer.Option(help="true: all is there; false: some may come; lossy: never.")
+        str | None,
+        typer.Option(help="true: all frames stored; false: undecided; lossy: frames lost."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List recorded sessions, newest first.
 
-    All of them, or those that fulfil all that is asked for.
+    Several filters must all match.
     """
     from rich.markup import escape
     from rich.table import Table
 
     from storage.sessions.filters import SessionFilter, parse_completeness, parse_t_ns
 
-    choice = SessionFilter(
+    filters = SessionFilter(
         nodes=tuple(node or ()),
         tags=tuple(tag or ()),
         take=take,
@@ -104,11 +101,11 @@ def sessions_command(
         complete=None if complete is None else parse_completeness(complete, where="--complete"),
     )
     if server is not None and data is not None:
-        raise UsageError("--server and --data are two places to look in", remedy="Name one")
+        raise UsageError("--server and --data exclude each other", remedy="Name one")
     found = (
-        _of_server(server or SERVER, ca, choice)
+        _list_server_sessions(server or SERVER, ca, filters)
         if data is None
-        else _in_folder(data_folder(data), choice)
+        else _list_folder_sessions(resolve_data_folder(data), filters)
     )
     if as_json:
         print_json({"items": found})
@@ -116,7 +113,7 @@ def sessions_command(
     table = Table(box=None, pad_edge=False)
     for heading in ("session", "name", "node", "s", "frames", "markers", "state"):
         right = heading in ("s", "frames", "markers")
-        # A row is one line: a name that goes on in the next could look like a line of ours.
+        # A row is one line: a wrapped name could look like another row.
         table.add_column(heading, justify="right" if right else "left", no_wrap=True)
     for session in found:
         lossy = ", lossy" if session["complete"] == "lossy" else ""
@@ -133,14 +130,14 @@ def sessions_command(
     stdout.print(table)
 
 
-@with_format_options
+@add_format_options
 def pull_command(
-    out: Annotated[Path, typer.Option(help="Folder to put it in; made if absent.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; created if missing.")],
     session: Annotated[str | None, typer.Argument(help="Id of the session.")] = None,
     take: Annotated[
         str | None,
         typer.Option(
-            help="All sessions of this take, as one file on the server's axis of time: "
+            help="All sessions of this take, as one file on the server's time axis: "
             f"--format {', '.join(MULTI_SESSION_FORMATS)}."
         ),
     ] = None,
@@ -155,11 +152,10 @@ def pull_command(
     *,
     options: FormatOptions,
 ) -> None:
-    """Download a sealed session: data, description, markers. Goes on where it was broken off.
+    """Download a sealed session: data, description, markers. A repeated command resumes it.
 
-    The data is compared with its hash. Some seconds or columns, another format, or all of a take,
-    are made by the server for the asking, and are one file in --out. Exit code 3: the session is
-    complete on disk, but lossy.
+    The data is verified by its hash. For a slice, another format or a take the server makes one
+    file. Exit code 3: downloaded completely, but the session is lossy.
     """
     import foottile
     from service.pull import pull_export, pull_session, pull_take_export
@@ -168,13 +164,13 @@ def pull_command(
     from storage.formats.writers.registry import get_format, get_multi_session_format
 
     if (session is None) == (take is None):
-        raise UsageError("what is to be pulled", expected="the id of a session, or --take")
-    own_clock = _clock_named(clock)
+        raise UsageError("nothing to pull is named, or twice", expected="a session's id, or --take")
+    clock_name = _parse_clock(clock)
     chosen = get_format(to) if take is None else get_multi_session_format(to)
-    part = Slice(start_s, end_s, _names(columns))
+    part = Slice(start_s, end_s, _parse_names(columns))
     with (
         foottile.connect(server or SERVER, ca=ca) as source,
-        progress(f"pulling {session or take}"),
+        show_progress(f"pulling {session or take}"),
     ):
         if session is None:
             pulled = pull_take_export(source, str(take), out, part, chosen, options)
@@ -182,25 +178,25 @@ def pull_command(
             part.is_whole_session
             and chosen is PARQUET
             and not options.specified_names
-            and own_clock == "node"
+            and clock_name == "node"
         ):
             pulled = pull_session(source, session, out)
         else:
-            pulled = pull_export(source, session, out, part, chosen, options, own_clock)
+            pulled = pull_export(source, session, out, part, chosen, options, clock_name)
     if as_json:
         print_json(pulled)
     elif "resumed_bytes" not in pulled:
-        say(f"{pulled['path']}: {pulled['bytes']} bytes")
+        echo(f"{pulled['path']}: {pulled['bytes']} bytes")
     else:
-        say(f"{pulled['path']}: {pulled['frames']} frames, {pulled['bytes']} bytes, hash verified")
+        echo(f"{pulled['path']}: {pulled['frames']} frames, {pulled['bytes']} bytes, hash verified")
         if pulled["resumed_bytes"]:
-            remark(f"{pulled['resumed_bytes']} bytes were there from before")
+            remark(f"resumed after {pulled['resumed_bytes']} bytes")
     if pulled["complete"] == "lossy":
-        remark("the session is lossy: some frames are missing for good")
+        remark("the session is lossy: frames are lost")
         raise typer.Exit(3)
 
 
-@with_format_options
+@add_format_options
 def export_command(
     out: Annotated[str, typer.Option(help="File to write; for many sessions, a folder or URI.")],
     to: FormatOption,
@@ -223,16 +219,18 @@ def export_command(
         bool | None,
         typer.Option(
             "--markers/--no-markers",
-            help="Add the column event: what people marked, at the frame nearest in time; default: "
-            "if there are events beside the frames.",
+            help="Add the column event: marker labels, at the nearest frame; default: if the "
+            "session has markers.",
         ),
     ] = None,
-    take: Annotated[str | None, typer.Option(help="Those of this take in --data, --merge.")] = None,
-    together: Annotated[
+    take: Annotated[
+        str | None, typer.Option(help="Sessions of this take in --data, with --merge.")
+    ] = None,
+    merge: Annotated[
         bool,
         typer.Option(
             "--merge",
-            help="All of them into one file, on the server's axis of time: "
+            help="Write one file for all, on the server's time axis: "
             f"{', '.join(MULTI_SESSION_FORMATS)}.",
         ),
     ] = False,
@@ -240,39 +238,39 @@ def export_command(
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Of many sessions print each as a line of JSON.")
+        bool, typer.Option("--json", help="Print each of many sessions as a line of JSON.")
     ] = False,
     *,
     options: FormatOptions,
 ) -> None:
     """Write a sealed session, or a slice of it, in another format.
 
-    Many sessions are written each into a folder of its id in --out; given again, the command goes
-    on where it was broken off. Exit code 3: some of them failed.
+    Each of many sessions is written into a folder of its id in --out; a repeated command resumes.
+    Exit code 3: some sessions failed.
     """
     from service.offline.archive.locations import is_remote
     from service.offline.export import ExportOptions, export_merged, export_session
     from storage.formats.slice import Slice
     from storage.formats.writers.registry import get_format
 
-    own_clock = _clock_named(clock)
+    clock_name = _parse_clock(clock)
     if take is not None:
         if sessions:
-            raise UsageError("--take and sessions are two ways to name them", remedy="Name one")
-        sessions, together = _of_take(take, data), True
-    part = Slice(start_s, end_s, _names(columns))
-    wanted = ExportOptions(
-        get_format(to).name, part, "server" if together else own_clock, markers, options
+            raise UsageError("--take and sessions exclude each other", remedy="Name one")
+        sessions, merge = _find_take_sessions(take, data), True
+    part = Slice(start_s, end_s, _parse_names(columns))
+    export_options = ExportOptions(
+        get_format(to).name, part, "server" if merge else clock_name, markers, options
     )
-    if together and (manifest is not None or is_remote(out)):
+    if merge and (manifest is not None or is_remote(out)):
         raise UsageError(
             "--merge with --manifest, or into a URI", remedy="Name the sessions, and a file"
         )
-    if not together and (not is_one(sessions, manifest) or is_remote(out)):
+    if not merge and (not is_single_session(sessions, manifest) or is_remote(out)):
         from service.offline.archive.tasks import ExportTask
 
-        summary = run_many(
-            ExportTask(wanted),
+        summary = run_task(
+            ExportTask(export_options),
             sessions,
             manifest,
             out=out,
@@ -281,29 +279,29 @@ def export_command(
             as_json=as_json,
         )
         if summary.states["failed"]:
-            raise typer.Exit(NOT_ALL)
+            raise typer.Exit(EXIT_INCOMPLETE)
         return
-    sources = [sealed_file(session, data) for session in sessions or [""]]
-    path = output_path(Path(out), *sources)
-    with progress(f"writing {path.name}"):
-        if together:
-            done = export_merged(sources, path, wanted)
+    sources = [find_sealed_file(session, data) for session in sessions or [""]]
+    path = resolve_output_path(Path(out), *sources)
+    with show_progress(f"writing {path.name}"):
+        if merge:
+            done = export_merged(sources, path, export_options)
         else:
-            done = export_session(sources[0], path, wanted)
-    say(f"{path}: {done.size_bytes} bytes")
+            done = export_session(sources[0], path, export_options)
+    echo(f"{path}: {done.size_bytes} bytes")
     for marker in done.left_out_markers:
-        remark(f"marker {marker.marker.label!r} is not in it: {marker.exclusion_reason}")
+        remark(f"marker {marker.marker.label!r} is left out: {marker.exclusion_reason}")
     for text in done.remarks:
         remark(text)
     if done.is_markers_file_missing:
         remark(f"without markers: there is no {MARKERS_NAME} beside {sources[0].name}")
 
 
-def _clock_named(clock: str) -> ClockName:
+def _parse_clock(clock: str) -> ClockName:
     """Return the clock of an option.
 
     Raises:
-        UsageError: there is no such clock.
+        UsageError: no such clock.
     """
     from storage.formats.export import CLOCK_NAMES
 
@@ -313,25 +311,27 @@ def _clock_named(clock: str) -> ClockName:
     raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCK_NAMES))
 
 
-def _names(columns: str | None) -> tuple[str, ...]:
+def _parse_names(columns: str | None) -> tuple[str, ...]:
     return tuple(name.strip() for name in (columns or "").split(",") if name.strip())
 
 
-def _of_take(take: str, data: Path | None) -> list[str]:
-    """Ids of a take's sessions, in the order of their nodes.
+def _find_take_sessions(take: str, data: Path | None) -> list[str]:
+    """Return ids of a take's sessions, ordered by node.
 
     Raises:
-        UsageError: there is none.
+        UsageError: no session.
     """
     from storage.sessions.filters import SessionFilter
 
-    found = _in_folder(data_folder(data), SessionFilter(take=take))
+    found = _list_folder_sessions(resolve_data_folder(data), SessionFilter(take=take))
     if not found:
-        raise UsageError(f"no session of take {take!r}", where=str(data_folder(data)))
+        raise UsageError(f"no session of take {take!r}", where=str(resolve_data_folder(data)))
     return [each["id"] for each in sorted(found, key=lambda each: (each["node"], each["id"]))]
 
 
-def _of_server(url: str, ca: Path | None, choice: SessionFilter) -> list[Mapping[str, Any]]:
+def _list_server_sessions(
+    url: str, ca: Path | None, filters: SessionFilter
+) -> list[Mapping[str, Any]]:
     import foottile
 
     def instant(t_ns: int | None) -> str | None:
@@ -339,18 +339,18 @@ def _of_server(url: str, ca: Path | None, choice: SessionFilter) -> list[Mapping
 
     with foottile.connect(url, ca=ca) as server:
         found = server.sessions(
-            choice.q,
-            node=choice.nodes,
-            tag=choice.tags,
-            take=choice.take,
-            since=instant(choice.from_t_ns),
-            until=instant(choice.to_t_ns),
-            complete=choice.complete,
+            filters.q,
+            node=filters.nodes,
+            tag=filters.tags,
+            take=filters.take,
+            since=instant(filters.from_t_ns),
+            until=instant(filters.to_t_ns),
+            complete=filters.complete,
         )
-        return [session.facts for session in found]
+        return [session.metadata for session in found]
 
 
-def _in_folder(data: Path, choice: SessionFilter) -> list[Mapping[str, Any]]:
+def _list_folder_sessions(data: Path, filters: SessionFilter) -> list[Mapping[str, Any]]:
     from storage.sessions.folder import Completeness, Session, SessionsFolder
 
     if not data.is_dir():
@@ -367,20 +367,20 @@ def _in_folder(data: Path, choice: SessionFilter) -> list[Mapping[str, Any]]:
 
     return [
         {
-            **session.model_dump(mode="json", exclude=_LONG),
+            **session.model_dump(mode="json", exclude=_UNLISTED_FIELDS),
             "complete": complete(session),
             "marker_count": len(session.markers),
         }
         for session in sessions
-        if choice.accepts(session, complete)
+        if filters.accepts(session, complete)
     ]
 
 
-def sealed_file(session: str, data: Path | None) -> Path:
-    """The sealed file that a path, a session's folder, or an id in a data folder means.
+def find_sealed_file(session: str, data: Path | None) -> Path:
+    """Return the sealed file of a path, a session's folder, or an id in a data folder.
 
     Raises:
-        UsageError: there is none.
+        UsageError: no sealed file.
     """
     from storage.sessions.folder import FRAMES_NAME, SessionsFolder
 
@@ -388,7 +388,7 @@ def sealed_file(session: str, data: Path | None) -> Path:
     if path.is_file():
         return path
     if not path.is_dir():
-        path = SessionsFolder(data_folder(data) / "sessions").get_path(session)
+        path = SessionsFolder(resolve_data_folder(data) / "sessions").get_path(session)
     if not (path / FRAMES_NAME).is_file():
         raise UsageError(
             f"no sealed session {session!r}",

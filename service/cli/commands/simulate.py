@@ -1,4 +1,4 @@
-"""`foottile simulate`: a session on emulated hardware in virtual time."""
+"""`foottile simulate`: sessions on emulated hardware in virtual time."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from service.cli.options import (
     ExactOption,
     FootOptions,
     JsonOption,
+    add_foot_options,
     check_emulated,
-    output_path,
+    echo,
     print_json,
-    progress,
     remark,
-    say,
-    with_foot_options,
+    resolve_output_path,
+    show_progress,
 )
-from service.cli.report import findings_json, tell_findings
+from service.cli.report import make_findings_json, print_findings
 from service.estimation import OFFLINE_LAG_MS
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @require_extra("server", "`foottile simulate`")
-@with_foot_options
+@add_foot_options
 def simulate_command(
     options: FootOptions,
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")],
@@ -39,7 +39,7 @@ def simulate_command(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(help="Length, lead included; default: that of the load or programme."),
+        typer.Option(help="Length with the lead; default: the load's or programme's."),
     ] = None,
     schedule: Annotated[
         str | None,
@@ -48,7 +48,7 @@ def simulate_command(
         ),
     ] = None,
     tiles: Annotated[
-        str | None, typer.Option(help="Indentation only: serials to press, T01,T02,...")
+        str | None, typer.Option(help="Indentation only: serials under the indenter, T01,T02,...")
     ] = None,
     truth: Annotated[
         bool, typer.Option("--truth", help="Add the true_* columns and print the error.")
@@ -60,10 +60,10 @@ def simulate_command(
     """Run a scene on emulated hardware in virtual time and write the session.
 
     The real driver reads emulated chips through an emulated bus; the same command and version give
-    the same bytes. Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but the bus cannot keep
-    the scene's frame rate.
+    the same bytes. Exit codes: 0 success, 1 failure, 2 wrong usage, 3 written, but the bus is too
+    slow for the scene's frame rate.
     """
-    # Imported here: the physics pulls in numba, which `--help` need not wait for.
+    # Imported here: the physics imports numba, which would slow down `--help`.
     from service.estimation.pipeline.model_set import validate_model_names
     from service.offline.calibration_lookup import find_calibration, replace_tiles
     from service.offline.simulation import SimulationOptions, run_simulation
@@ -73,14 +73,16 @@ def simulate_command(
     the_scene = load_scene(scene)
     if tiles is not None:
         if the_scene.ground.kind != "indentation":
-            raise UsageError("--tiles chooses what the mill presses", expected="an indentation")
+            raise UsageError("--tiles needs an indenter", expected="a scene with an indentation")
         the_scene = replace_tiles(the_scene, tiles.split(","))
     check_emulated(the_scene)
     if seconds is not None and not 0.0 < seconds < 1e9:
-        raise UsageError(f"--seconds {seconds:g}", expected="a sensible positive number")
-    foot = options.foot(the_scene)
+        raise UsageError(f"--seconds {seconds:g}", expected="a plausible positive number")
+    foot = options.make_foot(the_scene)
     inputs = [Path(scene), *([options.load] if options.load is not None else [])]
-    path = output_path(out if out is not None else Path(f"{the_scene.name}.parquet"), *inputs)
+    path = resolve_output_path(
+        out if out is not None else Path(f"{the_scene.name}.parquet"), *inputs
+    )
     has_estimates = not no_estimates and the_scene.calibration != "none"
     if has_estimates:
         validate_model_names(the_scene.models)
@@ -95,12 +97,12 @@ def simulate_command(
         )
         return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS, exact=exact)
 
-    with progress(f"simulating {the_scene.name}"):
+    with show_progress(f"simulating {the_scene.name}"):
         result = run_simulation(
             SimulationOptions(
                 scene=the_scene,
                 seconds=seconds,
-                schedule=_schedule(schedule),
+                schedule=_parse_schedule(schedule),
                 with_truth=truth,
                 foot=foot,
             ),
@@ -109,16 +111,16 @@ def simulate_command(
         )
     plates = foot.plates.paths_by_instrument
     if as_json:
-        print_json({**_as_json(result, path), "plates": list(plates.values())})
+        print_json({**_make_json(result, path), "plates": list(plates.values())})
     else:
-        _print(result, path)
+        _print_result(result, path)
         for name, file in plates.items():
-            say(f"{file}: the {name}; {make_injected_path(file)}: what was injected into it")
+            echo(f"{file}: the {name}; {make_injected_path(file)}: what was injected into it")
     if result.missed_slots:
         raise typer.Exit(3)
 
 
-def _as_json(result: SimulationResult, path: Path) -> dict[str, object]:
+def _make_json(result: SimulationResult, path: Path) -> dict[str, object]:
     pressed = result.indentation_trace
     return {
         "out": path,
@@ -132,13 +134,13 @@ def _as_json(result: SimulationResult, path: Path) -> dict[str, object]:
         "bytes": path.stat().st_size,
         "moved_to_edge": pressed.moved_samples if pressed else None,
         "limited": pressed.limited_samples if pressed else None,
-        **findings_json(result.findings),
+        **make_findings_json(result.findings),
     }
 
 
-def _print(result: SimulationResult, path: Path) -> None:
+def _print_result(result: SimulationResult, path: Path) -> None:
     size = path.stat().st_size
-    say(
+    echo(
         f"{path}: {result.frame_count} frames in {result.seconds:.3f} s of virtual time, "
         f"{result.rate_hz:.1f} frames/s, {size} bytes ({size / result.frame_count:.1f} a frame)"
     )
@@ -147,23 +149,23 @@ def _print(result: SimulationResult, path: Path) -> None:
     )
     remark(f"schedule {result.schedule_choice.schedule}: {result.schedule_choice.reason}")
     for serial in result.unmeasured_serials:
-        say(f"tile {serial}: its conversion time could not be measured, so it was given 3 ms")
+        echo(f"tile {serial}: its conversion time could not be measured, so it was given 3 ms")
     for serial, flags in result.flag_counts.items():
-        said = ", ".join(f"{n} {reason}" for reason, n in flags.items())
-        say(f"tile {serial}: of {result.frame_count} frames {said}")
+        text = ", ".join(f"{n} {reason}" for reason, n in flags.items())
+        echo(f"tile {serial}: of {result.frame_count} frames {text}")
     for serial in result.replaced_serials:
-        say(f"tile {serial} was replaced by another part: its readings are flagged from then on")
+        echo(f"tile {serial} was replaced by another part: its readings are flagged from then on")
     if result.missed_slots:
-        say(f"{result.missed_slots} slots were missed: the bus cannot keep this rate")
+        echo(f"{result.missed_slots} slots were missed: the bus cannot keep this rate")
     if (trace := result.indentation_trace) is not None:
-        say(
+        echo(
             f"load: {trace.moved_samples} samples had their COP moved to the hull's edge, "
             f"{trace.limited_samples} had a tile's force limited"
         )
-    tell_findings(result.findings)
+    print_findings(result.findings)
 
 
-def _schedule(name: str | None) -> AnySchedule | None:
+def _parse_schedule(name: str | None) -> AnySchedule | None:
     if name is None:
         return None
     names = ("auto", *get_args(ScheduleName))

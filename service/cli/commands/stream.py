@@ -1,4 +1,4 @@
-"""`foottile stream`: live frames as lines, for other programs."""
+"""`foottile stream`: live frames as lines of text for other programs."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from service.cli.options import CaOption, remark
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from foottile import Loss
-
 FORMATS = ("csv", "jsonl")
 
 
 def stream_command(
-    node: Annotated[str | None, typer.Argument(help="Name of the node; the only one.")] = None,
+    node: Annotated[
+        str | None, typer.Argument(help="Name of the node; default: the only one.")
+    ] = None,
     columns: ColumnsOption = None,
     to: Annotated[
-        str, typer.Option("--format", help="csv, or jsonl: a line of JSON each.")
+        str, typer.Option("--format", help="csv, or jsonl: a JSON object per line.")
     ] = "csv",
     policy: Annotated[
         str,
         typer.Option(
-            help="lossless: every frame, also over broken links; drop_oldest: not those that wait "
-            "for more than 2 s; latest: the newest."
+            help="lossless: every frame, also across broken links; drop_oldest: drop frames after "
+            "2 s; latest: the newest only."
         ),
     ] = "lossless",
     frames: Annotated[
-        int | None, typer.Option(min=1, max=2**53, help="End after so many; default: go on.")
+        int | None, typer.Option(min=1, max=2**53, help="Number of frames; default: unlimited.")
     ] = None,
     server: ServerOption = None,
     ca: CaOption = None,
 ) -> None:
     """Print live frames of a node with their estimates, one line each, until Ctrl-C.
 
-    Who reads may end it by going away, as in `foottile stream left | head`. What is lost is said on
+    It also ends with its reader, as in `foottile stream left | head`. Losses are reported on
     stderr.
     """
     import foottile
@@ -50,16 +50,16 @@ def stream_command(
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
-    chosen = next((known for known in POLICIES if known == policy), None)
+    chosen = next((each for each in POLICIES if each == policy), None)
     if chosen is None:
         raise UsageError(f"--policy {policy!r}", expected=", ".join(POLICIES))
     names = [name.strip() for name in (columns or "").split(",") if name.strip()]
     printed = 0
-    lines = Lines(sys.stdout.buffer, to)
+    lines = LineWriter(sys.stdout.buffer, to)
     try:
         with (
             foottile.connect(server or SERVER, ca=ca) as source,
-            source.live(node, names, policy=chosen, on_loss=_say_lost) as live,
+            source.live(node, names, policy=chosen, on_loss=lambda loss: remark(str(loss))) as live,
         ):
             for batch in live:
                 rows = batch if frames is None else batch.slice(0, frames - printed)
@@ -67,17 +67,17 @@ def stream_command(
                 printed += rows.num_rows
                 if printed == frames:
                     return
-    except BrokenPipeError:  # who read has seen enough
+    except BrokenPipeError:  # the reader has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except KeyboardInterrupt:  # that is how it ends
+    except KeyboardInterrupt:  # the regular end
         pass
 
 
-class Lines:
-    """Batches as lines of text.
+class LineWriter:
+    """Writer of batches as lines of text.
 
     Args:
-        sink: where they go; flushed after each batch.
+        sink: output, flushed after each batch.
         to: csv or jsonl.
     """
 
@@ -87,7 +87,7 @@ class Lines:
         self._names: list[str] = []
 
     def write(self, batch: pa.RecordBatch) -> None:
-        """Write its rows; of CSV the names first, and again when they change."""
+        """Write the rows of a batch; CSV has a header, repeated when the names change."""
         import pyarrow as pa
         import pyarrow.csv as pacsv
 
@@ -101,7 +101,3 @@ class Lines:
             for row in batch.to_pylist():
                 self._sink.write(json.dumps(row, separators=(",", ":")).encode() + b"\n")
         self._sink.flush()
-
-
-def _say_lost(loss: Loss) -> None:
-    remark(str(loss))

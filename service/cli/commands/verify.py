@@ -1,4 +1,4 @@
-"""`foottile verify`: what files prove of themselves."""
+"""`foottile verify`: integrity of sessions, journals and exports."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import UsageError
-from service.cli.many import (
-    NOT_ALL,
+from service.cli.multi_session import (
+    EXIT_INCOMPLETE,
     JobsOption,
     ManifestOption,
     SchedulerOption,
-    is_one,
-    run_many,
+    is_single_session,
+    run_task,
 )
-from service.cli.options import JsonOption, data_folder, print_json, progress, say
+from service.cli.options import JsonOption, echo, print_json, resolve_data_folder, show_progress
 
 if TYPE_CHECKING:
     from storage.sessions.folder import Ledger
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from storage.verify.journal import StreamReport
     from storage.verify.session import SessionReport
 
-_EXIT = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1, "unproven": 4, "export": 4}
-_IN_LINE = {"unproven": "not all proven"}
-_SENTENCE = {
+_EXIT_CODES = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1, "unproven": 4, "export": 4}
+_VERDICT_TEXTS = {"unproven": "not all proven"}
+_VERDICT_SENTENCES = {
     "complete": "Everything is whole and complete.",
     "lossy": "Everything is whole, but some frames are lost for good: they are counted above.",
     "pending": "Everything is whole, but not every session is sealed yet.",
@@ -42,8 +42,8 @@ def verify_command(
         list[str] | None,
         typer.Argument(
             metavar="TARGET ...",
-            help="Session (folder, or id in --data), data folder, a file of them, calibration; or "
-            "many sessions: folders, globs, URIs.",
+            help="Session (folder, or id in --data), data folder, one of their files, calibration; "
+            "or many sessions: folders, globs, URIs.",
         ),
     ] = None,
     data: Annotated[
@@ -52,7 +52,7 @@ def verify_command(
     ] = None,
     out: Annotated[
         str | None,
-        typer.Option(help="Folder or URI for the proofs of many sessions; those there are kept."),
+        typer.Option(help="Folder or URI for the reports of many sessions; existing ones stay."),
     ] = None,
     manifest: ManifestOption = None,
     jobs: JobsOption = None,
@@ -61,39 +61,41 @@ def verify_command(
 ) -> None:
     """Verify sessions and journals from their files: checksums, hashes, order and ledger.
 
-    Nothing is written, and a server may run meanwhile. Exit codes: 0 everything is whole and
-    complete, 1 something is damaged, 2 wrong usage, 3 whole, but lossy or not yet sealed, 4 not
-    all can be proven, as of a file that lies outside its session, and of an export: verify the
-    session that it was made from. Of many sessions it is 1 if one is damaged, and 3 if one could
-    not be read, too.
+    Nothing is written, and a server may run at the same time. Exit codes: 0 intact and complete, 1
+    damaged, 2 wrong usage, 3 intact, but lossy or not yet sealed, 4 not fully verifiable, as a file
+    outside its session, or an export: verify its source session. For many sessions: 1 if one is
+    damaged, 3 also if one cannot be read.
     """
     from storage.verify.data_folder import find_verdict, verify_path
 
-    if out is not None or _are_many(targets, manifest):
+    if out is not None or _has_many_sessions(targets, manifest):
         _verify_many(targets, manifest, out, jobs, scheduler, as_json=as_json)
         return
-    path = _path_of((targets or [""])[0], data)
-    with progress(f"reading {path}"):
+    path = _find_path((targets or [""])[0], data)
+    with show_progress(f"reading {path}"):
         report = verify_path(path, data_folder=data)
     verdict = find_verdict(report)
     if as_json:
         print_json(report.to_json_dict())
     else:
-        _tell(report)
-        say(_SENTENCE[verdict])
-    if code := _EXIT[verdict]:
+        _print_report(report)
+        echo(_VERDICT_SENTENCES[verdict])
+    if code := _EXIT_CODES[verdict]:
         raise typer.Exit(code)
 
 
-def _are_many(targets: list[str] | None, manifest: Path | None) -> bool:
-    """A single place is one target, as a data folder with its journals is, or holds sessions."""
+def _has_many_sessions(targets: list[str] | None, manifest: Path | None) -> bool:
+    """Return whether the targets are many sessions; a data folder counts as one target."""
     if manifest is None and targets is not None and len(targets) == 1 and Path(targets[0]).exists():
         from service.offline.archive.locations import find_session_locations, is_data_folder
 
         if not Path(targets[0]).is_dir() or is_data_folder(targets[0]):
             return False
-        return not is_one(targets, None) and next(find_session_locations(targets), None) is not None
-    return not is_one(targets, manifest)
+        return (
+            not is_single_session(targets, None)
+            and next(find_session_locations(targets), None) is not None
+        )
+    return not is_single_session(targets, manifest)
 
 
 def _verify_many(
@@ -107,20 +109,20 @@ def _verify_many(
 ) -> None:
     from service.offline.archive.tasks import VerifyTask
 
-    summary = run_many(
+    summary = run_task(
         VerifyTask(), targets, manifest, out=out, jobs=jobs, scheduler=scheduler, as_json=as_json
     )
-    codes = {_EXIT[verdict] for verdict in summary.verdicts if _EXIT[verdict]}
-    codes |= {NOT_ALL} if summary.states["failed"] else set()
+    codes = {_EXIT_CODES[verdict] for verdict in summary.verdicts if _EXIT_CODES[verdict]}
+    codes |= {EXIT_INCOMPLETE} if summary.states["failed"] else set()
     if codes:
         raise typer.Exit(min(codes))
 
 
-def _path_of(target: str, data: Path | None) -> Path:
+def _find_path(target: str, data: Path | None) -> Path:
     path = Path(target)
     if path.exists():
         return path
-    root = data_folder(data)
+    root = resolve_data_folder(data)
     for place in ("sessions", "trash"):
         if "/" not in target and (root / place / target).is_dir():
             return root / place / target
@@ -131,7 +133,7 @@ def _path_of(target: str, data: Path | None) -> Path:
     )
 
 
-def _tell(report: Report, *, is_part: bool = False) -> None:
+def _print_report(report: Report, *, is_part: bool = False) -> None:
     from storage.verify.data_folder import DataFolderReport
     from storage.verify.export import ExportReport
     from storage.verify.segment import SegmentReport
@@ -142,49 +144,49 @@ def _tell(report: Report, *, is_part: bool = False) -> None:
     if isinstance(report, DataFolderReport):
         parts: list[Report] = [*report.sessions, *report.streams]
         for part in parts:
-            _tell(part, is_part=True)
+            _print_report(part, is_part=True)
         unproven = report.to_json_dict()["unproven"]
         remarks = [f"{name}: set aside, it counts no more" for name in report.set_aside]
     elif isinstance(report, SessionReport):
-        say(_session_line(report))
+        echo(_format_session(report))
         unproven = report.unproven
     elif isinstance(report, ExportReport):
-        say(_export_line(report))
+        echo(_format_export(report))
     elif isinstance(report, SegmentReport):
         closed = "closed" if report.is_closed else "not closed"
-        say(f"segment {report.path.name}: {report.stored.count} frames, {closed}")
+        echo(f"segment {report.path.name}: {report.stored.count} frames, {closed}")
         remarks = report.remarks
     else:
-        say(_stream_line(report))
+        echo(_format_stream(report))
         remarks = report.remarks
     for problem in report.problems:
-        say(f"  damaged: {problem}")
+        echo(f"  damaged: {problem}")
     for text in remarks:
-        say(f"  {text}")
+        echo(f"  {text}")
     for what in () if is_part else unproven:
-        say(f"  not proven: {what}")
+        echo(f"  not proven: {what}")
 
 
-def _session_line(report: SessionReport) -> str:
+def _format_session(report: SessionReport) -> str:
     from storage.verify.data_folder import find_verdict
 
     verdict: Verdict = find_verdict(report)
-    said = (
+    text = (
         "in the trash"
         if report.is_in_trash and verdict != "damaged"
-        else _IN_LINE.get(verdict, verdict)
+        else _VERDICT_TEXTS.get(verdict, verdict)
     )
     name = f" ({report.name})" if report.name else ""
-    return f"session {report.id or report.path.name}{name}: {said}, {_counts(report.ledger)}"
+    return f"session {report.id or report.path.name}{name}: {text}, {_format_ledger(report.ledger)}"
 
 
-def _export_line(report: ExportReport) -> str:
+def _format_export(report: ExportReport) -> str:
     source = {name: value for name, value in report.source.items() if value not in (None, [])}
-    said = ", ".join(f"{name} {value}" for name, value in source.items())
-    return f"export {report.path.name} ({report.format}): {said or 'it does not say of what'}"
+    text = ", ".join(f"{name} {value}" for name, value in source.items())
+    return f"export {report.path.name} ({report.format}): {text or 'it does not say of what'}"
 
 
-def _counts(ledger: Ledger | None) -> str:
+def _format_ledger(ledger: Ledger | None) -> str:
     if ledger is None:
         return "nothing can be said of its frames"
     counts = {f"lost ({reason})": count for reason, count in ledger.lost.items()}
@@ -196,7 +198,7 @@ def _counts(ledger: Ledger | None) -> str:
     return text + (f", {ledger.missed_slots} slots missed" if ledger.missed_slots else "")
 
 
-def _stream_line(report: StreamReport) -> str:
+def _format_stream(report: StreamReport) -> str:
     lost = sum(numbers.count for numbers in report.lost.by_reason.values())
     return (
         f"journal {report.node}/{report.stream_id}: {report.stored.count} frames in "

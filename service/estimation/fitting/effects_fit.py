@@ -114,13 +114,13 @@ def _add_recovery_uncertainty(
     """Add the uncertainty of the recovery that was subtracted."""
     doubt = max(MISFIT_MIN, 0.0 if rubber is None else rubber.misfit)
 
-    def doubted(a: Parameter, b: Parameter) -> Parameter:
+    def add_doubt(a: Parameter, b: Parameter) -> Parameter:
         return Parameter(value=a.value, sigma=math.hypot(a.sigma, doubt * (a.value - b.value)))
 
     return TemperatureEffect(
-        kpa_per_k=doubted(now.kpa_per_k, before.kpa_per_k),
-        lag_s=doubted(now.lag_s, before.lag_s),
-        wall_per_kpa=doubted(now.wall_per_kpa, before.wall_per_kpa),
+        kpa_per_k=add_doubt(now.kpa_per_k, before.kpa_per_k),
+        lag_s=add_doubt(now.lag_s, before.lag_s),
+        wall_per_kpa=add_doubt(now.wall_per_kpa, before.wall_per_kpa),
     )
 
 

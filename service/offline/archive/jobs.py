@@ -105,7 +105,7 @@ def _run_unless_done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]
             return "made", task.process_session(source, work)
     _check_result_folder(place, job.results_location)
     results = ResultStore(job.results_location)
-    asked = ResultNote(
+    requested = ResultNote(
         command=task.command,
         software=job.client_version,
         place=place.uri,
@@ -116,9 +116,9 @@ def _run_unless_done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]
     )
     there = results.read_complete_note(place.session_id, task.command)
     if there is not None:
-        if there.has_same_inputs(asked):
+        if there.has_same_inputs(requested):
             return "there", dict(there.facts)
-        if there.place != place.uri and there.input_sha256 != asked.input_sha256:
+        if there.place != place.uri and there.input_sha256 != requested.input_sha256:
             raise StateError(
                 f"another session of this name has its result there: {there.place}",
                 where=place.uri,
@@ -127,7 +127,7 @@ def _run_unless_done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]
     pieces = None
     with open_local_session(place) as source:
         if isinstance(task, ChunkedTask) and task.needs_chunks(source):
-            pieces = ChunkStore(job.results_location, place.session_id, asked.input_key)
+            pieces = ChunkStore(job.results_location, place.session_id, requested.input_key)
             with pieces.open_folder(task.CHUNK_SUFFIXES) as folder:
                 if task.process_next_chunk(source, folder):
                     return Unfinished()
@@ -140,7 +140,7 @@ def _run_unless_done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]
                 results, place.session_id, task, partial(task.process_session, source)
             )
     facts, files = made
-    results.write_note(place.session_id, replace(asked, files=files, facts=facts))
+    results.write_note(place.session_id, replace(requested, files=files, facts=facts))
     if pieces is not None:
         pieces.delete()
     return "made", facts

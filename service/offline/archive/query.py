@@ -59,9 +59,9 @@ def run_query(archive: SessionArchive, sql: str) -> pa.Table:
                 "markers": archive.build_markers_table,
                 "sessions": archive.build_sessions_table,  # last: without those found damaged
             }
-            asked = _find_named_views(connection, sql)
+            requested = _find_named_views(connection, sql)
             for name, make in makers.items():
-                if name in asked:
+                if name in requested:
                     connection.register(name, make())
             return _cast_sums_to_int64(
                 _cast_intervals_to_text(connection.sql(sql)).to_arrow_table()

@@ -181,8 +181,8 @@ class ExportTask:
 
     def describe_options(self) -> dict[str, Any]:
         """See `SessionTask`."""
-        asked = self.export.options.model_dump(exclude_none=True)
-        return {**vars(self.export), "part": vars(self.export.part), "options": asked}
+        requested = self.export.options.model_dump(exclude_none=True)
+        return {**vars(self.export), "part": vars(self.export.part), "options": requested}
 
     def process_session(self, source: Path, result_folder: Path) -> dict[str, Any]:
         """See `SessionTask`."""

@@ -171,8 +171,8 @@ def _format_goals(goals: Sequence[Goal], draws: int) -> list[str]:
     for goal in goals:
         least = "" if goal.least is None else f"{goal.least:g} to "
         value = "-" if math.isnan(goal.value) else f"{goal.value:.3g}"
-        asked = f"{least}{goal.most:g}" if least else f"at most {goal.most:g}"
-        rows.append((goal.figure, goal.mode, value, asked, "yes" if goal.is_met else "NO"))
+        requested = f"{least}{goal.most:g}" if least else f"at most {goal.most:g}"
+        rows.append((goal.figure, goal.mode, value, requested, "yes" if goal.is_met else "NO"))
     lines = format_table(("of the full model set", "mode", "measured", "goal", "met"), rows)
     if draws < COVERAGE_GOAL_DRAWS:
         lines += ["", f"The coverage goals are for {COVERAGE_GOAL_DRAWS} draws or more."]

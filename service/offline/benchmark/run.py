@@ -64,8 +64,8 @@ class BenchmarkOptions:
 
     def apply_emulation_options(self, scene: Scene) -> Scene:
         """Return the scene with the options of its emulation replaced."""
-        asked = {"repeatability": self.repeatability, "correlated_ms": self.correlated_ms}
-        given = {name: value for name, value in asked.items() if value is not None}
+        requested = {"repeatability": self.repeatability, "correlated_ms": self.correlated_ms}
+        given = {name: value for name, value in requested.items() if value is not None}
         emulation = scene.emulation.model_copy(update=given)
         return scene.model_copy(update={"emulation": emulation})
 

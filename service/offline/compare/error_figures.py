@@ -280,8 +280,8 @@ def _compute_cop_errors(
     }
     most_m = SIGMAS_95 * np.hypot(sigma_m[both].astype(np.float64), reference_sigma_m or 0.0)
     for axis, off, most in zip("xy", off_m.T, most_m.T, strict=True):
-        told = reference_sigma_m is not None and np.isfinite(off).any()
-        figures[f"cop_coverage_{axis}_95"] = _mean(np.abs(off) <= most) if told else math.nan
+        has_sigma = reference_sigma_m is not None and np.isfinite(off).any()
+        figures[f"cop_coverage_{axis}_95"] = _mean(np.abs(off) <= most) if has_sigma else math.nan
     counts = {"ours": by_ours, "reference": by_reference, "both": both}
     return figures, {name: int(which.sum()) for name, which in counts.items()}
 

@@ -149,7 +149,8 @@ def _format_domes(result: Reproduction) -> Iterator[str]:
         "mm of Vytaflex 60 only; the emulated others are its dome with forces scaled by modulus "
         "and area, as `foottile domes` estimates them, all of one casting. So what this shows of "
         "them is that the indenter finds what is there, and no more. The paper's figure of the "
-        "curves (Fig. 5) is known here by a sentence: stiffer and larger domes shift it to higher force.",
+        "curves (Fig. 5) is known here by a sentence: stiffer and larger domes shift it to higher "
+        "force.",
         "",
         "![Force over pressure of six domes, and their shapes beside equation 2](domes.png)",
         "",

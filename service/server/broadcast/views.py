@@ -171,7 +171,7 @@ class ReplacementView(View):
         examples=["3f2a-91bc-0d4e-77a1"],
     )
     address: str = Field(description="Peer address; behind a proxy the proxy's.")
-    asked_t_ns: int = Field(description="Server's UTC.")
+    requested_t_ns: int = Field(description="Server's UTC.")
 
     @classmethod
     def from_replacement(cls, replacement: RefusedMachine) -> ReplacementView:

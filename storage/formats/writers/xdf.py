@@ -136,14 +136,14 @@ class _SessionEncoder:
     def read_chunks(self, *, is_alone: bool) -> Iterator[Mapping[str, Array]]:
         """Read the frames in chunks; beside other sessions they need the server's time."""
         export = self._export
-        asked = [*self._channel_quantities, "t_ns"]
-        asked += ["part"] if "part" in export.frame_source.quantity_names else []
-        asked += ["t_server_ns"] if export.clock is not None else []
-        asked += ["marker"] if export.markers is not None else []
+        requested = [*self._channel_quantities, "t_ns"]
+        requested += ["part"] if "part" in export.frame_source.quantity_names else []
+        requested += ["t_server_ns"] if export.clock is not None else []
+        requested += ["marker"] if export.markers is not None else []
         if export.options.rate is not None:
-            yield self._read_resampled(asked, is_alone=is_alone)
+            yield self._read_resampled(requested, is_alone=is_alone)
             return
-        for piece in export.read_chunks(asked):
+        for piece in export.read_chunks(requested):
             if not is_alone:
                 get_frame_instants_ns(export, piece)
             yield piece

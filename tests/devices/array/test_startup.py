@@ -105,7 +105,7 @@ def test_parts_of_1_6_ms_at_400_khz_reach_544_frames_a_second() -> None:
     while clock.now_ns() < 13_000_000_000:
         stops.append(ready.array.scan_frame().convert_stop_ns[0])
     assert np.median(np.diff(stops)) * 1e-9 == pytest.approx(1 / 544, rel=0.02)
-    assert ready.choice.reason == "as asked for"
+    assert ready.choice.reason == "as requested"
 
 
 # Which schedule
@@ -150,7 +150,7 @@ def test_what_was_asked_for_goes_before_what_the_scene_says() -> None:
     assert started(make_scene(array=array))[0].choice.schedule == "sequential"
     assert started(make_scene(array=array))[0].choice.reason == "as the scene says"
     ready, *_ = started(make_scene(array=array), schedule="pipelined")
-    assert (ready.choice.schedule, ready.choice.reason) == ("pipelined", "as asked for")
+    assert (ready.choice.schedule, ready.choice.reason) == ("pipelined", "as requested")
 
 
 @pytest.mark.parametrize("asked", ["auto", "simultaneous", "sequential"])

@@ -137,7 +137,8 @@ def test_a_recording_that_a_full_disk_did_not_take_was_never_begun(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as context:
-        context.setattr("storage.checksummed_json.write_whole", refusing(StorageError, "no space"))
+        refuse = refusing(StorageError, "no space")
+        context.setattr("storage.checksummed_json.write_atomically", refuse)
         answer = running.http.post("/sessions", json={"node": "bench", "name": "trial"})
         assert_problem(answer, 507, "/api/v1/sessions")
     assert running.sessions() == []

@@ -128,7 +128,7 @@ def test_a_mark_is_at_a_frame_of_its_own_part(
     marker = {"label": "here", "t_ns": int(rows["t_server_ns"][row])}
     assert running.http.post(f"{sealed.url}/markers", json=marker).status_code == 201
     part = {"start_s": max(0.0, at_s - 0.05), "end_s": at_s + 0.05}
-    marked = table(sealed.data(format="csv", columns="part,time_s,event", **part))
+    marked = table(sealed.data(format="csv", columns="part,time_s,marker", **part))
     (event,) = [i for i, label in enumerate(marked["marker"]) if label]
     assert marked["part"][event] == rows["part"][row]
     assert float(marked["time_s"][event]) == pytest.approx(float(rows["time_s"][row]), abs=1e-6)

@@ -182,7 +182,7 @@ def test_a_copy_that_took_its_place_between_sync_and_acknowledgement_is_promised
             copy.rename(data)
         check()
 
-    monkeypatch.setattr(folder, "check", swap_and_check)
+    monkeypatch.setattr(folder, "check_in_place", swap_and_check)
     sent = tared.send(30, 20.0)
     assert closed(tared.socket)[0] == 1012
     assert away.exists()

@@ -136,7 +136,7 @@ def test_a_person_accepts_another_machine_which_then_is_the_node(
     assert stranger.secret is not None
     assert asking["fingerprint"] == compute_fingerprint(stranger.secret)
     assert asking["address"] == "127.0.0.1"
-    assert abs(asking["asked_t_ns"] - before_t_ns) < 60e9
+    assert abs(asking["requested_t_ns"] - before_t_ns) < 60e9
     assert_refused(accept(running, "0000-0000-0000-0000"), 412, asking["fingerprint"])
     node.deliver(10)
     answer = accept(running, asking["fingerprint"])

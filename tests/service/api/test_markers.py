@@ -143,7 +143,7 @@ def test_a_mark_far_from_every_frame_is_counted_as_left_out(session: Recording) 
     assert labels(table) == {MARKED: "a stone"}
     early, _ = json.loads(table.schema.metadata[b"foottile.notes"])["markers"]
     assert (early["label"], early["left_out"]) == ("years ago", "no frame within a second of it")
-    sliced = session.data(format="csv", end_s=0.01, columns="seq,event")
+    sliced = session.data(format="csv", end_s=0.01, columns="seq,marker")
     assert sliced.headers["foottile-markers"] == "placed=0, left-out=2"
 
 
@@ -193,7 +193,7 @@ def test_a_mark_that_is_sent_again_after_a_full_disk_is_in_the_table_too(
             raise StorageError("cannot be written: no space", where=str(folder))
         write_markers(changed, folder)
 
-    monkeypatch.setattr("service.server.session_store.write_events", write)
+    monkeypatch.setattr("service.server.session_store.write_markers", write)
     body = {"label": "a stone", "id": "0123456789ab"}
     assert session.running.http.post(f"{session.url}/markers", json=body).status_code == 507
     full[0] = False
@@ -207,7 +207,7 @@ def test_the_table_of_events_is_given_as_it_is_stored(session: Recording, node: 
     answer = session.running.http.get(f"{session.url}/markers", params={"format": "parquet"})
     assert answer.content == (session.folder / "markers.parquet").read_bytes()
     recording = node.record()
-    for table in ("events", "clock"):
+    for table in ("markers", "clock"):
         refused = session.running.http.get(f"{recording.url}/{table}?format=parquet")
         assert_refused(refused, 409, "not written yet")
 

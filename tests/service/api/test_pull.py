@@ -128,7 +128,7 @@ def test_the_client_says_that_a_session_is_not_sealed(sealed: Sealed, tmp_path: 
 def test_the_client_says_that_there_is_no_such_session(sealed: Sealed, tmp_path: Path) -> None:
     with (
         foottile.connect(sealed.running.url) as server,
-        pytest.raises(foottile.UnknownError, match="no session"),
+        pytest.raises(foottile.NotFoundError, match="no session"),
     ):
         pull_session(server, "20200101T000000Z-000000", tmp_path)
 
@@ -137,7 +137,7 @@ def test_the_client_says_that_no_server_answers(running: Running, tmp_path: Path
     running.stop()
     with (
         foottile.connect(running.url) as server,
-        pytest.raises(foottile.NoAnswerError, match="foottile serve"),
+        pytest.raises(foottile.ServerUnavailableError, match="foottile serve"),
     ):
         pull_session(server, "20200101T000000Z-000000", tmp_path)
 

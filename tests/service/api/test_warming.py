@@ -53,7 +53,7 @@ def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
     assert running.node()["warnings"] == [COMPILING_NOTE]
     session = node.record()
     node.deliver(300, [20.0, 60.0])
-    so_far = running.http.get(f"/sessions/{session.id}/overview")
+    so_far = running.http.get(f"/sessions/{session.id}/timeseries")
     assert "has no frames yet" in so_far.json()["detail"]
     session.stop()
     before = shown(node)

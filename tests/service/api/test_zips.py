@@ -172,7 +172,7 @@ def test_of_a_session_that_is_deleted_on_the_way_there_is_no_zip_that_opens(
             assert deleted.wait(30)
         return real(*args)
 
-    monkeypatch.setattr(storage.formats.zip_stream, "_write_bytes", slow)
+    monkeypatch.setattr(storage.formats.zip_stream, "_put", slow)
 
     def delete() -> None:
         assert begun.wait(30)

@@ -20,12 +20,12 @@ import sys
 from pathlib import Path
 from service.api.logins import Logins
 from service.cli import main
-from service.cli.commands.serve import announce
-main.app = lambda: announce(
+from service.cli.commands.serve import print_addresses
+main.app = lambda: print_addresses(
     ["http://192.168.4.1:8000"],
     Path("daten-\\u00fc-\\u2603"),
     Logins("a-token-of-this-test"),
-    is_kept=True,
+    is_stored=True,
 )
 main.main()
 """

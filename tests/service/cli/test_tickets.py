@@ -12,8 +12,8 @@ import segno
 
 from service.api import interfaces
 from service.api.logins import Logins, Role
-from service.cli.commands.serve import announce
-from service.cli.tickets import qr_lines, remark_reach
+from service.cli.commands.serve import print_addresses
+from service.cli.tickets import make_qr_lines, remark_unreachable
 from tests.service.cli.outcome import Run
 from tests.service.running import ServeWith
 
@@ -25,7 +25,7 @@ _LIGHT_ABOVE_BELOW = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
 def test_a_code_is_drawn_with_light_blocks_module_by_module() -> None:
     text = f"{AWAY}/#ticket=0123456789abcdefABCDEF"
     rows: list[list[int]] = []
-    for line in qr_lines(text):
+    for line in make_qr_lines(text):
         halves = [_LIGHT_ABOVE_BELOW[block] for block in line]
         rows += [[above for above, _ in halves], [below for _, below in halves]]
     border = 2
@@ -37,7 +37,7 @@ def test_a_code_is_drawn_with_light_blocks_module_by_module() -> None:
 
 def test_a_code_of_ascii_has_the_same_modules() -> None:
     text = f"{AWAY}/#ticket=0123456789abcdefABCDEF"
-    drawn = qr_lines(text, is_ascii=True)
+    drawn = make_qr_lines(text, is_ascii=True)
     assert all(line.isascii() for line in drawn)
     rows = [[line[at : at + 2] == "##" for at in range(0, len(line), 2)] for line in drawn]
     dark = [list(row) for row in segno.make(text, error="l", micro=False).matrix]
@@ -49,7 +49,7 @@ def announced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], url: str, **how: bool
 ) -> tuple[str, Logins]:
     logins = Logins(TOKEN)
-    announce([url], tmp_path, logins, is_kept=True, **how)
+    print_addresses([url], tmp_path, logins, is_stored=True, **how)
     return capsys.readouterr().out, logins
 
 
@@ -119,7 +119,7 @@ def test_what_keeps_others_away_is_remarked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(interfaces, "list_addresses", lambda *, include_ipv6: addresses)
-    remark_reach([url], host)
+    remark_unreachable([url], host)
     said = capsys.readouterr().err
     assert word in said
     assert bool(said) is bool(word)

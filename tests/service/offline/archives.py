@@ -69,7 +69,7 @@ def sealed(
         calibration=calibration(*info.serials) if is_calibrated else None,
         problem=None if is_calibrated else "the node had no calibration",
         tares=(),
-        notes={},
+        notes={"lost": {}},
     )
     held = {info.stream_id: StreamState(stored=journal.stored)}
     done = seal_session(

@@ -160,9 +160,9 @@ def test_a_lead_that_comes_after_what_followed_it_is_tared_all_the_same(foot_of:
         foot.node.estimator.tare_controller.problem
         == "not tared: lift the foot, hold it still, and tare"
     )
-    foot.send(lead.rows(0, 50))
+    foot.send(lead.slice_rows(0, 50))
     assert foot.history == []
-    foot.send(lead.rows(50, 100))
+    foot.send(lead.slice_rows(50, 100))
     assert foot.history == [("lead", False)]
     assert foot.node.estimator.live.tare.frames == 100
     assert foot.offset_counts == pytest.approx([1.0, 1.0], abs=0.4)
@@ -252,7 +252,7 @@ def test_a_foot_whose_lead_failed_is_tared_as_soon_as_it_steps(foot_of: Any) -> 
     assert foot.history == [("flight", False)]
     assert foot.offset_counts == pytest.approx([2.0, 2.0], abs=0.6)
     assert foot.node.estimator.tare_controller.problem is None
-    assert "between two steps" in foot.node.estimator.tares.all[0].reason
+    assert "between two steps" in foot.node.estimator.tare_history.tares[0].reason
 
 
 def test_a_foot_that_stands_from_the_beginning_is_never_tared_unasked(foot_of: Any) -> None:
@@ -374,7 +374,7 @@ def test_an_old_tare_is_told_of(foot_of: Any) -> None:
     foot.live(1.0)
     foot.seq += 31 * 60 * 100
     foot.live(1.0)
-    assert foot.node.estimator.tare_controller.warnings() == [
+    assert foot.node.estimator.tare_controller.list_warnings() == [
         "tared 31 min ago: lift the foot, hold it still, and tare"
     ]
 
@@ -397,4 +397,4 @@ def test_a_node_without_calibration_is_not_tared_and_frames_pass(foot_of: Any) -
         foot.node.tare_now()
     assert foot.due == list(range(foot.seq))
     assert foot.node.journal is not None
-    assert foot.node.journal.held == Intervals([(0, foot.seq - 1)])
+    assert foot.node.journal.stored == Intervals([(0, foot.seq - 1)])

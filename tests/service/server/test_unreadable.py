@@ -209,7 +209,7 @@ def test_frames_in_a_journal_that_cannot_be_read_now_are_not_lost(
     with refused_journals(monkeypatch):
         running.start()
         tared.reboot()
-        mentioned = tuple(earlier.said(held=()) for earlier in tared.before)
+        mentioned = tuple(earlier.said(stored=()) for earlier in tared.before)
         tared.connect(earlier=mentioned if is_mentioned else ())
         stopped_after_fifty(tared, recording)
         assert recording.now()["state"] == "pending"

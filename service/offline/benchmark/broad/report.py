@@ -111,10 +111,10 @@ def _format_goals(goals: Sequence[Goal]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for goal in goals:
         value = "-" if math.isnan(goal.value) else f"{goal.value:.3g}"
-        asked = f"at most {goal.most:g}"
+        requested = f"at most {goal.most:g}"
         if goal.least is not None:
-            asked = f"{goal.least:g} to {goal.most:g}"
-        rows.append((goal.figure, goal.mode, value, asked, "yes" if goal.is_met else "NO"))
+            requested = f"{goal.least:g} to {goal.most:g}"
+        rows.append((goal.figure, goal.mode, value, requested, "yes" if goal.is_met else "NO"))
     return rows
 
 
@@ -139,7 +139,7 @@ def _coverage(rows: Sequence[CaseSummary]) -> list[str]:
         (
             *_place(row),
             *(
-                _covered(row.coverage[name].share, row.coverage_of_arrays[name].p5)
+                _format_coverage(row.coverage[name].share, row.coverage_of_arrays[name].p5)
                 for name in COVERAGE_TITLES
             ),
         )
@@ -218,7 +218,7 @@ def _refusals(bench: BroadBenchmarkResult) -> list[str]:
     return lines
 
 
-def _covered(share: float, worst: float) -> str:
+def _format_coverage(share: float, worst: float) -> str:
     return "-" if math.isnan(share) else f"{100 * share:.1f} % ({100 * worst:.0f})"
 
 

@@ -100,8 +100,8 @@ def _read_reusable_result(options: BroadOptions, task: ArrayTask) -> ArrayResult
     result = read_result(get_result_path(options.folder, task.seeds, task.number))
     if result is None or result.made_by != task.made_by:
         return None
-    is_asked = task.repeatability in (None, result.repeatability)
-    return result if is_asked else None
+    is_requested = task.repeatability in (None, result.repeatability)
+    return result if is_requested else None
 
 
 def _describe_run_time(results: Sequence[ArrayResult], left: int, jobs: int) -> str:

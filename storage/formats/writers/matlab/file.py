@@ -115,9 +115,9 @@ def _read_values(export: Export, column: Column) -> Array:
 def _read_instants(export: Export) -> dict[str, Array]:
     """Return the instants of the frames by each requested clock."""
     limit = min(FRAMES_MAX, _VALUES_MAX // max(len(export.array_info.tiles), 1))
-    asked = ["t_ns", *(["part"] if "part" in export.frame_source.quantity_names else [])]
-    asked += [] if export.clock is None else ["t_server_ns"]
-    return export.read_all(asked, frames_max=limit)
+    requested = ["t_ns", *(["part"] if "part" in export.frame_source.quantity_names else [])]
+    requested += [] if export.clock is None else ["t_server_ns"]
+    return export.read_all(requested, frames_max=limit)
 
 
 def _encode_meanings(quantities: Sequence[Column]) -> Iterator[bytes]:

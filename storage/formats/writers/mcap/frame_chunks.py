@@ -86,11 +86,15 @@ def read_frame_chunks(export: Export, columns: list[str]) -> Iterator[FrameChunk
     Raises:
         UsageError: as for `Export.read_chunks`; the server's time of a frame is unknown.
     """
-    asked = [*columns, "t_ns", *(["part"] if "part" in export.frame_source.quantity_names else [])]
-    asked += [column.name for column in SERVER_TIME_COLUMNS] if export.clock is not None else []
-    asked += ["marker"] if export.markers is not None else []
+    requested = [
+        *columns,
+        "t_ns",
+        *(["part"] if "part" in export.frame_source.quantity_names else []),
+    ]
+    requested += [column.name for column in SERVER_TIME_COLUMNS] if export.clock is not None else []
+    requested += ["marker"] if export.markers is not None else []
     last_shown = -1
-    for piece in export.read_chunks(asked):
+    for piece in export.read_chunks(requested):
         t_ns = get_frame_instants_ns(export, piece)
         turns = t_ns // DRAWING_INTERVAL_NS
         shown = np.flatnonzero(np.diff(turns, prepend=last_shown))

@@ -93,7 +93,7 @@ class Ros2Encoder:
             )
             for i in range(len(export.array_info.tiles))
         ]
-        self._markers = self._register_topic(
+        self._drawings = self._register_topic(
             f"{topic_prefix}/foot", "visualization_msgs/msg/MarkerArray"
         )
         self._markers = self._register_topic(f"{topic_prefix}/markers", "std_msgs/msg/String")
@@ -111,7 +111,7 @@ class Ros2Encoder:
             content = self._encode_cdr(self._make_message("std_msgs/msg/String", text))
             beside.setdefault(row, []).append((t_ns[row], self._markers, content))
         for row, content in zip(frames.drawn_rows, self._encode_drawings(frames), strict=True):
-            beside.setdefault(row, []).append((t_ns[row], self._markers, content))
+            beside.setdefault(row, []).append((t_ns[row], self._drawings, content))
         for row, at_ns in enumerate(t_ns):
             for channel, contents in topics:
                 yield at_ns, channel, contents[row]

@@ -118,8 +118,8 @@ def _make_feet(exports: Sequence[Export]) -> list[ExportedFoot]:
     )
     names = [""] if is_alone else nodes
     bodies = [DEFAULT_BODY] if is_alone else [f"{node}_{DEFAULT_BODY}" for node in nodes]
-    if (asked := exports[0].options.body) is not None:
-        bodies = asked.split(",")
+    if (requested := exports[0].options.body) is not None:
+        bodies = requested.split(",")
         if len(bodies) != len(exports):
             raise UsageError(
                 f"{len(bodies)} bodies for {len(exports)} sessions",

@@ -15,8 +15,8 @@ from typing import Any, Union, get_args, get_origin
 
 import pytest
 
+from service.cli.command_table import SUMMARIES, get_command_function
 from service.cli.options import FootOptions
-from service.cli.table import SUMMARIES, command_of
 from tests.service.cli.outcome import Outcome, Run
 
 NUMBERS = ("nan", "inf", "-inf", "-1", "1e308", str(10**30))
@@ -76,7 +76,7 @@ def options(*wanted: type) -> list[tuple[str, str]]:
     of_foot = set(inspect.signature(FootOptions).parameters)
     found = []
     for command in SUMMARIES:
-        parameters = inspect.signature(command_of(command), eval_str=True).parameters
+        parameters = inspect.signature(get_command_function(command), eval_str=True).parameters
         for name, parameter in parameters.items():
             # An emulated foot is refused by one function, whoever asks for it.
             if command != "simulate" and name in of_foot:

@@ -121,7 +121,7 @@ def test_the_command_guides_through_the_weights_and_writes_what_is_accepted(
                 play.force_n = 0.0
             return super().push(t_ns, kpa)
 
-    monkeypatch.setattr(weighings, "WeighingProcedure", Followed)
+    monkeypatch.setattr(weighings, "Weighing", Followed)
     monkeypatch.setenv("FOOTTILE_TOKEN", tared.running.shown["Authorization"].split()[-1])
     asked: tuple[Any, ...] = ("--tile", "T01", "--weights", "10N,20N,40N,60N,80N")
     with Play(tared, alive=True) as play:

@@ -82,7 +82,7 @@ def test_without_a_folder_it_is_kept_with_the_session(
     run: Run, session: Path, plate: Path, tmp_path: Path
 ) -> None:
     asked = ("--reference", plate, *LAB, "--sign", "-", "--lag-range-s", "3,4")
-    run("compare", session, *asked).fails(2, "is a file by itself")
+    run("compare", session, *asked).fails(2, "is a single file")
     folder = tmp_path / "20200101T000000Z-000000"
     folder.mkdir()
     shutil.copy(session, folder / "frames.parquet")
@@ -130,8 +130,8 @@ def test_what_the_reference_has_not_is_a_missed_limit_too(
         ((*LAB, "--sign", "-", "--lag-range-s", "100,200"), 1, "do not overlap"),
         ((*LAB, "--sign", "-", "--limits", "grf=1"), 2, "a limit of grf_frames"),
         ((*LAB, "--sign", "-", "--limits", "grf_mae_n"), 2, "NAME=VALUE"),
-        ((*LAB, "--sign", "-", "--sole-m", "260"), 2, "--sole-m '260' is no size of an insole"),
-        ((*LAB, "--sign", "-", "--sole-m", "0.2,x"), 2, "is no size of an insole"),
+        ((*LAB, "--sign", "-", "--sole-m", "260"), 2, "--sole-m '260' is not a size of an insole"),
+        ((*LAB, "--sign", "-", "--sole-m", "0.2,x"), 2, "is not a size of an insole"),
     ],
 )
 def test_what_cannot_be_compared_is_named_and_leaves_nothing_behind(

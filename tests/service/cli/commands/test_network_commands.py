@@ -266,7 +266,7 @@ def test_a_demo_prints_one_link_that_logs_a_browser_in_and_commands_need_no_toke
     assert [answer.status_code for answer in answers] == [200, 401]
     assert answers[0].json()["role"] == "operator"
     with foottile.connect(login.removesuffix("/api/v1/login")) as server:
-        assert server.ticket()["role"] == "operator"
+        assert server.create_invite()["role"] == "operator"
     demo.process.send_signal(signal.SIGINT)
     assert ended(demo.process) == 0
     said = (tmp_path / "stderr.txt").read_text()

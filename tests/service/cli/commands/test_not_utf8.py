@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from devices.errors import StorageError
-from service.cli.table import SUMMARIES
+from service.cli.command_table import SUMMARIES
 from storage.permissions import restrict_to_owner
 from tests.service.cli.commands.test_any_value import COMMANDS
 from tests.service.cli.outcome import Run

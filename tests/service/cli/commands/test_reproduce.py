@@ -9,7 +9,7 @@ import pytest
 
 from devices.errors import FootTileError
 from service.cli import reproduction
-from service.cli.laboratory import Laboratory, Trial
+from service.cli.laboratory import Laboratory, RecordingJob
 from tests.service.cli.outcome import Run
 
 pytestmark = pytest.mark.slow
@@ -56,7 +56,7 @@ class Lab:
 
     def __exit__(self, *_: object) -> None: ...
 
-    def record(self, trial: Trial) -> None:
+    def record(self, trial: RecordingJob) -> None:
         self.tried.append(trial.name)
         raise FootTileError(f"node {trial.name} has ended by itself, with code 1")
 
@@ -77,7 +77,7 @@ def test_a_trial_that_fails_twice_fails_alone_and_the_exit_code_says_so(
 def test_when_most_trials_fail_none_is_repeated(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Lab()
     monkeypatch.setattr(reproduction, "Laboratory", lab)
-    monkeypatch.setattr(reproduction, "spread", lambda *_: iter(()))  # no dome is pressed
+    monkeypatch.setattr(reproduction, "map_in_processes", lambda *_: iter(()))  # no dome is pressed
     outcome = run("reproduce", "--quick", "--trials", reproduction.REPEATED_MAX + 1, "--out", "o")
     assert outcome.code == 3
     assert len(lab.tried) == reproduction.REPEATED_MAX + 1
@@ -85,7 +85,7 @@ def test_when_most_trials_fail_none_is_repeated(run: Run, monkeypatch: pytest.Mo
 
 def test_a_node_that_does_not_start_is_said_with_its_log(tmp_path: Path) -> None:
     with Laboratory(tmp_path) as laboratory:
-        trial = Trial("wrong", ["--scene=no-such-scene"], 1.0, ())
+        trial = RecordingJob("wrong", ["--scene=no-such-scene"], 1.0, ())
         with pytest.raises(FootTileError, match="does not come") as raised:
             laboratory.record(trial)
     assert raised.value.where is not None

@@ -148,7 +148,7 @@ def test_estimate_says_which_models_a_recording_asks_for_and_what_they_are_good_
     assert {"rubber", "hysteresis"} <= set(bare["asks_for"]) <= {"gas", "rubber", "hysteresis"}
     said = run(*few).err
     for name, newtons in bare["asks_for"].items():
-        assert f"model {name!r} is not named, and is good for {newtons:.2f} N" in said
+        assert f"model {name!r} is inactive; it would change the GRF by {newtons:.2f} N" in said
     # Each is expected beside all others, so together they are more than what is gained.
     gained_n = bare["accuracy"]["grf_mae_n"] - whole["accuracy"]["grf_mae_n"]
     assert 0.5 * gained_n < sum(bare["asks_for"].values()) < 4.0 * gained_n
@@ -201,7 +201,7 @@ def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touc
     pressed = table["true_force_n_0"].to_numpy() == 110.0
     wrapped = pressed & (table["pressure_raw_0"].to_numpy() > 900)
     assert wrapped.sum() > 100
-    assert (table["status_0"].to_numpy()[wrapped] & 16 == 16).all()
+    assert (table["tile_flags_0"].to_numpy()[wrapped] & 16 == 16).all()
     assert (table["estimate_flags"].to_numpy()[pressed] & 1 == 1).all()
     assert (table["force_n_0"].to_numpy()[pressed] > 15.0).all()  # as creep may have left it
     assert np.isnan(table["force_sigma_n_0"].to_numpy()[pressed]).all()

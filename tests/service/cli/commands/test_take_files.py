@@ -36,7 +36,7 @@ def test_a_take_is_pulled_and_exported_by_its_id(
     for arguments, why in (
         (("export", "--take", NOBODY, *wanted), f"no session of take '{NOBODY}'"),
         (("export", take.sessions[0].id, "--take", take.id, *wanted), "Name one"),
-        (("pull", "--out", "here", "--server", url), "the id of a session, or --take"),
+        (("pull", "--out", "here", "--server", url), "a session's id, or --take"),
         (("pull", "--take", take.id, "--out", "here", "--server", url), "parquet holds one"),
     ):
         refused = run(*arguments)

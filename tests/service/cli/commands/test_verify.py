@@ -65,7 +65,7 @@ def test_a_crash_is_recovered_and_proven(run: Run, data: Path) -> None:
     assert "not every session is sealed" in before.out
     recovered = run("recover", data)
     assert (recovered.code, recovered.err.count("journal bench/")) == (0, 1)
-    assert f"session {ID} (walk): sealed and proven, 100 frames" in recovered.out
+    assert f"session {ID} (walk): sealed and verified, 100 frames" in recovered.out
     assert run("recover", data, "--json").printed()["sessions"] == []
     assert "nothing to recover" in run("recover", data).out
     after = run("verify", data)
@@ -164,7 +164,7 @@ def test_on_a_server_what_may_come_is_waited_for_unless_given_up(run: Run, data:
     assert waiting.code == 3
     assert "waits for its node" in waiting.out
     assert "--give-up" in waiting.err
-    assert "sealed and proven" in run("recover", data, "--give-up").out
+    assert "sealed and verified" in run("recover", data, "--give-up").out
 
 
 def test_frames_of_no_session_are_recovered_if_asked(run: Run, data: Path) -> None:
@@ -172,7 +172,7 @@ def test_frames_of_no_session_are_recovered_if_asked(run: Run, data: Path) -> No
     assert "nothing to recover" in run("recover", data).out
     found = run("recover", data, "--streams")
     assert found.code == 0
-    assert f"(recovered bench {BOOT}): sealed and proven, 100 frames" in found.out
+    assert f"(recovered bench {BOOT}): sealed and verified, 100 frames" in found.out
 
 
 def test_estimates_of_frames_out_of_order_are_refused(run: Run, data: Path, tmp_path: Path) -> None:

@@ -136,7 +136,8 @@ def test_a_worker_of_another_version_is_refused(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "service.offline.archive.dask_cluster.exact_software", lambda: "foottile 9 (ffffffffffff)"
+        "service.offline.archive.dask_cluster.compute_exact_version",
+        lambda: "foottile 9 (ffffffffffff)",
     )
     with pytest.raises(UsageError, match="another version: foottile foottile"):
         list(map_on_cluster(squared, range(3), scheduler_address=cluster.address))

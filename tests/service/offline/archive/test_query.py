@@ -204,8 +204,8 @@ def test_sums_of_integers_are_integers_however_great(made: Path) -> None:
 def test_only_what_a_question_is_about_is_read(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = find_sessions([str(made)])
     # `frames` is a column here, and `stances` a text: neither is opened.
-    monkeypatch.setattr(type(archive), "frames", None)
-    monkeypatch.setattr(type(archive), "make_stance_table", None)
+    monkeypatch.setattr(type(archive), "open_frames_dataset", None)
+    monkeypatch.setattr(type(archive), "build_stances_table", None)
     sql = "SELECT sum(frames) AS n, 'stances' AS text FROM sessions"
     (row,) = run_query(archive, sql).to_pylist()
     assert isinstance(row["n"], int)

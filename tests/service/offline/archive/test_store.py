@@ -147,7 +147,7 @@ def test_questions_to_a_store_read_what_they_are_about_and_answer_as_for_folders
         (
             "SELECT session_id, scene, frames FROM sessions ORDER BY 1",
             "SELECT session_id, number, peak_grf_n FROM stances ORDER BY ALL",
-            "SELECT session_id, label FROM events ORDER BY ALL",
+            "SELECT session_id, label FROM markers ORDER BY ALL",
             "SELECT session_id, sum(grf_n) AS n FROM frames GROUP BY 1 ORDER BY 1",
         )
     ):

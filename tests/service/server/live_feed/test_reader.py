@@ -311,10 +311,7 @@ def test_one_who_comes_back_in_the_middle_of_a_piece_has_each_frame_once(
 ) -> None:
     world.send_newest(40)
     item = world.read(world.reader(policy, Position(FIRST, 0)))
-    middle = (item.first_seq + item.to_seq) // 2
+    middle = (item.first_seq + item.last_seq) // 2
     following = world.read(world.reader(policy, Position(FIRST, middle)))
-    assert (following.first_seq, following.to_seq) == (middle, item.to_seq)
-    assert (
-        following.estimated[0].pressure_raw.tolist()
-        == item.estimated[0].pressure_raw[middle:].tolist()
-    )
+    assert (following.first_seq, following.last_seq) == (middle, item.last_seq)
+    assert following.batch[0].pressure_raw.tolist() == item.batch[0].pressure_raw[middle:].tolist()

@@ -111,13 +111,13 @@ def test_a_killed_process_has_left_every_frame_that_it_had_taken(tmp_path: Path)
     code = """
 import json, sys
 from pathlib import Path
-from devices.acquisition import FrameRow
+from devices.acquisition import AcquiredFrame
 from devices.frames import ArrayInfo
 from storage.journal.node.in_flight import InFlightWriter
 info = ArrayInfo.model_validate_json(sys.stdin.readline())
 keeper = InFlightWriter(Path(sys.argv[1]), info)
 for seq in range(10_000_000):
-    row = FrameRow(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
+    row = AcquiredFrame(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
     keeper.write_frame(row)
     if seq % 1000 == 999:
         print(seq, flush=True)

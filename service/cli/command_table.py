@@ -1,7 +1,6 @@
-"""The commands of `foottile`, each loaded when it is called: for `--help` none has to be.
+"""Commands of `foottile`, each imported when it is called; `--help` imports none.
 
-Together they import all there is, numpy and pydantic's models of scenes among it: two thirds of a
-second before a word is printed.
+Importing all takes two thirds of a second, with numpy and pydantic's models of scenes.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-_IN = "service.cli.commands"
+_PACKAGE = "service.cli.commands"
 
 SUMMARIES = {
     "demo": "Run a server and an emulated node, and print a link to the live page.",
@@ -45,37 +44,37 @@ _MODULES = {"pull": "sessions", "export": "sessions"}
 """Modules with more than one command."""
 
 
-def command_of(name: str) -> Callable[..., None]:
-    """The function of a command."""
+def get_command_function(name: str) -> Callable[..., None]:
+    """Import and return the function of a command."""
     function = name.replace("-", "_")
-    module = import_module(f"{_IN}.{_MODULES.get(name, function)}")
+    module = import_module(f"{_PACKAGE}.{_MODULES.get(name, function)}")
     command: Callable[..., None] = getattr(module, f"{function}_command")
     return command
 
 
-def loaded(name: str) -> Any:
-    """A command with its options, as typer runs it."""
-    from service.cli.options import with_finite_numbers
+def load_command(name: str) -> Any:
+    """Return a command with its options, as typer runs it."""
+    from service.cli.options import require_finite_numbers
 
     app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    app.command(name)(with_finite_numbers(command_of(name)))
+    app.command(name)(require_finite_numbers(get_command_function(name)))
     return typer.main.get_command(app)
 
 
-class Commands(TyperGroup):
-    """A group that knows names and summaries, and loads the one command that is called."""
+class LazyCommandGroup(TyperGroup):
+    """Command group with names and summaries that imports only the called command."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """The command that is called, loaded."""
+        """Return the called command, imported."""
         name, command, rest = super().resolve_command(ctx, args)
-        return name, command if name is None else loaded(name), rest
+        return name, command if name is None else load_command(name), rest
 
 
-def name_all(app: typer.Typer) -> None:
-    """Add the commands' names and summaries to a group of class `Commands`."""
+def add_summaries(app: typer.Typer) -> None:
+    """Add names and summaries of the commands to a `LazyCommandGroup`."""
     for name, summary in SUMMARIES.items():
-        app.command(name, help=summary)(_not_loaded)
+        app.command(name, help=summary)(_fail_unloaded)
 
 
-def _not_loaded() -> None:
+def _fail_unloaded() -> None:
     raise AssertionError("a command is loaded before it runs")

@@ -1,4 +1,4 @@
-"""What is closed at the end of a `with` block."""
+"""Base classes of objects that a `with` block closes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from types import TracebackType
 from typing import Self
 
 
-class Closing(ABC):
-    """Something with `close`."""
+class Closeable(ABC):
+    """Context manager that calls `close`."""
 
     @abstractmethod
     def close(self) -> None:
-        """End it."""
+        """Release the connections."""
 
     def __enter__(self) -> Self:
         return self
@@ -26,12 +26,12 @@ class Closing(ABC):
         self.close()
 
 
-class AsyncClosing(ABC):
-    """The same for asyncio."""
+class AsyncCloseable(ABC):
+    """Asynchronous context manager that calls `close`."""
 
     @abstractmethod
     async def close(self) -> None:
-        """End it."""
+        """Release the connections."""
 
     async def __aenter__(self) -> Self:
         return self

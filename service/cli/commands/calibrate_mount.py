@@ -1,4 +1,4 @@
-"""`foottile calibrate --reference`: a mounted foot against a force plate."""
+"""`foottile calibrate --reference`: calibration of a mounted foot on a force plate."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from service.cli.commands.sessions import sealed_file
-from service.cli.options import output_path, print_json, progress, remark, stdout
+from service.cli.commands.sessions import find_sealed_file
+from service.cli.options import print_json, remark, resolve_output_path, show_progress, stdout
 from service.estimation.effects import Parameter
 from service.offline.mount_calibration import (
     MountCalibrationOptions,
@@ -18,47 +18,47 @@ from service.offline.mount_calibration import (
 from service.sessions.calibration_file import write_calibration
 
 
-def calibrate_mounted(
-    session: Path, against: Path, out: Path, options: MountCalibrationOptions, *, as_json: bool
+def calibrate_mounted_foot(
+    session: Path, reference: Path, out: Path, options: MountCalibrationOptions, *, as_json: bool
 ) -> None:
-    """See `foottile calibrate --help`."""
-    source = sealed_file(str(session), None)
-    path = output_path(out, source, against)
-    with progress(f"calibrating {session.name} against {against.name}"):
-        found = calibrate_mount(source, against, options, name=path.stem)
+    """Fit a mounted foot to a force plate; see `foottile calibrate --help`."""
+    source = find_sealed_file(str(session), None)
+    path = resolve_output_path(out, source, reference)
+    with show_progress(f"calibrating {session.name} against {reference.name}"):
+        found = calibrate_mount(source, reference, options, name=path.stem)
     write_calibration(path, found.calibration)
     if as_json:
-        print_json(_content(found))
+        print_json(_make_json(found))
     else:
-        stdout.print(_table(found))
+        stdout.print(_make_table(found))
     if options.reference_gain_sigma == 0.0:
-        remark("the plate's own gain is taken as exact: --reference-gain-sigma says how well it is")
+        remark("the plate's gain is assumed exact; --reference-gain-sigma states its uncertainty")
     for note in found.comparison.notes:
         remark(note)
 
 
-def _content(found: MountCalibrationResult) -> dict[str, object]:
+def _make_json(found: MountCalibrationResult) -> dict[str, object]:
     mounted, mount = found.calibration.mounted, found.mount_fit
     return {
         "id": found.calibration.id,
         "against": None if mounted is None else mounted.against,
         "gains": {}
         if mounted is None
-        else {serial: _parameter(gain) for serial, gain in mounted.gains.items()},
-        "shear": None if mount.shear is None else _parameter(mount.shear),
+        else {serial: _make_parameter_json(gain) for serial, gain in mounted.gains.items()},
+        "shear": None if mount.shear is None else _make_parameter_json(mount.shear),
         "mae_before_n": mount.mae_before_n,
         "mae_after_n": mount.mae_after_n,
         "frames": mount.frame_count,
         "blocks": mount.block_count,
-        "late_s": _parameter(mount.residual_lag_s),
+        "late_s": _make_parameter_json(mount.residual_lag_s),
     }
 
 
-def _parameter(found: Parameter) -> dict[str, object]:
+def _make_parameter_json(found: Parameter) -> dict[str, object]:
     return {"value": found.value, "sigma": found.sigma, "interval_95": found.interval_95}
 
 
-def _table(found: MountCalibrationResult) -> Table:
+def _make_table(found: MountCalibrationResult) -> Table:
     mounted, mount = found.calibration.mounted, found.mount_fit
     table = Table(
         title=f"Calibration {found.calibration.name} ({found.calibration.id}), as mounted",

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from service.cli import commands
-from service.cli.table import SUMMARIES, command_of
+from service.cli.command_table import SUMMARIES, get_command_function
 from tests.service.cli.outcome import Run
 
 
 @pytest.mark.parametrize("name", SUMMARIES)
 def test_a_summary_is_the_first_sentence_of_its_command(name: str) -> None:
-    said = inspect.getdoc(command_of(name))
+    said = inspect.getdoc(get_command_function(name))
     assert said is not None
     assert said.replace("\n", " ").startswith(SUMMARIES[name])
     assert SUMMARIES[name].endswith(".")

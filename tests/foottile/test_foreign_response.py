@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import foottile
-from foottile.foreign import explain_foreign
-from foottile.live_protocol import Asked, LiveProtocol
+from foottile.foreign_response import explain_foreign_response
+from foottile.live_protocol import LiveProtocol, LiveRequest
 from tests.service.fake_node import FakeNode
 from tests.service.node.publishing import Publishing
 from tests.service.running import Running
@@ -53,7 +53,7 @@ def test_a_question_that_another_program_answers(answer: bytes, words: tuple[str
             lambda: server.record("bench", "x"),
             lambda: server.tare("bench"),
         ):
-            with pytest.raises(foottile.NoAnswerError) as raised:
+            with pytest.raises(foottile.ServerUnavailableError) as raised:
                 ask()
             assert_said(raised.value, (url, *words))
 
@@ -63,7 +63,7 @@ def test_a_download_that_another_program_answers(
     answer: bytes, words: tuple[str, ...], tmp_path: Path
 ) -> None:
     with portal(answer) as url, foottile.connect(url) as server:
-        with pytest.raises(foottile.NoAnswerError) as raised:
+        with pytest.raises(foottile.ServerUnavailableError) as raised:
             server.download_take("x", tmp_path / "take.mat", format="mat")
         assert_said(raised.value, (url, *words))
     assert list(tmp_path.iterdir()) == []
@@ -72,7 +72,7 @@ def test_a_download_that_another_program_answers(
 @cases
 def test_a_live_stream_that_another_program_answers(answer: bytes, words: tuple[str, ...]) -> None:
     with portal(answer) as url, foottile.connect(url) as server:
-        with pytest.raises(foottile.NoAnswerError) as raised:
+        with pytest.raises(foottile.ServerUnavailableError) as raised:
             next(server.live("bench"))
         assert_said(raised.value, (url, *words))
 
@@ -84,7 +84,7 @@ async def test_an_asynchronous_stream_follows_no_redirect_either(
 ) -> None:
     with portal(answer) as url:
         async with foottile.connect_async(url) as server:
-            with pytest.raises(foottile.NoAnswerError) as raised:
+            with pytest.raises(foottile.ServerUnavailableError) as raised:
                 await anext(server.live("bench"))
             assert_said(raised.value, (url, *words))
 
@@ -111,14 +111,14 @@ def test_a_redirect_gets_no_token() -> None:
         foottile.connect(url, "a-token") as server,
     ):
         for ask in (server.nodes, lambda: next(server.live())):
-            with pytest.raises(foottile.NoAnswerError, match="leads to"):
+            with pytest.raises(foottile.ServerUnavailableError, match="leads to"):
                 ask()
     assert asked == []
 
 
 def test_a_redirect_to_tls_names_the_address_to_use() -> None:
     for url in ("http://lab:8000/api/v1/nodes", "ws://lab:8000/api/v1/ingest"):
-        said = explain_foreign(url, 301, {"location": "https://lab/api/v1/nodes"})
+        said = explain_foreign_response(url, 301, {"location": "https://lab/api/v1/nodes"})
         assert said is not None
         assert "Use the address with https://, https://lab" in said
 
@@ -134,14 +134,16 @@ def test_json_of_another_program_is_not_taken_for_a_servers(body: str) -> None:
                 lambda: server.session("x"),
                 lambda: server.tares("x"),
             ):
-                with pytest.raises(foottile.NoAnswerError, match="expected"):
+                with pytest.raises(foottile.ServerUnavailableError, match="expected"):
                     ask()
-            with pytest.raises(foottile.NoAnswerError, match=r"websocket|answer"):
+            with pytest.raises(foottile.ServerUnavailableError, match=r"websocket|answer"):
                 next(server.live())
 
 
 def test_what_a_stranger_sends_does_not_reach_the_terminal() -> None:
-    said = explain_foreign("http://lab", 302, {"location": "http://x/\x1b[2J" + "y" * 5000})
+    said = explain_foreign_response(
+        "http://lab", 302, {"location": "http://x/\x1b[2J" + "y" * 5000}
+    )
     assert said is not None
     assert "\x1b" not in said
     assert len(said) < 1000
@@ -163,7 +165,7 @@ def test_a_proxy_of_the_environment_is_not_asked(
 
 
 def test_a_stream_that_has_begun_goes_on_when_a_login_page_is_over() -> None:
-    asked = Asked.of("http://lab:8000", "bench", (), "lossless", None, None)
+    asked = LiveRequest.create("http://lab:8000", "bench", (), "lossless", None, None)
     protocol = LiveProtocol(asked)
     html = {"content-type": "text/html"}
     answers: tuple[tuple[int, dict[str, str]], ...] = (
@@ -174,8 +176,8 @@ def test_a_stream_that_has_begun_goes_on_when_a_login_page_is_over() -> None:
         (503, {}),
     )
     for status, headers in answers:
-        assert protocol.refused(status, headers, b"") is not None
-    protocol.take('{"type": "stream", "stream_id": "b", "from_seq": 0}')
+        assert protocol.explain_rejection(status, headers, b"") is not None
+    protocol.parse_message('{"type": "stream", "stream_id": "b", "from_seq": 0}')
     for status, headers in answers:
-        assert protocol.refused(status, headers, b"") is None
-    assert isinstance(protocol.refused(401, {}, b"{}"), foottile.RefusedError)
+        assert protocol.explain_rejection(status, headers, b"") is None
+    assert isinstance(protocol.explain_rejection(401, {}, b"{}"), foottile.AccessDeniedError)

@@ -1,4 +1,4 @@
-"""Commands over many sessions: which are meant, how the work is spread, and what is said of it."""
+"""Commands over many sessions: selection, parallel execution, report and summary."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import typer
 
 from devices.errors import UsageError
 from devices.text import escape_control_chars
-from service.cli.options import remark, say, stderr
+from service.cli.options import echo, remark, stderr
 
 if TYPE_CHECKING:
     from service.offline.archive.job_runner import JobMapper, OutcomeCounts
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from service.offline.archive.locations import SessionLocation
     from service.offline.archive.tasks import SessionTask
 
-NOT_ALL = 3
-"""Exit code: finished, but not with every session."""
+EXIT_INCOMPLETE = 3
+"""Exit code: finished, but some sessions failed."""
 
 ManifestOption = Annotated[
     Path | None,
@@ -36,12 +36,12 @@ JobsOption = Annotated[
 ]
 SchedulerOption = Annotated[
     str | None,
-    typer.Option(help="Work on a Dask cluster, at its scheduler's address, not on this machine."),
+    typer.Option(help="Address of a Dask scheduler: run on its cluster."),
 ]
 
 
-def is_one(places: Sequence[str] | None, manifest: Path | None) -> bool:
-    """Is a single session asked for, as a file, a folder or an id?"""
+def is_single_session(places: Sequence[str] | None, manifest: Path | None) -> bool:
+    """Return whether the arguments name a single session: a file, a folder or an id."""
     from service.offline.archive.locations import is_remote
     from storage.sessions.folder import FRAMES_NAME
     from storage.sessions.metadata import SESSION_NAME
@@ -55,7 +55,7 @@ def is_one(places: Sequence[str] | None, manifest: Path | None) -> bool:
     return not os.path.isdir(place) or any(os.path.exists(f"{place}/{n}") for n in names)
 
 
-def run_many(
+def run_task(
     task: SessionTask,
     places: Sequence[str] | None,
     manifest: Path | None,
@@ -65,12 +65,12 @@ def run_many(
     scheduler: str | None,
     as_json: bool,
 ) -> OutcomeCounts:
-    """Do a task with many sessions, say what became of each that failed, and count.
+    """Run a task on many sessions, print the failures and return the counts.
 
-    A result that is there, made from the same in the same way, is not made again.
+    An existing result of the same input and task is kept.
 
     Raises:
-        UsageError: nothing, or twice the same, says which sessions; or a place is not there.
+        UsageError: no sessions, two ways to name them, or a missing location.
     """
     from service.offline.archive.jobs import Job
     from service.offline.archive.locations import (
@@ -83,15 +83,17 @@ def run_many(
 
     if (manifest is None) == (not places):
         raise UsageError(
-            "no session is named" if manifest is None else "--manifest and sessions are two ways",
+            "no session is named"
+            if manifest is None
+            else "--manifest and sessions exclude each other",
             expected="sessions, folders of them, or --manifest",
         )
     if jobs is not None and scheduler is not None:
-        raise UsageError("--jobs and --scheduler are two ways to spread work", remedy="Name one")
+        raise UsageError("--jobs and --scheduler exclude each other", remedy="Name one")
 
     out = None if out is None else make_absolute(out)
 
-    def found() -> Iterator[SessionLocation]:
+    def list_locations() -> Iterator[SessionLocation]:
         if manifest is not None:
             return (
                 parse_session_location(row["session"]) for row in read_rows(manifest, {"session"})
@@ -102,34 +104,37 @@ def run_many(
             raise make_no_session_error(places or ())
         return chain([first], sessions)
 
-    return run_plan(
-        (Job(place, task, out) for place in found()),
+    return run_jobs_with_report(
+        (Job(place, task, out) for place in list_locations()),
         command=task.command,
-        count=found,
+        list_again=list_locations,
         out=out,
-        spread=spread_over(jobs, scheduler),
+        job_mapper=make_job_mapper(jobs, scheduler),
         as_json=as_json,
     )
 
 
-def run_plan(
+def run_jobs_with_report(
     jobs: Iterable[Job],
     *,
     command: str,
-    count: Callable[[], Iterator[Any]],
+    list_again: Callable[[], Iterator[Any]],
     out: str | None,
-    spread: JobMapper,
+    job_mapper: JobMapper,
     as_json: bool,
 ) -> OutcomeCounts:
-    """Run jobs, show how far they are, write the report, and say what came of them.
+    """Run jobs, show progress, write the report and print a summary.
 
     Args:
         jobs: one for each session.
-        command: of their tasks.
-        count: finds them once more, to count them where progress is shown.
-        out: of their results; None: nothing is kept.
-        spread: over processes or a cluster.
-        as_json: each outcome is a line of JSON on stdout.
+        command: name of the command.
+        list_again: lists the sessions once more, to count them for a progress bar.
+        out: path or URI of the results; None: no results.
+        job_mapper: maps jobs to processes or a cluster.
+        as_json: print each outcome as a line of JSON on stdout.
+
+    Raises:
+        UsageError: no job.
     """
     from service.offline.archive.job_runner import OutcomeCounts, run_jobs
     from service.offline.archive.result_store import ResultStore
@@ -137,31 +142,31 @@ def run_plan(
     jobs = iter(jobs)
     first = next(jobs, None)
     if first is None:
-        raise UsageError("there is no row in the list of sessions")
-    summary = OutcomeCounts()
+        raise UsageError("the list of sessions has no row")
+    counts = OutcomeCounts()
     results = None if out is None else ResultStore(out)
     if results is not None:
         results.prepare_folder()
     with ExitStack() as stack:
-        report = stack.enter_context(_report(results, command))
-        tell = stack.enter_context(_progress(command, count))
-        for outcome in run_jobs(chain([first], jobs), spread):
-            summary.add_outcome(outcome)
+        report = stack.enter_context(_open_report(results, command))
+        show_outcome = stack.enter_context(_show_progress(command, list_again))
+        for outcome in run_jobs(chain([first], jobs), job_mapper):
+            counts.add_outcome(outcome)
             line = json.dumps({k: v for k, v in vars(outcome).items() if v not in ("", {})})
             if report is not None:
                 report.write(line + "\n")
                 report.flush()
             if as_json:
-                say(line)
-            tell(outcome)
+                echo(line)
+            show_outcome(outcome)
     if results is not None:
         results.remove_work_folder()
-    _tell(summary, command, out, as_json=as_json)
-    return summary
+    _print_summary(counts, command, out, as_json=as_json)
+    return counts
 
 
-def spread_over(jobs: int | None, scheduler: str | None) -> JobMapper:
-    """Processes of this machine, or a cluster."""
+def make_job_mapper(jobs: int | None, scheduler: str | None) -> JobMapper:
+    """Return a mapper to processes of this machine or to a cluster."""
     if scheduler is not None:
         from service.offline.archive.dask_cluster import map_on_cluster
 
@@ -177,8 +182,8 @@ def spread_over(jobs: int | None, scheduler: str | None) -> JobMapper:
 
 
 @contextmanager
-def _report(results: Any, command: str) -> Iterator[IO[str] | None]:
-    """A line for each outcome, beside the results; a store gets it when all is over."""
+def _open_report(results: Any, command: str) -> Iterator[IO[str] | None]:
+    """Open the report, a line for each outcome; a remote store receives it at the end."""
     if results is None:
         yield None
         return
@@ -196,8 +201,10 @@ def _report(results: Any, command: str) -> Iterator[IO[str] | None]:
 
 
 @contextmanager
-def _progress(command: str, count: Callable[[], Iterator[Any]]) -> Iterator[Callable[..., None]]:
-    """How far it is and how long it will take, on a terminal."""
+def _show_progress(
+    command: str, list_again: Callable[[], Iterator[Any]]
+) -> Iterator[Callable[..., None]]:
+    """Show progress and remaining time on a terminal."""
     if not stderr.is_terminal:
         yield lambda outcome: None
         return
@@ -212,32 +219,32 @@ def _progress(command: str, count: Callable[[], Iterator[Any]]) -> Iterator[Call
     text = TextColumn("{task.description}")
     bar = Progress(text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=stderr)
     with bar:
-        shown = bar.add_task(command, total=sum(1 for _ in count()))
+        shown = bar.add_task(command, total=sum(1 for _ in list_again()))
 
-        def tell(outcome: Outcome) -> None:
+        def show_outcome(outcome: Outcome) -> None:
             if outcome.state == "failed":
-                remark(_failure(outcome))
+                remark(_format_failure(outcome))
             bar.advance(shown)
 
-        yield tell
+        yield show_outcome
 
 
-def _failure(outcome: Outcome) -> str:
-    """Place and reason; a reason may begin with a file in that place."""
+def _format_failure(outcome: Outcome) -> str:
+    """Return place and reason; the reason may already begin with a file in that place."""
     place = escape_control_chars(outcome.place)
     within = outcome.reason.startswith((f"{place}/", f"{place}: "))
     return outcome.reason if within else f"{place}: {outcome.reason}"
 
 
-def _tell(summary: OutcomeCounts, command: str, out: str | None, *, as_json: bool) -> None:
-    states = summary.states
+def _print_summary(counts: OutcomeCounts, command: str, out: str | None, *, as_json: bool) -> None:
+    states = counts.states
     if not as_json:
         where = f"{out}: " if out is not None else ""
-        counts = [f"{states['made']} made", f"{states['there']} there before"]
-        verdicts = ", ".join(f"{n} {verdict}" for verdict, n in sorted(summary.verdicts.items()))
+        parts = [f"{states['made']} made", f"{states['there']} there before"]
+        verdicts = ", ".join(f"{n} {verdict}" for verdict, n in sorted(counts.verdicts.items()))
         failed = f", {states['failed']} failed" if states["failed"] else ""
-        say(f"{where}{command}: {', '.join(counts)}{failed}{'; ' if verdicts else ''}{verdicts}")
-    for outcome in () if stderr.is_terminal else summary.failures:
-        remark(_failure(outcome))
-    if states["failed"] > len(summary.failures):
-        remark(f"and {states['failed'] - len(summary.failures)} more, which the report lists")
+        echo(f"{where}{command}: {', '.join(parts)}{failed}{'; ' if verdicts else ''}{verdicts}")
+    for outcome in () if stderr.is_terminal else counts.failures:
+        remark(_format_failure(outcome))
+    if states["failed"] > len(counts.failures):
+        remark(f"and {states['failed'] - len(counts.failures)} more, listed in the report")

@@ -1,4 +1,4 @@
-"""Answers that are not a foottile server's: of captive portals, proxies and other programs."""
+"""HTTP responses of other programs: captive portals, proxies, other servers."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from urllib.parse import urljoin, urlsplit
 _TEXT_MAX = 200
 
 
-def explain_foreign(
+def explain_foreign_response(
     url: str, status: int, headers: Mapping[str, str], *, expected: str = ""
 ) -> str | None:
-    """Return who answered in place of a foottile server and what to do; None if it is one.
+    """Return the sender and the remedy of a foreign response; None for a foottile server's.
 
     Args:
-        url: what was asked for.
-        status: of the answer.
-        headers: of the answer, their names in small letters.
-        expected: what has to come, if anything but an HTML page is not enough: `JSON`.
+        url: requested address.
+        status: HTTP status.
+        headers: headers, with names in lower case.
+        expected: expected content; with it every response counts as foreign, not only HTML pages
+            and redirects.
     """
     url = re.sub("^ws", "http", url)
     is_redirect = status in range(300, 400) and status != HTTPStatus.NOT_MODIFIED
@@ -28,27 +29,31 @@ def explain_foreign(
     wants_login = status == HTTPStatus.NETWORK_AUTHENTICATION_REQUIRED
     if not (is_redirect or is_page or wants_login or expected):
         return None
-    program = f" of {_shown(headers['server'])}" if headers.get("server") else ""
-    came = f"HTTP {status}{program}"
+    program = f" of {_printable(headers['server'])}" if headers.get("server") else ""
+    problem = f"HTTP {status}{program}"
     remedy = (
         f"Open {_origin(url)} in a browser: a network may ask for a login, or another program has "
         "this address"
     )
     if is_redirect:
         target = urljoin(url, headers.get("location", ""))
-        came += f", which leads to {_shown(target)}"
+        problem += f", which leads to {_printable(target)}"
         if _is_same_but_secure(url, target):
-            remedy = f"Use the address with https://, {_shown(_origin(target))}"
+            remedy = f"Use the address with https://, {_printable(_origin(target))}"
     elif is_page:
-        came += " with an HTML page"
+        problem += " with an HTML page"
     elif kind:
-        came += f" with {_shown(kind)}"
-    return f"{came}; expected {expected or 'the answer'} of a foottile server. {remedy}"
+        problem += f" with {_printable(kind)}"
+    return f"{problem}; expected {expected or 'the answer'} of a foottile server. {remedy}"
 
 
 def _is_same_but_secure(url: str, target: str) -> bool:
-    asked, led = urlsplit(url), urlsplit(target)
-    return asked.scheme == "http" and led.scheme == "https" and asked.hostname == led.hostname
+    requested, parts = urlsplit(url), urlsplit(target)
+    return (
+        requested.scheme == "http"
+        and parts.scheme == "https"
+        and requested.hostname == parts.hostname
+    )
 
 
 def _origin(url: str) -> str:
@@ -56,5 +61,5 @@ def _origin(url: str) -> str:
     return f"{parts.scheme}://{parts.netloc}"
 
 
-def _shown(text: str) -> str:
+def _printable(text: str) -> str:
     return "".join(letter for letter in text if letter.isprintable())[:_TEXT_MAX]
