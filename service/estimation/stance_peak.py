@@ -16,7 +16,7 @@ MAX_HALF_WIDTH = 256
 _CHUNK = 4096
 """Number of frames that are searched together: a longer stance needs no more memory."""
 _AGREEMENT_SIGMAS = 1.0
-_SELECTION_SIGMAS = 5.0
+_SELECTION_SIGMAS = 6.0
 _NOISE_CAP = 8.0
 _CENTRES_PER_HALF = 8
 """Number of windows with centres within half the width of one; all frames, if they are fewer."""
@@ -41,7 +41,7 @@ class PeakSearch:
     (Savitzky and Golay 1964). At frame i their value is a_h = sum(c_j f_j), with the noise
     v_h = sqrt(sum(c_j² q_j²)). A window counts if it agrees with all narrower windows k,
     |a_h - a_k| <= v_k (Lepski 1991). The peak is the a_h with the largest lower bound
-    a_h - 5 v_h: 5 sigmas exceed the noise of the largest of thousands of frames (Duembgen and
+    a_h - 6 v_h: 6 sigmas exceed the noise of the largest of many thousand frames (Duembgen and
     Spokoiny 2001), so only a significantly larger force is taken from a narrower window.
 
     The residuals of parabolas through five frames give the variance q² of independent noise. A
