@@ -92,6 +92,8 @@ class PeakSearch:
         while half <= MAX_HALF_WIDTH:
             is_used = (centres >= half) & (centres < len(force_n) - half)
             is_used &= centres % max(1, half // _CENTRES_PER_HALF) == 0
+            most_n = narrower[0] + _AGREEMENT_SIGMAS * narrower[1]  # of a window that agrees
+            is_used &= np.all(most_n > self._best.lower_n, axis=0)
             centres, narrower = centres[is_used], narrower[..., is_used]
             frames, weights = _fit_parabolas(t_ns, centres, half)
             value_n = np.sum(weights * force_n[frames], axis=1)
@@ -100,9 +102,8 @@ class PeakSearch:
             is_used = np.all(agrees, axis=0)
             if not is_used.any():
                 return
-            centres, narrower = centres[is_used], narrower[..., is_used]
-            value_n, scatter_n = value_n[is_used], scatter_n[is_used]
-            narrower = np.append(narrower, [[value_n], [scatter_n]], axis=1)
+            narrower = np.append(narrower, [[value_n], [scatter_n]], axis=1)[..., is_used]
+            centres, (value_n, scatter_n) = centres[is_used], narrower[:, -1]
             lower_n = value_n - _SELECTION_SIGMAS * scatter_n
             at = int(np.argmax(lower_n))
             if lower_n[at] > self._best.lower_n:
@@ -119,24 +120,15 @@ class PeakSearch:
 
 
 def _fit_parabolas(t_ns: Times, centres: npt.NDArray[np.intp], half: int) -> tuple[Any, Floats]:
-    """Return the frames of windows, and their weights in the least-squares parabola's value.
-
-    Args:
-        t_ns: (n,), times of the frames.
-        centres: (k,), frames at which the values are.
-        half: number of frames to either side.
-
-    Returns:
-        Two arrays (k, 2 half + 1).
-    """
+    """Return frames (k, 2 half + 1) of windows about centres, and weights of their parabolas."""
     frames = centres[:, None] + np.arange(-half, half + 1)
     if half == 0:
         return frames, np.ones(frames.shape)
     x = (t_ns[frames] - t_ns[centres][:, None]) / (t_ns[frames[:, -1:]] - t_ns[frames[:, :1]])
-    _, s1, s2, s3, s4 = (np.sum(x**power, axis=1, keepdims=True) for power in range(5))
+    x2 = x * x
+    s1, s2, s3, s4 = (np.sum(of, axis=1, keepdims=True) for of in (x, x2, x * x2, x2 * x2))
     # First row of the inverse of the normal equations, by cofactors.
-    of_1, of_x, of_x2 = s2 * s4 - s3**2, s2 * s3 - s1 * s4, s1 * s3 - s2**2
-    weights = of_1 + of_x * x + of_x2 * x**2
+    weights = (s2 * s4 - s3 * s3) + (s2 * s3 - s1 * s4) * x + (s1 * s3 - s2 * s2) * x2
     return frames, weights / np.sum(weights, axis=1, keepdims=True)
 
 
@@ -147,4 +139,4 @@ def _estimate_noise_n2(t_ns: Times, force_n: Floats) -> float:
         return 0.0
     frames, weights = _fit_parabolas(t_ns, centres, 2)
     residual_n = force_n[2:-2] - np.sum(weights * force_n[frames], axis=1)
-    return float(np.mean(residual_n**2 / (1.0 - weights[:, 2])))
+    return float(np.sum(residual_n**2) / np.sum(1.0 - weights[:, 2]))
