@@ -18,6 +18,7 @@ import numpy.typing as npt
 from devices.arrays import Floats, Times
 from service.estimation.estimates import SIGMAS_95, EstimateFlag
 from service.estimation.foot import CONTACT_UNKNOWN, LONG_GAP_NS
+from service.estimation.stance_peak import PeakSearch
 
 STANCE_INPUT_COLUMNS = (
     "contact",
@@ -57,10 +58,10 @@ class Stance:
         end_t_ns: UTC of its last frame.
         duration_sigma_s: standard uncertainty of the duration (docs/method.md); NaN if the frame
             before or after the stance is missing, or if the GRF rises or falls too slowly there.
-        peak_grf_n: largest known GRF; NaN without any, or if a tile was saturated, which hides the
-            peak.
-        peak_t_ns: UTC of the first frame with that GRF; None without a peak.
-        peak_sigma_n: standard uncertainty of the GRF in that frame.
+        peak_grf_n: largest GRF without the bias by noise (`service.estimation.stance_peak`); NaN
+            without any, or if a tile was saturated, which hides the peak.
+        peak_t_ns: UTC of the frame with that GRF; None without a peak.
+        peak_sigma_n: standard uncertainty of the peak.
         impulse_n_s: integral of the GRF by the trapezoidal rule, in newton seconds; NaN if a frame
             is missing or has no GRF.
         impulse_sigma_n_s: standard uncertainty of the impulse, for errors of the GRF that are equal
@@ -123,7 +124,7 @@ def compute_stances(seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) 
 class StanceDetector:
     """Detector of stances in consecutive frames; the result does not depend on the batches.
 
-    It stores sums and no frames: its memory does not grow with the length of a stance.
+    It stores sums and the last seconds: its memory does not grow with the length of a stance.
     """
 
     def __init__(self) -> None:
@@ -298,8 +299,7 @@ class _OpenStance:
     status: int = 0
     integrals: tuple[float, float] = (0.0, 0.0)
     """Integrals of the GRF and of its sigma over time, in newton seconds."""
-    peak: tuple[float, int, float] | None = None
-    """GRF, instant and sigma."""
+    peak: PeakSearch = field(default_factory=PeakSearch)
     head: _ForceSeries = field(default_factory=_ForceSeries.make_empty)
     """First frames, up to one `EDGE_NS` after the first."""
     tail: _ForceSeries = field(default_factory=_ForceSeries.make_empty)
@@ -320,16 +320,12 @@ class _OpenStance:
         t_ns, unsure = t_ns[rows], columns["contact"][rows] == CONTACT_UNKNOWN
         grf_n = columns["grf_n"][rows].astype(np.float64)  # a copy
         grf_n[unsure] = np.nan
-        there = np.isfinite(grf_n)
+        sigma_n = columns["grf_sigma_n"][rows].astype(np.float64)
         self.frames += len(grf_n)
-        self.unknown += int(np.count_nonzero(~there))
+        self.unknown += int(np.count_nonzero(~np.isfinite(grf_n)))
         self.status |= int(np.bitwise_or.reduce(columns["estimate_flags"][rows]))
-        self._add_force(_ForceSeries(t_ns, grf_n, columns["grf_sigma_n"][rows].astype(np.float64)))
-        if there.any():
-            at = int(np.argmax(np.where(there, grf_n, -np.inf)))
-            if self.peak is None or grf_n[at] > self.peak[0]:
-                sigma_n = float(columns["grf_sigma_n"][rows][at])
-                self.peak = float(grf_n[at]), int(t_ns[at]), sigma_n
+        self.peak.add_frames(t_ns, grf_n, sigma_n)
+        self._add_force(_ForceSeries(t_ns, grf_n, sigma_n))
         stated = np.isfinite(columns["cop_x_m"][rows]) & ~unsure
         if stated.any():
             self._add_cop(columns["cop_x_m"][rows][stated], columns["cop_sigma_x_m"][rows][stated])
@@ -409,8 +405,8 @@ class _OpenStance:
     def to_stance(self, behind: _Frame | None) -> Stance:
         """Make the stance; `behind` is the next frame with known contact, if there is one."""
         missing = self.last.seq - self.first.seq + 1 - self.frames
-        hidden = self.peak is None or self.status & EstimateFlag.SATURATED
-        peak_n, peak_t_ns, peak_sigma_n = self.peak or (np.nan, 0, np.nan)
+        peak = None if self.status & EstimateFlag.SATURATED else self.peak.finish()
+        peak_n, peak_t_ns, peak_sigma_n = peak or (np.nan, None, np.nan)
         x_first_m, x_last_m = self.cop_x_m or (np.nan, np.nan)
         range_m, range_sigma_m = self._cop_range_m()
         behind = behind if self.last.is_adjacent_edge(behind) else None
@@ -421,9 +417,9 @@ class _OpenStance:
             begin_t_ns=self.first.t_ns,
             end_t_ns=self.last.t_ns,
             duration_sigma_s=self._duration_sigma_s(behind),
-            peak_grf_n=np.nan if hidden else peak_n,
-            peak_t_ns=None if hidden else peak_t_ns,
-            peak_sigma_n=np.nan if hidden else peak_sigma_n,
+            peak_grf_n=peak_n,
+            peak_t_ns=peak_t_ns,
+            peak_sigma_n=peak_sigma_n,
             impulse_n_s=self.integrals[0] if has_impulse else np.nan,
             impulse_sigma_n_s=self._impulse_sigma_n_s(behind) if has_impulse else np.nan,
             cop_x_first_m=x_first_m,

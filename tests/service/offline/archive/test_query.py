@@ -50,7 +50,7 @@ def test_the_peaks_of_all_third_hops_in_mud(made: Path) -> None:
     rows = answer(THIRD_IN_MUD, made)
     assert [row["session_id"] for row in rows] == [IDS[0], IDS[1]]
     for row, peak_n in zip(rows, (40.0, 44.0), strict=True):
-        assert row["peak_grf_n"] == pytest.approx(peak_n, abs=5.0)  # the greatest of noisy ones
+        assert row["peak_grf_n"] == pytest.approx(peak_n, abs=5.0)
         assert row["is_whole"]
 
 
