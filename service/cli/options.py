@@ -296,8 +296,12 @@ class FootOptions:
 
     def to_arguments(self) -> list[str]:
         """Return these options as arguments of another command."""
-        values = {f.name.replace("_", "-"): getattr(self, f.name) for f in fields(self)}
-        return [f"--{name}={value}" for name, value in values.items() if value is not None]
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return [
+            f"--{name.removesuffix('_').replace('_', '-')}={value}"
+            for name, value in values.items()
+            if value is not None
+        ]
 
 
 def add_foot_options(command: Callable[..., None]) -> Callable[..., None]:
