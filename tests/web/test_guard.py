@@ -106,7 +106,8 @@ def test_an_error_is_told_once_and_covers_no_control(
           const box = document.getElementById("guard").getBoundingClientRect();
           const apart = (rect) => rect.bottom <= box.top || rect.top >= box.bottom;
           const all = [...document.querySelectorAll("header *, #live *, #actions *")];
-          const isSeen = (e) => e instanceof HTMLElement && e.getBoundingClientRect().width > 1;
+          const area = ({ width, height }) => width * height;  // an empty box covers nothing
+          const isSeen = (e) => e instanceof HTMLElement && area(e.getBoundingClientRect()) > 1;
           const seen = all.filter(isSeen);
           return seen.filter((e) => !apart(e.getBoundingClientRect())).map((e) => e.outerHTML);
         }""")
