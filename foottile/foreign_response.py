@@ -48,12 +48,8 @@ def explain_foreign_response(
 
 
 def _is_same_but_secure(url: str, target: str) -> bool:
-    requested, parts = urlsplit(url), urlsplit(target)
-    return (
-        requested.scheme == "http"
-        and parts.scheme == "https"
-        and requested.hostname == parts.hostname
-    )
+    source, parts = urlsplit(url), urlsplit(target)
+    return source.scheme == "http" and parts.scheme == "https" and source.hostname == parts.hostname
 
 
 def _origin(url: str) -> str:

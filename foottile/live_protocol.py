@@ -116,10 +116,10 @@ class LiveProtocol:
         """Return the websocket address that begins or resumes the stream."""
         request = self._request
         query = {"format": "arrow", "policy": request.policy}
-        given = {"node": request.node, "columns": ",".join(request.columns) or None}
-        given |= {"stream_id": self._stream_id}
-        given |= {"from_seq": None if self._next_seq is None else str(self._next_seq)}
-        query |= {name: value for name, value in given.items() if value is not None}
+        position = {"node": request.node, "columns": ",".join(request.columns) or None}
+        position |= {"stream_id": self._stream_id}
+        position |= {"from_seq": None if self._next_seq is None else str(self._next_seq)}
+        query |= {name: value for name, value in position.items() if value is not None}
         self._schema = None
         return f"ws{request.url.removeprefix('http')}/api/v1/live?{urlencode(query)}"
 

@@ -71,7 +71,7 @@ def publish_local_server(server: LocalServer) -> Iterator[None]:
 
     path = _record_path(urlsplit(server.url).port or 80)
     if path is None:
-        raise FileNotFoundError(errno.ENOENT, "no home folder is known", f"user {os.getuid()}")
+        raise FileNotFoundError(errno.ENOENT, "no home folder", f"user {os.getuid()}")
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not _is_private(path.parent.lstat()):
         path.parent.chmod(0o700)

@@ -116,7 +116,7 @@ def _tabulate_ranges(calibration: Calibration) -> Table:
             "ended by: the load, which went no further, or the chip, whose reading did not",
         ],
         *("tile", "end\nkPa", "absolute\nkPa", "left to 115\nkPa", "force\nN", "ended by"),
-        *("drift\nkPa", "temp.\ncounts", "about\ndegC"),
+        *("drift\nkPa", "raw T\ncounts", "about\ndegC"),
     )
     for tile in calibration.tiles:
         facts = tile.bench

@@ -219,12 +219,12 @@ def _show_progress(
     text = TextColumn("{task.description}")
     bar = Progress(text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=stderr)
     with bar:
-        shown = bar.add_task(command, total=sum(1 for _ in list_again()))
+        task_id = bar.add_task(command, total=sum(1 for _ in list_again()))
 
         def show_outcome(outcome: Outcome) -> None:
             if outcome.state == "failed":
                 remark(_format_failure(outcome))
-            bar.advance(shown)
+            bar.advance(task_id)
 
         yield show_outcome
 

@@ -259,7 +259,7 @@ class FootOptions:
             )
         if scene.array.bus == EMULATED and scene.ground.kind == "trace" and self.load is None:
             raise UsageError(
-                f"scene {scene.name!r} presses a recorded load, and none was given",
+                f"scene {scene.name!r} needs a recorded load, and none is named",
                 remedy="Add --load FILE",
             )
         offset_m = parse_pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
@@ -296,8 +296,12 @@ class FootOptions:
 
     def to_arguments(self) -> list[str]:
         """Return these options as arguments of another command."""
-        values = {f.name.replace("_", "-"): getattr(self, f.name) for f in fields(self)}
-        return [f"--{name}={value}" for name, value in values.items() if value is not None]
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return [
+            f"--{name.removesuffix('_').replace('_', '-')}={value}"
+            for name, value in values.items()
+            if value is not None
+        ]
 
 
 def add_foot_options(command: Callable[..., None]) -> Callable[..., None]:

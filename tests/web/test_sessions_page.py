@@ -91,7 +91,7 @@ def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is
     expect(said).to_have_count(1)
     trashed.get_by_role("button", name="Restore").click()
     expect(trashed).to_have_count(0)
-    expect(said).to_have_count(0)  # it no longer holds
+    expect(said).to_have_count(0, timeout=4000)  # it would leave by itself after 10 s
     expect(row).to_have_count(1)
     choose(page, row, "Delete")
     expect(trashed).to_have_count(1)

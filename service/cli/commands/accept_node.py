@@ -40,6 +40,6 @@ def accept_node_command(
                 f"no other machine asks to connect as {node!r}",
                 remedy="Start the machine; it retries every few seconds",
             )
-        chosen = fingerprint or replacement["fingerprint"]
-        source.http.send("POST", f"{path}/accept-replacement", {"fingerprint": chosen})
-    echo(f"{node} is now the machine {chosen}")
+        accepted = fingerprint or replacement["fingerprint"]
+        source.http.send("POST", f"{path}/accept-replacement", {"fingerprint": accepted})
+    echo(f"{node} is now the machine {accepted}")

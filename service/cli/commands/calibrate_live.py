@@ -145,7 +145,7 @@ def _show_until_done(source: Server, path: str, weighing: dict[str, Any]) -> dic
     Raises:
         CalibrationError: a user cancelled the weighing.
     """
-    shown, warned, printed_count = "", None, 0
+    printed, warned, printed_count = "", None, 0
     with show_progress(weighing["prompt"]) as show_status:
         while weighing["state"] in ("weighing", "fitting"):
             if weighing["warning"] not in (None, warned):
@@ -156,8 +156,8 @@ def _show_until_done(source: Server, path: str, weighing: dict[str, Any]) -> dic
                 remark(text)
             printed_count = len(texts)
             text = _format_status(weighing)
-            if text != shown:
-                shown = text
+            if text != printed:
+                printed = text
                 show_status(text)
             time.sleep(_POLL_S)
             found = source.http.get(path)["weighing"]

@@ -33,14 +33,16 @@ def domes_command(
     """
     if load_n is not None and not 0.0 < load_n < float("inf"):
         raise UsageError(f"--load-n {load_n} is not a load", expected="newtons above 0")
-    chosen = None if load_n is None else select_dome_for_load(load_n)
+    selected = None if load_n is None else select_dome_for_load(load_n)
     if as_json:
         print_json(
             {
                 "load_n": load_n,
-                "dome": None if chosen is None else chosen.dome.name,
-                "verdict": None if chosen is None or load_n is None else chosen.judge_load(load_n),
-                "basis": None if chosen is None else chosen.source,
+                "dome": None if selected is None else selected.dome.name,
+                "verdict": None
+                if selected is None or load_n is None
+                else selected.judge_load(load_n),
+                "basis": None if selected is None else selected.source,
                 "fast_share": compute_fast_load_ratio(),
                 "domes": [
                     {
@@ -82,8 +84,8 @@ def domes_command(
         stdout.print(table)
         echo(_NOTES.format(fast=100 * compute_fast_load_ratio()))
         if load_n is not None:
-            echo(f"For {load_n:g} N: {_format_choice(chosen, load_n)}")
-    if load_n is not None and chosen is None:
+            echo(f"For {load_n:g} N: {_format_choice(selected, load_n)}")
+    if load_n is not None and selected is None:
         raise typer.Exit(3)
 
 
@@ -94,12 +96,12 @@ A load within milliseconds reaches full scale at about {fast:.0f} % of it.
 Outside: estimated part of a change of air or water pressure that a tile reads."""
 
 
-def _format_choice(chosen: SaturationLoad | None, load_n: float) -> str:
-    if chosen is None:
+def _format_choice(selected: SaturationLoad | None, load_n: float) -> str:
+    if selected is None:
         return "none of them; share the load between tiles."
-    if chosen.judge_load(load_n) == "covers":
-        return f"{chosen.dome.name} ({chosen.source})."
+    if selected.judge_load(load_n) == "covers":
+        return f"{selected.dome.name} ({selected.source})."
     return (
-        f"perhaps {chosen.dome.name}: it saturates somewhere between {chosen.low_n:.0f} and "
-        f"{chosen.high_n:.0f} N ({chosen.source})."
+        f"perhaps {selected.dome.name}: it saturates somewhere between {selected.low_n:.0f} and "
+        f"{selected.high_n:.0f} N ({selected.source})."
     )

@@ -175,5 +175,5 @@ def print_addresses(
     if not has_screen:
         place = f"in {data / TOKEN_NAME}" if is_stored else "FOOTTILE_TOKEN"
         remark(f"its token is {place}; `foottile invite` prints a login link")
-    shown = token if sys.stderr.isatty() else where
-    remark(f"a node: FOOTTILE_TOKEN={shown} foottile node --scene FILE --server {urls[0]}")
+    token_text = token if sys.stderr.isatty() else where
+    remark(f"a node: FOOTTILE_TOKEN={token_text} foottile node --scene FILE --server {urls[0]}")

@@ -166,23 +166,23 @@ def pull_command(
     if (session is None) == (take is None):
         raise UsageError("nothing to pull is named, or twice", expected="a session's id, or --take")
     clock_name = _parse_clock(clock)
-    chosen = get_format(to) if take is None else get_multi_session_format(to)
+    writer = get_format(to) if take is None else get_multi_session_format(to)
     part = Slice(start_s, end_s, _parse_names(columns))
     with (
         foottile.connect(server or SERVER, ca=ca) as source,
         show_progress(f"pulling {session or take}"),
     ):
         if session is None:
-            pulled = pull_take_export(source, str(take), out, part, chosen, options)
+            pulled = pull_take_export(source, str(take), out, part, writer, options)
         elif (
             part.is_whole_session
-            and chosen is PARQUET
+            and writer is PARQUET
             and not options.specified_names
             and clock_name == "node"
         ):
             pulled = pull_session(source, session, out)
         else:
-            pulled = pull_export(source, session, out, part, chosen, options, clock_name)
+            pulled = pull_export(source, session, out, part, writer, options, clock_name)
     if as_json:
         print_json(pulled)
     elif "resumed_bytes" not in pulled:

@@ -50,8 +50,8 @@ def stream_command(
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
-    chosen = next((each for each in POLICIES if each == policy), None)
-    if chosen is None:
+    policy_name = next((each for each in POLICIES if each == policy), None)
+    if policy_name is None:
         raise UsageError(f"--policy {policy!r}", expected=", ".join(POLICIES))
     names = [name.strip() for name in (columns or "").split(",") if name.strip()]
     printed = 0
@@ -59,7 +59,9 @@ def stream_command(
     try:
         with (
             foottile.connect(server or SERVER, ca=ca) as source,
-            source.live(node, names, policy=chosen, on_loss=lambda loss: remark(str(loss))) as live,
+            source.live(
+                node, names, policy=policy_name, on_loss=lambda loss: remark(str(loss))
+            ) as live,
         ):
             for batch in live:
                 rows = batch if frames is None else batch.slice(0, frames - printed)

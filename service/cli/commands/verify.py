@@ -188,7 +188,7 @@ def _format_export(report: ExportReport) -> str:
 
 def _format_ledger(ledger: Ledger | None) -> str:
     if ledger is None:
-        return "nothing can be said of its frames"
+        return "unknown frames"
     counts = {f"lost ({reason})": count for reason, count in ledger.lost.items()}
     counts["pending"] = ledger.pending
     text = f"{ledger.recorded} recorded"

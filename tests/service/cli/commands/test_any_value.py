@@ -274,3 +274,7 @@ def test_what_is_no_folder_is_refused_in_a_sentence(
     for name in PLACES.keys() - FOLDERS:
         PLACES[name](tmp_path / name)
         check(run_short(command, *given(IN_FOLDERS[command, option], name)), 1, 2)
+
+
+def test_an_option_is_passed_on_by_its_name_on_the_command_line() -> None:
+    assert "--map=grf_n=force" in FootOptions(map_="grf_n=force").to_arguments()

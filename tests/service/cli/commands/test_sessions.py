@@ -268,7 +268,7 @@ def test_a_part_that_could_not_be_measured_is_said_on_the_terminal(
     fault = faulty("stale", tile="T03", t_s=0.0, duration_s=0.5)
     (tmp_path / "faulty.toml").write_text(scene_text("standing") + fault)
     arguments = ("simulate", "--scene", "faulty.toml", "--seconds", 1, "--no-estimates")
-    said = "tile T03: its conversion time could not be measured, so it was given 3 ms"
+    said = "tile T03: conversion time not measurable; 3 ms assumed"
     assert said in run(*arguments).out
     assert json.loads(run(*arguments, "--json").out)["unmeasured"] == ["T03"]
     healthy = run("simulate", "--scene", "standing", "--seconds", 1, "--no-estimates", "--json")
