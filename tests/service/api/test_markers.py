@@ -236,7 +236,7 @@ def test_an_export_of_a_pulled_session_has_the_marks_and_names_those_it_has_not(
 ) -> None:
     out = tmp_path / f"out.{to}"
     assert command(monkeypatch, "export", pulled, "--format", to, "--out", out) == 0
-    assert "'years ago' is not in it: no frame within a second" in capsys.readouterr().err
+    assert "'years ago' is left out: no frame within a second" in capsys.readouterr().err
     asked = {} if to == "arrow" else {"markers": "true"}
     assert out.read_bytes() == session.data(format=to, **asked).content
     bare = tmp_path / f"bare.{to}"
@@ -272,7 +272,7 @@ def test_marks_without_a_clock_table_are_at_no_frame_and_that_is_said(
         command(monkeypatch, "export", pulled, "--format", "csv", "--out", tmp_path / "out.csv")
         == 0
     )
-    assert "'a stone' is not in it: there is no clock.parquet" in capsys.readouterr().err
+    assert "'a stone' is left out: there is no clock.parquet" in capsys.readouterr().err
 
 
 def test_a_damaged_table_of_events_is_an_error_and_marks_can_be_left_out(
