@@ -253,7 +253,9 @@ def test_a_damaged_comparison_is_said_to_be_and_the_page_stays(
     with browser.new_context() as context:  # its console says 422, and is right
         page = context.new_page()
         page.goto(url_of(compared, against="damaged"))
-        expect(page.locator("#beside-summary")).to_contain_text("it has no hash: it was cut off or edited")
+        expect(page.locator("#beside-summary")).to_contain_text(
+            "it has no hash: it was cut off or edited"
+        )
         expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
     (folder / "compare.json").unlink()
     folder.rmdir()
