@@ -276,7 +276,10 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 # --- the product's own protocol, and broken ones --------------------------------------------------
 
-WRITE_WHOLE = "from storage.durable_files import write_atomically\nwrite_atomically(Path('a'), b'new' * 400)\n"
+WRITE_WHOLE = """
+from storage.durable_files import write_atomically
+write_atomically(Path('a'), b'new' * 400)
+"""
 WITHOUT_FSYNC = """
 Path('.a.tmp').write_bytes(b'new' * 400)
 os.replace('.a.tmp', 'a')
