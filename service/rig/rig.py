@@ -80,10 +80,6 @@ _TRIAL_FRAMES = 100
 _REIDENTIFY_INTERVAL_NS = 2_000_000_000
 """Interval of attempts to identify a replaced part."""
 
-_SERVO_TIMEOUT_S = 0.1
-_EMULATED_SERVO_TIMEOUT_S = 1.0
-"""An emulated servo shares a machine that may be busy: that is not silence."""
-
 # Python's switch interval: an emulated servo's thread may hold the lock for about a bit at most.
 _SWITCH_S = 0.0002
 
@@ -270,11 +266,9 @@ class Rig:
         self, scene: ServoSection, world: World | None, stack: ExitStack
     ) -> ThreadedServoSource:
         port: str | Callable[[], str] = scene.port
-        timeout_s = _SERVO_TIMEOUT_S
         if port == EMULATED and world is not None:
             emulated = stack.enter_context(world.open_servo(scene, self._line_clock))
             port = lambda: emulated.port  # noqa: E731
-            timeout_s = _EMULATED_SERVO_TIMEOUT_S
         servo = open_servo(
             port,
             baudrate=scene.baudrate,
@@ -282,7 +276,6 @@ class Rig:
             servo_id=scene.id,
             model=scene.model,
             protocol=scene.protocol,
-            timeout_s=timeout_s,
             allows_missing_port=True,
         )
         stack.callback(servo.close)
