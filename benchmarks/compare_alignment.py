@@ -170,7 +170,7 @@ def row(name: str, draws: Draws) -> str:
             low, high = one.interval_95
             hits[i] += low <= value <= high
         errors.append(np.array([one.value for one in estimates]) - np.array(true.of(found)))
-        sigmas.append([math.hypot(one.sigma, one.own) for one in estimates])
+        sigmas.append([math.hypot(one.sigma, one.repeating_sigma) for one in estimates])
     count = len(sigmas)
     cells = [
         f"{100.0 * hit / count:.1f} % ({factor * sigma:.2g}, {factor * error:+.2g}{unit})"

@@ -30,7 +30,7 @@ STEPS = {
     "build": "writing it",
     "open": "Journal.open",
     "read": "Journal.read, all of it",
-    "seal": "SessionFrames into SessionWriter, raw",
+    "seal": "SessionFrames into SealedFileWriter, raw",
 }
 _CHUNK = 4096
 _SAMPLED = 2000

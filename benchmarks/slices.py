@@ -279,7 +279,7 @@ def command_cpu_s(path: Path, minutes: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out.arrow"
         words = [sys.executable, "-c", _RUN, "export", str(path), "--format", "arrow"]
-        words += ["--out", str(out), "--columns", COLUMN, "--no-marks"]
+        words += ["--out", str(out), "--columns", COLUMN, "--no-markers"]
         words += [f"--start-s={start_s}", f"--end-s={start_s + SECONDS}"]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
         if not len(_column(out.read_bytes())):

@@ -38,7 +38,7 @@ def forbid_compilation() -> Iterator[None]:
     """Context manager: forbid compilation in this thread; only cached machine code runs.
 
     Raises:
-        NotKeptError: a called function is not in the cache.
+        NotCompiledError: a called function is not in the cache.
     """
     _thread_state.cached_only = True
     try:

@@ -206,8 +206,6 @@ _CANNOT_SYNC_FOLDERS = {*(errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.E
 """Errors of file systems that sync files only, such as CIFS, vboxsf, WSL's and some of FUSE.
 
 PostgreSQL and SQLite ignore them, too: no program can do more there.
-
-PostgreSQL and SQLite go on after them, too: no program can do more there.
 """
 _warned_devices: set[int] = set()
 """File systems (`st_dev`) without folder sync that a warning was logged for."""

@@ -234,7 +234,7 @@ def test_an_installed_wheel_and_a_checkout_both_find_the_page(
     wheels: dict[str, Path], tmp_path: Path
 ) -> None:
     unpack(wheels["checkout"], tmp_path / "installed")
-    code = "import service.api.app; print(service.api.app.page_folder())"
+    code = "import service.api.app; print(service.api.app.find_page_folder())"
     for root, page in (
         (tmp_path / "installed", tmp_path / "installed" / "service" / "web"),
         (ROOT, ROOT / "web"),

@@ -156,7 +156,7 @@ class FrameSender:
         while True:
             oldest_s = next(iter(self._pending_pings.values()), None)
             if oldest_s is not None and time.monotonic() - oldest_s > _PING_TIMEOUT_S:
-                raise LinkError(f"the server has not on_pong for {_PING_TIMEOUT_S:g} s")
+                raise LinkError(f"the server has not answered for {_PING_TIMEOUT_S:g} s")
             await self.send_ping()
             await asyncio.sleep(_PING_INTERVAL_S)
 

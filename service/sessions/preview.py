@@ -110,7 +110,7 @@ class SessionPreview:
         """Return whether frames or tares before the present position have changed."""
         return not self._is_valid(self._position, inputs)
 
-    def rewind(self, inputs: SessionInputs) -> None:
+    def rewind_to_checkpoint(self, inputs: SessionInputs) -> None:
         """Drop everything after the last valid checkpoint."""
         all_, true = self.checkpoints.checkpoints, self.valid_checkpoints(inputs)
         kept_frames = self._bins.truncate(true[-1].estimated_frames)
@@ -223,14 +223,14 @@ class SessionPreviews:
         self._retry_after_s: dict[str, float] = {}
         self._one_at_a_time = threading.Lock()
 
-    def get_updated(self, inputs: SessionInputs) -> SessionPreview:
-        """Return a session's preview, updated with the present frames.
+    def advance_preview(self, inputs: SessionInputs) -> SessionPreview:
+        """Estimate more of a session for a bounded time, and return its preview.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
         """
         with self._one_at_a_time:
-            return self._get_updated(inputs)
+            return self._advance_preview(inputs)
 
     def get_quickly(self, inputs: SessionInputs) -> SessionPreview:
         """Return a session's preview without waiting for a long catch-up.
@@ -238,35 +238,37 @@ class SessionPreviews:
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
         """
-        so_far = self._previews.get(inputs.session.id)
-        return so_far if so_far is not None and so_far.is_catching_up else self.get_updated(inputs)
+        preview = self._previews.get(inputs.session.id)
+        if preview is not None and preview.is_catching_up:
+            return preview
+        return self.advance_preview(inputs)
 
     def discard(self, session_id: str) -> None:
         """Remove the preview of a session that is sealed or gone."""
         self._previews.pop(session_id, None)
         self._retry_after_s.pop(session_id, None)
 
-    def _get_updated(self, inputs: SessionInputs) -> SessionPreview:
+    def _advance_preview(self, inputs: SessionInputs) -> SessionPreview:
         name = inputs.session.id
-        so_far = self._previews.get(name)
-        if so_far is None:
-            so_far = self._previews[name] = SessionPreview(inputs, self._folder)
-        elif not so_far.can_use(inputs) or so_far.is_outdated(inputs):
+        preview = self._previews.get(name)
+        if preview is None:
+            preview = self._previews[name] = SessionPreview(inputs, self._folder)
+        elif not preview.can_use(inputs) or preview.is_outdated(inputs):
             if time.monotonic() < self._retry_after_s.get(name, 0.0):
-                return so_far
-            if so_far.can_use(inputs):
-                so_far.rewind(inputs)
+                return preview
+            if preview.can_use(inputs):
+                preview.rewind_to_checkpoint(inputs)
             else:
-                before, so_far = so_far, SessionPreview(inputs, self._folder)
-                so_far.start_repeated_work(before)
-                self._previews[name] = so_far
+                before, preview = preview, SessionPreview(inputs, self._folder)
+                preview.start_repeated_work(before)
+                self._previews[name] = preview
         self._previews.move_to_end(name)
         while len(self._previews) > _PREVIEWS_KEPT:
             self.discard(next(iter(self._previews)))
         try:
-            so_far.update(inputs)
+            preview.update(inputs)
         except FootTileError:
             self.discard(name)
             raise
-        self._retry_after_s[name] = time.monotonic() + _REST_FACTOR * so_far.repeated_work_s
-        return so_far
+        self._retry_after_s[name] = time.monotonic() + _REST_FACTOR * preview.repeated_work_s
+        return preview

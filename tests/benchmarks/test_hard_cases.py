@@ -78,7 +78,7 @@ def test_a_rate_is_bounded_as_that_of_a_poisson_process(hard: ModuleType, alarms
 def test_a_healthy_foot_has_a_line_for_each_share_of_lost_frames(
     hard: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hard, "UNSATURATED_MARGIN_SIGMAS", ({},))
+    monkeypatch.setattr(hard, "NOISES", ({},))
     monkeypatch.setattr(hard, "LADDERS", {"static": hard.LADDERS["static"]})
     lines = list(hard.healthy(Path(), 0.006, [0.0, 0.1], ["rolling"]))
     assert [line.split("|")[1:7] for line in lines[:2]] == [

@@ -65,8 +65,8 @@ def test_a_long_journal_is_built_opened_read_and_sealed_whole(
 ) -> None:
     hours, data = part("hours"), part("data")
     pattern = data.emulated(8, 1.5)
-    with hours.SessionWriter(tmp_path / "pattern.parquet", pattern.info, {}) as writer:
-        writer.append(pattern.frames, {})
+    with hours.SealedFileWriter(tmp_path / "pattern.parquet", pattern.info, {}) as writer:
+        writer.append_frames(pattern.frames, {})
     steps = [hours.step(name, tmp_path, 0.001) for name in hours.STEPS]
     assert {step.frames for step in steps} == {round(3.6 * data.FULL_RATE_HZ)}
 

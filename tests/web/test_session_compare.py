@@ -189,13 +189,15 @@ def test_the_difference_of_two_sessions_has_the_interval_of_a_welch_test(
           const cell = document.querySelector("[data-figure=peak] td:last-child").textContent;
           const moments = (values) => module.momentsOf(stances(values), "peak_grf_n");
           const { mean, half } = module.differenceOf(moments(own), moments(other));
-          return { textContent, cell, mean, half };
+          const same = module.differenceOf(moments([9, 9, 9]), moments([8, 8, 8])).half;
+          return { textContent, cell, mean, half, same };
         })""",
         values,
     )
     welch = scipy.stats.ttest_ind(values[1], values[0], equal_var=False).confidence_interval(0.95)
     assert found["mean"] == pytest.approx((welch.low + welch.high) / 2)
     assert found["half"] == pytest.approx((welch.high - welch.low) / 2, rel=0.03)
+    assert np.isnan(found["same"]), "no scatter is no certainty"
     assert f"0.8 ± {found['half']:.1f}" in found["textContent"]
     assert not re.search(r"[0-9]", found["cell"])  # two stances do not bound their scatter
 

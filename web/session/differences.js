@@ -18,12 +18,12 @@ export function momentsOf(stances, name) {
 const quantileOf = (freedom) => Z + (Z ** 3 + Z) / (4 * freedom) + (5 * Z ** 5 + 16 * Z ** 3 + 3 * Z) / (96 * freedom ** 2)
   + (3 * Z ** 7 + 19 * Z ** 5 + 17 * Z ** 3 - 15 * Z) / (384 * freedom ** 3);
 
-/** Return `other` minus `own` and half of its 95 % interval (Welch); null: too few stances. */
+/** Return `other` minus `own` and half of its 95 % interval (Welch), NaN without scatter; null: too few stances. */
 export function differenceOf(own, other) {
   if (Math.min(own.count, other.count) < STANCES_MIN) return null;
   const [a, b] = [own.variance / own.count, other.variance / other.count];
   const freedom = (a + b) ** 2 / (a ** 2 / (own.count - 1) + b ** 2 / (other.count - 1));
-  return { mean: other.mean - own.mean, half: a + b > 0 ? quantileOf(freedom) * Math.sqrt(a + b) : 0 };
+  return { mean: other.mean - own.mean, half: quantileOf(freedom) * Math.sqrt(a + b) };
 }
 
 /** Fill the table with whole stances of this and another session. @param {string} name of the other */

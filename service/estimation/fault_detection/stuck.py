@@ -100,7 +100,7 @@ def compute_run_limits(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
 
 @cache  # computed at every tare, during which a server sends no frames
 def _compute_repeat_chances() -> tuple[Floats, Floats]:
-    """Compute the largest chance of a repeat, by either share (see `limits`)."""
+    """Compute the largest chance of a repeat, by either share (see `StuckLimits`)."""
     shares = np.arange(SHARE_STEPS + 1) / SHARE_STEPS
     steps = np.geomspace(_STEP_MAX, _STEP_MIN, 2000)
     by_repeats = np.interp(shares, compute_share_apart(steps, 0), steps)

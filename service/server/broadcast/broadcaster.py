@@ -60,7 +60,7 @@ class Subscriber:
                 self._socket.write_framed(tick.framed)
                 return
             self._backlog, self._backlog_since_s = PendingUpdate(), now_s
-        self._backlog.put_back(tick.update)
+        self._backlog.add_update(tick.update)
         if is_ready:
             self._socket.write_framed(
                 frame_texts(self._backlog.pop_update().encode_messages(tick.ages_ms))

@@ -156,8 +156,8 @@ class PendingUpdate:
         self._progress_by_session, self._dropped, self._summaries = {}, {}, {}
         return news
 
-    def put_back(self, update: Update) -> None:
-        """Put back an update that could not be sent."""
+    def add_update(self, update: Update) -> None:
+        """Add an update that is newer than what is there."""
         self._notices.extend(update.notices)
         self._progress_by_session |= update.progress_by_session
         for node, dropped in update.dropped.items():

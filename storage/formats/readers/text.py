@@ -208,7 +208,7 @@ def parse_columns(
 ) -> dict[str, Column]:
     """Return the numbers of the needed columns, without trailing empty lines.
 
-    The decimal mark is detected if `decimal` is None.
+    The decimal mark is detected if `decimal_mark` is None.
 
     Raises:
         FileFormatError: lines differ in their number of cells, a cell is no number, or there are

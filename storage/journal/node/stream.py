@@ -198,7 +198,7 @@ class NodeStream:
             self._lost.add(numbers - (self._union_of_acked() - needed_here), reason)
 
     def recent_batches(self, from_seq: int) -> list[EncodedBatch]:
-        """Return the newest batches in memory with frames from `seq` on, oldest first."""
+        """Return the newest batches in memory with frames from `from_seq` on, oldest first."""
         with self._lock:
             found = list(
                 takewhile(lambda b: b.seq_last >= from_seq, reversed(self._recent.batches))

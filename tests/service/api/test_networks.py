@@ -78,7 +78,7 @@ try:
     token = open(os.environ["DATA"] + "/token").read()
     for url in urls:
         with foottile.connect(url, token) as server:
-            print(server.nodes(), len(server.ticket()["urls"]))
+            print(server.nodes(), len(server.create_invite()["urls"]))
             try:
                 next(server.live("nobody"))
             except foottile.UsageError as error:

@@ -162,7 +162,7 @@ def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(
     if tared:
         recorded.tares.append(taken_at(0, 0.0))
     so_fars = SessionPreviews(folder)
-    so_far = so_fars.get_updated(recorded.sources())
+    so_far = so_fars.advance_preview(recorded.sources())
     try:
         for what, n in [*happened, ("look", 0), ("slice", 0), ("slice", 100)]:
             match what:
@@ -172,7 +172,7 @@ def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(
                     journal, frames = recorded.late.pop(0)
                     journal.append_new_frames(frames)
                 case "look":
-                    so_far = so_fars.get_updated(recorded.sources())
+                    so_far = so_fars.advance_preview(recorded.sources())
                 case "tare":
                     at = max(
                         [PERIOD_NS * (recorded.now + n), *(t.t_ns - 10**18 for t in recorded.tares)]
@@ -186,7 +186,7 @@ def test_any_slice_at_any_moment_is_that_of_the_whole_in_one_go(
                     so_it_is(so_far, recorded.sources(), part)
         so_it_is(so_far, recorded.sources(), Slice())
         assert_the_overview_is_as_in_one_go(
-            so_fars.get_updated(recorded.sources()), recorded.sources()
+            so_fars.advance_preview(recorded.sources()), recorded.sources()
         )
     finally:
         recorded.close()
@@ -243,7 +243,7 @@ def read_by(
 def test_what_a_slice_costs_does_not_depend_on_where_it_is(
     long: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    so_far = SessionPreviews(tmp_path).get_updated(long.sources())
+    so_far = SessionPreviews(tmp_path).advance_preview(long.sources())
     apart = so_far.checkpoints.distance_frames
     assert len(so_far.checkpoints.checkpoints) <= 6
     assert 1000 <= apart < 4000
@@ -263,14 +263,14 @@ def test_after_frames_that_came_late_only_what_is_behind_them_is_estimated_anew(
     recorded.come(4000)
     recorded.come(100, late=True)
     recorded.come(900)
-    so_far = so_fars.get_updated(recorded.sources())
+    so_far = so_fars.advance_preview(recorded.sources())
     before = so_far.checkpoints.checkpoints
     journal, frames = recorded.late.pop()
     journal.append_new_frames(frames)
     true = so_far.valid_checkpoints(recorded.sources())
     assert 4000 - 2 * EVERY < true[-1].fed_frames <= 4000
     assert list(true) == list(before[: len(true)])
-    assert so_fars.get_updated(recorded.sources()) is so_far
+    assert so_fars.advance_preview(recorded.sources()) is so_far
     assert so_far.checkpoints.checkpoints[: len(true) - 2] == before[: len(true) - 2]
     assert_the_overview_is_as_in_one_go(so_far, recorded.sources())
     so_it_is(so_far, recorded.sources(), Slice(8.1, 8.3))
@@ -287,7 +287,7 @@ def test_a_disk_that_is_full_or_forgets_costs_time_and_no_frame(
     so_fars = SessionPreviews(tmp_path)
     if failing == "put":
         monkeypatch.setattr(ScratchFile, "append", refuse)
-    so_far = so_fars.get_updated(long.sources())
+    so_far = so_fars.advance_preview(long.sources())
     assert (len(so_far.checkpoints.checkpoints) == 1) == (failing == "put")
     if failing == "get":
         monkeypatch.setattr(ScratchFile, "read", refuse)
@@ -299,12 +299,12 @@ def test_without_a_tare_there_are_raw_frames_and_once_there_is_one_estimates(
 ) -> None:
     recorded, so_fars = Recorded(tmp_path), SessionPreviews(tmp_path)
     recorded.come(300)
-    raw = so_fars.get_updated(recorded.sources())
+    raw = so_fars.advance_preview(recorded.sources())
     so_it_is(raw, recorded.sources(), Slice(0.3, 0.4))
     assert not raw.has_estimates
     recorded.tares.append(taken_at(2_000_000 * 200, 0.0))
     so_it_is(raw, recorded.sources(), Slice(0.3, 0.4))
-    estimated = so_fars.get_updated(recorded.sources())
+    estimated = so_fars.advance_preview(recorded.sources())
     assert estimated.has_estimates
     so_it_is(estimated, recorded.sources(), Slice(0.3, 0.4))
     recorded.close()
@@ -322,7 +322,7 @@ def test_a_clock_that_was_set_back_has_its_parts_one_behind_the_other(
             recorded.begin_part(150)
         recorded.come(1)
         if come == looked - 1:
-            so_far = so_fars.get_updated(recorded.sources())
+            so_far = so_fars.advance_preview(recorded.sources())
     for begin_s, number in ((0.2, 0), (0.42, 1)):
         part = Slice(begin_s, begin_s + 0.02, ("part",))
         so_it_is(so_far, recorded.sources(), part)

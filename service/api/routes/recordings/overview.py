@@ -142,7 +142,7 @@ async def _preview_response(
     part = Slice(query.start_s, query.end_s)
 
     def make() -> bytes:
-        so_far = server.previews.get_updated(sources)
+        so_far = server.previews.advance_preview(sources)
         seen, serials = so_far.get_bins(part, query.points), list(sources.info.serials)
         flags = {"provisional": True, "catching_up": so_far.is_catching_up}
         return _encode(session, seen, serials, flags, query, as_arrow=as_arrow, as_gzip=as_gzip)

@@ -51,7 +51,7 @@ def test_what_people_read_says_the_same(run: Run) -> None:
 def test_a_rate_that_will_not_hold_is_said_with_what_would(run: Run) -> None:
     found = run("doctor", "--scene", "standing", "--rate-hz", 700, "--json").printed(3)
     assert found["holds"] is False
-    assert "700 frames/s asked for will not hold: ask for 531 or less" in found["verdict"]
+    assert "700 frames/s requested will not hold: ask for 531 or less" in found["verdict"]
 
 
 def test_a_rate_that_another_schedule_would_hold_is_said_with_its_name(doctor: Doctor) -> None:
@@ -63,7 +63,7 @@ def test_a_rate_that_another_schedule_would_hold_is_said_with_its_name(doctor: D
 def test_the_raspberry_pi_that_runs_at_five_eighths_is_recognised(doctor: Doctor) -> None:
     found = doctor(scene_text("standing") + "\n[emulation]\nscl_part = 0.625\n").printed()
     assert found["scl_hz"] == pytest.approx(250_000, rel=1e-3)
-    assert "runs at 250 kHz where 400 are asked for" in found["verdict"]
+    assert "runs at 250 kHz where 400 are requested" in found["verdict"]
     assert "core_freq" in found["verdict"]
 
 

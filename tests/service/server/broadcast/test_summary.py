@@ -329,8 +329,8 @@ def test_what_was_taken_and_not_told_is_told_later_as_if_it_had_not_been_taken(
             summary.add_progress("bench", {"session": {"frames": seq}})
         seq += rows
         if at in ticks:
-            missed.put_back(feed.pop_update())
-    missed.put_back(feed.pop_update())
+            missed.add_update(feed.pop_update())
+    missed.add_update(feed.pop_update())
     once, again = taken(told_once), taken(missed)
     assert told_or_dropped(once) == told_or_dropped(again) == seq
     if period_ns == PERIOD_NS and seq < SUMMARY_NS // PERIOD_NS:
