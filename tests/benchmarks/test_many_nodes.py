@@ -18,7 +18,7 @@ def played(
 ) -> str:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     many_nodes = importlib.import_module("many_nodes")
-    monkeypatch.setattr(many_nodes, "SEAL_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(many_nodes, "SETTLE_S", 0.5)
     monkeypatch.setattr(sys, "argv", ["many_nodes.py", *options])
     many_nodes.main()
     return capsys.readouterr().out

@@ -5,7 +5,7 @@ import { ask, edit } from "../common/dialogs.js";
 import { frames } from "../common/losses.js";
 import { isOperator } from "../common/login.js";
 import { menuButton } from "../common/menu.js";
-import { notice, quietly, withdraw } from "../common/notices.js";
+import { notice, quietly } from "../common/notices.js";
 import { byId, el, setData, setText } from "../common/text.js";
 import { Chosen } from "./chosen.js";
 import { counts, head, makeRow, makeTakeRow } from "./row.js";
@@ -103,7 +103,6 @@ export class Sessions {
 
   /** Add or replace a session. @param {Session} session */
   update(session) {
-    withdraw(session.id); // restored
     if (!isIncluded(session, this.filter)) return this.drop(session.id);
     // Outdated response: a sealed session stays sealed.
     if (this.sessions.get(session.id)?.state === "sealed" && session.state !== "sealed") return null;

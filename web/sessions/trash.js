@@ -2,7 +2,7 @@
 
 import * as api from "../common/api.js";
 import { ask } from "../common/dialogs.js";
-import { notice, quietly } from "../common/notices.js";
+import { notice, quietly, withdraw } from "../common/notices.js";
 import { byId, bytes, el, localTime, setText } from "../common/text.js";
 
 /** List of deleted sessions. */
@@ -43,6 +43,7 @@ export class Trash {
   restore(session) {
     return quietly(async () => {
       const restored = await api.restoreSession(session.id);
+      withdraw(session.id); // here, since messages of the live socket may be of before the deletion
       this.onRestored(restored);
       notice(`Restored “${restored.name}”.`);
       await this.load();
