@@ -157,7 +157,7 @@ class PendingUpdate:
         return news
 
     def add_update(self, update: Update) -> None:
-        """Add an update that is newer than what is there."""
+        """Add an update that is newer than the present content."""
         self._notices.extend(update.notices)
         self._progress_by_session |= update.progress_by_session
         for node, dropped in update.dropped.items():
