@@ -186,8 +186,10 @@ def test_played_it_ends_with_the_last_frame_and_space_holds_it(
     expect(replay).not_to_have_attribute("data-seq", str(stored["seq"][0]))
     page.keyboard.press(" ")
     expect(play).to_have_attribute("data-going", "false")
+    two_pictures = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    page.evaluate(two_pictures)  # the last step before the stop is drawn with the next picture
     held = page.locator("#readout").get_attribute("data-time-s")
-    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    page.evaluate(two_pictures)
     assert page.locator("#readout").get_attribute("data-time-s") == held
     page.click("[data-speed='4']")
     expect(page.locator("[data-speed='4']")).to_have_attribute("aria-pressed", "true")
