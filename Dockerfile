@@ -7,9 +7,10 @@
 
 FROM python:3.12-slim-bookworm AS build
 WORKDIR /src
-COPY requirements.lock ./
+ARG LOCK=requirements.lock
+COPY $LOCK ./
 # Every download is compared with its hash here; what follows takes nothing from anywhere else.
-RUN pip download --no-cache-dir --require-hashes -r requirements.lock -d /wheels
+RUN pip download --no-cache-dir --require-hashes -r $LOCK -d /wheels
 # .dockerignore names what there is to copy.
 COPY . .
 ARG EXTRAS=server,emulation

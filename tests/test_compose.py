@@ -55,8 +55,9 @@ def compose(tmp_path: Path) -> Iterator[Compose]:
         run(file, "down", "--volumes", "--timeout", "20")
 
 
-def built(tag: str, extras: str) -> None:
-    words = ("build", "--network", "host", "--build-arg", f"EXTRAS={extras}", "-t", tag, str(ROOT))
+def built(tag: str, extras: str, lock: str = "requirements.lock") -> None:
+    arguments = ("--build-arg", f"EXTRAS={extras}", "--build-arg", f"LOCK={lock}")
+    words = ("build", "--network", "host", *arguments, "-t", tag, str(ROOT))
     subprocess.run(["docker", *words], check=True, capture_output=True)
 
 
@@ -79,7 +80,7 @@ def test_a_cluster_comes_up_lets_nobody_in_from_outside_and_does_the_work(
     compose: Compose, tmp_path: Path
 ) -> None:
     file = ROOT / "deploy" / "docker-compose.yml"
-    built("foottile-archive", "server,archive")
+    built("foottile-archive", "server,archive", "requirements-dev.lock")
     for number in range(4):
         sealed(tmp_path / "archive", number, 20.0, 30.0)
     for path in (tmp_path / "archive", *(tmp_path / "archive").rglob("*")):

@@ -114,7 +114,7 @@ def test_what_is_missing_is_named_with_the_extra_that_brings_it(
 @pytest.mark.parametrize(
     ("lock", "left_out"),
     [
-        ("requirements.lock", {"rig", "bench", "opensim"}),
+        ("requirements-dev.lock", {"rig", "bench", "opensim"}),
         ("requirements-lowest.lock", {"rig", "bench", "opensim", "dev"}),
     ],
 )
@@ -124,6 +124,15 @@ def test_a_lock_is_compiled_from_every_extra_but_those_that_say_why_not(
     command = (ROOT / lock).read_text().splitlines()[1]
     for extra in PROJECT["optional-dependencies"].keys() - left_out:
         assert f"--extra {extra}" in command
+
+
+def test_all_locks_of_a_checkout_pin_the_same_versions() -> None:
+    demo, dev = (
+        set(re.findall(r"^[a-z0-9-]+==\S+", (ROOT / lock).read_text(), re.MULTILINE))
+        for lock in ("requirements.lock", "requirements-dev.lock")
+    )
+    assert len({pin.split("==")[0] for pin in demo}) <= 60
+    assert demo - dev == set()
 
 
 def test_the_lowest_versions_that_are_declared_are_those_of_their_lock() -> None:
