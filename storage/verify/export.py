@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,7 +52,7 @@ class ExportReport:
 
 
 def read_export(path: Path) -> ExportReport | None:
-    """Read an export to its end.
+    """Recognise an export; read Parquet and Arrow to their end, and both ends of CSV.
 
     Returns:
         None if it is no export: a sealed session, another file, or too damaged to tell.
@@ -116,7 +117,12 @@ def _read_csv_export(path: Path) -> ExportReport | None:
     if not names or not all(name in known_names or _TILE_COLUMN.match(name) for name in names):
         return None
     first = dict(zip(names, *cells, strict=False)) if cells else {}
-    return ExportReport(path, "csv", _parse_json_object(first.get(EXPORT_COLUMN, "")))
+    report = ExportReport(path, "csv", _parse_json_object(first.get(EXPORT_COLUMN, "")))
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        if file.read() != b"\n":
+            report.problems.append("its last row is cut off; export it again")
+    return report
 
 
 def _parse_source(metadata: dict[bytes, bytes]) -> dict[str, Any]:

@@ -12,11 +12,10 @@ import pyarrow.parquet as pq
 from devices.errors import FileFormatError
 from devices.input_files import check_regular_file
 from storage.formats.readers.table import INSTANT_COLUMN, STANDARD_UNITS, ForceTable
-from storage.schema import COLUMNS_BY_NAME
+from storage.parquet_hash import FORMAT_KEY
+from storage.schema import ARRAY_INFO_KEY, COLUMNS_BY_NAME
 from storage.sessions.reader import SealedFileReader
 from storage.sessions.time_axis import NODE_AXIS, TimeAxis
-
-SESSION_KEY = b"foottile.format"
 
 
 def read_session_table(path: Path, extra_names: Collection[str]) -> ForceTable | None:
@@ -81,6 +80,7 @@ def is_sealed_session(path: Path) -> bool:
         return False
     try:
         check_regular_file(path)
-        return SESSION_KEY in (pq.read_schema(path).metadata or {})
+        # Markers, clocks and stances have the format too; tiles are a session's alone.
+        return {FORMAT_KEY, ARRAY_INFO_KEY} <= (pq.read_schema(path).metadata or {}).keys()
     except (OSError, pa.ArrowException) as error:
         raise FileFormatError(f"cannot be read: {error}", where=str(path)) from error

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from devices.errors import FileFormatError, FootTileError, UsageError
 from storage.formats.readers.sample_times import respace_repeated_times
 from storage.formats.reference import ReferenceData, ReferenceOptions, read_reference
+from storage.hashed_table import write_hashed_table
 
 LAB = ReferenceOptions(
     {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "COPx", "cop_y_m": "COPy"},
@@ -68,6 +69,13 @@ def test_parquet_is_read_as_csv_is(tmp_path: Path) -> None:
     assert found.grf_n.tolist() == [1.0, 9.0]
     assert found.cop_m is not None
     np.testing.assert_allclose(found.cop_m, [[0.001, 0.002], [np.nan, np.nan]])
+
+
+def test_a_table_of_ours_that_is_no_session_is_read_as_any_other(tmp_path: Path) -> None:
+    path = tmp_path / "stances.parquet"
+    write_hashed_table(path, pa.table({"Time": [0.0, 0.5], "Fz": [1, 9]}))
+    stated = ReferenceOptions({"time_s": "Time", "grf_n": "Fz"}, {"grf": "N"}, "+")
+    assert read_reference(path, stated).grf_n.tolist() == [1.0, 9.0]
 
 
 MOT = """ground reactions
