@@ -133,7 +133,7 @@ class Estimator:
 
         Args:
             plan: plan of the estimator that the state comes from.
-            state: answer of `kept`, of the same version.
+            state: result of `state_dict`, of the same version.   (not my package)
 
         Raises:
             ValueError: the state is of another plan; compiled code would read beyond its memory.

@@ -34,7 +34,7 @@ class DataFolder:
     """Data folder, locked by one server until `close`.
 
     The server waits for a folder that was moved or unmounted; meanwhile nothing is written at its
-    path. The folder may come back mounted again, or as a copy, which its id proves: `ensure_open`.
+    path. The folder may come back mounted again, or as a copy: its id is compared.
 
     Args:
         path: created if absent.
@@ -59,7 +59,7 @@ class DataFolder:
             raise
 
     def check_in_place(self) -> None:
-        """Check that the folder in use is at its path. Runs in any thread.
+        """Check that the folder in use is still at its path. Runs in any thread.
 
         Raises:
             FolderGoneError: it is not; the error names the folder that is there now.
@@ -77,7 +77,7 @@ class DataFolder:
         )
 
     def reopen(self) -> None:
-        """Lock the folder at the path if it has the same id: mounted again, or a copy.
+        """Lock the folder at the path anew; it must have the same id: mounted again, or a copy.
 
         Files that are open in the former folder are lost: the caller has closed them all.
 

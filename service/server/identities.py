@@ -72,7 +72,7 @@ class NodeIdentities:
         """Damage found, and the consequence, as text."""
 
     def read_secret(self, node: str) -> str | None:
-        """Read the secret of a node; None if unknown or damaged.
+        """Read the secret of a node; None if there is none, or if it is damaged and set aside.
 
         Args:
             node: its name, valid as a folder name.
@@ -104,10 +104,10 @@ class NodeIdentities:
         )
 
     def verify_claim(self, claim: IdentityClaim, now_t_ns: int) -> bool:
-        """Return whether a claim is proven; False if the node has no secret here.
+        """Refuse a false claim; return whether it is proven, False if the node has no secret here.
 
         Raises:
-            HangUp: the name belongs to another machine.
+            CloseConnection: (same text)
             StorageError: as `read_secret`.
         """
         node, answer = claim.node, claim.proof
@@ -126,7 +126,7 @@ class NodeIdentities:
         )
 
     def store_first_secret(self, claim: IdentityClaim) -> None:
-        """Store the secret of a first contact. A failure is logged: frames matter more."""
+        """Try to store the secret of a first contact; a failure is logged: frames matter more."""
         try:
             if claim.proof.secret is not None:
                 self._store_secret(claim.node, claim.proof.secret)

@@ -101,7 +101,7 @@ class ServerNode:
 
     @property
     def info(self) -> ArrayInfo:
-        """Description of the present stream's array."""
+        """Description of the present stream's array, from the last hello."""
         return self.hello.array_info
 
     @property
@@ -144,7 +144,7 @@ class ServerNode:
 
     @property
     def lost_by_reason(self) -> dict[str, int]:
-        """Number of lost frames of the present stream, by reason."""
+        """Number of lost frames of the present stream, by reason; unexplained: node_restarted."""
         unobtainable = self.missing_frames - self.present_stream.obtainable
         named = {
             why: lost.count
@@ -172,7 +172,7 @@ class ServerNode:
         return self._rate_meter.rate_hz(self.info.nominal_rate_hz, silent_ns)
 
     def on_hello(self, hello: Hello, now_t_ns: int) -> None:
-        """Update streams and estimates from hello of a node that has connected.
+        """Update streams and estimates from hello; the caller sets `is_connected`.
 
         Args:
             hello: its message; every known stream in it has the array of before.

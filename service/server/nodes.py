@@ -124,7 +124,7 @@ class NodeRegistry:
         return node
 
     def remove(self, name: str) -> None:
-        """Remove a node whose first hello could not be accepted."""
+        """Remove a node whose first hello could not be accepted from memory; its files stay."""
         self._nodes.pop(name, None)
 
     def _create_node(self, hello: Hello) -> ServerNode:

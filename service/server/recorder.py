@@ -51,7 +51,7 @@ class Recorder:
             store.cache(self._with_clock_offsets(session))
 
     def on_node_hello(self, node: ServerNode) -> None:
-        """Add missing clock measurements to the sessions of a node that has connected.
+        """Add missing clock measurements to a node's unsealed sessions, in memory.
 
         Those are missing after a first contact, and for streams into which a session was extended.
         """
@@ -159,7 +159,7 @@ class Recorder:
 
         Args:
             session_id: id of the session.
-            if_revision: expected `said_of`; None: any.
+            if_revision: expected `user_fields_revision`; None: any.
 
         Raises:
             UnknownError: no session has this id.
@@ -192,7 +192,7 @@ class Recorder:
         return book.get_session(session_id)
 
     def record_clock_offset(self, node: ServerNode, row: ClockSample, now_t_ns: int) -> None:
-        """Record a measurement of a node's clock, in its stream and its sessions.
+        """Record a plausible measurement of a node's clock, in its stream and its sessions.
 
         The stream's log has it already; sessions are saved with their next change. A measurement
         whose server time is far from the present time is dropped, as is one that is far from the

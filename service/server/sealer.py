@@ -64,7 +64,7 @@ class SessionSealer:
         self._failures: dict[str, str] = {}
 
     def on_node_hello(self, node: ServerNode) -> None:
-        """Extend the sessions of a node into the streams that its hello lists.
+        """Extend the unsealed sessions of a node into the streams that its hello lists.
 
         If its tiles have changed, a new session continues the recording: a file describes one
         array.
@@ -84,7 +84,7 @@ class SessionSealer:
         return current_inputs(session, self._nodes.get(session.node), exact=self._exact)
 
     def poll(self) -> None:
-        """Find the ends of stopped sessions, and seal those whose frames are all here."""
+        """Find the ends of stopped sessions, and start to seal those whose frames are all here."""
         for session in self._store.list_unsealed():
             if time.monotonic() < self._retry_after_s.get(session.id, 0.0):
                 continue
@@ -102,7 +102,7 @@ class SessionSealer:
         return self._store.get_session(session_id)
 
     async def close(self) -> None:
-        """Wait for the sessions that are being sealed."""
+        """Wait until the sessions that are being sealed are sealed; none is cancelled."""
         await asyncio.gather(*self._sealing.values(), return_exceptions=True)
 
     def is_sealing(self, session_id: str) -> bool:

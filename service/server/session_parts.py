@@ -93,7 +93,7 @@ def mark_stopped(session: Session, node: ServerNode | None) -> Session:
 
 
 def extend_parts(session: Session, node: ServerNode) -> list[Session]:
-    """Extend the session's parts to the present end of its node's streams.
+    """Extend the session's parts to the present end of its node's streams; nothing is saved.
 
     Returns:
         The session, and further ones that continue it where the node came back with other tiles.
@@ -170,7 +170,7 @@ def iterate_needed_parts(session: Session, node: ServerNode | None) -> Iterator[
 
 
 def clock_offsets_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
-    """Return the clock measurements from the beginning of a part on, and the last before it."""
+    """Return the present stream's clock measurements since a part begins, and the last before."""
     begin_t_ns = (
         journal.find_t_ns_near(part.seq_first, is_upper=False)
         if (journal := node.journal)
@@ -332,7 +332,7 @@ def has_unreadable_journal(session: Session, node: ServerNode | None) -> bool:
 
 
 def is_complete(session: Session, node: ServerNode | None) -> bool:
-    """Return whether all obtainable frames are stored and synced."""
+    """Return whether the end is found, and all obtainable frames are stored and synced."""
     if session.parts[-1].seq_last is None or has_unreadable_journal(session, node):
         return False
     for stream_id, numbers in group_numbers_by_stream(session.parts).items():

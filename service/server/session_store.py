@@ -32,7 +32,7 @@ log = logging.getLogger("foottile.book")
 
 
 def load_or_rebuild(folder: SessionsFolder) -> tuple[list[Session], dict[str, str]]:
-    """Load all sessions, rebuilding damaged ones; return them, and errors by id."""
+    """Load all sessions, and rebuild damaged ones on the disk; return them, and errors by id."""
     found, unreadable = folder.load_all()
     errors: dict[str, str] = {}
     for session_id, error in unreadable.items():
@@ -114,7 +114,7 @@ class Trash:
         return self._sessions.remove(session_id)
 
     def purge(self) -> list[Path]:
-        """Remove all sessions for good; return their folders, to be deleted by `delete_files`.
+        """Rename the folders of all sessions for `delete_files`, which deletes them; return them.
 
         Raises:
             StorageError: a folder cannot be moved; its session and those after it are still in the
@@ -259,7 +259,7 @@ class SessionStore:
 
         Args:
             session_id: id of the session.
-            if_revision: expected `said_of`; None: any.
+            if_revision: expected `user_fields_revision`; None: any.
             changes: new values by name.
 
         Raises:

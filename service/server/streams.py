@@ -225,14 +225,14 @@ class ServerStream:
         return requested & needed
 
     def on_present(self, hello: Hello, now_t_ns: int) -> None:
-        """Handle hello of the node for which this is the present stream."""
+        """Apply hello of which this is the present stream: bounds, obtainable frames, losses."""
         self.limit = StreamLimit.from_hello(hello, now_t_ns)
         self.node_ranges = Intervals((*hello.stored, (hello.next_seq, NO_END)))
         self._update_notes(hello.lost, next_seq=None)
         self._extend_start(min((first for first, _ in hello.stored), default=hello.next_seq))
 
     def on_earlier(self, report: EarlierStream) -> None:
-        """Handle the node's report of how this stream ended."""
+        """Apply the node's report of how this stream ended: end, obtainable frames, losses."""
         self.node_ranges = Intervals(report.stored)
         self.first_t_ns = report.t_ns_first
         # A node that was killed may have an older count than it had reported.
@@ -247,7 +247,7 @@ class ServerStream:
         )
 
     def on_unlisted(self) -> None:
-        """Handle a hello without this stream: nothing more will come; the next sync closes it."""
+        """Retire the stream, which hello lacks: nothing more will come; the next sync closes it."""
         self.node_ranges = Intervals()
         if self.journal is not None:
             self.journal.retire_open_segments()
@@ -260,7 +260,7 @@ class ServerStream:
         )
 
     def check_frames(self, frames: FrameBatch, now_t_ns: int) -> str:
-        """Check received frames; frames that break a rule are never requested again.
+        """Check received frames; those that break a rule are lost as refused: never request them.
 
         Args:
             frames: of one message.

@@ -104,7 +104,7 @@ class Weighing:
 
     @property
     def number(self) -> int:
-        """Index of the weight that is next, or on the tile."""
+        """Index in `weights` of the weight that is next, or on the tile."""
         return len(self.held)
 
     @property
@@ -140,7 +140,7 @@ class Weighing:
                 return f"All weights are done: unload {tile}"
 
     def push(self, t_ns: npt.NDArray[np.int64], kpa: Floats) -> list[Action]:
-        """Take readings of the tile, and return the changes of markers, in order.
+        """Feed readings of the tile; return the changes of markers, in order.
 
         Args:
             t_ns: (n,), instants, rising from call to call.

@@ -145,7 +145,7 @@ class Weighings:
         return found
 
     def start(self, node: ServerNode, plan: WeighingPlan) -> NodeWeighing:
-        """Begin to record, and to follow the pressure of the first tile.
+        """Start a recording, and the guided calibration of the first tile in it.
 
         Raises:
             StateError: one is under way on this node, or the node cannot be recorded now.
@@ -195,7 +195,7 @@ class Weighings:
         return self._of[node.name]
 
     def push(self, node: ServerNode, due: Sequence[EstimatedBatch]) -> None:
-        """Take the newest frames of a node; cheap if none of its tiles is calibrated."""
+        """Feed the newest frames of a node to its weighing; cheap if there is none."""
         weighing = self._of.get(node.name)
         if weighing is None or node.stream_id != weighing.stream_id:
             return
@@ -221,7 +221,7 @@ class Weighings:
         return weighing
 
     async def end(self, node: str, session_id: str | None = None) -> None:
-        """Cancel the weighing of a node, or forget one that has ended; its recording stays.
+        """Cancel the weighing of a node and stop its recording, or remove one that has ended.
 
         Raises:
             UnknownError, ChangedError: as `get`.
@@ -231,7 +231,7 @@ class Weighings:
         await self._cancel(weighing)
 
     def check(self, node: ServerNode, now_s: float) -> None:
-        """End the weighing of a node without progress, without recording, or that has left.
+        """End, as failed, the weighing of a node without progress, frames or recording.
 
         Args:
             node: of the server.

@@ -80,7 +80,7 @@ class Checkpoints:
         newest.end_ns = max(newest.end_ns, int(t_ns.max()))
 
     def add_checkpoint(self, checkpoint: Checkpoint, state: Columns | None) -> None:
-        """Add a checkpoint; without effect if the disk is full.
+        """Try to add a checkpoint; without effect if the disk is full.
 
         Args:
             checkpoint: checkpoint behind all present ones.

@@ -94,7 +94,7 @@ class ComparisonSeriesCache:
         self._one_at_a_time = threading.Lock()
 
     def get(self, folder: Path) -> ComparisonSeries | None:
-        """Return the series of a comparison; None: it has none.
+        """Return the series of a comparison, read if it is not cached; None: it has none.
 
         Raises:
             DamagedFileError: the file is damaged.

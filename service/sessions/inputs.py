@@ -32,7 +32,7 @@ class SessionInputs:
         journals: journals by stream id.
         calibration: calibration for estimates; None: raw frames only.
         problem: reason why there is none.
-        tares: tares in force, oldest first; `Tare.lost` where one is lost.
+        tares: tares in force, oldest first; `Tare.make_lost` where one is lost.
         notes: further metadata for the file.
         exact: True: estimates are not rounded.
     """

@@ -78,7 +78,7 @@ class OverviewWriter:
             self.problem = f"{_NOT_WRITTEN}: {error}"
 
     def write_file(self, folder: Path, frames_sha256: str) -> None:
-        """Write `overview.arrow`."""
+        """Try to write `overview.arrow`; a failure is reported in `problem`."""
         if self.problem is not None:
             return
         try:

@@ -43,7 +43,6 @@ class SessionStream(StreamState):
         find_seqs_around: lookup of the frames next to a time.
         offset_ns: offset from its times to the clock that gives the stop's time; None: unknown, or
             no session is stopped by that clock.
-            None: not known, or no session ends by that clock.
         last_seen_t_ns: arrival time of its last frame, by that clock; None: unknown.
     """
 
@@ -55,7 +54,7 @@ class SessionStream(StreamState):
     last_seen_t_ns: int | None = None
 
     def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
-        """Return the node's time of the newest frame up to `seq`, or of the oldest from it."""
+        """Return the node's time of the newest frame up to `seq` or the oldest from it, or None."""
         return (
             self.journal.find_t_ns_near(seq, is_upper=newest) if self.journal is not None else None
         )
@@ -69,7 +68,7 @@ def find_seqs_around(
     Args:
         journal: journal of the stream.
         t_ns: the time, node's UTC.
-        min_seq: earlier numbers do not count; the last is `at_least` - 1 if there is none.
+        min_seq: earlier numbers do not count; the last is `min_seq` - 1 if there is none.
         wait_for_missing: ignored, since nothing is cached here.
 
     Returns:
@@ -93,7 +92,7 @@ Streams = Mapping[str, SessionStream]
 
 
 def close_at_stop(session: Session, streams: Streams, *, wait_for_missing: bool = False) -> Session:
-    """Close the open parts whose stream has passed the stop.
+    """Return the session with those open parts closed whose stream has passed the stop.
 
     Args:
         session: the session.
@@ -112,7 +111,7 @@ def close_at_stop(session: Session, streams: Streams, *, wait_for_missing: bool 
 
 
 def close_at_stream_end(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
-    """Close every open part at the end of its stream.
+    """Return the session with every open part closed at the end of its stream.
 
     Args:
         session: the session.
@@ -137,7 +136,7 @@ def close_at_stream_end(session: Session, streams: Streams, now_t_ns: int | None
 
 
 def close_unfinished(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
-    """Close every part at its stored frames: no more will come.
+    """Return the session with every part closed at its stored frames: no more will come.
 
     A session without a stop gets the time of its newest frame as stop.
 
@@ -161,7 +160,7 @@ def close_unfinished(session: Session, streams: Streams, now_t_ns: int | None = 
 
 
 def close_part(session: Session, part: Part, seq_last: int, max_lost_tail: int = 0) -> Session:
-    """Return the session with a part closed at a number; up to `tail` lost frames may follow."""
+    """Return the session with a part closed; up to `max_lost_tail` lost frames may follow."""
     closed = part.model_copy(update={"seq_last": max(seq_last, part.seq_first - 1)})
     parts = tuple(closed if each is part else each for each in session.parts)
     update: dict[str, object] = {"parts": parts}

@@ -136,7 +136,7 @@ class EstimateStream:
 
         Args:
             batches: next frames.
-            is_final: True: no more frames will come; else `kept` has the frames that wait for
+            is_final: True: no more frames will come; else `state_dict` has the frames that wait for
                 their look-ahead.
 
         Raises:

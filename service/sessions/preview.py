@@ -81,7 +81,7 @@ class SessionPreview:
         return list(checkpoints[: max(1, count)])
 
     def update(self, inputs: SessionInputs) -> None:
-        """Estimate the frames that have come; `can_use` is true of `inputs`, the present ones.
+        """Estimate new frames for `UPDATE_BUDGET_S` at most; `can_use` is true of `inputs`.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
@@ -134,7 +134,7 @@ class SessionPreview:
         self._inputs = inputs
 
     def start_repeated_work(self, previous: SessionPreview) -> None:
-        """Start measuring repeated work, up to the position of another preview."""
+        """Reset the time of repeated work, which is measured up to another preview's position."""
         self._fed_before_rewind, self.repeated_work_s = previous._position.fed_frames, 0.0
 
     def get_bins(self, time_slice: Slice, points: int) -> BinnedSlice:
@@ -233,7 +233,7 @@ class SessionPreviews:
             return self._advance_preview(inputs)
 
     def get_quickly(self, inputs: SessionInputs) -> SessionPreview:
-        """Return a session's preview without waiting for a long catch-up.
+        """Return a session's preview; it is advanced first unless it is catching up.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.

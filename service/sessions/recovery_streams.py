@@ -89,7 +89,7 @@ class OpenedStream:
             self.notes.save(self.journal.folder)
 
     def invalidate_damaged(self, first: int, last: int) -> None:
-        """Read the stored frames from `first` to `last`; frames with a wrong checksum are lost.
+        """Read the stored frames from `first_seq` to `last_seq`, and invalidate damaged ones.
 
         Raises:
             StorageError: it cannot be read.
@@ -111,7 +111,7 @@ class OpenedStream:
 def open_streams(
     data: Path, report_step: Callable[[str], None], *, is_node_folder: bool
 ) -> tuple[dict[tuple[str, str], OpenedStream], list[str]]:
-    """Open every journal of a data folder; this cuts off partial batches and syncs the rest.
+    """Open and mend every journal of a data folder: cut off partial batches, sync the rest.
 
     Args:
         data: the data folder.
@@ -149,7 +149,7 @@ def open_streams(
 
 
 def read_hello(data: Path, node: str) -> dict[str, Any]:
-    """Read the node's last hello on the server's disk; empty if there is none."""
+    """Read the node's last hello on the server's disk; empty if it is missing or unreadable."""
     try:
         content = json.loads(read_checksummed_json(data / "nodes" / node / "hello.json"))
     except (OSError, ValueError, RecursionError):

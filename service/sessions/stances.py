@@ -64,7 +64,7 @@ class StancesWriter:
             self._analyse_waiting()
 
     def write_file(self, folder: Path, frames_sha256: str) -> None:
-        """Write `stances.parquet`; without estimates, delete the file of an earlier attempt."""
+        """Try to write `stances.parquet`; without estimates, delete that of an earlier attempt."""
         path = folder / STANCES_NAME
         if not self._has_estimates:
             with suppress(OSError):

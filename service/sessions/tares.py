@@ -71,7 +71,7 @@ class TareHistory:
 
     @property
     def tares(self) -> list[RecordedTare]:
-        """All known tares, oldest first."""
+        """All intact tares, of any array and undone ones too, oldest first."""
         return [entry for entry in self._entries if isinstance(entry, RecordedTare)]
 
     def is_empty(self, info: ArrayInfo) -> bool:
@@ -98,7 +98,7 @@ class TareHistory:
         return any(first <= t_ns <= last for first, last in self._lost_intervals())
 
     def tare_for_estimates(self, info: ArrayInfo) -> Tare | None:
-        """Return the tare for estimates: in force, the stand-in of a lost one, or None."""
+        """Return the tare in force, else `Tare.make_lost` for a lost one, else None."""
         in_force = self.tare_in_force(info)
         if in_force is not None:
             return in_force.tare
@@ -131,7 +131,7 @@ class TareHistory:
         """Return the tares in force at some time of an interval, oldest first.
 
         Those are the last one before it and all within; without one before, the first within is
-        used from the beginning on. `Tare.lost` stands for a lost one, from the earliest time at
+        ... `Tare.make_lost` stands for a lost one ..., from the earliest time at
         which it may have been in force.
         """
         gaps = list(self._lost_intervals())
@@ -167,7 +167,7 @@ class TareHistory:
         return entry.tare.t_ns if isinstance(entry, RecordedTare) else otherwise
 
     def add_tare(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
-        """Add a tare and put it in force.
+        """Store a tare, which puts it in force.
 
         Args:
             tare: the tare.

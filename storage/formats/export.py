@@ -79,7 +79,7 @@ def make_frame_source(
     span_ns: tuple[int, int] | None = None,
     axis: TimeAxis = NODE_AXIS,
 ) -> FrameSource:
-    """Return the source of given frames; consumes the first batch that is not empty.
+    """Return a source of given frames that can be read once; consume the first batch with frames.
 
     Args:
         frame_chunks: frames with their further columns, in order.
@@ -168,7 +168,7 @@ class Export:
         return "grf_n" in self.frame_source.quantity_names
 
     def select_columns(self, columns: Sequence[str] = ()) -> dict[str, str]:
-        """Return the quantity of each selected column by flat name, in order.
+        """Return the quantity of each given, selected, or else any column by flat name, in order.
 
         Args:
             columns: names, of all tiles or of one; empty: the slice's columns, or all.

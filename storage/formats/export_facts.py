@@ -30,7 +30,7 @@ _SERVER_TIME_BASE = (
 def make_export_facts(
     notes: Mapping[str, object], provenance: Mapping[str, object], *, has_server_time: bool
 ) -> dict[str, object]:
-    """Return the facts of an export of unmodified frames, as JSON.
+    """Return completeness, losses, time base and axes of an export of unmodified frames, as JSON.
 
     Args:
         notes: notes of the session, with its ledger if it is sealed.

@@ -53,7 +53,7 @@ class Subscriber:
         self._backlog_since_s = 0.0
 
     def send_tick(self, tick: Tick, now_s: float) -> None:
-        """Write the update with the backlog, or add it to the backlog."""
+        """Write the update, or merge it into the backlog of a subscriber that does not read."""
         is_ready = self._socket.is_writable
         if self._backlog is None:
             if is_ready:
@@ -70,7 +70,7 @@ class Subscriber:
             self.disconnect(CloseConnection(LinkCloseCode.TOO_SLOW, "this client does not read"))
 
     def disconnect(self, reason: Exception) -> None:
-        """Request that the subscriber is disconnected."""
+        """Request that the subscriber is disconnected, by its task; the first reason counts."""
         if not self.disconnected.done():
             self.disconnected.set_exception(reason)
 
@@ -96,7 +96,7 @@ class RateGroup:
         self._nodes = nodes
 
     def pending_update(self) -> PendingUpdate:
-        """Return the content of the next tick, for additions, and schedule the tick."""
+        """Schedule the next tick, and return its content, for additions."""
         self._has_pending.set()
         return self._pending
 
@@ -170,7 +170,7 @@ class Broadcaster:
                 del self._groups[key]
 
     def send_notice(self, message: Mapping[str, Any]) -> None:
-        """Send a message to all subscribers with the next update."""
+        """Queue a message to all subscribers for the next update."""
         if self._groups:
             text = encode_json(message)
             for summary in self._pending_updates():
@@ -179,12 +179,12 @@ class Broadcaster:
     def send_progress(
         self, node: str, progress_by_session: Mapping[str, Mapping[str, Any]]
     ) -> None:
-        """Send the progress of sessions of a node to all subscribers, by id."""
+        """Queue the progress of sessions, by id, for the subscribers of their node."""
         for summary in self._pending_updates():
             summary.add_progress(node, progress_by_session)
 
     def add_frames(self, node: ServerNode, due: list[EstimatedBatch]) -> None:
-        """Add estimated frames of a node to its history and to the next updates."""
+        """Add estimated frames of a node to its histories and to the next updates."""
         self._nodes[node.name] = node
         for frames, columns in due:
             node.published_t_ns = int(frames.t_ns[-1])
@@ -199,14 +199,14 @@ class Broadcaster:
                     summary.add_frames(node.name, piece)
 
     def force_history(self, node: ServerNode) -> ForceHistory:
-        """Return the force history of a node's present stream."""
+        """Return the force history of a node's present stream; an empty one if it has no frames."""
         recent = self._force_histories.get(node.name)
         return (
             recent if recent is not None and recent.stream_id == node.stream_id else ForceHistory()
         )
 
     def tile_history(self, node: ServerNode) -> TileHistory:
-        """Return the tile history of a node's present stream."""
+        """Return the tile history of a node's present stream; it replaces one of another stream."""
         return self._get_tile_history(node, len(node.info.tiles))
 
     def _get_tile_history(self, node: ServerNode, tiles: int) -> TileHistory:
@@ -216,7 +216,7 @@ class Broadcaster:
         return recent
 
     def newest_frame_age_ms(self, node: ServerNode) -> float | None:
-        """Return the age of the newest frame of a node's present stream; None if unknown."""
+        """Return the age of a node's newest published frame; None if unknown."""
         has_frames = node.last_seq is not None
         return _newest_frame_ages_ms([node]).get(node.name) if has_frames else None
 

@@ -38,7 +38,7 @@ class ForceHistory:
         """Newest merged span, to which more may be added."""
         self._merged = np.zeros(_MERGED_MAX, _ROW)
         self._count = 0
-        """Number of spans ever written to the ring `_merge_to_bins`."""
+        """Number of spans ever written to the ring `_merged`."""
 
     def add_span(self, stream_id: str, span: ForceSpan) -> None:
         """Add frames that are published now.

@@ -125,7 +125,7 @@ class PendingUpdate:
         self._notices.append(message)
 
     def add_frames(self, node: str, summary: FrameSummary) -> None:
-        """Add the summary of newer frames of a node."""
+        """Merge the summary of newer frames of a node, unless it is filtered out."""
         if self._node_filter not in (None, node):
             return
         span = summary.span
@@ -143,7 +143,7 @@ class PendingUpdate:
         self._summaries[node] = summary
 
     def add_progress(self, node: str, progress_by_session: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add the progress of sessions of a node, by id; only the newest per session is sent."""
+        """Add the progress of sessions of a node, unless it is filtered out; the newest is sent."""
         if self._node_filter in (None, node):
             self._progress_by_session |= progress_by_session
 

@@ -61,7 +61,7 @@ class CalibrationAssignment:
             self.problem = f"the calibration that was assigned cannot be read: {error}"
 
     def assign(self, calibration: Calibration, t_ns: int) -> None:
-        """Assign a calibration.
+        """Store a calibration as the assigned one, in place of the present one.
 
         Raises:
             StorageError: it cannot be stored; the assignment is unchanged.
@@ -70,7 +70,7 @@ class CalibrationAssignment:
         self.current, self.problem = AssignedCalibration(calibration, t_ns), None
 
     def unassign(self, t_ns: int) -> None:
-        """Remove the assignment: the node's own calibration is used again.
+        """Remove the assignment, on the disk too: the node's own calibration is used again.
 
         Raises:
             StorageError: that cannot be stored; the assignment is unchanged.

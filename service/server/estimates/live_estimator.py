@@ -127,10 +127,10 @@ class LiveEstimator:
         self._run = EstimateRun(plan)
 
     def continue_from(self, previous: LiveEstimator) -> None:
-        """Continue the same stream from an estimator with another calibration.
+        """Take the frames of an estimator of the same stream with another calibration, and end it.
 
-        Its recent frames are copied, and its frames that wait for their look-ahead are flushed
-        first.
+        Its recent frames are taken over, not copied; frames that wait for their look-ahead are
+        flushed first.
         """
         previous.set_tare(None)
         self._recent, self._flushed = previous._recent, previous._flushed
@@ -193,7 +193,7 @@ class LiveEstimator:
         return float(shift_n.sum()) if np.isfinite(shift_n).all() else None
 
     def tare_from_lead(self, lead: FrameBatch) -> Tare:
-        """Compute the tare from an emulated lead.
+        """Compute the tare from an emulated lead; the tare in force is unchanged.
 
         Raises:
             TareError: its frames give no tare, or there is no calibration.
@@ -227,7 +227,7 @@ class LiveEstimator:
         )
 
     def compute_tare(self) -> Tare:
-        """Compute the tare from the newest unloaded interval of the last seconds.
+        """Compute a tare from the newest unloaded interval of the last seconds, not in force yet.
 
         Raises:
             TareError: there is no such interval, no calibration, or no frame.

@@ -49,7 +49,7 @@ class NodeEstimator:
 
     @property
     def info(self) -> ArrayInfo:
-        """Array of the present stream."""
+        """Array of the present stream, from the last hello."""
         return self._hello.array_info
 
     @property
@@ -90,7 +90,7 @@ class NodeEstimator:
         return self._ended_epochs.get(stream_id, ())
 
     def assign_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
-        """Assign a calibration, used from the next frame on.
+        """Store the assigned calibration, and use it from the next frame on.
 
         Sessions that are being recorded keep theirs.
 

@@ -131,14 +131,14 @@ class TareController:
         """Undo a tare; the one before is in force again.
 
         Raises:
-            UnknownError, StorageError: as for `TareHistory.undo`.
+            UnknownError, StorageError: as for `TareHistory.undo_tare`.
         """
         self._history.undo_tare(tare_id)
         self._flight_warning = None
         self._live.set_tare(self._history.tare_for_estimates(self._info))
 
     def update(self, journal: Journal | None, get_obtainable: Callable[[], Intervals]) -> None:
-        """Check new frames: tare from a lead that has ended, or in flight.
+        """Tare from a lead that has ended, or in flight, if that is due.
 
         Args:
             journal: journal of the stream.

@@ -66,7 +66,7 @@ class ArrowEncoder:
         return self.schema.serialize().to_pybytes()
 
     def encode_rows(self, rows: FrameRows, cache: EncodeCache) -> Iterator[tuple[bytes, int]]:
-        """Yield frames as messages of at most `MAX_SERIES_ROWS` rows, and the number after each.
+        """Yield messages of at most `ROWS_MAX` frames, each with the number of the next frame.
 
         Args:
             rows: the frames.

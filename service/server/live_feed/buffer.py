@@ -158,7 +158,7 @@ class FeedBuffers:
         return self._buffers.setdefault(node, FeedBuffer(self._turn))
 
     def add_batches(self, node: ServerNode, due: list[EstimatedBatch]) -> None:
-        """Add estimated frames of a node's present stream; cheap without readers."""
+        """Add estimated frames of a node's present stream to its buffer, if it has one."""
         memory = self._buffers.get(node.name)
         if memory is not None:
             memory.add_batches(node.stream_id, due)

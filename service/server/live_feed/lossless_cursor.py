@@ -69,10 +69,10 @@ class LosslessCursor:
         """Number of the next batch, while the reader is served from the buffer."""
 
     def next_event(self) -> FeedEvent | Recompute | None:
-        """Return the next event; None: nothing yet.
+        """Return the next event and go on to the one after; None: nothing yet.
 
         Raises:
-            HangUp: the reader cannot go on; the reason has the position to resume from.
+            CloseConnection: (same text)
         """
         memory = self._buffer
         if (position := self.position) is None:

@@ -1,7 +1,7 @@
 """Position of a reader that prefers new frames over all frames; no I/O.
 
-- `drop_oldest_waiting`: frames older than `QUEUE_NS` at their turn are dropped.
-- `find_latest_position`: of the buffered batches, only the newest is sent.
+- policy `drop_oldest`: frames older than `QUEUE_NS` at their turn are dropped.
+- policy `latest`: of the buffered batches, only the newest is sent.
 
 The reader waits for nothing, and every dropped frame is reported: from a reader's first frame on,
 frames sent and frames reported add up to every known frame.
@@ -16,7 +16,7 @@ from service.server.live_feed.events import FeedEvent, FrameRows, Gap, Position,
 from service.server.live_feed.stream_view import StreamView
 
 QUEUE_NS = 2_000_000_000
-"""Age limit of waiting frames for `drop_oldest_waiting`."""
+"""Age limit of waiting frames for the policy `drop_oldest`."""
 SLOW, LATE = "slow", "late"
 
 
@@ -49,7 +49,7 @@ class LossyCursor:
             self._next_number = self._next_number if found is None else found.number
 
     def next_event(self) -> FeedEvent | None:
-        """Return the next event; None: nothing yet."""
+        """Return the next event and go on to the one after; None: nothing yet."""
         while self._next_number < self._buffer.next_number:
             piece, position = self._oldest_allowed(), self.position
             reason = SLOW if piece.number > self._next_number else LATE

@@ -36,7 +36,7 @@ def start_position(
     """Return the first frame for a reader; None: the next one that comes.
 
     Raises:
-        HangUp: no stream has this id.
+        CloseConnection: (same text)
     """
     if stream_id is None and from_seq is None:
         return None
@@ -98,7 +98,7 @@ class FeedReader:
         """Yield events without end.
 
         Raises:
-            HangUp: the reader cannot go on.
+            CloseConnection: the reader cannot go on.
         """
         announced_id: str | None = None
         async with self._buffer.subscribe() as news:
@@ -117,7 +117,7 @@ class FeedReader:
         """Return the next event; None: nothing yet.
 
         Raises:
-            HangUp: the reader cannot go on.
+            CloseConnection: the reader cannot go on.
         """
         while True:
             step = self._cursor.next_event()

@@ -33,7 +33,7 @@ def is_bioware(head: str) -> bool:
 
 
 def read_bioware(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read the vertical force and centre of pressure of each plate.
+    """Parse the vertical force and centre of pressure of each plate, whichever columns are needed.
 
     Raises:
         FileFormatError: names or force plates are missing, or numbers do not fit the names.

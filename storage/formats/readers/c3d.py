@@ -55,12 +55,12 @@ class C3dFile:
     notes: tuple[str, ...] = ()
 
     def get_text_parameter(self, group: str, name: str) -> list[str]:
-        """Return a parameter that is a list of texts; empty if it is missing."""
+        """Return a parameter that is a list of texts; empty if missing or of another type."""
         value = self.parameters.get(group, {}).get(name)
         return value if isinstance(value, list) else []
 
     def get_number_parameter(self, group: str, name: str) -> RawNumbers:
-        """Return a parameter that is an array of numbers; empty if it is missing."""
+        """Return a parameter that is an array of numbers; empty if missing or of another type."""
         value = self.parameters.get(group, {}).get(name)
         return np.empty(0) if value is None or isinstance(value, list) else value
 

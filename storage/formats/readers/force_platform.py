@@ -56,7 +56,7 @@ _MOMENT = re.compile(r"(k?N)[ .*·-]?(mm|cm|m)", re.IGNORECASE)
 
 
 def read_force_platforms(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read force and centre of pressure of each plate, at the rate of analog samples.
+    """Read force and centre of pressure of each readable plate of a C3D file, at the analog rate.
 
     Columns are `plate1_fz`, `plate1_cop_x`, `plate1_cop_y` and so on, in the file's units. A
     single plate has the names `grf_n`, `cop_x_m` and `cop_y_m` as well, if the file states units.

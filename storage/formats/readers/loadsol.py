@@ -36,7 +36,7 @@ def is_loadsol(head: str) -> bool:
 
 
 def read_loadsol(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read the force of each sole as `left_fz`, `right_fz`, with the times of the needed one.
+    """Parse the force of each sole as `left_fz`, `right_fz`, at times picked by `is_time_source`.
 
     Raises:
         FileFormatError: a cell is no number, or the needed soles differ in their times.

@@ -38,7 +38,7 @@ def is_moticon(head: str) -> bool:
 
 
 def read_moticon(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read force and centre of pressure of each sole: `left_fz`, `left_cop_x`, `left_cop_y`.
+    """Parse force and centre of pressure of each sole: `left_fz`, `left_cop_x`, `left_cop_y`.
 
     Raises:
         FileFormatError: a cell is no number, or times are longer than the recording.

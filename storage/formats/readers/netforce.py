@@ -41,7 +41,7 @@ def is_netforce(head: str) -> bool:
 
 
 def read_netforce(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read the vertical force and centre of pressure of each plate, beside the numbered columns.
+    """Parse the vertical force and centre of pressure of each plate, beside the numbered columns.
 
     Raises:
         FileFormatError: lines have different numbers of cells, or a cell is no number.

@@ -39,7 +39,7 @@ def is_nexus(head: str) -> bool:
 
 
 def read_nexus(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read the vertical force and centre of pressure of each plate, at the rate of the devices.
+    """Parse the vertical force and centre of pressure of each plate, at the rate of the devices.
 
     Raises:
         FileFormatError: no section has a force plate, or numbers do not fit its head.

@@ -34,7 +34,7 @@ _UNITS = ((re.compile(r"_v[xyz]?(_\d+)?$"), "N"), (re.compile(r"_p[xyz]?(_\d+)?$
 
 
 def read_opensim_table(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read a `.mot` or `.sto` file.
+    """Read time and the needed columns of a `.mot` or `.sto` file.
 
     Raises:
         FileFormatError: unreadable, header or names are missing, or numbers do not fit the names.

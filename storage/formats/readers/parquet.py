@@ -25,7 +25,7 @@ from storage.parquet_hash import FORMAT_KEY, check_file_hash, read_stated_and_ac
 
 
 def read_parquet_table(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read a Parquet file.
+    """Read the needed columns of a Parquet file; verify the hash of a FootTile session.
 
     Raises:
         FileFormatError: the file cannot be read, is too large, or a needed column is not numeric.

@@ -22,7 +22,7 @@ _CELL_FACTORS = {"force_n": 1.0, "pressure_kpa": 1e3}
 
 
 def read_pressure_plate(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read force and centre of pressure of every frame; NaN if a cell is NaN.
+    """Read a `.npz` file of cells as total force and centre of pressure; NaN if a cell is NaN.
 
     The centre of pressure is NaN without load.
 

@@ -55,7 +55,7 @@ def is_bag_folder(path: Path) -> bool:
 
 @require_extra("mcap", "To read ROS bags and MCAP")
 def read_bag_table(path: Path, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read the wrenches of the needed topics; the only topic of a bag needs no mapping.
+    """Read all columns of each topic with a needed column, or of a bag's only topic of wrenches.
 
     Raises:
         FileFormatError: unreadable, no wrenches, or two needed topics differ in their times.

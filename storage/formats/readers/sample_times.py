@@ -12,7 +12,7 @@ DEVIATION_MAX_STEPS = 1.5
 
 
 def respace_repeated_times(time_s: Floats) -> tuple[Floats, str]:
-    """Replace rounded times with repetitions by times at a constant rate.
+    """Replace all times by times at a constant rate if rounding made some of them equal.
 
     Times are returned unchanged unless the rate is clear: no time falls, and all deviate from a
     constant rate by rounding only.

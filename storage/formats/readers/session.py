@@ -19,7 +19,7 @@ from storage.sessions.time_axis import NODE_AXIS, TimeAxis
 
 
 def read_session_table(path: Path, extra_names: Collection[str]) -> ForceTable | None:
-    """Read a sealed FootTile session; return None for another kind of file.
+    """Read the standard and optional columns that a sealed session has; None for another file.
 
     Raises:
         FileFormatError: the session is damaged, or has no frames.

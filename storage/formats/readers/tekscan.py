@@ -33,7 +33,7 @@ def is_tekscan(head: str) -> bool:
 
 
 def read_tekscan(text: str, where: str, is_needed: ColumnFilter, values_max: int) -> ForceTable:
-    """Read total force and centre of pressure, from the middle of the sensor.
+    """Parse the frames of cells to total force and centre of pressure, from the sensor's middle.
 
     Raises:
         FileFormatError: a fact is missing, frames are truncated, or a cell is no number.

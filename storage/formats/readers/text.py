@@ -96,7 +96,7 @@ def parse_text_table(
     values_max: int,
     options: TextOptions | None = None,
 ) -> ForceTable:
-    """Read the columns of a text.
+    """Parse the needed columns of a text.
 
     Raises:
         FileFormatError: the text is too large, has no columns of numbers, or a cell of a needed
@@ -350,7 +350,7 @@ def _units_by_name(names: Sequence[str], units: Sequence[str]) -> dict[str, str]
 
 
 def split_cells_unchanged(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line, unchanged."""
+    """Return the cells of a line of CSV without their quotes, trailing empty cells included."""
     if delimiter == BLANKS:
         return line.split()
     try:

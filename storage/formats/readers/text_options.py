@@ -51,5 +51,5 @@ class TextOptions:
 
     @property
     def is_plain_table(self) -> bool:
-        """True if an option declares a plain table; the head is then not inspected."""
+        """True if an option other than the encoding is set; the head is then not inspected."""
         return any(one is not None for one in (self.skip_rows, self.units_row, self.decimal))

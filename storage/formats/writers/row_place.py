@@ -21,7 +21,7 @@ _COP_MASKED = 16
 
 
 def with_row_place(columns: Mapping[str, Array], info: ArrayInfo) -> dict[str, Array]:
-    """Return the columns, with the row's place as the coordinate that it does not measure.
+    """Return the columns, with the place of a row of tiles as the unmeasured COP across it.
 
     Args:
         columns: `NEEDED` and any others, (n,) each.

@@ -36,7 +36,7 @@ class LiveFeedSession:
         server: server of the nodes.
 
     Raises:
-        HangUp: the query is invalid, or its stream or columns do not exist.
+        CloseConnection: the query is invalid, or its stream or columns do not exist.
     """
 
     def __init__(self, socket: WebSocket, server: Server) -> None:
@@ -78,7 +78,7 @@ class LiveFeedSession:
         """Send frames until the connection ends.
 
         Raises:
-            HangUp: it cannot go on; the reason has the position to resume from.
+            CloseConnection: it cannot go on; the reason has the position to resume from.
             WebSocketDisconnect: the client has disconnected.
         """
         hello = {
@@ -130,7 +130,7 @@ class LiveFeedSession:
         """Send one message, once there is room for it.
 
         Raises:
-            HangUp: the client has read nothing for too long.
+            CloseConnection: the client has read nothing for too long.
         """
         try:
             async with asyncio.timeout(TOO_SLOW_S):

@@ -21,7 +21,7 @@ from storage.schema import COLUMNS_BY_NAME, Array, Column, numpy_dtype_of
 
 
 def list_quantities(export: Export) -> list[Column]:
-    """Return the selected quantities in the order of their columns, without markers."""
+    """Return the selected quantities in column order, without `marker` and `time_utc`."""
     chosen = dict.fromkeys(export.select_columns().values())
     return [COLUMNS_BY_NAME[of] for of in chosen if of not in ("time_utc", "marker")]
 

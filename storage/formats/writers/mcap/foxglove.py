@@ -59,7 +59,7 @@ def list_frame_message_columns(export: Export) -> list[str]:
 
 
 def list_needed_columns(export: Export) -> list[str]:
-    """Return the columns to read."""
+    """Return the flat columns to read for Foxglove messages."""
     drawn = [name for name in _SCENE_COLUMNS if export.has_forces]
     return [*list_frame_message_columns(export), *drawn]
 

@@ -43,7 +43,7 @@ _TEMPERATURE_HOLD_NS = _NS
 
 
 def list_needed_columns(export: Export) -> list[str]:
-    """Return the columns to read."""
+    """Return the quantities to read for ROS 2 messages."""
     return [*_READINGS, *(_FORCES if export.has_forces else ())]
 
 
